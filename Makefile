@@ -1,0 +1,61 @@
+# Everything from a bare checkout with Python 3.11 or 3.12: `make test`. See `make help`.
+
+PYTHON ?=
+export PYTHON
+
+VENV   := .venv/bin/python
+COLCON := env -u PYTHONDONTWRITEBYTECODE $(VENV) -c 'import sys; from colcon_core.command import main; sys.exit(main())'
+# every command that starts nodes needs the workspace in its environment
+IN_WORKSPACE := . install/setup.sh &&
+
+VENV_STAMP  := .venv/.stamp
+BUILD_STAMP := install/.stamp
+
+# The environment that .venv was made for; a copied checkout, another Python or a newly sourced ROS makes a new one.
+WANTED := $(CURDIR) PYTHON=$(PYTHON) ROS_DISTRO=$(ROS_DISTRO)
+ifneq ($(strip $(WANTED)),$(strip $(shell cat $(VENV_STAMP) 2>/dev/null)))
+$(VENV_STAMP): FORCE
+endif
+
+# Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
+INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
+
+.PHONY: help build test demo bench clean distclean FORCE
+
+help:
+	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
+	@echo 'make test       build, lint, types, docstrings, tests'
+	@echo 'make demo       build, then simulated stage, calibration, identification and compensation over DDS'
+	@echo 'make bench      build, then the benchmarks'
+	@echo 'make clean      remove what was built and all caches'
+	@echo 'make distclean  the same, and .venv'
+	@echo 'PYTHON=/path/to/python3.12 chooses the Python; 3.11 and 3.12 work'
+
+build: $(BUILD_STAMP)
+
+$(VENV_STAMP): setup.py tools/make_venv.sh $(wildcard requirements/*.txt)
+	@tools/make_venv.sh
+	@echo '$(WANTED)' >$@
+
+$(BUILD_STAMP): $(VENV_STAMP) $(INSTALLED)
+	@rm -rf build install
+	@$(COLCON) build --symlink-install --event-handlers console_start_end- summary-
+	@touch $@
+
+test: build
+	$(VENV) -m ruff check .
+	$(VENV) -m mypy
+	$(IN_WORKSPACE) $(VENV) -m pytest
+
+demo: build
+	$(IN_WORKSPACE) $(VENV) demo/run_demo.py
+
+bench: build
+	$(IN_WORKSPACE) $(VENV) benchmarks/run_all.py
+
+clean:
+	rm -rf build install log .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -path ./.venv -prune -o -name __pycache__ -prune -exec rm -rf {} +
+
+distclean: clean
+	rm -rf .venv slpi_ros.egg-info

@@ -1,0 +1,50 @@
+"""Hysteresis compensation for piezo stages: identify a model from a bag, simulate it, invert it.
+
+SLPI is the Separated Level-loop Prandtl-Ishlinskii model. Nothing here needs a running ROS graph.
+"""
+
+import os
+
+from slpi_ros.errors import SlpiError
+from slpi_ros.identification.fit import identify
+from slpi_ros.identification.record import Record
+from slpi_ros.model import AxisModel, HeldAtLimitWarning, StageModel
+from slpi_ros.model_file import load_model, save_model
+
+__all__ = [
+    "AxisModel",
+    "HeldAtLimitWarning",
+    "Record",
+    "SlpiError",
+    "StageModel",
+    "identify",
+    "load_model",
+    "read_bag",
+    "save_model",
+]
+
+
+def read_bag(path: str | os.PathLike[str], topic: str = "stage_state") -> Record:
+    """Read voltage and displacement of a stage from a bag.
+
+    Parameters
+    ----------
+    path : path-like
+        A rosbag2 folder, or a lone mcap or sqlite3 file.
+    topic : str
+        A topic of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts.
+
+    Returns
+    -------
+    Record
+        ``t`` in seconds, shape (N,); ``voltage`` and ``displacement`` per axis, shape (N,), in volts and metres.
+
+    Raises
+    ------
+    SlpiError
+        If the bag cannot be read; the message says what to do.
+    """
+    # Bags need rosbags, models do not: whoever only compensates does without it.
+    from slpi_ros.bags import read_bag as read
+
+    return read(path, topic)

@@ -1,0 +1,119 @@
+"""Finding a recording: the bag on disk, the topic in the bag, and what to say when it is not there."""
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from slpi_ros.errors import RecordError, SlpiError
+
+_SUFFIXES = (".mcap", ".db3")
+_WANTED = "give a rosbag2 folder or an .mcap or .db3 file"
+
+
+def partial_path(path: str | os.PathLike[str]) -> Path:
+    """Return the folder that holds the bag of this path until it is complete."""
+    path = Path(path)
+    return path.with_name(f".{path.name}.partial")
+
+
+def locate(path: Path) -> Path:
+    """Return what a bag reader can open: a folder with metadata, or a bag file.
+
+    Raises
+    ------
+    RecordError
+        If there is none at this path.
+    """
+    if not path.exists():
+        hint = _WANTED
+        if path.name and partial_path(path).exists():
+            hint = f"its recording is unfinished, in {partial_path(path)}: wait for the recorder to end"
+        raise RecordError(f"{path}: no such bag; {hint}")
+    if path.is_file():
+        if path.suffix in _SUFFIXES:
+            return path
+        hint = {
+            ".csv": "import the table first with `slpi import`",
+            ".bag": "convert a ROS 1 bag first with `rosbags-convert`",
+        }.get(path.suffix, _WANTED)
+        raise RecordError(f"{path}: not a bag of ROS 2; {hint}")
+    if (path / "metadata.yaml").exists():
+        return path
+    files = sorted(file for file in path.iterdir() if file.suffix in _SUFFIXES)
+    if len(files) == 1:
+        return files[0]
+    if files:
+        raise RecordError(
+            f"{path}: {len(files)} bag files but no metadata.yaml; make one with `ros2 bag reindex {path}`, "
+            "or give one of the files"
+        )
+    raise RecordError(f"{path}: a folder without metadata.yaml and without .mcap or .db3 file; not a bag")
+
+
+@contextmanager
+def translated(source: Path) -> Iterator[None]:
+    """Turn whatever a damaged bag makes its reader raise into a RecordError of one line."""
+    try:
+        yield
+    except SlpiError:
+        raise
+    except PermissionError as error:
+        raise RecordError(f"{source}: cannot be read ({one_line(error)}); check the permissions") from error
+    except Exception as error:
+        # struct, zstd, yaml, sqlite, unicode, memory...: a damaged file fails in any way
+        reason = one_line(error)
+        raise RecordError(f"{source}: damaged or unfinished ({reason}); {_remedy(source)}") from error
+
+
+def _remedy(source: Path) -> str:
+    """Say what can be tried with a bag that does not open."""
+    if source.is_dir():
+        return "rebuild metadata.yaml with `ros2 bag reindex`, or give its .mcap or .db3 file alone"
+    if source.suffix == ".mcap":
+        return f"if its recorder was killed, recover with `mcap recover {source} -o NEW.mcap`"
+    return f"try `sqlite3 {source} .recover | sqlite3 NEW.db3`"
+
+
+def one_line(error: Exception) -> str:
+    """Return what the error says, short and without line breaks."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def match_topic(topics: Mapping[str, str], topic: str, msgtype: str, source: Path) -> str:
+    """Return the full name of the topic that is meant.
+
+    Parameters
+    ----------
+    topics : mapping of str to str
+        Full name to type of what the bag holds.
+    topic : str
+        Full name, or its last parts where they leave no doubt.
+    msgtype : str
+        The type it must have.
+    source : Path
+        The bag, for messages.
+
+    Raises
+    ------
+    RecordError
+        If there is none, more than one, or it is of another type.
+    """
+    contents = ", ".join(f"{name} ({topics[name]})" for name in sorted(topics)) or "no topics"
+    wanted = absolute_name(topic)
+    found = [name for name in topics if absolute_name(name) == wanted]
+    found = found or sorted(name for name in topics if name.endswith(wanted))
+    if not found:
+        raise RecordError(f"{source}: no topic '{topic}'; the bag holds {contents}")
+    if len(found) > 1:
+        raise RecordError(f"{source}: topic '{topic}' may be {' or '.join(found)}; give the full name")
+    if topics[found[0]] != msgtype:
+        raise RecordError(
+            f"{source}: topic '{found[0]}' is {topics[found[0]]}, not {msgtype}; the bag holds {contents}"
+        )
+    return found[0]
+
+
+def absolute_name(topic: str) -> str:
+    """Return the topic with exactly one leading slash."""
+    return f"/{topic.strip('/')}"

@@ -1,0 +1,317 @@
+"""Bags in and out: the stage's recordings as rosbag2 folders or lone files, mcap or sqlite3.
+
+This is the only module that imports rosbags, and no rosbags exception leaves it.
+"""
+
+import os
+import shutil
+import sqlite3
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
+from rosbags.typesys import Stores, TypesysError, get_typestore
+
+from slpi_ros.bag_files import absolute_name, locate, match_topic, one_line, partial_path, translated
+from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.identification.record import Record
+from slpi_ros.joint_state import (
+    JointStateBlock,
+    choose_joints,
+    decode_joint_states,
+    joint_state_layout,
+)
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+
+_BAG_VERSION: Literal[9] = 9  # what ROS 2 Jazzy writes
+_WRITE_ERRORS = (OSError, sqlite3.Error, WriterError)
+
+
+def read_bag(
+    path: str | os.PathLike[str], topic: str = "stage_state", *, axes: Sequence[str] | None = None
+) -> Record:
+    """Read voltage and displacement of a stage from a bag.
+
+    Parameters
+    ----------
+    path : path
+        A rosbag2 folder, or a lone ``.mcap`` or ``.db3`` file.
+    topic : str
+        Name with or without the leading slash; it also finds ``/ns/stage_state`` when that is the only one.
+        Of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts.
+    axes : sequence of str, optional
+        The axes to read, in this order; all that the messages name when not given or empty.
+
+    Returns
+    -------
+    Record
+        Time is the header stamp, or the time of recording where no header is stamped. NaN where a message
+        does not hold an axis.
+
+    Raises
+    ------
+    RecordError
+        If there is no such bag, topic or axis, or the bag cannot be read; the message says what to do.
+    """
+    path = Path(path)
+    source = locate(path)
+    with translated(source):
+        logged, messages = _collect(source, topic)
+        samples = decode_joint_states(messages, _deserialise)
+    chosen = choose_joints(samples, axes, f"{path}, topic '{topic}'")
+    return Record(
+        time_ns=samples.stamp_ns if samples.stamp_ns.any() else logged,
+        voltage={axis: samples.effort[axis] for axis in chosen},
+        displacement={axis: samples.position[axis] for axis in chosen},
+        source=str(path),
+        hardware_id=samples.frame_id,
+    )
+
+
+def write_bag(
+    path: str | os.PathLike[str], record: Record, *, storage: str = "mcap", topic: str = "/stage_state"
+) -> None:
+    """Write a record as a new rosbag2 folder that ``read_bag`` reads back without loss.
+
+    Parameters
+    ----------
+    path : path
+        The folder to make.
+    record : Record
+        What to write; its hardware id becomes the messages' ``frame_id``.
+    storage : {"mcap", "sqlite3"}
+        File format.
+    topic : str
+        Name of the topic.
+
+    Raises
+    ------
+    RecordError
+        If the path exists, or cannot be written.
+    """
+    displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
+    voltage = np.column_stack([record.voltage[axis] for axis in record.axes])
+    messages = joint_state_layout(record.axes, record.hardware_id).encode(
+        JointStateBlock(record.time_ns, displacement, voltage)
+    )
+    # readers sort by log time: where stamps run backwards, the order of the record must survive
+    logged = np.maximum.accumulate(record.time_ns)
+    with BagWriter(path, storage=storage, topic=topic) as bag:
+        for stamp, message in zip(logged.tolist(), messages, strict=True):
+            bag.write_raw(stamp, message)
+
+
+class BagWriter:
+    """A bag being written; a context manager.
+
+    Until it is complete the bag is in ``.NAME.partial`` beside its place, so a folder of that name is always
+    a whole bag. An exception inside ``with`` discards it; without ``with``, call ``close`` or ``discard``.
+
+    Parameters
+    ----------
+    path : path
+        The rosbag2 folder to make; parent folders are made too.
+    storage : {"mcap", "sqlite3"}
+        File format.
+    topic : str, optional
+        Topic of type ``sensor_msgs/JointState`` that ``write`` and ``write_raw`` go to; None to announce
+        all topics by ``add_topic``.
+    hardware_id : str
+        The stage, for messages made by ``write``.
+
+    Attributes
+    ----------
+    path : Path
+        Where the bag will be.
+    partial : Path
+        Where it is until then.
+    message_count : int
+        Messages written so far.
+
+    Raises
+    ------
+    RecordError
+        If the path or an unfinished bag of that name exists, or cannot be written.
+    UsageError
+        If there is no such storage.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        storage: str = "mcap",
+        topic: str | None = "/stage_state",
+        hardware_id: str = "",
+    ) -> None:
+        if storage not in STORAGES:
+            raise UsageError(f"no bag storage '{storage}'; choose {' or '.join(STORAGES)}")
+        self.path = Path(path).absolute()
+        self.partial = partial_path(self.path)
+        self.message_count = 0
+        self._hardware_id = hardware_id
+        self._topic = topic
+        self._connections: dict[str, Any] = {}
+        if os.path.lexists(self.path):
+            raise RecordError(f"{path}: exists already; choose another name, or remove it first")
+        if self.partial.exists():
+            raise RecordError(
+                f"{self.partial}: an unfinished bag of the same name; wait for its recorder, or, if that was "
+                "killed, move the folder away (mcap files can be saved with `mcap recover`)"
+            )
+        try:
+            self._writer = Writer(
+                self.partial / self.path.name, version=_BAG_VERSION, storage_plugin=STORAGES[storage]
+            )
+            self._writer.open()
+        except _WRITE_ERRORS as error:
+            shutil.rmtree(self.partial, ignore_errors=True)
+            raise RecordError(f"{path}: cannot be made ({one_line(error)}); choose another place") from error
+        if topic is not None:
+            self.add_topic(topic)
+
+    def add_topic(self, topic: str, msgtype: str = JOINT_STATE) -> None:
+        """Announce a topic.
+
+        Parameters
+        ----------
+        topic : str
+            Name; a missing leading slash is added.
+        msgtype : str
+            As in ``sensor_msgs/msg/JointState``; any type of ROS 2 Jazzy's own packages.
+
+        Raises
+        ------
+        RecordError
+            If the definition of the type is not known here.
+        """
+        name = absolute_name(topic)
+        try:
+            self._connections[name] = self._writer.add_connection(name, msgtype, typestore=_typestore())
+        except (KeyError, TypesysError) as error:
+            raise RecordError(
+                f"{name}: no definition of type {msgtype}, only of ROS 2 Jazzy's own; leave this topic out"
+            ) from error
+        except _WRITE_ERRORS as error:
+            raise self._failure(error) from error
+
+    def write(
+        self, stamp_ns: int, names: Sequence[str], displacement: ArrayLike, voltage: ArrayLike
+    ) -> None:
+        """Write one sample of all axes.
+
+        Parameters
+        ----------
+        stamp_ns : int, nanoseconds
+            Stamp of the header and time of the log.
+        names : sequence of str, length K
+            Axes.
+        displacement : array_like, shape (K,), metres
+            Measured displacement.
+        voltage : array_like, shape (K,), volts
+            Applied voltage.
+        """
+        row = (1, len(names))
+        block = JointStateBlock(
+            np.array([stamp_ns], np.int64),
+            np.asarray(displacement, float).reshape(row),
+            np.asarray(voltage, float).reshape(row),
+        )
+        self.write_raw(stamp_ns, joint_state_layout(tuple(names), self._hardware_id).encode(block)[0])
+
+    def write_raw(self, stamp_ns: int, message: bytes, topic: str | None = None) -> None:
+        """Write a message that is serialised already.
+
+        Parameters
+        ----------
+        stamp_ns : int, nanoseconds
+            Time of the log.
+        message : bytes
+            CDR with its encapsulation header.
+        topic : str, optional
+            One that was announced; by default the writer's own.
+        """
+        name = absolute_name(topic or self._topic or "")
+        if name not in self._connections:
+            raise UsageError(f"{self.path}: topic '{name}' was not announced; call add_topic first")
+        try:
+            self._writer.write(self._connections[name], stamp_ns, message)
+        except _WRITE_ERRORS as error:
+            raise self._failure(error) from error
+        self.message_count += 1
+
+    def close(self) -> None:
+        """Complete the bag and put it in its place.
+
+        Raises
+        ------
+        RecordError
+            If the disk does not take it; what is there stays in the partial folder.
+        """
+        try:
+            self._writer.close()
+            (self.partial / self.path.name).rename(self.path)
+            self.partial.rmdir()
+        except _WRITE_ERRORS as error:
+            raise self._failure(error) from error
+
+    def discard(self) -> None:
+        """Give up: remove everything written so far."""
+        # a full disk lets even this fail; there is nothing left to lose
+        with suppress(*_WRITE_ERRORS):
+            self._writer.abort()
+        shutil.rmtree(self.partial, ignore_errors=True)
+
+    def __enter__(self) -> Self:
+        """Return the open writer."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete the bag, or discard it after an exception."""
+        if error is not None:
+            self.discard()
+            return
+        try:
+            self.close()
+        except RecordError:
+            self.discard()
+            raise
+
+    def _failure(self, error: Exception) -> RecordError:
+        return RecordError(
+            f"{self.path}: cannot be written ({one_line(error)}); free some space or choose another place"
+        )
+
+
+def _collect(source: Path, topic: str) -> tuple[NDArray[np.int64], list[bytes]]:
+    """Return log times and serialised messages of the topic, in the order of the log."""
+    with Reader(source) as reader:
+        name = match_topic({c.topic: c.msgtype for c in reader.connections}, topic, JOINT_STATE, source)
+        connections = [c for c in reader.connections if c.topic == name]
+        rows = [(stamp, message) for _, stamp, message in reader.messages(connections)]
+    if not rows:
+        raise RecordError(f"{source}: no message on topic '{topic}'; was the stage's driver running?")
+    return np.array([stamp for stamp, _ in rows], np.int64), [message for _, message in rows]
+
+
+def _deserialise(message: bytes) -> Any:
+    """Return the message as an object; a short one raises."""
+    # not Typestore.deserialize_cdr: it refuses the garbage that rclpy's serialize_message leaves at the end
+    definition = _typestore().get_msgdef(JOINT_STATE)
+    decode = definition.deserialize_cdr_le if message[1] & 1 else definition.deserialize_cdr_be
+    return decode(message[4:], 0, definition.cls, _typestore())[0]
+
+
+@cache
+def _typestore() -> Any:
+    return get_typestore(Stores.ROS2_JAZZY)

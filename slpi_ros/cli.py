@@ -1,0 +1,165 @@
+"""The command line ``slpi``: it needs no running ROS graph.
+
+Exit codes: 0 done, 1 the data do not allow it, 2 wrong usage; what is wrong is said in one line.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from slpi_ros import bags, tables
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.identification.fit import KINDS, identify
+from slpi_ros.model import StageModel, check_time, held_message
+from slpi_ros.model_file import load_model, save_model
+from slpi_ros.reports.text import describe_model
+from slpi_ros.stream import Limits
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        options.run(options)
+    except SlpiError as error:
+        print(f"slpi {options.command}: {_one_line(error)}", file=sys.stderr)
+        return error.exit_code
+    except (OSError, MemoryError) as error:
+        print(f"slpi {options.command}: {_one_line(error) or 'not enough memory'}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="slpi", description="Hysteresis models of piezo stages: identify, simulate, compensate.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+
+    command = commands.add_parser("import", help="turn a CSV table of measured data into a bag")
+    command.set_defaults(run=_import)
+    command.add_argument("table", metavar="DATA.csv")
+    command.add_argument("-o", "--output", metavar="BAG", required=True, help="folder of the new bag")
+    command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
+    command.add_argument("--voltage", metavar="COLUMN", nargs="+", default=(), help="one for all axes or one for each")
+    command.add_argument("--displacement", metavar="COLUMN", nargs="+", default=(), help="one for each axis")
+    command.add_argument("--displacement-unit", default="um", help="m, mm, um or nm, where column names do not say it")
+    command.add_argument(
+        "--axes", metavar="NAME", nargs="+", default=(), help="names of the axes; default: from the columns"
+    )
+    command.add_argument("--hardware-id", metavar="ID", default="", help="which stage it is")
+    command.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
+
+    command = commands.add_parser("identify", help="identify the model of a stage from a bag")
+    command.set_defaults(run=_identify)
+    command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a lone mcap or sqlite3 file")
+    command.add_argument("-o", "--output", metavar="MODEL.json", required=True)
+    command.add_argument("--kind", choices=KINDS, default="slpi")
+    command.add_argument("--topic", default="stage_state")
+    command.add_argument("--axis", metavar="NAME", nargs="+", help="default: every axis of the bag")
+    command.add_argument("--start", metavar="S", type=float, help="fit only from here on, seconds from the first stamp")
+    command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
+    command.add_argument("--report", metavar="DIR", help="also write a page with plots")
+
+    command = commands.add_parser("simulate", help="voltage to displacement")
+    command.set_defaults(run=_simulate)
+    command.add_argument("model", metavar="MODEL.json")
+    command.add_argument("table", metavar="VOLTAGE.csv", help="columns time_s, <axis>_V")
+    command.add_argument("-o", "--output", metavar="DISPLACEMENT.csv", required=True)
+
+    command = commands.add_parser("compensate", help="desired displacement to voltage")
+    command.set_defaults(run=_compensate)
+    command.add_argument("model", metavar="MODEL.json")
+    command.add_argument("table", metavar="DESIRED.csv", help="columns time_s, <axis>_m")
+    command.add_argument("-o", "--output", metavar="VOLTAGE.csv", required=True)
+    command.add_argument("--voltage-min", metavar="V", type=float, default=-np.inf, help="default: what was identified")
+    command.add_argument("--voltage-max", metavar="V", type=float, default=np.inf)
+
+    command = commands.add_parser("show", help="say what a model holds")
+    command.set_defaults(run=_show)
+    command.add_argument("model", metavar="MODEL.json")
+    return parser
+
+
+def _import(options: argparse.Namespace) -> None:
+    record = tables.import_csv(
+        options.table,
+        time=options.time,
+        voltage=options.voltage,
+        displacement=options.displacement,
+        displacement_unit=options.displacement_unit,
+        axes=options.axes,
+    )
+    record = replace(record, hardware_id=options.hardware_id)
+    bags.write_bag(options.output, record, storage=options.storage)
+    print(f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s")
+
+
+def _identify(options: argparse.Namespace) -> None:
+    if len(options.bags) > 1:
+        raise UsageError(f"{len(options.bags)} bags given; this version fits one bag at a time")
+    record = bags.read_bag(options.bags[0], options.topic, axes=options.axis)
+    model = identify(record, options.kind, start=options.start, stop=options.stop)
+    save_model(model, options.output)
+    if options.report:
+        # Plotting is slow to load, and most commands do without.
+        from slpi_ros.reports.identification import write_report
+
+        write_report(Path(options.report), record, model)
+    print("\n".join(describe_model(model)))
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    model = load_model(options.model)
+    t, voltage = tables.read_table(options.table, "V")
+    tables.write_table(options.output, t, model.simulate(t, _known(voltage, model, options.table)), "m")
+
+
+def _compensate(options: argparse.Namespace) -> None:
+    model = load_model(options.model)
+    t, desired = tables.read_table(options.table, "m")
+    check_time(t)
+    limits = Limits(options.voltage_min, options.voltage_max)
+    voltage = {}
+    for axis, y in _known(desired, model, options.table).items():
+        try:
+            voltage[axis], held = model.axis(axis).compensate(y, limits)
+        except SlpiError as error:
+            raise type(error)(f"{options.table}, axis '{axis}': {error}") from None
+        if held.any():
+            print(f"slpi compensate: axis '{axis}': {held_message(held)}", file=sys.stderr)
+    tables.write_table(options.output, t, voltage, "V")
+
+
+def _known(columns: dict[str, np.ndarray], model: StageModel, table: str) -> dict[str, np.ndarray]:
+    """Return the columns of a table if the model holds all their axes."""
+    for axis in columns:
+        if axis not in model.axes:
+            raise SlpiError(
+                f"{table}: column of axis '{axis}', but the model holds {', '.join(model.axes)}; rename the column"
+            )
+    return columns
+
+
+def _show(options: argparse.Namespace) -> None:
+    print("\n".join(describe_model(load_model(options.model))))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,108 @@
+"""The play operator and the classical Prandtl-Ishlinskii (PI) model: branches of one shape everywhere.
+
+SLPI paper, Eq. 1 (play operator), Eq. 8 (PI model), Eq. 10-12 (analytic inverse, as corrected in the documentation).
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.errors import ModelError
+from slpi_ros.hysteresis.shape import END, Curve
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PrandtlIshlinskii:
+    """A weighted sum of play operators, ``P[v] = sum_i w_i p_i[v]``; the one with threshold 0 is the linear term.
+
+    At rest every operator is in the middle of its play, and moves after ``r_i``; in a primed memory it is at the end,
+    as after a long fall, and moves up after ``2 r_i``.
+
+    Parameters
+    ----------
+    thresholds : ndarray, shape (n,), volts
+        ``0 <= r_1 < r_2 < ...``
+    weights : ndarray, shape (n,), metres per volt
+
+    Raises
+    ------
+    ModelError
+        If thresholds and weights do not fit, or the sum of the first weights is negative somewhere.
+    """
+
+    thresholds: FloatArray
+    weights: FloatArray
+    symmetric_rest: bool = field(default=True, init=False)
+    _branch: Curve = field(init=False, repr=False)
+    _first: Curve = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check the operators and lay out the two shapes that all branches have."""
+        r, w = self.thresholds, self.weights
+        if r.ndim != 1 or r.shape != w.shape or r.size == 0:
+            raise ModelError(f"PI: {r.shape} thresholds and {w.shape} weights; give as many of each, at least one")
+        if not (np.isfinite(r).all() and np.isfinite(w).all() and r[0] >= 0 and (np.diff(r) > 0).all()):
+            raise ModelError("PI: thresholds must be finite, not negative and rise strictly; weights must be finite")
+        if np.min(np.cumsum(w)) < 0:
+            raise ModelError(
+                "PI: the sum of the first weights must not be negative, else a branch falls where the voltage rises"
+            )
+        object.__setattr__(self, "_branch", self._curve(2.0))
+        object.__setattr__(self, "_first", self._curve(1.0))
+
+    @property
+    def invertible(self) -> bool:
+        """Whether every voltage change moves the output: the linear weight is positive and stays so in every sum."""
+        return bool(self.thresholds[0] == 0 and np.min(np.cumsum(self.weights)) > 0)
+
+    def branch(self, direction: int, v_turn: float) -> Curve:
+        """Return ``F(u) = sum_i w_i max(u - 2 r_i, 0)``, the same from everywhere."""
+        return self._branch
+
+    def first_rise(self, v_rest: float) -> Curve:
+        """Return the first rise of a virgin model, ``F(u) = sum_i w_i max(u - r_i, 0)``."""
+        return self._first
+
+    def inverse(self) -> "PrandtlIshlinskii":
+        """Return the analytic inverse, a PI model from displacement (m) to voltage (V).
+
+        ``r'_i = sum_{j<=i} w_j (r_i - r_j)``, ``w'_1 = 1 / w_1``, ``w'_i = -w_i / (W_{i-1} W_i)`` with
+        ``W_i`` the sum of the
+        first i weights (Eq. 12, the linear weight being that of threshold 0).
+
+        Raises
+        ------
+        ModelError
+            If the model is not invertible.
+        """
+        if not self.invertible:
+            raise ModelError("PI: no inverse without a threshold 0 of positive weight; add a linear term")
+        r, w = self.thresholds, self.weights
+        total = np.cumsum(w)
+        thresholds = r * total - np.cumsum(w * r)
+        weights = np.concatenate([[1.0 / w[0]], -w[1:] / (total[:-1] * total[1:])])
+        moving = np.concatenate([[True], w[1:] != 0])
+        return PrandtlIshlinskii(thresholds[moving], weights[moving])
+
+    def _curve(self, plays: float) -> Curve:
+        """Return the curve on which operator i moves after `plays` times its threshold."""
+        knots = plays * self.thresholds
+        slopes = np.cumsum(self.weights)
+        if knots[0] > 0:
+            knots, slopes = np.concatenate([[0.0], knots]), np.concatenate([[0.0], slopes])
+        knots = np.append(knots, knots[-1] + END)
+        values = np.concatenate([[0.0], np.cumsum(slopes * np.diff(knots))])
+        return Curve(knots.tolist(), values.tolist())
+
+
+def play(threshold: float) -> PrandtlIshlinskii:
+    """Return the play operator of `threshold` (V): ``p = max(v - r, min(v + r, p))``, Eq. 1. It has no inverse.
+
+    Parameters
+    ----------
+    threshold : float, volts
+    """
+    return PrandtlIshlinskii(np.array([threshold]), np.array([1.0]))

@@ -1,0 +1,227 @@
+"""What each kind of model adds along a branch, linear in its parameters, and what its parameters must obey."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from slpi_ros.hysteresis.family import LoopFamily
+from slpi_ros.hysteresis.kinds import Hysteresis
+from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.identification.walk import Walk
+
+FloatArray = NDArray[np.float64]
+
+# No branch may be flatter than this share of the mean gain: a flat branch has no inverse.
+LEAST_GAIN = 0.02
+# How firmly the first rise is kept parallel to a rise from the low end, where the record does not show it.
+RISE_TIE = 0.1
+# Vertices for which the roughness penalties are dimensioned, so that one weight means the same on every grid.
+REFERENCE_VERTICES = 41
+
+
+class Basis(Protocol):
+    """Parameters ``x``, shape (size + 1,), of a model; the last one is the displacement at rest."""
+
+    @property
+    def size(self) -> int:
+        """Number of parameters without the displacement at rest."""
+
+    @property
+    def symmetric_rest(self) -> bool:
+        """As in `slpi_ros.hysteresis.memory.Shape`."""
+
+    def branch_part(self, walk: Walk) -> sp.csr_array:
+        """Return what each sample's branch adds, shape (N, size)."""
+
+    def roughness(self) -> sp.csr_array:
+        """Return the rows whose squared sum is the roughness, shape (r, size + 1)."""
+
+    def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
+        """Return ``C``, shape (m, size + 1), and bound of ``C x >= bound``, for a mean gain in units of x per volt."""
+
+    def shape(self, x: FloatArray, gain: float) -> Hysteresis:
+        """Return the model with parameters `x` (m) and mean gain `gain` (m/V)."""
+
+    def covered(self, branch_part: sp.csr_array) -> float:
+        """Return the share of the parameters that the samples of a `branch_part` touch, 0..1."""
+
+
+@dataclass(frozen=True)
+class SurfaceBasis:
+    """The loop family on a uniform grid: the surface below the diagonal, then the first rise."""
+
+    grid: FloatArray
+    symmetric_rest: bool = False
+
+    @property
+    def size(self) -> int:
+        """Cells below the diagonal and values of the first rise."""
+        n = self.grid.size
+        return n * (n - 1) // 2 + n
+
+    @cached_property
+    def _column(self) -> NDArray[np.int64]:
+        """Parameter of each vertex pair, shape (n, n); -1 on and above the diagonal."""
+        n = self.grid.size
+        column = np.full((n, n), -1)
+        column[np.tril_indices(n, -1)] = np.arange(n * (n - 1) // 2)
+        return column
+
+    @property
+    def _rise_columns(self) -> NDArray[np.int64]:
+        n = self.grid.size
+        return n * (n - 1) // 2 + np.arange(n)
+
+    def branch_part(self, walk: Walk) -> sp.csr_array:
+        """Return plus or minus the surface between origin and sample; on the first rise, the rise between them."""
+        v, v_origin, sign = walk.v, walk.v_origin, walk.direction.astype(np.float64)
+        rises, falls_long = walk.first_rise, walk.long_fall
+        upper, lower = np.maximum(v, v_origin), np.minimum(v, v_origin)
+        part = self._surface_rows(upper, lower, np.where(rises | falls_long, 0.0, sign))
+        if falls_long.any():
+            top = np.full(v.size, self.grid[-1])
+            fall = falls_long.astype(np.float64)
+            part = part + self._surface_rows(top, np.full(v.size, v[0]), fall) - self._surface_rows(top, v, fall)
+        if rises.any():
+            rise = rises.astype(np.float64)
+            part = part + self._rise_rows(v, rise) - self._rise_rows(v_origin, rise)
+        return sp.csr_array(part)
+
+    def _cell(self, v: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+        x = (v - self.grid[0]) / (self.grid[1] - self.grid[0])
+        cell = np.clip(np.floor(x).astype(np.int64), 0, self.grid.size - 2)
+        return cell, x - cell
+
+    def _surface_rows(self, upper: FloatArray, lower: FloatArray, factor: FloatArray) -> sp.csr_array:
+        """Rows that give `factor` times the surface: bilinear, and linear in the cells on the diagonal."""
+        (i, p), (j, q) = self._cell(upper), self._cell(lower)
+        row = np.arange(upper.size)
+        on_diagonal = i == j
+        corners = [(i + 1, j, np.where(on_diagonal, p - q, p * (1 - q)))]
+        for di, dj, weight in ((0, 0, (1 - p) * (1 - q)), (0, 1, (1 - p) * q), (1, 1, p * q)):
+            corners.append((i + di, j + dj, np.where(on_diagonal, 0.0, weight)))
+        rows, columns, values = [], [], []
+        for at_i, at_j, weight in corners:
+            used = (factor != 0) & (at_i > at_j) & (weight != 0)
+            rows.append(row[used])
+            columns.append(self._column[at_i[used], at_j[used]])
+            values.append((factor * weight)[used])
+        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+        return sp.csr_array(entries, shape=(upper.size, self.size))
+
+    def _rise_rows(self, v: FloatArray, factor: FloatArray) -> sp.csr_array:
+        cell, p = self._cell(v)
+        row = np.arange(v.size)
+        columns = np.concatenate([self._rise_columns[cell], self._rise_columns[cell + 1]])
+        values = np.concatenate([factor * (1 - p), factor * p])
+        return sp.csr_array((values, (np.concatenate([row, row]), columns)), shape=(v.size, self.size))
+
+    def roughness(self) -> sp.csr_array:
+        """Return differences that vanish for what a record does not show to be otherwise.
+
+        Third differences along a branch: loops are smooth. Second differences along the diagonal: loops change evenly
+        with their vertex (for the classical PI model not at all). The first rise: smooth, and parallel to a rise from
+        the low end.
+        """
+        n, column, rise = self.grid.size, self._column, self._rise_columns
+        i, j = np.tril_indices(n, -1)
+        scale = n / REFERENCE_VERTICES
+        along = [
+            self._differences([(i + k, j, w) for k, w in enumerate((-1.0, 3.0, -3.0, 1.0))]),
+            self._differences([(i, j - k, w) for k, w in enumerate((-1.0, 3.0, -3.0, 1.0))]),
+        ]
+        across = self._differences([(i + k, j + k, w) for k, w in enumerate((1.0, -2.0, 1.0))])
+        bend = sp.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(n - 2, n))
+        step = sp.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(n - 1, n))
+        low_end = sp.csr_array((np.ones(n - 1), (np.arange(1, n), column[1:, 0])), shape=(n, self.size))
+        as_rise = sp.csr_array((np.ones(n), (np.arange(n), rise)), shape=(n, self.size))
+        first = sp.csr_array(([1.0], ([0], [rise[0]])), shape=(1, self.size))
+        blocks = [scale**2 * block for block in along] + [scale * across]
+        blocks += [scale * bend @ as_rise, RISE_TIE * step @ (as_rise - low_end), RISE_TIE * first]
+        rows = sp.vstack(blocks, format="csr")
+        return sp.csr_array(sp.hstack([rows, sp.csr_array((rows.shape[0], 1))], format="csr"))
+
+    def _differences(self, stencil: list[tuple[NDArray[np.int64], NDArray[np.int64], float]]) -> sp.csr_array:
+        """Rows of weighted sums over the surface, where the whole stencil lies on it (zero on the diagonal)."""
+        n = self.grid.size
+        fits = np.ones(stencil[0][0].size, dtype=bool)
+        for i, j, _ in stencil:
+            fits &= (i < n) & (j >= 0) & (i >= j)
+        rows = np.arange(np.count_nonzero(fits))
+        total = sp.csr_array((rows.size, self.size))
+        for i, j, weight in stencil:
+            column = self._column[i[fits], j[fits]]
+            on = column >= 0
+            total = total + sp.csr_array((np.full(on.sum(), weight), (rows[on], column[on])), shape=total.shape)
+        return sp.csr_array(total)
+
+    def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
+        """Every branch, and the first rise, must rise by the least gain between neighbouring vertices."""
+        n = self.grid.size
+        i, j = np.tril_indices(n, -1)
+        upward = self._differences([(i, j, 1.0), (i - 1, j, -1.0)])
+        downward = self._differences([(i, j, 1.0), (i, j + 1, -1.0)])
+        rise = sp.csr_array(
+            (np.tile([-1.0, 1.0], n - 1), (np.repeat(np.arange(n - 1), 2), np.repeat(self._rise_columns, 2)[1:-1])),
+            shape=(n - 1, self.size),
+        )
+        rows = sp.vstack([upward, downward, rise], format="csr")
+        least = LEAST_GAIN * gain * (self.grid[1] - self.grid[0])
+        matrix = sp.hstack([rows, sp.csr_array((rows.shape[0], 1))], format="csr")
+        return sp.csr_array(matrix), np.full(rows.shape[0], least)
+
+    def shape(self, x: FloatArray, gain: float) -> LoopFamily:
+        """Return the loop family."""
+        n = self.grid.size
+        surface = np.zeros((n, n))
+        surface[np.tril_indices(n, -1)] = x[: n * (n - 1) // 2]
+        return LoopFamily(self.grid, surface, x[self._rise_columns] - x[self._rise_columns[0]], gain)
+
+    def covered(self, branch_part: sp.csr_array) -> float:
+        """Return the share of the surface's vertex pairs that the samples of a `branch_part` touch, 0..1."""
+        pairs = self.size - self.grid.size
+        touched = np.unique(branch_part.indices)
+        return float(np.count_nonzero(touched < pairs) / pairs)
+
+
+@dataclass(frozen=True)
+class PlayBasis:
+    """The classical PI model: one weight for each threshold."""
+
+    thresholds: FloatArray
+    symmetric_rest: bool = True
+
+    @property
+    def size(self) -> int:
+        """Number of play operators."""
+        return self.thresholds.size
+
+    def branch_part(self, walk: Walk) -> sp.csr_array:
+        """Return how far each play operator has moved along the branch."""
+        way = np.abs(walk.v - walk.v_origin)[:, None]
+        play = np.where(walk.from_rest[:, None], 1.0, 2.0) * self.thresholds
+        play[walk.long_fall] = 0.0
+        moved = np.maximum(way - play, 0.0) * walk.direction[:, None]
+        return sp.csr_array(moved)
+
+    def roughness(self) -> sp.csr_array:
+        """Return no rows: the weights are few and not negative, that is smooth enough."""
+        return sp.csr_array((1, self.size + 1))
+
+    def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
+        """No weight may be negative, and the linear one must be positive."""
+        bound = np.zeros(self.size)
+        bound[0] = LEAST_GAIN * gain
+        return sp.csr_array(sp.eye_array(self.size, self.size + 1)), bound
+
+    def shape(self, x: FloatArray, gain: float) -> PrandtlIshlinskii:
+        """Return the PI model."""
+        return PrandtlIshlinskii(self.thresholds, np.maximum(x[:-1], 0.0))
+
+    def covered(self, branch_part: sp.csr_array) -> float:
+        """Return the share of operators that the samples of a `branch_part` move, 0..1."""
+        return float(np.unique(branch_part.indices).size / self.size)

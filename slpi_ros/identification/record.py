@@ -1,0 +1,72 @@
+"""The aligned recording that identification works on: one clock, one voltage and one displacement per axis."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.errors import RecordError, UsageError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Record:
+    """Voltage and displacement of the axes of one stage, on one clock.
+
+    Parameters
+    ----------
+    time_ns : ndarray of int64, shape (N,), nanoseconds
+        Stamps as recorded; not yet checked for order.
+    voltage : mapping of axis name to ndarray, shape (N,), volts
+        Applied voltage.
+    displacement : mapping of axis name to ndarray, shape (N,), metres
+        Measured displacement; NaN where the sensor gave nothing.
+    source : str
+        Where it came from, for messages and for the model document.
+    hardware_id : str
+        The stage, as its driver names it; "" when the record does not say.
+
+    Raises
+    ------
+    RecordError
+        If the arrays do not have the same length or the axes differ.
+    """
+
+    time_ns: NDArray[np.int64]
+    voltage: Mapping[str, FloatArray]
+    displacement: Mapping[str, FloatArray]
+    source: str = "record"
+    hardware_id: str = ""
+    axes: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check that every axis has both signals, one value for each stamp."""
+        if set(self.voltage) != set(self.displacement) or not self.voltage:
+            raise RecordError(
+                f"{self.source}: voltage of axes {sorted(self.voltage)} but displacement of "
+                f"{sorted(self.displacement)}; each axis needs both"
+            )
+        for axis in self.voltage:
+            for name, signal in (("voltage", self.voltage[axis]), ("displacement", self.displacement[axis])):
+                if signal.shape != self.time_ns.shape:
+                    raise RecordError(
+                        f"{self.source}: {name} of axis '{axis}' has {signal.shape} values "
+                        f"for {self.time_ns.shape} stamps"
+                    )
+        object.__setattr__(self, "axes", tuple(self.voltage))
+
+    @property
+    def t(self) -> FloatArray:
+        """Time since the first stamp, shape (N,), seconds."""
+        return (self.time_ns - self.time_ns[0]) * 1e-9 if self.time_ns.size else np.empty(0)
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return int(self.time_ns.size)
+
+    def require_axis(self, axis: str) -> None:
+        """Raise UsageError when the record has no such axis."""
+        if axis not in self.axes:
+            raise UsageError(f"{self.source}: no axis '{axis}'; it holds {', '.join(self.axes)}")

@@ -1,0 +1,109 @@
+"""The samples of one axis that a fit uses, after the checks that every fit needs."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.errors import RecordError
+from slpi_ros.identification.record import Record
+
+FloatArray = NDArray[np.float64]
+
+# Fewer samples than this say nothing about a loop.
+FEWEST = 50
+# The memory counts as wiped once the voltage has come this near to both ends of its range (share of the range).
+NEAR_END = 0.02
+
+
+@dataclass(frozen=True)
+class Samples:
+    """One axis, in time order, without gaps in the voltage.
+
+    Parameters
+    ----------
+    v : ndarray, shape (N,), volts
+        All that moves the memory.
+    y : ndarray, shape (N,), metres
+        Finite where `fitted`.
+    fitted : ndarray of bool, shape (N,)
+        Samples whose displacement is to be fitted.
+    primed : bool
+        Whether a long fall to the first voltage wiped the memory; else the axis had never been moved.
+    """
+
+    v: FloatArray
+    y: FloatArray
+    fitted: NDArray[np.bool_]
+    primed: bool = False
+
+    def after(self, history: tuple[float, ...]) -> "Samples":
+        """Return the samples with the voltages of an earlier drive before them."""
+        before = np.array(history)
+        return Samples(
+            np.concatenate([before, self.v]),
+            np.concatenate([np.zeros(before.size), self.y]),
+            np.concatenate([np.zeros(before.size, dtype=bool), self.fitted]),
+            primed=before.size > 0,
+        )
+
+    def only(self, chosen: NDArray[np.bool_]) -> "Samples":
+        """Return the samples with only those fitted that are `chosen`, shape (N,)."""
+        return replace(self, fitted=self.fitted & chosen)
+
+    @property
+    def voltage_range(self) -> tuple[float, float]:
+        """Smallest and largest voltage among the fitted samples, volts."""
+        v = self.v[self.fitted]
+        return float(v.min()), float(v.max())
+
+    @property
+    def spread(self) -> tuple[float, float]:
+        """Voltage (V) and displacement (m) covered by the fitted samples, outliers apart."""
+        v, y = (np.percentile(x[self.fitted], (1, 99)) for x in (self.v, self.y))
+        return float(v[1] - v[0]), float(y[1] - y[0])
+
+    @property
+    def wiped(self) -> NDArray[np.bool_]:
+        """Which samples come after both ends of the voltage range have been visited, shape (N,)."""
+        low, high = self.v.min(), self.v.max()
+        margin = NEAR_END * (high - low)
+        seen_low = np.maximum.accumulate(self.v <= low + margin)
+        seen_high = np.maximum.accumulate(self.v >= high - margin)
+        both: NDArray[np.bool_] = seen_low & seen_high
+        return both
+
+
+def select_samples(record: Record, axis: str, start: float | None, stop: float | None) -> Samples:
+    """Take one axis of a record from ``start <= t < stop`` (s), with the voltage before it.
+
+    Raises
+    ------
+    UsageError
+        If the record has no such axis.
+    RecordError
+        If the samples are too few, out of order, or one signal does not vary.
+    """
+    record.require_axis(axis)
+    where = f"{record.source}: axis '{axis}'"
+    back = np.flatnonzero(np.diff(record.time_ns) < 0)
+    if back.size:
+        at = int(back[0]) + 1
+        raise RecordError(
+            f"{record.source}: time runs backwards at sample {at} (t = {record.t[at]:.6g} s); sort the record"
+        )
+    t, v, y = record.t, record.voltage[axis], record.displacement[axis]
+    used = np.isfinite(v) & (t < (np.inf if stop is None else stop))
+    t, v, y = t[used], v[used], y[used]
+    fitted = np.isfinite(y) & (t >= (-np.inf if start is None else start))
+    count = int(np.count_nonzero(fitted))
+    if count < FEWEST:
+        raise RecordError(
+            f"{where}: {count} usable samples of {len(record)} between start and stop; at least {FEWEST} are needed"
+        )
+    for name, unit, signal in (("voltage", "V", v[fitted]), ("displacement", "m", y[fitted])):
+        if np.ptp(signal) <= 1e-9 * np.max(np.abs(signal)):
+            raise RecordError(
+                f"{where}: {name} stays at {signal[0]:g} {unit}; record a drive over the range to be used"
+            )
+    return Samples(v, np.where(fitted, y, 0.0), fitted)

@@ -1,0 +1,83 @@
+"""What moved the stage before the record began? Nobody knows; the record tells which assumption explains it best."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.identification.samples import FEWEST, Samples
+
+FloatArray = NDArray[np.float64]
+
+# Turns of the decaying drive that stands for "somewhere in the middle".
+MIDDLE_LOOPS = 20
+# Another start than rest must explain the record this much better than rest does.
+BETTER = 0.9
+# What came before the memory was wiped is left out when it makes the rest of the record fit this much worse.
+MISLEADING = 1.1
+
+
+class Fit(Protocol):
+    """A fit of the samples it was made for."""
+
+    def reweighted(self) -> "Fit":
+        """Return the fit with outliers weighed down."""
+
+    def residual(self) -> FloatArray:
+        """Return the error of every sample, fitted or not, shape (N,)."""
+
+
+def histories(samples: Samples) -> list[tuple[float, ...]]:
+    """Return what may have gone before: nothing (rest), a long fall, a long rise, a decaying oscillation.
+
+    Each is a list of voltages (V) as in `slpi_ros.model.Start`.
+    """
+    v0, low, high = float(samples.v[0]), float(samples.v.min()), float(samples.v.max())
+    shrink = 1.0 - np.arange(1, MIDDLE_LOOPS) / MIDDLE_LOOPS
+    decay = np.column_stack([v0 + (high - v0) * shrink, v0 - (v0 - low) * shrink])
+    middle = [low, *decay.ravel().tolist()]
+    return [(), (v0,), (low,), tuple(middle)]
+
+
+def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> tuple[Samples, tuple[float, ...]]:
+    """Choose the history that explains the record best.
+
+    Parameters
+    ----------
+    samples : Samples
+        From rest.
+    pose : callable
+        Makes a fit of samples.
+
+    Returns
+    -------
+    Samples
+        With the history before them; without what came before the memory was wiped, where no history explains that.
+    tuple of float, volts
+        The history.
+    """
+    wiped = samples.fitted & samples.wiped
+    enough = np.count_nonzero(wiped) >= max(FEWEST, 0.5 * np.count_nonzero(samples.fitted))
+    candidates = histories(samples)
+    residuals = [_residual(pose(samples.after(history)), samples) for history in candidates]
+    rms = [np.sqrt(np.mean(residual[samples.fitted] ** 2)) for residual in residuals]
+    best = int(np.argmin(rms))
+    if rms[best] > BETTER * rms[0]:
+        best = 0
+    unseen = not np.any(samples.fitted & ~samples.wiped)
+    if unseen:
+        best = len(candidates) - 1
+    history = candidates[best]
+    kept = samples
+    if enough and not unseen:
+        alone = _residual(pose(samples.only(samples.wiped).after(candidates[-1])), samples)
+        if np.sqrt(np.mean(residuals[best][wiped] ** 2)) > MISLEADING * np.sqrt(np.mean(alone[wiped] ** 2)):
+            kept = samples.only(samples.wiped)
+            history = history or candidates[-1]
+    return kept.after(history), history
+
+
+def _residual(fit: Fit, samples: Samples) -> FloatArray:
+    """Return the errors of a fit on `samples`, without those of its history."""
+    return fit.reweighted().residual()[-samples.v.size :]

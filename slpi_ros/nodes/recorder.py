@@ -1,0 +1,176 @@
+"""Node ``recorder``: topics into a bag, where rosbag2 is not installed."""
+
+import importlib
+import math
+import sys
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from slpi_ros.bags import JOINT_STATE, BagWriter
+from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.nodes.runner import request_stop, run
+
+# a burst must fit while the disk is slow
+DEPTH = 10_000
+DISCOVERY_PERIOD = 0.1
+STAGE_STATE = "stage_state"
+_READ_ONLY = ParameterDescriptor(read_only=True, dynamic_typing=True)
+
+
+class Recorder(Node):
+    """Writes topics to a bag until it is stopped.
+
+    Subscribes whatever the parameter ``topics`` names, with the reliability and durability that the
+    publishers offer; messages stay serialised. Until the recording is complete the bag is in
+    ``.NAME.partial`` beside its place.
+    Parameters, all read-only: ``output`` (the rosbag2 folder to make), ``topics`` (default
+    ``[stage_state]``), ``storage`` (``mcap`` or ``sqlite3``), ``duration`` (s from the start of the node; 0:
+    until a signal).
+
+    Raises
+    ------
+    UsageError
+        If a parameter has a value that makes no recording.
+    RecordError
+        If the bag cannot be made.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("recorder")
+        output = str(self._parameter("output", ""))
+        if not output:
+            raise UsageError("recorder: no output; name the bag to make with --ros-args -p output:=FOLDER")
+        # names as other nodes see them, after namespace and remapping
+        self._awaited = {self.resolve_topic_name(topic): topic for topic in self._topics()}
+        duration = self._duration()
+        storage = str(self._parameter("storage", "mcap"))
+        self._bag: BagWriter | None = BagWriter(output, storage=storage, topic=None)
+        self._listening: dict[str, Any] = {}
+        for name, topic in self._awaited.items():
+            # its type is known, so nothing is lost between the first message and the next look at the graph
+            if topic.rpartition("/")[2] == STAGE_STATE:
+                self._subscribe(name, JOINT_STATE, ())
+        # a simulated clock may stand still
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._discovery = self.create_timer(DISCOVERY_PERIOD, self._discover, clock=clock)
+        if duration:
+            self.create_timer(duration, lambda: request_stop(), clock=clock)
+        self.get_logger().info(f"recording {', '.join(self._awaited)} into {output}")
+
+    def destroy_node(self) -> None:
+        """Complete the bag, then destroy the node.
+
+        Raises
+        ------
+        RecordError
+            If nothing was recorded, or the bag cannot be completed.
+        """
+        try:
+            self._finish()
+        finally:
+            super().destroy_node()
+
+    def _discover(self) -> None:
+        """Subscribe topics whose publishers have appeared, as these publish."""
+        for name in list(self._awaited):
+            if publishers := self.get_publishers_info_by_topic(name):
+                del self._awaited[name]
+                try:
+                    self._subscribe(name, self._type_of(name, publishers), publishers)
+                except RecordError as error:
+                    request_stop(error)
+        if not self._awaited:
+            self._discovery.cancel()
+
+    def _type_of(self, name: str, publishers: Sequence[Any]) -> str:
+        types = {publisher.topic_type for publisher in publishers}
+        types |= {JOINT_STATE} if name in self._listening else set()
+        if len(types) > 1:
+            raise RecordError(f"recorder: {name} is both {' and '.join(sorted(types))}; use one type")
+        return str(types.pop())
+
+    def _subscribe(self, name: str, msgtype: str, publishers: Sequence[Any]) -> None:
+        """Subscribe a topic in the way that all its publishers can serve; again if that has changed."""
+        offers = [publisher.qos_profile for publisher in publishers]
+        reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+        latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers) and offers
+        qos = QoSProfile(
+            depth=DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        former = self._listening.get(name)
+        if former is not None and former.qos_profile == qos:
+            return
+        if former is not None:
+            self.destroy_subscription(former)
+        elif self._bag is not None:
+            self._bag.add_topic(name, msgtype)
+        self._listening[name] = self.create_subscription(
+            _message_class(name, msgtype), name, partial(self._record, name), qos, raw=True
+        )
+
+    def _record(self, name: str, message: bytes) -> None:
+        if self._bag is None:
+            return
+        try:
+            self._bag.write_raw(self.get_clock().now().nanoseconds, message, name)
+        except RecordError as error:
+            request_stop(RecordError(f"{error}; its unfinished files are in {self._bag.partial}"))
+            self._bag = None
+
+    def _finish(self) -> None:
+        """Put the bag in its place, unless nothing is in it."""
+        bag, self._bag = self._bag, None
+        if bag is None:
+            return
+        if not bag.message_count:
+            bag.discard()
+            raise RecordError(f"{bag.path}: not written, as no message came; check the parameter topics")
+        try:
+            bag.close()
+        except RecordError as error:
+            raise RecordError(f"{error}; its unfinished files are in {bag.partial}") from error
+        self.get_logger().info(f"{bag.message_count} messages in {bag.path}")
+
+    def _parameter(self, name: str, default: Any) -> Any:
+        return self.declare_parameter(name, default, _READ_ONLY).value
+
+    def _topics(self) -> list[str]:
+        topics = self._parameter("topics", [STAGE_STATE])
+        if not isinstance(topics, list) or not topics or not all(isinstance(t, str) and t for t in topics):
+            raise UsageError(f"recorder: topics is {topics!r}; give a list of names, as in [stage_state]")
+        return topics
+
+    def _duration(self) -> float:
+        duration = self._parameter("duration", 0.0)
+        if isinstance(duration, bool) or not isinstance(duration, int | float):
+            raise UsageError(f"recorder: duration is {duration!r}; give seconds, or 0 for no end")
+        if not (math.isfinite(duration) and duration >= 0):
+            raise UsageError(f"recorder: duration is {duration} s; give 0 or more")
+        return float(duration)
+
+
+def _message_class(topic: str, msgtype: str) -> Any:
+    package, kind, name = msgtype.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{kind}"), name)
+    except (ImportError, AttributeError) as error:
+        raise RecordError(
+            f"recorder: {topic} is {msgtype}, which is not installed; source its workspace or leave it out"
+        ) from error
+
+
+def main() -> int:
+    """Run the node; return the exit code of the process."""
+    return run(Recorder)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""What a model holds, in words."""
+
+from slpi_ros.hysteresis.kinds import DESCRIPTIONS
+from slpi_ros.model import AxisModel, StageModel
+
+
+def describe_model(model: StageModel) -> list[str]:
+    """Return lines that say what a model holds, in µm and nm."""
+    head = f"stage '{model.hardware_id}'" if model.hardware_id else "stage of unknown hardware id"
+    lines = [f"{head}, identified {model.created or 'at an unknown time'}"]
+    for name, axis in model.axes.items():
+        lines += [f"axis {name}: {line}" for line in describe_axis(axis)]
+    return lines
+
+
+def describe_axis(axis: AxisModel) -> list[str]:
+    """Return lines that say what one axis holds."""
+    quality, start = axis.quality, axis.start
+    (v_low, v_high), (y_low, y_high) = axis.voltage_range, axis.displacement_range
+    size = len(getattr(axis.hysteresis, "grid", getattr(axis.hysteresis, "weights", ())))
+    parts = "loop vertices" if axis.kind == "slpi" else "play operators"
+    began = "a memory assumed wiped" if start.history else "rest, never moved"
+    stroke = y_high - y_low
+    return [
+        f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {size} {parts}",
+        f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} um "
+        f"({quality.covered:.0%} of the model seen)",
+        f"starts from {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um",
+        f"error on the record: {quality.rms * 1e9:.1f} nm rms ({quality.rms / stroke:.3%} of the displacement range), "
+        f"{quality.maximum * 1e9:.1f} nm at most",
+        f"error on blocks left out: {quality.held_out_rms * 1e9:.1f} nm rms; "
+        f"sensor noise about {quality.floor_rms * 1e9:.1f} nm rms",
+        f"from {quality.samples} samples of {quality.source}",
+        "effects: none",
+    ]

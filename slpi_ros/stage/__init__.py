@@ -1,0 +1,1 @@
+"""A simulated stage whose physics is none of the compensator's models."""

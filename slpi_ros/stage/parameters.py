@@ -1,0 +1,114 @@
+"""What a simulated stage is made of, as numbers."""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from slpi_ros.errors import UsageError
+
+
+@dataclass(frozen=True)
+class StageParameters:
+    """One axis of a simulated stage.
+
+    Parameters
+    ----------
+    stroke : float, metres
+        Height of the closed loop between 0 V and `nominal_voltage`.
+    hysteresis : float
+        Width of that loop at its middle voltage, as a share of the stroke.
+    nominal_voltage : float, volts
+        Upper end of the loop to which `stroke` and `hysteresis` refer.
+    threshold_min, threshold_max : float, volts
+        Range of the relay thresholds. A range that begins below 0 V leaves a remanence at 0 V.
+    levels : int
+        Levels of the relay grid.
+    width_scale : float, volts
+        Distance between the two thresholds of a relay at which the density has fallen to 1/e.
+    width_growth : float
+        Relative change of `width_scale` from the middle to the upper end of the threshold range.
+    bias_slope, bias_bow : float
+        Logarithm of the density at the upper end of the threshold range, relative to its middle: the part odd
+        in the bias and the part even in it.
+    curvature : float
+        Cubic share of the reversible part; negative saturates towards the ends of the threshold range.
+    noise_rms : float, metres
+        Gaussian sensor noise.
+    quantisation : float, metres
+        Step of the sensor's digits; 0 for none.
+    offset : float, metres
+        What the sensor reads at rest.
+
+    Raises
+    ------
+    UsageError
+        If a value is not finite or describes no stage.
+    """
+
+    stroke: float = 22e-6
+    hysteresis: float = 0.14
+    nominal_voltage: float = 100.0
+    threshold_min: float = -20.0
+    threshold_max: float = 120.0
+    levels: int = 280
+    width_scale: float = 40.0
+    width_growth: float = 0.3
+    bias_slope: float = 0.3
+    bias_bow: float = 0.2
+    curvature: float = 0.1
+    noise_rms: float = 8e-9
+    quantisation: float = 1e-9
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no stage."""
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not math.isfinite(value):
+                raise UsageError(f"stage: {item.name} is {value}; give a finite number")
+        for name, holds, need in (
+            ("stroke", self.stroke > 0, "more than 0 m"),
+            ("hysteresis", 0 <= self.hysteresis < 1, "a share from 0 to below 1"),
+            ("threshold_min", self.threshold_min <= 0, "0 V or less, so that the stage can rest at 0 V"),
+            ("nominal_voltage", self.nominal_voltage > 0, "more than 0 V"),
+            ("threshold_max", self.threshold_max >= self.nominal_voltage, "at least nominal_voltage"),
+            ("levels", self.levels >= 2, "at least 2"),
+            ("width_scale", self.width_scale > 0, "more than 0 V"),
+            ("width_growth", abs(self.width_growth) < 1, "between -1 and 1"),
+            ("curvature", self.curvature > -1 / 3, "more than -1/3, or the stage would turn back"),
+            ("noise_rms", self.noise_rms >= 0, "0 m or more"),
+            ("quantisation", self.quantisation >= 0, "0 m or more"),
+        ):
+            if not holds:
+                raise UsageError(f"stage: {name} is {getattr(self, name)}; it must be {need}")
+
+    @classmethod
+    def random(cls, seed: int) -> "StageParameters":
+        """Draw a plausible stage: 20 to 25 µm, 12 to 17 % hysteresis, a density that differs with bias.
+
+        Parameters
+        ----------
+        seed : int
+            The same seed gives the same stage.
+
+        Returns
+        -------
+        StageParameters
+            Sensor noise and quantisation keep their defaults.
+        """
+        rng = np.random.default_rng(seed)
+
+        def draw(low: float, high: float) -> float:
+            return float(rng.uniform(low, high))
+
+        return cls(
+            stroke=draw(20e-6, 25e-6),
+            hysteresis=draw(0.12, 0.17),
+            width_scale=draw(30.0, 60.0),
+            width_growth=draw(-0.4, 0.4),
+            bias_slope=draw(-0.2, 0.8),
+            bias_bow=draw(-0.4, 0.4),
+            curvature=draw(-0.1, 0.2),
+            offset=draw(-0.2e-6, 0.2e-6),
+        )

@@ -1,0 +1,63 @@
+"""What all tests share: a ROS graph of their own, the installed programs and the measured data."""
+
+import atexit
+import fcntl
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+
+
+def _reserve_ros_domain() -> int:
+    """Take a ROS domain that no other test run of this machine uses until this process ends."""
+    domains = range(1, 102)  # the ones that are safe on every system
+    for turn in range(len(domains)):
+        domain = domains[(os.getpid() + turn) % len(domains)]
+        lock = open(Path(tempfile.gettempdir()) / f"slpi_ros_test_domain_{os.getuid()}_{domain}.lock", "w")  # noqa: SIM115
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            continue
+        atexit.register(lock.close)  # keeps the file, and with it the lock, until the end
+        return domain
+    raise RuntimeError("all ROS domains are taken by other test runs; wait for one to end")
+
+
+# Set before any test module imports rclpy; the nodes that tests start inherit both.
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+os.environ["ROS_DOMAIN_ID"] = str(_reserve_ros_domain())
+
+# No verdict depends on the clock, and CI draws the same examples every time.
+hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize="CI" in os.environ)
+hypothesis.settings.load_profile("slpi_ros")
+
+
+@pytest.fixture(scope="session")
+def installed() -> Callable[[str], Path]:
+    """Return a function from a program's name to its path, the one that ``ros2 run slpi_ros NAME`` starts."""
+
+    def path_of(name: str) -> Path:
+        path = CHECKOUT / "install" / "slpi_ros" / "lib" / "slpi_ros" / name
+        if not path.exists():
+            pytest.fail(f"{path} is not there: run 'make build'")
+        return path
+
+    return path_of
+
+
+@pytest.fixture(scope="session")
+def measured_data() -> Path:
+    """Return the folder of the measured records, or skip where it is not at hand."""
+    named = os.environ.get("SLPI_MEASURED_DATA")
+    folder = Path(named) if named else CHECKOUT.parent / "shared" / "data"
+    if named and not folder.is_dir():
+        pytest.fail(f"SLPI_MEASURED_DATA={named} is no folder")
+    if not folder.is_dir():
+        pytest.skip(f"no measured data: {folder} does not exist and SLPI_MEASURED_DATA is not set")
+    return folder

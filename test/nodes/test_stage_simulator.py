@@ -1,0 +1,179 @@
+"""The simulated stage as a process of its own, over DDS."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from rclpy.context import Context  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_msgs.msg import Float64MultiArray  # noqa: E402
+
+from slpi_ros.stage.stage import Stage  # noqa: E402
+
+QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+# one domain for each test process, below the range where DDS meets ephemeral ports
+DOMAIN = 1 + os.getpid() % 100
+PATIENCE_S = 30.0
+
+
+@pytest.fixture(autouse=True)
+def loopback(monkeypatch):
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
+
+
+def start(**parameters) -> subprocess.Popen[str]:
+    arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
+    command = [sys.executable, "-m", "slpi_ros.nodes.stage_simulator", "--ros-args", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+class Bench:
+    """What stands at the other end of the topics."""
+
+    def __init__(self, context: Context) -> None:
+        self.node = rclpy.create_node("bench", context=context)
+        self.states: list[JointState] = []
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
+        self._commands = self.node.create_publisher(Float64MultiArray, "voltage_command", QOS)
+        self.node.create_subscription(JointState, "stage_state", self.states.append, QOS)
+
+    def send(self, *voltages: float) -> None:
+        self._commands.publish(Float64MultiArray(data=list(voltages)))
+
+    def spin_until(self, done: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not done():
+            assert process.poll() is None, f"the simulator has ended: {process.stderr.read()}"
+            assert time.monotonic() < deadline, f"nothing happened; {len(self.states)} states so far"
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def connect(self, process: subprocess.Popen[str], axes: int) -> None:
+        """Command rest until an answer comes: neither direction loses anything from then on."""
+
+        def answered() -> bool:
+            if self._commands.get_subscription_count():
+                self.send(*[0.0] * axes)
+            return bool(self.states)
+
+        self.spin_until(answered, process)
+
+    def moved(self) -> list[JointState]:
+        """Return the states after those that answered `connect`."""
+        return [state for state in self.states if any(state.effort)]
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+
+
+@contextmanager
+def simulator(**parameters):
+    process = start(**parameters)
+    context = Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    bench = Bench(context)
+    try:
+        yield bench, process
+    finally:
+        bench.close()
+        rclpy.shutdown(context=context)
+        process.kill()
+        process.communicate()
+
+
+def expected(seed, axes, commands):
+    stage = Stage.random(axes, seed, noise_rms=0.0)
+    return [stage.measure(stage.step(0.0, command)) for command in commands]
+
+
+def test_every_command_is_answered_in_order_with_what_the_stage_does():
+    commands = [(10.0, 90.0), (60.5, 20.0), (30.25, 45.0), (80.0, 0.0), (1.0, 100.0)]
+    # unquoted, YAML takes y for a boolean
+    with simulator(axes="['x', 'y']", seed=4, noise_rms=0.0, hardware_id="bench_7") as (bench, process):
+        bench.connect(process, axes=2)
+        for command in commands:
+            bench.send(*command)
+        bench.spin_until(lambda: len(bench.moved()) >= len(commands), process)
+        states = bench.moved()
+    assert [tuple(state.effort) for state in states] == commands
+    assert [list(state.position) for state in states] == expected(4, ["x", "y"], commands)
+    assert all(list(state.name) == ["x", "y"] for state in states)
+    assert all(state.header.frame_id == "bench_7" for state in states)
+    stamps = [(state.header.stamp.sec, state.header.stamp.nanosec) for state in states]
+    assert stamps == sorted(stamps) and stamps[0][0] > 0
+
+
+def test_the_amplifier_saturates():
+    with simulator(noise_rms=0, voltage_min=0, voltage_max=80) as (bench, process):
+        bench.connect(process, axes=1)
+        for command in (1e6, 40.0, -50.0, 10.0):
+            bench.send(command)
+        bench.spin_until(lambda: bool(bench.states) and list(bench.states[-1].effort) == [10.0], process)
+        states = bench.states[-4:]
+    assert [state.effort[0] for state in states] == [80.0, 40.0, 0.0, 10.0]
+    positions = [state.position[0] for state in states]
+    assert positions == [y for (y,) in expected(0, ["x"], [[80.0], [40.0], [0.0], [10.0]])]
+
+
+def test_commands_that_are_none_are_ignored_and_counted():
+    with simulator(noise_rms=0.0) as (bench, process):
+        bench.connect(process, axes=1)
+        for command in ((), (10.0, 20.0), (math.nan,), (math.inf,), (-math.inf,), (25.0,)):
+            bench.send(*command)
+        bench.spin_until(lambda: bool(bench.moved()), process)
+        states = bench.moved()
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=PATIENCE_S)
+    assert [list(state.effort) for state in states] == [[25.0]]
+    assert [list(state.position) for state in states] == expected(0, ["x"], [[25.0]])
+    assert "commands ignored so far: 1" in said and "Traceback" not in said
+    assert process.returncode == 0
+
+
+def test_a_stage_that_does_not_answer_publishes_on_its_own():
+    with simulator(answer_commands=False, rate=100, noise_rms=5e-9, seed=2) as (bench, process):
+        bench.spin_until(lambda: len(bench.states) >= 5, process)
+        assert all(list(state.effort) == [0.0] for state in bench.states)
+
+        def moved() -> bool:
+            bench.send(50.0)
+            return len(bench.moved()) >= 20
+
+        bench.spin_until(moved, process)
+        readings = [state.position[0] for state in bench.moved()]
+    ((true,),) = expected(2, ["x"], [[50.0]])
+    assert len(set(readings)) > 5
+    assert max(abs(y - true) for y in readings) < 8 * 5e-9
+
+
+@pytest.mark.parametrize(
+    ("parameters", "complaint"),
+    [
+        ({"voltage_min": 50.0, "voltage_max": 20.0}, "voltage_min is 50.0 V"),
+        ({"voltage_max": 500.0}, "voltage_max 500.0 V"),
+        ({"axes": "[x, x]"}, "not unique"),
+        ({"noise_rms": ".nan"}, "noise_rms is nan"),
+        ({"rate": 0.0, "answer_commands": False}, "rate is 0.0 Hz"),
+        ({"rate": "fast"}, "rate is 'fast'"),
+        ({"seed": -1}, "seed is -1"),
+        ({"answer_commands": "7"}, "answer_commands"),
+    ],
+)
+def test_parameters_of_which_no_stage_can_be_made(parameters, complaint):
+    process = start(**parameters)
+    _, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 2
+    assert complaint in said and "Traceback" not in said and len(said.splitlines()) == 1

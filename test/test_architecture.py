@@ -1,0 +1,141 @@
+"""The package's architecture: what may import what, and what no module may do."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "slpi_ros"
+ROOT = Path(__file__).resolve().parents[1] / PACKAGE
+
+# From top to bottom. A module may import its own layer and those below it.
+LAYERS = (
+    {"nodes", "cli"},
+    {"reports", "experiments"},
+    {"diagnosis"},
+    {"bags", "bag_files", "csv_table", "joint_state", "tables"},
+    {"identification"},
+    {"model", "model_file", "schemas", "stream"},
+    {"effects"},
+    {"hysteresis"},
+    {"errors"},
+)
+
+# The simulated stage stands beside the layers: it knows nothing of the compensator, and only these know it.
+BESIDE = "stage"
+MAY_IMPORT_BESIDE = {"nodes", "experiments"}
+
+# Modules outside the package that only one part of it may import.
+ONLY_NODES = {"ament_index_python", "launch", "launch_ros", "rclpy", "rosidl_runtime_py"}
+ONLY_NODES_ENDINGS = ("_msgs", "_srvs", "_interfaces")
+ONLY_BAGS = {"rosbags"}
+
+UNSAFE_MODULES = {"cloudpickle", "dill", "joblib", "marshal", "pickle", "shelve"}
+UNSAFE_CALLS = {"compile", "eval", "exec"}
+
+LONGEST_FILE = 320
+
+FILES = sorted(ROOT.rglob("*.py"))
+LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
+
+every_file = pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+
+
+def part_of(path: Path) -> str:
+    """Return the part a file belongs to; "" is the public API, ``slpi_ros/__init__.py``."""
+    first = path.relative_to(ROOT).parts[0].removesuffix(".py")
+    return "" if first == "__init__" else first
+
+
+def nodes_of(path: Path) -> Iterator[ast.AST]:
+    """Yield every node of a file's syntax tree."""
+    return ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    """Yield the full dotted name of every module or name that a file imports, wherever in the file."""
+    package = [PACKAGE, *path.relative_to(ROOT).parent.parts]
+    for node in nodes_of(path):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+
+
+def parts_imported_by(path: Path) -> set[str]:
+    """Return the parts of the package that a file imports; "" where it imports the public API itself."""
+    names = [name.split(".") for name in imports_of(path)]
+    within = [name[1] if len(name) > 1 else "" for name in names if name[0] == PACKAGE]
+    return {part if part in LEVEL or part == BESIDE else "" for part in within}
+
+
+def outside_imported_by(path: Path) -> set[str]:
+    """Return the top-level modules outside the package that a file imports."""
+    return {name.split(".")[0] for name in imports_of(path)} - {PACKAGE}
+
+
+def needs_ros(module: str) -> bool:
+    return module in ONLY_NODES or module.endswith(ONLY_NODES_ENDINGS)
+
+
+@every_file
+def test_every_part_has_a_layer(path: Path) -> None:
+    assert part_of(path) in LEVEL.keys() | {"", BESIDE}, f"add {part_of(path)!r} to LAYERS"
+
+
+@every_file
+def test_folder_is_a_package(path: Path) -> None:
+    assert (path.parent / "__init__.py").exists(), "setup.py does not install a folder without __init__.py"
+
+
+@every_file
+def test_imports_point_down(path: Path) -> None:
+    part, imported = part_of(path), parts_imported_by(path)
+    if part == "":
+        allowed = LEVEL.keys() - LAYERS[0]
+    elif part == BESIDE:
+        allowed = {BESIDE, "errors"}
+    else:
+        allowed = {below for below in LEVEL if LEVEL[below] >= LEVEL[part]}
+        allowed |= {BESIDE} if part in MAY_IMPORT_BESIDE else set()
+        allowed |= {""} if part in LAYERS[0] else set()
+    assert imported <= allowed, f"{part or PACKAGE} may not import {sorted(imported - allowed)}"
+
+
+@every_file
+def test_ros_stays_in_nodes(path: Path) -> None:
+    ros = {module for module in outside_imported_by(path) if needs_ros(module)}
+    assert part_of(path) == "nodes" or not ros
+
+
+@every_file
+def test_rosbags_stays_in_bags(path: Path) -> None:
+    assert path == ROOT / "bags.py" or not outside_imported_by(path) & ONLY_BAGS
+
+
+@every_file
+def test_nothing_runs_what_it_reads(path: Path) -> None:
+    assert not outside_imported_by(path) & UNSAFE_MODULES
+    calls = [node for node in nodes_of(path) if isinstance(node, ast.Call)]
+    called = {call.func.id for call in calls if isinstance(call.func, ast.Name)}
+    assert not called & UNSAFE_CALLS
+    assert not any(keyword.arg == "allow_pickle" for call in calls for keyword in call.keywords)
+
+
+@every_file
+def test_file_is_short(path: Path) -> None:
+    lines = len(path.read_text(encoding="utf-8").splitlines())
+    assert lines <= LONGEST_FILE, "a file holds one concept: split it"
+
+
+def test_public_api_loads_neither_ros_nor_rosbags() -> None:
+    code = f"import sys, {PACKAGE}; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"
+    command = [sys.executable, "-c", code]
+    loaded = set(subprocess.run(command, cwd=ROOT.parent, stdout=subprocess.PIPE, text=True, check=True).stdout.split())
+    assert PACKAGE in loaded
+    assert not {module for module in loaded if needs_ros(module)} | loaded & ONLY_BAGS

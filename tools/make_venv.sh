@@ -1,0 +1,61 @@
+#!/bin/sh
+# Make .venv for this checkout: on top of a sourced ROS 2 Jazzy, or with ROS 2 Jazzy from wheels where none is sourced.
+# Candidates for Python: $PYTHON, python3, python3.12, python3.11. An existing .venv of the same Python is reused.
+set -eu
+cd "$(dirname "$0")/.."
+
+fail() { echo "slpi_ros: $*" >&2; exit 1; }
+
+# Debian and Ubuntu ship Python without ensurepip unless python3-venv is installed.
+suitable() {
+    "$1" -c "import sys, ensurepip, venv$2; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))" </dev/null >/dev/null 2>&1
+}
+
+first_suitable() {
+    for candidate in ${PYTHON:+"$PYTHON"} python3 python3.12 python3.11; do
+        if suitable "$candidate" "$1"; then "$candidate" -c 'import sys; print(sys.executable)'; return; fi
+    done
+}
+
+flavour=wheels python=
+case "${ROS_DISTRO:-}" in
+    '') ;;
+    jazzy) python=$(first_suitable ', rclpy'); [ -z "$python" ] || flavour=sourced ;;
+    *) fail "ROS 2 $ROS_DISTRO is sourced, but jazzy is needed: use a shell that sources jazzy or no ROS at all" ;;
+esac
+[ -n "$python" ] || python=$(first_suitable '')
+[ -n "$python" ] || fail "no Python 3.11 or 3.12 with venv among ${PYTHON:+$PYTHON, }python3, python3.12, python3.11:" \
+    "install one (apt install python3-venv), or run 'make build PYTHON=/path/to/python3.12'"
+
+# A venv cannot be moved nor change its Python: anything but the very same one is made anew.
+identity="$flavour $python $("$python" -V) $PWD"
+if [ "$(cat .venv/.identity 2>/dev/null)" != "$identity" ]; then
+    echo "slpi_ros: making .venv with $("$python" -V) ($python), ROS 2 Jazzy: $flavour; this takes a minute or two"
+    rm -rf .venv
+    if [ "$flavour" = sourced ]; then site=--system-site-packages; else site=; fi
+    "$python" -m venv $site .venv
+fi
+
+# What the sourced ROS and the system bring stays as it is; only what pip adds is pinned.
+constraints=.venv/constraints.txt
+if [ "$flavour" = sourced ]; then
+    .venv/bin/python - requirements/lock.txt >$constraints <<'PY'
+import re, sys
+from importlib.metadata import distributions
+
+def plain(name): return re.sub(r"[-_.]+", "-", name).lower()
+
+present = {plain(d.name) for d in distributions() if not d.locate_file("").is_relative_to(sys.prefix)}
+for line in open(sys.argv[1]):
+    if line.startswith("#") or plain(line.split("==")[0]) not in present:
+        print(line, end="")
+PY
+else
+    cp requirements/lock.txt $constraints
+fi
+
+pip() { .venv/bin/python -m pip install -qq --disable-pip-version-check -c $constraints "$@"; }
+pip -r requirements/build.txt
+if [ "$flavour" = wheels ]; then pip -r requirements/ros.txt; fi
+pip --no-build-isolation --use-pep517 -e '.[test]'
+echo "$identity" >.venv/.identity

@@ -6,13 +6,14 @@ points ``alpha`` and ``beta``. A falling branch from ``alpha`` is ``y_a - E(alph
 grid's spacing; between vertices it is interpolated.
 """
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.memory import Curve
+from slpi_ros.hysteresis.shape import END, Curve
 
 FloatArray = NDArray[np.float64]
 
@@ -85,7 +86,7 @@ class LoopFamily:
         gain, n = self.edge_gain, len(nodes)
         ahead = self._first_node_ahead(v_turn, s)
         if ahead == n:
-            return Curve([0.0, 1.0], [0.0, gain])
+            return Curve([0.0, END], [0.0, END * gain])
         u = [s * (node - v_turn) for node in nodes[ahead:]]
         near = ahead if s > 0 else n - 1 - ahead
         if ahead == 0:
@@ -98,14 +99,12 @@ class LoopFamily:
         if u[0] > 0.0:
             u.insert(0, 0.0)
             f.insert(0, 0.0)
-        u.append(u[-1] + 1.0)
-        f.append(f[-1] + gain)
+        u.append(u[-1] + END)
+        f.append(f[-1] + END * gain)
         return Curve(u, f)
 
     def _first_node_ahead(self, v_turn: float, s: int) -> int:
         """Index, counted in direction `s`, of the first vertex at or ahead of `v_turn`."""
-        from bisect import bisect_left, bisect_right
-
         if s > 0:
             return bisect_left(self._nodes, v_turn)
         return len(self._nodes) - bisect_right(self._nodes, v_turn)
@@ -117,8 +116,8 @@ class LoopFamily:
         ahead = [node for node in self._nodes if node > v_rest]
         u = [0.0, *(node - v_rest for node in ahead)]
         f = [0.0, *(rise(node) - start for node in ahead)]
-        u.append(u[-1] + 1.0)
-        f.append(f[-1] + self.edge_gain)
+        u.append(u[-1] + END)
+        f.append(f[-1] + END * self.edge_gain)
         return Curve(u, f)
 
     def extended_rise(self, v: float) -> float:

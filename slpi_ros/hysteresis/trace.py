@@ -17,7 +17,7 @@ AT_REST, LONG_FALL = -1, -2
 
 
 class Piece(NamedTuple):
-    """Samples ``start:stop`` on the branch that started at sample `origin` (or `AT_REST`, `LONG_FALL`) in `direction`."""
+    """Samples ``start:stop`` on the branch that started at sample `origin`, or `AT_REST`, or is the `LONG_FALL`."""
 
     start: int
     stop: int

@@ -11,9 +11,9 @@ IN_WORKSPACE := . install/setup.sh &&
 VENV_STAMP  := .venv/.stamp
 BUILD_STAMP := install/.stamp
 
-# The environment that .venv was made for; a copied checkout, another Python or a newly sourced ROS makes a new one.
-WANTED := $(CURDIR) PYTHON=$(PYTHON) ROS_DISTRO=$(ROS_DISTRO)
-ifneq ($(strip $(WANTED)),$(strip $(shell cat $(VENV_STAMP) 2>/dev/null)))
+# What .venv has to be made for: a copied checkout, another Python or a newly sourced ROS needs another one.
+WANTED := $(CURDIR) ROS_DISTRO=$(ROS_DISTRO) $(if $(PYTHON),PYTHON=$(PYTHON))
+ifneq ($(filter-out $(shell cat $(VENV_STAMP) 2>/dev/null),$(WANTED)),)
 $(VENV_STAMP): FORCE
 endif
 

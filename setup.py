@@ -33,7 +33,7 @@ setup(
         "matplotlib>=3.6",
         "numpy>=1.26,<3",
         "osqp>=1.0,<2",
-        "rosbags>=0.10",
+        "rosbags>=0.11",
         "scipy>=1.11",
     ],
     extras_require={

@@ -1,6 +1,7 @@
 """Finding a recording: the bag on disk, the topic in the bag, and what to say when it is not there."""
 
 import os
+import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,6 +56,7 @@ def locate(path: Path) -> Path:
 def translated(source: Path) -> Iterator[None]:
     """Turn whatever a damaged bag makes its reader raise into a RecordError of one line."""
     try:
+        _require_whole(source)
         yield
     except SlpiError:
         raise
@@ -64,6 +66,21 @@ def translated(source: Path) -> Iterator[None]:
         # struct, zstd, yaml, sqlite, unicode, memory...: a damaged file fails in any way
         reason = one_line(error)
         raise RecordError(f"{source}: damaged or unfinished ({reason}); {_remedy(source)}") from error
+
+
+def _require_whole(source: Path) -> None:
+    """Raise EOFError for an SQLite file that lacks its end: SQLite itself would read zeros there."""
+    files = sorted(source.iterdir()) if source.is_dir() else [source]
+    for file in (file for file in files if file.suffix == ".db3"):
+        with file.open("rb") as stream:
+            header = stream.read(100)
+        # https://sqlite.org/fileformat.html: the size in the header counts if both change counters agree
+        if len(header) < 100 or header[24:28] != header[92:96]:
+            continue
+        page, pages = struct.unpack_from(">H", header, 16)[0], struct.unpack_from(">I", header, 28)[0]
+        size, wanted = file.stat().st_size, pages * (65536 if page == 1 else page)
+        if size < wanted:
+            raise EOFError(f"{size} bytes of {wanted} in {file.name}")
 
 
 def _remedy(source: Path) -> str:

@@ -21,12 +21,7 @@ from rosbags.typesys import Stores, TypesysError, get_typestore
 from slpi_ros.bag_files import absolute_name, locate, match_topic, one_line, partial_path, translated
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.identification.record import Record
-from slpi_ros.joint_state import (
-    JointStateBlock,
-    choose_joints,
-    decode_joint_states,
-    joint_state_layout,
-)
+from slpi_ros.joint_state import JointStateBlock, choose_joints, decode_joint_states, joint_state_layout
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}

@@ -155,7 +155,7 @@ def paths(
     bottom = case.span[0] - 0.4 * case.width if low is None else low
     top = case.span[1] + 0.4 * case.width if high is None else high
     move = st.tuples(st.sampled_from(TARGETS), fractions(0, 1), st.sampled_from((1, 1, 1, 2, 7, 40, 75)))
-    stops = [case.rest[0]]
+    stops = [min(max(case.rest[0], bottom), top)]
     stretches = []
     for target, share, count in draw(st.lists(move, min_size=1, max_size=max_size)):
         last = stops[-1]

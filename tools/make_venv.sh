@@ -1,29 +1,30 @@
 #!/bin/sh
 # Make .venv for this checkout: on top of a sourced ROS 2 Jazzy, or with ROS 2 Jazzy from wheels where none is sourced.
-# Candidates for Python: $PYTHON, python3, python3.12, python3.11. An existing .venv of the same Python is reused.
+# Candidates for Python: $PYTHON, that of an existing .venv (which then stays), python3, python3.12, python3.11.
 set -eu
 cd "$(dirname "$0")/.."
 
 fail() { echo "slpi_ros: $*" >&2; exit 1; }
 
-# Debian and Ubuntu ship Python without ensurepip unless python3-venv is installed.
-suitable() {
-    "$1" -c "import sys, ensurepip, venv$2; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))" </dev/null >/dev/null 2>&1
-}
-
-first_suitable() {
-    for candidate in ${PYTHON:+"$PYTHON"} python3 python3.12 python3.11; do
-        if suitable "$candidate" "$1"; then "$candidate" -c 'import sys; print(sys.executable)'; return; fi
+# Print the first Python 3.11 or 3.12 that imports what it has to, followed to the program itself:
+# no venv, no version manager's proxy. (Debian and Ubuntu have no ensurepip unless python3-venv is installed.)
+first_python() {
+    for candidate in ${PYTHON:+"$PYTHON"} .venv/bin/python python3 python3.12 python3.11; do
+        real=$("$candidate" -c 'import os, sys; print(os.path.realpath(sys._base_executable))' 2>/dev/null) || continue
+        if "$real" -c "import sys, $1; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))" 2>/dev/null; then
+            echo "$real"
+            return
+        fi
     done
 }
 
 flavour=wheels python=
 case "${ROS_DISTRO:-}" in
     '') ;;
-    jazzy) python=$(first_suitable ', rclpy'); [ -z "$python" ] || flavour=sourced ;;
+    jazzy) python=$(first_python 'ensurepip, venv, rclpy'); [ -z "$python" ] || flavour=sourced ;;
     *) fail "ROS 2 $ROS_DISTRO is sourced, but jazzy is needed: use a shell that sources jazzy or no ROS at all" ;;
 esac
-[ -n "$python" ] || python=$(first_suitable '')
+[ -n "$python" ] || python=$(first_python 'ensurepip, venv')
 [ -n "$python" ] || fail "no Python 3.11 or 3.12 with venv among ${PYTHON:+$PYTHON, }python3, python3.12, python3.11:" \
     "install one (apt install python3-venv), or run 'make build PYTHON=/path/to/python3.12'"
 

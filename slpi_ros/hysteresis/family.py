@@ -46,10 +46,9 @@ class LoopFamily:
     rise: FloatArray
     edge_gain: float
     symmetric_rest: bool = field(default=False, init=False)
-    _nodes: list[float] = field(init=False, repr=False)
-    _nodes_down: list[float] = field(init=False, repr=False)
-    _rows_down: list[list[float]] = field(init=False, repr=False)
-    _columns_up: list[list[float]] = field(init=False, repr=False)
+    _vertices: list[float] = field(init=False, repr=False)
+    _ahead: dict[int, FloatArray] = field(init=False, repr=False)
+    _lines: dict[int, list[FloatArray]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the surface and lay its rows and columns out in the order in which branches run through them."""
@@ -65,62 +64,52 @@ class LoopFamily:
         steps = (np.diff(self.grid), np.diff(self.rise), up, down, np.array([self.edge_gain]))
         if not all(np.isfinite(step).all() and np.min(step) > 0 for step in steps):
             raise ModelError("loop family: grid, first rise and every row and column of the surface must rise strictly")
-        nodes = self.grid.tolist()
+        far = END * self.edge_gain
         object.__setattr__(self, "surface", triangle)
-        object.__setattr__(self, "_nodes", nodes)
-        object.__setattr__(self, "_nodes_down", nodes[::-1])
-        object.__setattr__(self, "_rows_down", [triangle[i, i::-1].tolist() for i in range(n)])
-        object.__setattr__(self, "_columns_up", [triangle[j:, j].tolist() for j in range(n)])
+        object.__setattr__(self, "_vertices", self.grid.tolist())
+        object.__setattr__(
+            self,
+            "_ahead",
+            {1: np.append(self.grid, self.grid[-1] + END), -1: np.append(self.grid[::-1], self.grid[0] - END)},
+        )
+        rows = [np.append(triangle[i, i::-1], triangle[i, 0] + far) for i in range(n)]
+        columns = [np.append(triangle[j:, j], triangle[-1, j] + far) for j in range(n)]
+        object.__setattr__(self, "_lines", {1: columns, -1: rows})
 
     def branch(self, direction: int, v_turn: float) -> Curve:
         """Return the branch that starts at `v_turn` (V): a row or a column of the surface, interpolated."""
-        if direction > 0:
-            return self._sweep(v_turn, self._nodes, self._columns_up, 1)
-        return self._sweep(v_turn, self._nodes_down, self._rows_down, -1)
-
-    def _sweep(self, v_turn: float, nodes: list[float], lines: list[list[float]], s: int) -> Curve:
-        """Walk from `v_turn` along `nodes`, which run in direction `s`, on the lines of its two neighbours.
-
-        ``lines[k]`` starts at grid vertex k, where the surface is zero.
-        """
-        gain, n = self.edge_gain, len(nodes)
-        ahead = self._first_node_ahead(v_turn, s)
+        vertices, lines, n = self._ahead[direction], self._lines[direction], self.grid.size
+        ahead = self._first_vertex_ahead(v_turn, direction)
         if ahead == n:
-            return Curve([0.0, END], [0.0, END * gain])
-        u = [s * (node - v_turn) for node in nodes[ahead:]]
-        near = ahead if s > 0 else n - 1 - ahead
-        if ahead == 0:
-            f = [value + gain * u[0] for value in lines[near]]
+            return Curve.of(np.array([[0.0, END], [0.0, END * self.edge_gain]]))
+        # One column for the turning point itself; the lines already end with the far knot.
+        knots = np.zeros((2, n - ahead + 2))
+        u, f = knots[0, 1:], knots[1, 1:]
+        np.subtract(vertices[ahead:], v_turn, out=u)
+        u *= direction
+        near = ahead if direction > 0 else n - 1 - ahead
+        if ahead:
+            share = float(u[0]) / abs(float(vertices[ahead] - vertices[ahead - 1]))
+            np.multiply(lines[near - direction][1:], share, out=f)
+            f += (1.0 - share) * lines[near]
         else:
-            share = u[0] / (nodes[ahead] - nodes[ahead - 1]) * s
-            rest = 1.0 - share
-            behind = lines[near - s]
-            f = [share * b + rest * a for a, b in zip(lines[near], behind[1:], strict=True)]
-        if u[0] > 0.0:
-            u.insert(0, 0.0)
-            f.insert(0, 0.0)
-        u.append(u[-1] + END)
-        f.append(f[-1] + END * gain)
-        return Curve(u, f)
+            np.add(lines[near], self.edge_gain * u[0], out=f)
+        return Curve.of(knots if u[0] > 0.0 else knots[:, 1:])
 
-    def _first_node_ahead(self, v_turn: float, s: int) -> int:
-        """Index, counted in direction `s`, of the first vertex at or ahead of `v_turn`."""
-        if s > 0:
-            return bisect_left(self._nodes, v_turn)
-        return len(self._nodes) - bisect_right(self._nodes, v_turn)
+    def _first_vertex_ahead(self, v_turn: float, direction: int) -> int:
+        """Index, counted in `direction`, of the first vertex at or ahead of `v_turn`."""
+        if direction > 0:
+            return bisect_left(self._vertices, v_turn)
+        return len(self._vertices) - bisect_right(self._vertices, v_turn)
 
     def first_rise(self, v_rest: float) -> Curve:
         """Return the first rise from `v_rest` (V)."""
-        rise = self.extended_rise
-        start = rise(v_rest)
-        ahead = [node for node in self._nodes if node > v_rest]
-        u = [0.0, *(node - v_rest for node in ahead)]
-        f = [0.0, *(rise(node) - start for node in ahead)]
-        u.append(u[-1] + END)
-        f.append(f[-1] + END * self.edge_gain)
-        return Curve(u, f)
+        ahead = self.grid[self.grid > v_rest]
+        u = np.concatenate([[0.0], ahead - v_rest])
+        rise = np.interp(v_rest + u, self.grid, self.rise) + self.edge_gain * self._outside(v_rest + u)
+        f = rise - rise[0]
+        return Curve.of(np.array([np.append(u, u[-1] + END), np.append(f, f[-1] + END * self.edge_gain)]))
 
-    def extended_rise(self, v: float) -> float:
-        """Return the first-rise curve at `v` (V), also outside the grid, metres."""
-        inside = min(max(v, self._nodes[0]), self._nodes[-1])
-        return float(np.interp(inside, self.grid, self.rise)) + self.edge_gain * (v - inside)
+    def _outside(self, v: FloatArray) -> FloatArray:
+        """How far `v` (V) lies above the grid, or (negative) below it."""
+        return v - np.clip(v, self.grid[0], self.grid[-1])

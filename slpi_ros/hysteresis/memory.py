@@ -57,7 +57,7 @@ class Memory:
     __slots__ = (
         *("_shape", "_rest", "_turns", "_direction", "_v", "_y"),
         # the present branch: origin, curve, where it closes, and how far the quick path may go on it
-        *("_v0", "_y0", "_u", "_f", "_close", "_reach_u", "_reach_f"),
+        *("_v0", "_y0", "_curve", "_u", "_f", "_close", "_reach_u", "_reach_f"),
     )
 
     def __init__(
@@ -68,8 +68,7 @@ class Memory:
         self.restore(MemoryState(0, rest_voltage, rest_displacement, (), ()))
         if primed:
             top = rest_voltage + FAR
-            u, f = shape.branch(-1, top)
-            fallen = float(np.interp(FAR, u, f))
+            fallen = float(np.interp(FAR, *shape.branch(-1, top).knots))
             self.restore(MemoryState(-1, rest_voltage, rest_displacement, (top,), (rest_displacement + fallen,)))
 
     @property
@@ -222,13 +221,14 @@ class Memory:
         v_turns, y_turns = self._turns
         if v_turns:
             self._v0, self._y0 = v_turns[-1], y_turns[-1]
-            self._u, self._f = shape.branch(s, self._v0)
+            self._curve = shape.branch(s, self._v0)
             self._close = (v_turns[-2], y_turns[-2]) if len(v_turns) > 1 else self._first_closing(s)
         else:
             self._v0, self._y0 = self._rest
             falls_from_low_end = s < 0 and not shape.symmetric_rest
-            self._u, self._f = shape.branch(s, self._v0) if falls_from_low_end else shape.first_rise(self._v0)
+            self._curve = shape.branch(s, self._v0) if falls_from_low_end else shape.first_rise(self._v0)
             self._close = (s * inf, s * inf) if s else self._rest
+        self._u, self._f, _ = self._curve
         self._reach_u = min(s * (self._close[0] - self._v0), self._u[-1])
         self._reach_f = min(s * (self._close[1] - self._y0), self._f[-1])
 
@@ -282,12 +282,12 @@ class Memory:
         """Return the branch up to `farthest` as ascending knots of the driven and of the answering coordinate."""
         s = self._direction
         origin = (self._v0, self._y0)
-        drive, response = np.array((self._u, self._f))[:: 1 - 2 * coordinate]
-        # The last knot is too far away for exact arithmetic.
         reach = s * (farthest - origin[coordinate])
-        last_gain = (response[-1] - response[-2]) / (drive[-1] - drive[-2])
-        drive[-1] = max(reach, drive[-2])
-        response[-1] = response[-2] + (drive[-1] - drive[-2]) * last_gain
+        drive, response = self._curve.knots[:, :-1][:: 1 - 2 * coordinate]
+        if reach > drive[-1]:
+            # The last knot is too far away for exact arithmetic.
+            (*_, d0, d1), (*_, r0, r1) = self._curve[1::-1] if coordinate else self._curve[:2]
+            drive, response = np.append(drive, reach), np.append(response, r0 + (reach - d0) * ((r1 - r0) / (d1 - d0)))
         return (origin[coordinate] + s * drive)[::s], (origin[1 - coordinate] + s * response)[::s]
 
     def pieces(self, x: FloatArray, start: int, stop: int, coordinate: int) -> Iterator[tuple[int, int]]:

@@ -95,7 +95,7 @@ class PrandtlIshlinskii:
             knots, slopes = np.concatenate([[0.0], knots]), np.concatenate([[0.0], slopes])
         knots = np.append(knots, knots[-1] + END)
         values = np.concatenate([[0.0], np.cumsum(slopes * np.diff(knots))])
-        return Curve(knots.tolist(), values.tolist())
+        return Curve.of(np.array([knots, values]))
 
 
 def play(threshold: float) -> PrandtlIshlinskii:

@@ -2,16 +2,31 @@
 
 from typing import NamedTuple, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
 # No voltage lies farther than this from rest (V); the last knot of every branch lies `END` beyond the others.
 FAR = 1e5
 END = 4 * FAR
 
 
 class Curve(NamedTuple):
-    """A branch shape ``F`` as knots (V, m), strictly increasing from ``u[0] = f[0] = 0``, the last one `END` beyond."""
+    """A branch shape ``F`` as knots (V, m), strictly increasing from ``u[0] = f[0] = 0``, the last one `END` beyond.
+
+    The same knots twice: as lists, which are quick to search one by one, and as an array, shape (2, k).
+    """
 
     u: list[float]
     f: list[float]
+    knots: FloatArray
+
+    @classmethod
+    def of(cls, knots: FloatArray) -> "Curve":
+        """Return the curve through knots, shape (2, k)."""
+        u, f = knots.tolist()
+        return cls(u, f, knots)
 
 
 class Shape(Protocol):

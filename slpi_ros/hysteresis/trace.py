@@ -25,6 +25,9 @@ class Piece(NamedTuple):
     origin: int
 
 
+_IDENTITY = Curve.of(np.array([[0.0, END], [0.0, END]]))
+
+
 class _Straight:
     """A shape without hysteresis: enough to move the stack."""
 
@@ -33,7 +36,7 @@ class _Straight:
 
     def branch(self, direction: int, v_turn: float) -> Curve:
         """Return the identity."""
-        return Curve([0.0, END], [0.0, END])
+        return _IDENTITY
 
     def first_rise(self, v_rest: float) -> Curve:
         """Return the identity."""

@@ -224,4 +224,4 @@ class PlayBasis:
 
     def covered(self, branch_part: sp.csr_array) -> float:
         """Return the share of operators that the samples of a `branch_part` move, 0..1."""
-        return float(np.unique(branch_part.indices).size / self.size)
+        return float(np.count_nonzero(np.unique(branch_part.indices) < self.size) / self.size)

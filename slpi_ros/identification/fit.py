@@ -79,12 +79,17 @@ def identify(
 
 @dataclass(frozen=True)
 class _Problem:
-    """One basis on one record: displacement in units of `scale`, robust weights, zero where a sample is not fitted."""
+    """One basis on one record.
+
+    Displacement is in units of `scale`; weights are zero where a sample is not fitted; `rough` is the matrix of the
+    basis's roughness.
+    """
 
     basis: Basis
     design: Design
     y: FloatArray
     weights: FloatArray
+    rough: FloatArray
     scale: float
     gain: float
 
@@ -98,8 +103,7 @@ class _Problem:
         return (self.design.predict(x) - self.y)[fitted] * self.scale
 
     def penalty(self, smoothness: float, count: float) -> FloatArray:
-        rough = self.basis.roughness()
-        matrix: FloatArray = (rough.T @ rough).toarray() * (smoothness * count / 1000)
+        matrix = self.rough * (smoothness * count / 1000)
         matrix[np.diag_indices_from(matrix)] += RIDGE * count
         return matrix
 
@@ -200,4 +204,13 @@ def _pose(samples: Samples, basis: Basis) -> _Problem:
     walk = Walk.along(samples.v, symmetric_rest=basis.symmetric_rest, primed=samples.primed)
     design = Design.of(walk, basis.branch_part(walk))
     volts, metres = samples.spread
-    return _Problem(basis, design, samples.y / metres, samples.fitted.astype(np.float64), metres, metres / volts)
+    rough = basis.roughness()
+    return _Problem(
+        basis=basis,
+        design=design,
+        y=samples.y / metres,
+        weights=samples.fitted.astype(np.float64),
+        rough=(rough.T @ rough).toarray(),
+        scale=metres,
+        gain=metres / volts,
+    )

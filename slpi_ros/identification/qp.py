@@ -45,7 +45,7 @@ def solve_qp(matrix: FloatArray, vector: FloatArray, constraints: sp.csr_array, 
         verbose=False, eps_abs=TOLERANCE, eps_rel=TOLERANCE, max_iter=50_000, polishing=True,
     )  # fmt: skip
     solver.warm_start(x=free)
-    result = solver.solve()
+    result = solver.solve(raise_error=False)
     if result.info.status_val != osqp.SolverStatus.OSQP_SOLVED:
         raise IdentificationError(
             f"the quadratic program did not converge (OSQP: {result.info.status}); check the record for gross errors"
@@ -57,7 +57,7 @@ def solve_qp(matrix: FloatArray, vector: FloatArray, constraints: sp.csr_array, 
 def solve_free(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     """Minimise ``x' M x / 2 - b' x`` without constraints; parameters and errors as in `solve_qp`."""
     try:
-        solution: FloatArray = scipy.linalg.solve(matrix, vector, assume_a="pos")
+        solution: FloatArray = scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), vector)
     except np.linalg.LinAlgError:
         raise IdentificationError("the record does not determine the model; drive more of the voltage range") from None
     return solution

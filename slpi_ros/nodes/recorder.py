@@ -19,6 +19,8 @@ from slpi_ros.nodes.runner import request_stop, run
 # a burst must fit while the disk is slow
 DEPTH = 10_000
 DISCOVERY_PERIOD = 0.1
+# publishers and subscribers may take seconds to find each other
+PATIENCE = 5.0
 STAGE_STATE = "stage_state"
 _READ_ONLY = ParameterDescriptor(read_only=True, dynamic_typing=True)
 
@@ -30,8 +32,8 @@ class Recorder(Node):
     publishers offer; messages stay serialised. Until the recording is complete the bag is in
     ``.NAME.partial`` beside its place.
     Parameters, all read-only: ``output`` (the rosbag2 folder to make), ``topics`` (default
-    ``[stage_state]``), ``storage`` (``mcap`` or ``sqlite3``), ``duration`` (s from the start of the node; 0:
-    until a signal).
+    ``[stage_state]``), ``storage`` (``mcap`` or ``sqlite3``), ``duration`` (s from the first message; it
+    ends too when none has come 5 s after that time; 0: until a signal).
 
     Raises
     ------
@@ -48,7 +50,7 @@ class Recorder(Node):
             raise UsageError("recorder: no output; name the bag to make with --ros-args -p output:=FOLDER")
         # names as other nodes see them, after namespace and remapping
         self._awaited = {self.resolve_topic_name(topic): topic for topic in self._topics()}
-        duration = self._duration()
+        self._duration = self._seconds()
         storage = str(self._parameter("storage", "mcap"))
         self._bag: BagWriter | None = BagWriter(output, storage=storage, topic=None)
         self._listening: dict[str, Any] = {}
@@ -56,11 +58,11 @@ class Recorder(Node):
             # its type is known, so nothing is lost between the first message and the next look at the graph
             if topic.rpartition("/")[2] == STAGE_STATE:
                 self._subscribe(name, JOINT_STATE, ())
-        # a simulated clock may stand still
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._discovery = self.create_timer(DISCOVERY_PERIOD, self._discover, clock=clock)
-        if duration:
-            self.create_timer(duration, lambda: request_stop(), clock=clock)
+        # the clock of a simulation may stand still
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._discovery = self.create_timer(DISCOVERY_PERIOD, self._discover, clock=self._steady)
+        if self._duration:
+            self._end = self._stop_in(self._duration + PATIENCE)
         self.get_logger().info(f"recording {', '.join(self._awaited)} into {output}")
 
     def destroy_node(self) -> None:
@@ -116,17 +118,36 @@ class Recorder(Node):
             _message_class(name, msgtype), name, partial(self._record, name), qos, raw=True
         )
 
+    def _stop_in(self, seconds: float) -> Any:
+        return self.create_timer(seconds, lambda: request_stop(), clock=self._steady)
+
     def _record(self, name: str, message: bytes) -> None:
         if self._bag is None:
             return
+        if self._duration and not self._bag.message_count:
+            self.destroy_timer(self._end)
+            self._end = self._stop_in(self._duration)
         try:
             self._bag.write_raw(self.get_clock().now().nanoseconds, message, name)
         except RecordError as error:
             request_stop(RecordError(f"{error}; its unfinished files are in {self._bag.partial}"))
             self._bag = None
 
+    def _drain(self) -> None:
+        """Record what came before the end: the executor has stopped, but the middleware still holds it."""
+        for name, subscription in self._listening.items():
+            with subscription.handle:
+                # a publisher that never rests must not keep us here
+                for _ in range(DEPTH):
+                    taken = subscription.handle.take_message(subscription.msg_type, True)
+                    if taken is None:
+                        break
+                    self._record(name, taken[0])
+
     def _finish(self) -> None:
         """Put the bag in its place, unless nothing is in it."""
+        if self.context.ok():
+            self._drain()
         bag, self._bag = self._bag, None
         if bag is None:
             return
@@ -148,7 +169,7 @@ class Recorder(Node):
             raise UsageError(f"recorder: topics is {topics!r}; give a list of names, as in [stage_state]")
         return topics
 
-    def _duration(self) -> float:
+    def _seconds(self) -> float:
         duration = self._parameter("duration", 0.0)
         if isinstance(duration, bool) or not isinstance(duration, int | float):
             raise UsageError(f"recorder: duration is {duration!r}; give seconds, or 0 for no end")

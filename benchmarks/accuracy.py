@@ -1,0 +1,85 @@
+"""How well a path that was not in the record is followed, on simulated stages that are no model of the compensator.
+
+Mean and maximum error against the true displacement, in % of stroke; the best classical PI model of the same record beside it.
+"""
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+import slpi_ros
+from slpi_ros.stage.drive import calibration_drive, scan_path
+from slpi_ros.stage.parameters import StageParameters
+from slpi_ros.stage.preisach import PreisachStage
+
+FloatArray = NDArray[np.float64]
+V_MAX = 100.0
+NOISE = 8e-9
+
+
+def fresh(seed: int) -> PreisachStage:
+    """Return the stage of a seed, never moved."""
+    return PreisachStage(replace(StageParameters.random(seed), noise_rms=NOISE), seed)
+
+
+def record_of(t: FloatArray, v: FloatArray, y: FloatArray) -> slpi_ros.Record:
+    """Return a record of one axis."""
+    return slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y}, "calibration")
+
+
+def calibrated(seed: int, duration: float, rate: float) -> tuple[slpi_ros.Record, float, float]:
+    """Drive the stage of a seed; return the record, and the reachable displacements once it has been moved (m)."""
+    stage = fresh(seed)
+    t, v = calibration_drive(0.0, V_MAX, duration=duration, rate=rate, seed=seed)
+    true, measured = stage.run(t, v)
+    low = stage.run(np.array([t[-1] + 1.0]), np.array([0.0]))[0][0]
+    return record_of(t, v, measured), float(low), float(true.max())
+
+
+def errors(model: slpi_ros.StageModel, seed: int, low: float, high: float, duration: float, rate: float) -> FloatArray:
+    """Follow an unseen path with the model's voltages; return the sizes of the errors, in shares of the stroke."""
+    t, desired = scan_path(low, high, duration=duration, rate=rate, seed=1000 + seed)
+    achieved, _ = fresh(seed).run(t, model.compensate(t, desired))
+    share: FloatArray = np.abs(achieved - desired) / (high - low)
+    return share
+
+
+def below_remanence(model: slpi_ros.StageModel, seed: int, low: float, high: float, rate: float) -> tuple[float, float]:
+    """Return the mean error of a path's second half, after an excursion out of reach, and without it."""
+    t, desired = scan_path(low, high, duration=20.0, rate=rate, seed=2000 + seed)
+    excursion = desired.copy()
+    middle = slice(desired.size // 4, desired.size // 2)
+    excursion[middle] = low - 0.1 * (high - low) * np.sin(np.linspace(0.0, np.pi, excursion[middle].size))
+    means = []
+    for path in (excursion, desired):
+        v, _ = model.axes["x"].compensate(path)
+        achieved, _ = fresh(seed).run(t, v)
+        half = desired.size // 2 + int(rate)
+        means.append(float(np.mean(np.abs(achieved - path)[half:]) / (high - low)))
+    return means[0], means[1]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--duration", type=float, default=60.0, help="seconds of calibration drive")
+    parser.add_argument("--rate", type=float, default=200.0)
+    options = parser.parse_args()
+    print(f"{options.duration:g} s of calibration, {NOISE * 1e9:g} nm noise, errors in % of stroke")
+    print("seed   slpi mean    max     pi mean    max   ratio   after an excursion below reach (without it)")
+    for seed in range(options.seeds):
+        record, low, high = calibrated(seed, options.duration, options.rate)
+        margin = 0.02 * (high - low)
+        low, high = low + margin, high - margin
+        models = {kind: slpi_ros.identify(record, kind) for kind in ("slpi", "pi")}
+        found = {kind: errors(model, seed, low, high, 40.0, options.rate) for kind, model in models.items()}
+        (a, b), (c, d) = ((100 * e.mean(), 100 * e.max()) for e in (found["slpi"], found["pi"]))
+        after, without = below_remanence(models["slpi"], seed, low - margin, high, options.rate)
+        print(f"{seed:4d} {a:11.4f} {b:6.3f} {c:11.3f} {d:6.2f} {c / a:7.0f} {100 * after:14.4f} ({100 * without:.4f})")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""The demo's side of the ROS graph: start nodes as processes, send samples in time, keep what comes back."""
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from numpy.typing import NDArray
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+FloatArray = NDArray[np.float64]
+QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+EXECUTABLES = Path(__file__).resolve().parents[1] / "install" / "slpi_ros" / "lib" / "slpi_ros"
+
+
+@contextmanager
+def executable(name: str, **parameters: str | float | bool) -> Iterator[subprocess.Popen[bytes]]:
+    """Run one of the package's nodes until the block ends; it gets the time to finish its work."""
+    command = [str(EXECUTABLES / name), "--ros-args", "--log-level", "warn"]
+    for key, value in parameters.items():
+        command += ["-p", f"{key}:={value}"]
+    process = subprocess.Popen(command, start_new_session=True)
+    try:
+        yield process
+    finally:
+        os.killpg(process.pid, signal.SIGINT)
+        try:
+            process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+class Operator(Node):
+    """Sends voltages or wishes at a steady rate and listens to the stage."""
+
+    def __init__(self) -> None:
+        super().__init__("operator")
+        self.voltage = self.create_publisher(Float64MultiArray, "voltage_command", QOS)
+        self.desired = self.create_publisher(JointState, "desired_displacement", QOS)
+        self._answers: list[tuple[float, float]] = []
+        self.create_subscription(JointState, "stage_state", self._keep, QOS)
+
+    def _keep(self, state: JointState) -> None:
+        self._answers.append((state.effort[0], state.position[0]))
+
+    def wait_until(self, what: str, condition: Callable[[], bool], timeout: float = 30.0) -> None:
+        """Wait for the graph to be ready."""
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                raise SystemExit(f"demo: {what} did not happen within {timeout:g} s")
+            time.sleep(0.02)
+
+    def drive(self, voltages: Sequence[float], rate: float) -> FloatArray:
+        """Apply voltages (V) one after the other; return voltage and measured displacement, shape (N, 2), V and m."""
+        return self._send([Float64MultiArray(data=array("d", [v])) for v in voltages], self.voltage.publish, rate)
+
+    def follow(self, displacements: Sequence[float], rate: float) -> FloatArray:
+        """Wish for displacements (m) one after the other; return as `drive` does."""
+        return self._send([JointState(name=["x"], position=[y]) for y in displacements], self._wish, rate)
+
+    def _wish(self, message: JointState) -> None:
+        message.header.stamp = self.get_clock().now().to_msg()
+        self.desired.publish(message)
+
+    def _send(self, messages: Sequence[object], publish: Callable[[object], None], rate: float) -> FloatArray:
+        self._answers = []
+        start = time.monotonic()
+        for k, message in enumerate(messages):
+            time.sleep(max(0.0, start + k / rate - time.monotonic()))
+            publish(message)
+        self.wait_until(f"the answer to all of {len(messages)} samples", lambda: len(self._answers) >= len(messages))
+        return np.array(self._answers[: len(messages)])
+
+
+@contextmanager
+def operator() -> Iterator[Operator]:
+    """Run an operator whose callbacks are served in the background."""
+    rclpy.init()
+    node = Operator()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def spin() -> None:
+        try:
+            while rclpy.ok():
+                executor.spin_once(timeout_sec=0.2)
+        except ExternalShutdownException:
+            pass
+
+    thread = threading.Thread(target=spin, daemon=True)
+    thread.start()
+    try:
+        yield node
+    finally:
+        rclpy.try_shutdown()
+        thread.join(timeout=5)

@@ -1,0 +1,43 @@
+"""One compensator: ros2 launch slpi_ros compensator.launch.py params_file:=... model_file:=..."""
+
+from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition, UnlessCondition
+from launch.substitutions import EqualsSubstitution, LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import LifecycleNode
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
+
+ONE_AXIS = PathJoinSubstitution([FindPackageShare("slpi_ros"), "config", "one_axis.yaml"])
+
+
+def generate_launch_description() -> LaunchDescription:
+    model_file = LaunchConfiguration("model_file")
+    no_model_file = EqualsSubstitution(model_file, "")
+    as_in_params_file = [LaunchConfiguration("params_file")]
+    with_model_file = [*as_in_params_file, {"model_file": ParameterValue(model_file, value_type=str)}]
+    return LaunchDescription([
+        DeclareLaunchArgument("params_file", default_value=ONE_AXIS, description="parameters of the compensator"),
+        DeclareLaunchArgument("model_file", default_value="", description="model document, if not in params_file"),
+        DeclareLaunchArgument("namespace", default_value="", description="of the node and its topics"),
+        DeclareLaunchArgument(
+            "voltage_topic", default_value="voltage_command", description="where voltages go: a controller's commands"
+        ),
+        compensator(as_in_params_file, IfCondition(no_model_file)),
+        compensator(with_model_file, UnlessCondition(no_model_file)),
+    ])  # fmt: skip
+
+
+def compensator(parameters: list, condition: IfCondition) -> LifecycleNode:
+    # The node configures and activates itself unless its parameter autostart is false.
+    return LifecycleNode(
+        package="slpi_ros",
+        executable="compensator",
+        name="compensator",
+        namespace=LaunchConfiguration("namespace"),
+        parameters=parameters,
+        remappings=[("voltage_command", LaunchConfiguration("voltage_topic"))],
+        output="screen",
+        condition=condition,
+    )

@@ -1,0 +1,210 @@
+"""Node ``identify``: a bag in, a latched model out."""
+
+import math
+import sys
+import time
+from dataclasses import dataclass
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from slpi_ros.errors import UsageError
+from slpi_ros.identification.fit import KINDS
+from slpi_ros.model import StageModel
+from slpi_ros.model_file import parse_model
+from slpi_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Health
+from slpi_ros.nodes.fit_process import FitOutcome, FitProcess, FitRequest
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, choice, number
+from slpi_ros.nodes.qos import LATCHED
+from slpi_ros.nodes.runner import run
+
+POLL_PERIOD = 0.1
+REPORT_PERIOD = (0.05, 3600.0)
+
+DECLARATIONS = (
+    Declaration(
+        "bags", [""],
+        "The bag to identify: a rosbag2 folder, or a lone mcap or db3 file. Setting a parameter later identifies anew.",
+    ),
+    Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
+    Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}."),
+    Declaration("output", "", "File to write the model to as well; empty: none."),
+    Declaration(
+        "start", math.nan, "Fit from here on, seconds from the bag's first stamp; NaN or negative: from the first.",
+        number=True,
+    ),
+    Declaration(
+        "stop", math.nan, "Fit up to here, seconds from the bag's first stamp; NaN or negative: to the last.",
+        number=True,
+    ),
+    Declaration(
+        "diagnostic_period", 1.0, "Seconds between two reports on /diagnostics.",
+        read_only=True, between=REPORT_PERIOD, number=True,
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class IdentifySettings:
+    """What the node is told by its parameters.
+
+    Parameters
+    ----------
+    request : FitRequest or None
+        What to identify; None without a bag.
+    diagnostic_period : float, seconds
+    """
+
+    request: FitRequest | None
+    diagnostic_period: float
+
+    @classmethod
+    def of(cls, values: Values) -> "IdentifySettings":
+        """Make the settings of all parameters by name.
+
+        Raises
+        ------
+        UsageError
+            If a value makes no sense.
+        """
+        bags = [bag for bag in values["bags"] if bag]
+        if len(bags) > 1:
+            raise UsageError(f"parameter bags names {len(bags)} bags; this version identifies one bag at a time")
+        if not values["topic"]:
+            raise UsageError("parameter topic is empty; name the topic of the bag, as in stage_state")
+        kind = choice(values, "kind", KINDS)
+        start, stop = bound(values, "start"), bound(values, "stop")
+        if start is not None and stop is not None and not start < stop:
+            raise UsageError(f"parameter start is {start:g} s and stop {stop:g} s; start before you stop")
+        request = FitRequest(bags[0], values["topic"], kind, start, stop, values["output"]) if bags else None
+        return cls(request, number(values, "diagnostic_period", *REPORT_PERIOD))
+
+
+def bound(values: Values, name: str) -> float | None:
+    """Return a time of the record, seconds; None where NaN or a negative number says that there is none."""
+    given = values[name]
+    if isinstance(given, float) and math.isnan(given):
+        return None
+    seconds = number(values, name, -math.inf, math.inf)
+    return seconds if seconds >= 0 else None
+
+
+class Identify(Node):
+    """A node that identifies the stage of a bag and keeps the model latched on ``stage_model``.
+
+    Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`. A bag that cannot be identified is
+    reported, and the last good model stays published.
+
+    Raises
+    ------
+    UsageError
+        If the parameters make no sense.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("identify")
+        self._parameters = Parameters(self, DECLARATIONS, IdentifySettings.of)
+        self._publisher = self.create_publisher(String, "stage_model", LATCHED)
+        self._diagnostics = Diagnostics(self, "identify")
+        self._job: FitProcess | None = None
+        self._model: StageModel | None = None
+        self._error = ""
+        # A simulated clock may stand still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._poll = self.create_timer(POLL_PERIOD, self._look, clock=steady, autostart=False)
+        self.create_timer(self._parameters.settings.diagnostic_period, self._report, clock=steady)
+        self._parameters.follow(self._begin)
+        self._begin(self._parameters.settings)
+
+    def destroy_node(self) -> None:
+        """End the identification under way, then destroy the node."""
+        self._end_job()
+        super().destroy_node()
+
+    def _begin(self, settings: IdentifySettings) -> None:
+        """Start to identify what the parameters name, in place of what is under way."""
+        self._end_job()
+        self._error = ""
+        if settings.request is None:
+            self.get_logger().warning("no bag to identify; set the parameter bags")
+        else:
+            self._job, self._job_start = FitProcess(settings.request), time.monotonic()
+            self._poll.reset()
+        self._report()
+
+    def _end_job(self) -> None:
+        self._poll.cancel()
+        if self._job:
+            self._job.end()
+            self._job = None
+
+    def _look(self) -> None:
+        """Look whether the identification is done."""
+        outcome = self._job.outcome() if self._job else None
+        if outcome:
+            self._job = None
+            self._poll.cancel()
+            self._take(outcome)
+
+    def _take(self, outcome: FitOutcome) -> None:
+        if outcome.document:
+            self._model = parse_model(outcome.document, "identify")
+            self._publisher.publish(String(data=outcome.document))
+            self.get_logger().info(described(self._model))
+        self._error = outcome.error
+        if self._error:
+            self.get_logger().error(self._error)
+        self._report()
+
+    def _report(self) -> None:
+        model = self._model
+        values: dict[str, object] = {
+            "state": "identifying" if self._job else "waiting",
+            "model.created": model.created if model else "",
+            "model.hardware_id": model.hardware_id if model else "",
+            "last_error": self._error,
+        }
+        for name, axis in model.axes.items() if model else ():
+            quality = axis.quality
+            values |= {
+                f"{name}.kind": axis.kind,
+                f"{name}.rms_nm": f"{quality.rms * 1e9:.2f}",
+                f"{name}.held_out_rms_nm": f"{quality.held_out_rms * 1e9:.2f}",
+                f"{name}.maximum_nm": f"{quality.maximum * 1e9:.2f}",
+                f"{name}.floor_rms_nm": f"{quality.floor_rms * 1e9:.2f}",
+                f"{name}.samples": quality.samples,
+                f"{name}.covered": f"{quality.covered:.3f}",
+                f"{name}.source": quality.source,
+            }
+        problems = ((ERROR, self._error),) if self._error else ()
+        if not problems and not model and not self._job:
+            problems = ((WARN, "no bag to identify; set the parameter bags"),)
+        hardware_id = model.hardware_id if model else ""
+        self._diagnostics.report(Health(problems, self._doing(), values, hardware_id))
+
+    def _doing(self) -> str:
+        if self._job:
+            return f"identifying {self._job.request.bag} for {time.monotonic() - self._job_start:.0f} s"
+        return described(self._model) if self._model else ""
+
+
+def described(model: StageModel) -> str:
+    """Say in one line how good a model is."""
+    axes = []
+    for name, axis in model.axes.items():
+        quality, (low, high) = axis.quality, axis.displacement_range
+        axes.append(
+            f"{name}: {axis.kind}, rms {quality.rms * 1e9:.1f} nm (held out {quality.held_out_rms * 1e9:.1f} nm) "
+            f"of {(high - low) * 1e6:.3g} um from {quality.samples} samples"
+        )
+    return f"identified {'; '.join(axes)}"
+
+
+def main() -> int:
+    """Run the node; return the exit code of the process."""
+    return run(Identify)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

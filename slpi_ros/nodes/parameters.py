@@ -1,0 +1,145 @@
+"""Parameters of a node, declared in one table and validated together."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from slpi_ros.errors import SlpiError, UsageError
+
+Settings = TypeVar("Settings")
+Values = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """One parameter.
+
+    Parameters
+    ----------
+    name : str
+    default : object
+        Its type is the parameter's type.
+    description : str
+        What ``ros2 param describe`` shows.
+    read_only : bool
+        Whether only the start of the node may set it.
+    between : (float, float), optional
+        Smallest and largest value of a number; without it any.
+    number : bool
+        Whether integers, and one value for each axis, may stand for the default's one double.
+    """
+
+    name: str
+    default: Any
+    description: str
+    read_only: bool = False
+    between: tuple[float, float] | None = None
+    number: bool = False
+
+    def descriptor(self) -> ParameterDescriptor:
+        """Return what rclpy shows, and checks where it can."""
+        described = ParameterDescriptor(
+            description=self.description, read_only=self.read_only, dynamic_typing=self.number
+        )
+        if self.between:
+            low, high = self.between
+            described.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        return described
+
+
+class Parameters(Generic[Settings]):
+    """The parameters of a node and the settings made of them, which change together or not at all.
+
+    Parameters
+    ----------
+    node : Node
+    declarations : sequence of Declaration
+    make : callable
+        Makes the settings of all values by name; its SlpiError refuses them.
+
+    Raises
+    ------
+    UsageError
+        If the values given at the start make no settings.
+    """
+
+    def __init__(
+        self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]
+    ) -> None:
+        self._node, self._make = node, make
+        self._values: dict[str, Any] = {
+            entry.name: node.declare_parameter(entry.name, entry.default, entry.descriptor()).value
+            for entry in declarations
+        }
+        self.settings = make(self._values)
+
+    def follow(self, apply: Callable[[Settings], None], check: Callable[[Settings], None] | None = None) -> None:
+        """From now on allow changes that `check` lets pass (it raises SlpiError if not), and `apply` them."""
+        self._applied, self._checked = apply, check
+        self._node.add_on_set_parameters_callback(self._check)
+        self._node.add_post_set_parameters_callback(self._apply)
+
+    def _check(self, changes: Sequence[Parameter]) -> SetParametersResult:
+        try:
+            settings = self._make(self._values | self._ours(changes))
+            if self._checked:
+                self._checked(settings)
+        except SlpiError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, changes: Sequence[Parameter]) -> None:
+        if ours := self._ours(changes):
+            self._values |= ours
+            self.settings = self._make(self._values)
+            self._applied(self.settings)
+
+    def _ours(self, changes: Sequence[Parameter]) -> dict[str, Any]:
+        """Leave out rclpy's own, such as use_sim_time."""
+        return {change.name: change.value for change in changes if change.name in self._values}
+
+
+def number(values: Values, name: str, low: float, high: float) -> float:
+    """Return the parameter `name` as a float.
+
+    Raises
+    ------
+    UsageError
+        Unless it is one finite number from `low` to `high`.
+    """
+    return numbers(values, name, ("",), low, high)[0]
+
+
+def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: float) -> list[float]:
+    """Return the parameter `name` as floats, one for each axis; a single value stands for all of them.
+
+    Raises
+    ------
+    UsageError
+        Unless all are finite numbers from `low` to `high`.
+    """
+    given = values[name]
+    one = isinstance(given, bool | int | float)
+    several = [given] * len(axes) if one else list(given) if isinstance(given, Sequence) else []
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in several):
+        several = []
+    if len(several) != len(axes):
+        wanted = "a number" if len(axes) == 1 else f"a number, or one for each of the axes {', '.join(axes)}"
+        raise UsageError(f"parameter {name} is {given!r}; give {wanted}")
+    for value in several:
+        if not (math.isfinite(value) and low <= value <= high):
+            raise UsageError(f"parameter {name} is {value:g}; give a value from {low:g} to {high:g}")
+    return [float(value) for value in several]
+
+
+def choice(values: Values, name: str, known: Sequence[str]) -> str:
+    """Return the parameter `name`; UsageError unless it is one of `known`."""
+    given = values[name]
+    if given not in known:
+        raise UsageError(f"parameter {name} is {given!r}; choose one of {', '.join(known)}")
+    return str(given)

@@ -1,0 +1,156 @@
+"""Identification: what it finds, what it stands, and what it refuses."""
+
+import numpy as np
+import pytest
+from identification.records import calibration, record_of, rms, stage
+
+import slpi_ros
+from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.stage.drive import scan_path
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return calibration(seed=1)
+
+
+@pytest.fixture(scope="module")
+def model(recorded):
+    return slpi_ros.identify(recorded[0])
+
+
+def unseen_error(model, seed):
+    """Follow an unseen path on the seed's stage; return errors in shares of the stroke."""
+    low, high = 4e-6, 0.95 * model.axes["x"].displacement_range[1]
+    t, desired = scan_path(low, high, duration=20.0, rate=200.0, seed=77)
+    achieved, _ = stage(seed).run(t, model.compensate(t, desired))
+    return np.abs(achieved - desired) / (high - low)
+
+
+def test_the_residual_is_the_sensor_noise(recorded, model):
+    record, true = recorded
+    simulated = model.simulate(record.t, record.voltage["x"])
+    assert rms(simulated - true) < 6e-9
+    quality = model.axes["x"].quality
+    assert 7e-9 < quality.rms < 9e-9
+    assert 7e-9 < quality.floor_rms < 9e-9
+    assert 0.5 < quality.covered <= 1.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_unseen_paths_are_followed(seed):
+    record, _ = calibration(seed, duration=30.0)
+    error = unseen_error(slpi_ros.identify(record), seed)
+    assert error.mean() < 0.0005 and error.max() < 0.003
+    classical = unseen_error(slpi_ros.identify(record, "pi"), seed)
+    assert classical.mean() > 25 * error.mean()
+
+
+def test_a_classical_stage_is_identified_by_both_kinds():
+    truth = PrandtlIshlinskii(np.array([0.0, 10.0, 25.0]), np.array([1e-7, 4e-8, 3e-8]))
+    t = np.arange(0, 20, 0.01)
+    v = 50 - 50 * np.cos(2 * np.pi * t / 2) * np.interp(t, [0, 20], [1.0, 0.1])
+    v[0] = 0.0
+    y = Memory(truth).forward_array(v)
+    for kind in ("pi", "slpi"):
+        found = slpi_ros.identify(record_of(t, v, y), kind)
+        assert rms(found.simulate(t, v) - y) < 5e-4 * np.ptp(y), kind
+
+
+def test_identification_is_deterministic(recorded, model):
+    again = slpi_ros.identify(recorded[0])
+    np.testing.assert_array_equal(again.axes["x"].hysteresis.surface, model.axes["x"].hysteresis.surface)
+
+
+def test_outliers_stale_samples_and_dropouts_do_little_harm(recorded, model):
+    record, _ = recorded
+    rng = np.random.default_rng(0)
+    y = record.displacement["x"].copy()
+    spikes = rng.random(y.size) < 0.05
+    y[spikes] += rng.normal(0, 80e-9, spikes.sum())
+    stale = np.flatnonzero(rng.random(y.size) < 0.01)
+    y[stale] = y[np.maximum(stale - 1, 0)]
+    y[rng.random(y.size) < 0.02] = np.nan
+    spoiled = slpi_ros.identify(record_of(record.t, record.voltage["x"], y))
+    assert unseen_error(spoiled, 1).mean() < 2.0 * unseen_error(model, 1).mean() + 5e-5
+
+
+def test_a_record_that_starts_in_mid_loop_is_understood(recorded):
+    record, _ = recorded
+    late = record.t > 1.7
+    assert not record.voltage["x"][late][0] < 5.0
+    cut = record_of(record.t[late], record.voltage["x"][late], record.displacement["x"][late])
+    found = slpi_ros.identify(cut)
+    wiped = cut.t > 6.0
+    error = found.simulate(cut.t, cut.voltage["x"]) - cut.displacement["x"]
+    assert rms(error[wiped]) < 12e-9
+
+
+def test_voltage_before_the_start_still_moves_the_memory(recorded):
+    record, true = recorded
+    found = slpi_ros.identify(record, start=5.0)
+    error = found.simulate(record.t, record.voltage["x"]) - true
+    assert rms(error[record.t >= 5.0]) < 8e-9
+
+
+def test_several_axes_and_a_choice_of_them(recorded):
+    record, _ = recorded
+    both = slpi_ros.Record(
+        record.time_ns,
+        {"x": record.voltage["x"], "y": record.voltage["x"]},
+        {"x": record.displacement["x"], "y": 2 * record.displacement["x"]},
+    )
+    assert list(slpi_ros.identify(both, "pi").axes) == ["x", "y"]
+    assert list(slpi_ros.identify(both, "pi", axes=["y"]).axes) == ["y"]
+    with pytest.raises(UsageError, match="no axis 'z'"):
+        slpi_ros.identify(both, "pi", axes=["z"])
+
+
+def spoil(record, **changes):
+    parts = {"t": record.t.copy(), "v": record.voltage["x"].copy(), "y": record.displacement["x"].copy()}
+    for key, change in changes.items():
+        parts[key] = change(parts[key])
+    return record_of(parts["t"], parts["v"], parts["y"])
+
+
+BAD = {
+    "voltage without variation": ({"v": lambda v: np.full_like(v, 20.0)}, "voltage stays at 20 V"),
+    "displacement without variation": ({"y": lambda y: np.full_like(y, 1e-6)}, "displacement stays at 1e-06 m"),
+    "no displacement": ({"y": lambda y: np.full_like(y, np.nan)}, "0 usable samples"),
+    "infinite": ({"v": lambda v: np.full_like(v, np.inf)}, "0 usable samples"),
+    "time backwards": ({"t": lambda t: np.concatenate([t[:100], t[50:-50]])}, "time runs backwards at sample 100"),
+    "one sample": ({key: lambda x: x[:1] for key in "tvy"}, "1 usable samples"),
+    "nothing": ({key: lambda x: x[:0] for key in "tvy"}, "0 usable samples"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_be_fitted_is_said(recorded, case):
+    changes, message = BAD[case]
+    with pytest.raises(RecordError, match=message):
+        slpi_ros.identify(spoil(recorded[0], **changes))
+
+
+def test_single_bad_samples_are_left_out(recorded):
+    def spoil_some(values):
+        values[[100, 1500, 3000]] = np.nan, np.inf, -np.inf
+        return values
+
+    found = slpi_ros.identify(spoil(recorded[0], y=spoil_some, v=lambda v: spoil_some(v[::-1])[::-1]), "pi")
+    assert found.axes["x"].quality.samples == len(recorded[0]) - 6
+
+
+def test_unknown_kind_and_empty_window(recorded):
+    with pytest.raises(UsageError, match="unknown kind 'nonsense'"):
+        slpi_ros.identify(recorded[0], "nonsense")
+    with pytest.raises(RecordError, match="usable samples"):
+        slpi_ros.identify(recorded[0], start=1000.0)
+
+
+def test_axes_of_different_length_are_refused():
+    with pytest.raises(RecordError, match="voltage of axis 'x' has"):
+        slpi_ros.Record(np.arange(5), {"x": np.zeros(4)}, {"x": np.zeros(5)})
+    with pytest.raises(RecordError, match="each axis needs both"):
+        slpi_ros.Record(np.arange(5), {"x": np.zeros(5)}, {"y": np.zeros(5)})

@@ -1,0 +1,92 @@
+"""What stands around a compensator in its tests: a sender of wishes, and ears for what it answers."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from nodes.ros_helpers import RELIABLE, Graph, NodeProcess, on_graph, started, values_of
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+SECOND_NS = 1_000_000_000
+START_NS = 1_700_000_000 * SECOND_NS
+PERIOD_NS = 5_000_000
+# Sent but not yet answered: less than the depth of the compensator's queue.
+AHEAD = 50
+# Reports are what most tests wait for.
+QUICK = {"diagnostic_period": 0.2}
+
+
+class Client:
+    """The other end of one compensator."""
+
+    def __init__(self, graph: Graph, node: NodeProcess, namespace: str, names: Mapping[str, str], desired: Any) -> None:
+        self.graph, self.node = graph, node
+        self.name = f"{namespace}/compensator"
+        self._role = f"{self.name}: compensator"
+        self._answers = graph.record(
+            Float64MultiArray, names.get("voltage_command", f"{namespace}/voltage_command"), RELIABLE
+        )
+        self._wishes = graph.node.create_publisher(
+            desired, names.get("desired_displacement", f"{namespace}/desired_displacement"), RELIABLE
+        )
+        graph.watch_diagnostics()
+
+    @property
+    def answers(self) -> list[list[float]]:
+        """All voltages so far, volts."""
+        return [list(message.data) for message in self._answers]
+
+    def report(self, what: str = "a report", **wanted: object) -> tuple[Any, dict[str, str]]:
+        """Wait for a report with these key-values; return it and all its values."""
+        texts = {key: str(value) for key, value in wanted.items()}
+        status = self.graph.wait_for_status(
+            self._role, lambda status: texts.items() <= values_of(status).items(), f"{what} {texts}"
+        )
+        return status, values_of(status)
+
+    def connect(self, state: str = "active") -> "Client":
+        """Wait until nothing that is sent can be lost."""
+        self.report("the state", state=state)
+        if state != "unconfigured":
+            self.graph.spin_until(self._wishes.get_subscription_count, "the compensator's ears")
+        return self
+
+    def publish(self, message: Any) -> None:
+        self._wishes.publish(message)
+
+    def wish(self, names: Sequence[str], displacements: Sequence[float], stamp_ns: int = 0) -> None:
+        self.publish(wish(names, displacements, stamp_ns))
+
+    def ask(self, names: Sequence[str], displacements: Sequence[float], stamp_ns: int = 0) -> list[float]:
+        """Return the voltages for one message."""
+        before = len(self._answers)
+        self.wish(names, displacements, stamp_ns)
+        self.graph.spin_until(lambda: len(self._answers) > before, f"an answer; it said: {self.node.stderr}")
+        return self.answers[before]
+
+    def follow(self, names: Sequence[str], path: np.ndarray, start_ns: int = START_NS) -> np.ndarray:
+        """Return the voltages, shape (N, axes), for a path, shape (N, names), of one sample every `PERIOD_NS`."""
+        before = len(self._answers)
+        for i, row in enumerate(path.tolist()):
+            self.wish(names, row, start_ns + i * PERIOD_NS)
+            self.graph.spin_until(lambda sent=i: sent - (len(self._answers) - before) < AHEAD, f"answer {i}")
+        self.graph.spin_until(lambda: len(self._answers) - before >= len(path), f"{len(path)} answers")
+        return np.array(self.answers[before:])
+
+
+def wish(names: Sequence[str], displacements: Sequence[float], stamp_ns: int = 0) -> JointState:
+    """Return a desired message, metres."""
+    message = JointState(name=list(names), position=list(displacements))
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND_NS)
+    return message
+
+
+@contextmanager
+def compensator(
+    *arguments: str, namespace: str = "", names: Mapping[str, str] | None = None, desired: Any = JointState, **parameters: Any
+) -> Iterator[Client]:
+    """Start a compensator and stand around it; `names` tells remapped topics."""
+    with on_graph() as graph, started("compensator", {**QUICK, **parameters}, *arguments) as node:
+        yield Client(graph, node, namespace, names or {}, desired)

@@ -1,0 +1,236 @@
+"""Tables: measured data of any source, and command tables whose round trip is exact."""
+
+import os
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from slpi_ros.bags import read_bag, write_bag
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.tables import import_csv, read_table, write_table
+
+MEASURED = {
+    "afm_double_sine_x": (3531, ("x",), 1.2, 150.0, 20.0e-6),
+    "afm_triangle_sine": (4824, ("x", "y", "z"), 1.2, 150.0, 20.0e-6),
+    "picma_1hz_decay_grow": (14155, ("x",), 0.005, 3.5, 46.0e-6),
+    "picma_1hz_major": (8027, ("x",), 0.005, 3.6, 49.7e-6),
+    "piezo_150v_1hz": (50001, ("x",), 0.0002, 150.0, 39.5e-6),
+}
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Return a function that writes lines to a file and returns its path."""
+
+    def write(*lines: str, encoding: str = "utf-8"):
+        path = tmp_path / "table.csv"
+        path.write_bytes("\n".join([*lines, ""]).encode(encoding))
+        return path
+
+    return write
+
+
+def refusal(call, *args, **kwargs) -> str:
+    """Return the one line with which a call refuses."""
+    with pytest.raises(SlpiError) as caught:
+        call(*args, **kwargs)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_measured_record(measured_data, name, tmp_path):
+    samples, axes, period, top, stroke = MEASURED[name]
+    record = import_csv(measured_data / f"{name}.csv")
+    assert (len(record), record.axes) == (samples, axes)
+    assert np.median(np.diff(record.time_ns)) == pytest.approx(period * 1e9, rel=0.01)
+    for axis in axes:
+        assert record.voltage[axis].max() == pytest.approx(top, rel=0.01)
+        assert np.nanmax(record.displacement[axis]) - np.nanmin(record.displacement[axis]) == pytest.approx(
+            stroke, rel=0.2
+        )
+    write_bag(tmp_path / "bag", record)
+    read = read_bag(tmp_path / "bag")
+    np.testing.assert_array_equal(read.time_ns, record.time_ns)
+    for axis in axes:
+        np.testing.assert_array_equal(read.voltage[axis], record.voltage[axis])
+        np.testing.assert_array_equal(read.displacement[axis], record.displacement[axis])
+
+
+def test_drop_outs_of_a_measured_record(measured_data):
+    record = import_csv(measured_data / "afm_triangle_sine.csv")
+    assert [int(np.isnan(record.displacement[axis]).sum()) for axis in "xyz"] == [0, 37, 71]
+    assert all(np.isfinite(voltage).all() for voltage in record.voltage.values())
+
+
+@pytest.mark.parametrize(
+    ("header", "displacement"),
+    [
+        ("time_s,voltage_V,displacement_um", {"x": 3e-6}),
+        ("time_s,voltage_V,displacement_nm", {"x": 3e-9}),
+        ("time_s,voltage_V,displacement", {"x": 3e-6}),
+        ("time_s,voltage_V,displacement_x_mm,displacement_tilt_m", {"x": 3e-3, "tilt": 4.0}),
+        ("time_s,x_V,x_m", {"x": 3.0}),
+        ("time_s,x_V,x_um,noise_um", {"x": 3e-6}),
+        ("time_s,voltage,desired_um,displacement_um", {"x": 4e-6}),
+    ],
+)
+def test_columns_speak_for_themselves(table, header, displacement):
+    width = header.count(",") + 1
+    record = import_csv(table(header, *[f"{row}," + ",".join("234"[: width - 1]) for row in range(3)]))
+    assert record.time_ns.tolist() == [0, 1_000_000_000, 2_000_000_000]
+    assert {axis: values[0] for axis, values in record.displacement.items()} == pytest.approx(displacement)
+    assert {axis: values[0] for axis, values in record.voltage.items()} == dict.fromkeys(displacement, 2.0)
+
+
+@pytest.mark.parametrize(("column", "scale"), [("time_ms", 1e6), ("timestamp", 1e9), ("time_us", 1e3)])
+def test_unit_of_time(table, column, scale):
+    record = import_csv(table(f"other,{column},voltage_mV,displacement_um", "0,1,2000,3", "0,2,2000,3"))
+    assert record.time_ns.tolist() == [scale, 2 * scale]
+    assert record.voltage["x"].tolist() == [2.0, 2.0]
+
+
+def test_voltages_go_to_the_axis_they_name(table):
+    path = table("time_s,y_V,x_V,displacement_x_um,displacement_y_um", "0,20,10,1,2", "1,20,10,1,2")
+    record = import_csv(path)
+    assert (record.voltage["x"][0], record.voltage["y"][0]) == (10, 20)
+    columns = ["displacement_x_um", "displacement_y_um"]
+    record = import_csv(path, voltage=["y_V", "x_V"], displacement=columns, axes=["a", "b"])
+    assert (record.voltage["a"][0], record.voltage["b"][0]) == (20, 10)
+
+
+def test_columns_and_unit_by_option(table):
+    path = table("when,drive,sensor,spare", "0.5,1,7,", "0.75,2,8,text")
+    record = import_csv(path, time="when", voltage=["drive"], displacement=["sensor"], displacement_unit="nm")
+    assert record.axes == ("sensor",)
+    assert record.time_ns.tolist() == [500_000_000, 750_000_000]
+    assert record.displacement["sensor"].tolist() == pytest.approx([7e-9, 8e-9])
+    with pytest.raises(UsageError, match="no displacement unit 'inch'"):
+        import_csv(path, displacement_unit="inch")
+    with pytest.raises(UsageError, match="2 axes for the displacement columns sensor"):
+        import_csv(path, time="when", voltage=["drive"], displacement=["sensor"], axes=["x", "y"])
+
+
+def test_empty_cells_are_nan(table):
+    record = import_csv(table("time_s,voltage_V,displacement_um", "0,1,", "1,,2", "2,3,nan", "", "3,4, 5 "))
+    np.testing.assert_allclose(record.displacement["x"], [np.nan, 2e-6, np.nan, 5e-6])
+    np.testing.assert_array_equal(record.voltage["x"], [1, np.nan, 3, 4])
+
+
+def test_time_before_zero_is_shifted(table):
+    path = table("time_s,voltage_V,displacement_um", "-0.25,0,0", "0,0,0", "0.5,0,0")
+    assert import_csv(path).time_ns.tolist() == [0, 250_000_000, 750_000_000]
+
+
+@pytest.mark.parametrize("mark", ["\ufeff", ""])
+@pytest.mark.parametrize("end", ["\r\n", "\n"])
+def test_as_spreadsheets_write_it(tmp_path, mark, end):
+    path = tmp_path / "table.csv"
+    lines = ['"time_s", voltage_V,"displacement_um"', '"0","1",2', "1,1,2", ""]
+    path.write_bytes((mark + end.join(lines)).encode())
+    assert import_csv(path).displacement["x"].tolist() == pytest.approx([2e-6, 2e-6])
+
+
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        (["time_s,voltage_V,displacement_um", "0,1,2", "1,1,2 um"], "line 3, column 'displacement_um': '2 um' is not"),
+        (["time_s,voltage_V,displacement_um", "0,1,2", "", "1,x,2"], "line 4, column 'voltage_V': 'x' is not"),
+        (["time_s,voltage_V,displacement_um", "0,1,2", "1,1"], "line 3 has 2 cells, the first line 3"),
+        (["time_s,voltage_V,displacement_um", "0,5,1,5,2,5", "1,5,1,5,2,5"], "line 2 has 6 cells"),
+        (["time_s,voltage_V,displacement_um", "0,1,2"], "1 rows of data; at least two"),
+        (["time_s,voltage_V,displacement_um"], "0 rows of data"),
+        (["time_s,voltage_V,displacement_um", "0,1,2", ",1,2"], "line 3, column 'time_s': nan; every row needs a time"),
+        (["time_s,voltage_V,displacement_um", "0,1,2", "inf,1,2"], "line 3, column 'time_s': inf"),
+        (["time_s,voltage_V,displacement_um", "0,1,2", "3e9,1,2"], "3000000000; more than 2^31 s"),
+        (["time_s,voltage_V,displacement_um", "0,1,2", "2,1,2", "1,1,2"], "line 4, column 'time_s': 1; time runs back"),
+        (["t,voltage_V,displacement_um", "0,1,2", "1,1,2"], "no time column; there is t, voltage_V, displacement_um"),
+        (["time_s,displacement_um", "0,1", "1,1"], "no voltage column"),
+        (["time_s,voltage_V,desired_um", "0,1,2", "1,1,2"], "no displacement column"),
+        (["time_s;voltage_V;displacement_um", "0;1;2", "1;1;2"], "no displacement column"),
+        (["time_s,voltage_V,voltage_V,displacement_um", "0,1,2,3", "1,1,2,3"], "2 voltage columns"),
+        (["time_s,voltage_V,displacement_um,displacement_um", "0,1,2,3", "1,1,2,3"], "two of them the same"),
+        (["time_s,time_s,voltage_V,displacement_um", "0,1,2,3", "1,1,2,3"], "two columns 'time_s'"),
+        (["time_s,a_V,b_V,displacement_x_um,displacement_y_um,displacement_z_um"], "voltage columns (a_V, b_V) for 3"),
+        (["0,1,2", "1,1,2"], "numbers in the first line"),
+        ([""], "no names in the first line"),
+        ([], "no names in the first line"),
+        (["a" * 200_000], "the first line holds no names"),
+        (["time_s,voltage_V,displacement_um", "0,1,2", f"1,1,{'9' * 200_000}x"], "line 3: not a table"),
+    ],
+)
+def test_bad_table(table, lines, says):
+    message = refusal(import_csv, table(*lines))
+    assert says in message
+    assert len(message) < 500
+
+
+def test_column_that_is_not_there(table):
+    path = table("time_s,voltage_V,displacement_um", "0,1,2", "1,1,2")
+    for option in ({"time": "when"}, {"voltage": ["when"]}, {"displacement": ["when"]}):
+        assert "no column 'when'; there is time_s, voltage_V" in refusal(import_csv, path, **option)
+
+
+def test_no_text_file(tmp_path):
+    assert "no such file" in refusal(import_csv, tmp_path / "nothing.csv")
+    assert "cannot be read" in refusal(import_csv, tmp_path)
+    for junk in (bytes(range(256)) * 10, b"\0" * 100, b"time_s,displacement_\xb5m\n"):
+        (tmp_path / "junk.csv").write_bytes(junk)
+        assert "not a text file" in refusal(import_csv, tmp_path / "junk.csv")
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.lists(
+        st.tuples(st.floats(allow_nan=False, allow_infinity=False), st.integers(0, 10**12)), min_size=2, max_size=20
+    ),
+    st.sampled_from(["V", "m"]),
+)
+def test_table_round_trip_is_exact(tmp_path, rows, suffix):
+    t = np.cumsum([step for _, step in rows]) * 1e-9
+    columns = {"x": np.array([value for value, _ in rows]), "long name": np.array([-value for value, _ in rows])}
+    write_table(tmp_path / "table.csv", t, columns, suffix)
+    read_t, read = read_table(tmp_path / "table.csv", suffix)
+    assert list(read) == ["x", "long name"]
+    np.testing.assert_allclose(read_t, t, rtol=0, atol=0.51e-9)
+    for axis, values in columns.items():
+        assert read[axis].tobytes() == values.tobytes()
+    assert os.listdir(tmp_path) == ["table.csv"]
+
+
+def test_only_the_wanted_columns_count(table):
+    path = table("note,x_m,time_s,y_V,x_V", "a,,0,1,2", "b,,0,3,4", "c,nan,0.5,5,6")
+    t, columns = read_table(path, "V")
+    assert t.tolist() == [0, 0, 0.5]
+    assert {axis: values.tolist() for axis, values in columns.items()} == {"y": [1, 3, 5], "x": [2, 4, 6]}
+
+
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        (["time_s,x_V", "0,1", "1,nan"], "line 3, column 'x_V': nan; every cell needs a finite number"),
+        (["time_s,x_V", "0,1", "1,"], "line 3, column 'x_V': nan"),
+        (["time_s,x_V", "0,1", "", "1,-inf"], "line 4, column 'x_V': -inf"),
+        (["time_s,x_V", "nan,1", "1,1"], "line 2, column 'time_s': nan"),
+        (["time_s,x_V", "1,1", "0.5,1"], "line 3, column 'time_s': 0.5; time runs backwards"),
+        (["time_s,x_V", "0,1", "1,one"], "line 3, column 'x_V': 'one' is not a number"),
+        (["time_s,x_V", "0,1"], "at least two"),
+        (["time,x_V", "0,1", "1,1"], "no column 'time_s'; there is time, x_V"),
+        (["time_s,x_m", "0,1", "1,1"], "no column <axis>_V; there is time_s, x_m"),
+    ],
+)
+def test_bad_command_table(table, lines, says):
+    assert says in refusal(read_table, table(*lines), "V")
+
+
+def test_table_that_cannot_be_written(tmp_path):
+    t = np.arange(3.0)
+    write_table(tmp_path / "table.csv", t, {"x": t}, "V")
+    assert "2 values of axis 'x' but 3 times" in refusal(write_table, tmp_path / "table.csv", t, {"x": t[:2]}, "V")
+    assert "cannot be written" in refusal(write_table, tmp_path / "no" / "table.csv", t, {"x": t}, "V")
+    assert "cannot be written" in refusal(write_table, tmp_path / "table.csv" / "below", t, {"x": t}, "V")
+    assert "cannot be written" in refusal(write_table, tmp_path, t, {"x": t}, "V")
+    assert os.listdir(tmp_path) == ["table.csv"]
+    assert read_table(tmp_path / "table.csv", "V")[1]["x"].tolist() == [0, 1, 2]

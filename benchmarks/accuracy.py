@@ -1,6 +1,7 @@
 """How well a path that was not in the record is followed, on simulated stages that are no model of the compensator.
 
-Mean and maximum error against the true displacement, in % of stroke; the best classical PI model of the same record beside it.
+Mean and maximum error against the true displacement, in % of stroke; the classical PI model of the same record beside
+it.
 """
 
 import argparse

@@ -111,9 +111,8 @@ def growth() -> None:
         thresholds = np.linspace(0.0, SPAN / 2, operators)
         model = PrandtlIshlinskii(thresholds, np.full(operators, 2e-7 / operators))
         y = wishes(model, decaying(100_000, 100))
-        print(
-            f"  {operators:>10,} play operators {1e3 * median_time(lambda y=y, m=model: Memory(m).inverse_array(y)):10.2f}"
-        )
+        spent = median_time(lambda y=y, m=model: Memory(m).inverse_array(y))
+        print(f"  {operators:>10,} play operators {1e3 * spent:10.2f}")
     for turns in (10, 100, 1000, 10_000):
         y = wishes(family, decaying(100_000, turns)).tolist()
         memory = Memory(family)

@@ -1,4 +1,7 @@
-"""Held-out, free-run errors on measured records, classical PI beside the loop family. Needs the folder of measured data."""
+"""Held-out, free-run errors on measured records, classical PI beside the loop family.
+
+The folder of measured data is that of SLPI_MEASURED_DATA.
+"""
 
 import os
 import sys

@@ -28,6 +28,8 @@ from slpi_ros.stage.drive import calibration_drive, scan_path  # noqa: E402
 
 RATE = 250.0
 V_MIN, V_MAX = 0.0, 100.0
+# The graph shows a node a moment before its topics are connected, seconds.
+SETTLE = 1.5
 KINDS = {"pi": "classical PI", "slpi": "SLPI"}
 
 
@@ -43,6 +45,7 @@ def calibrate(stage: Operator, bag: Path, duration: float) -> None:
     _, v = calibration_drive(V_MIN, V_MAX, duration=duration, rate=RATE, seed=1)
     with executable("recorder", output=str(bag)):
         stage.wait_until("the recorder to listen", lambda: stage.count_subscribers("stage_state") >= 2)
+        time.sleep(SETTLE)
         stage.drive(v.tolist(), RATE)
 
 
@@ -71,7 +74,7 @@ def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y
                 stage.count_publishers("voltage_command") >= 2 and stage.count_subscribers("desired_displacement") >= 1
             ),
         )
-        time.sleep(1.0)
+        time.sleep(SETTLE)
         return plots.Run(name, t, y, stage.follow(y.tolist(), RATE)[:, 1])
 
 
@@ -106,8 +109,7 @@ def write_page(
     page.figure(picture, "Displacement and error over time.")
     page.figure(plots.linearity(named), "Achieved over desired displacement: a straight line is the aim.")
     page.heading("The model")
-    for line in describe_model(model):
-        page.text(line)
+    page.lines(describe_model(model))
     v, y = record.voltage["x"], record.displacement["x"]
     page.figure(plots.loops(v, y, model.simulate(record.t, v)), "The calibration drive, measured and simulated.")
     page.write(path)

@@ -16,6 +16,7 @@ from slpi_ros.hysteresis.family import LoopFamily
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.model import AxisModel, FitQuality, Start
 
 FloatArray = NDArray[np.float64]
 
@@ -190,3 +191,35 @@ def stream_forward(memory: Memory, v: FloatArray) -> FloatArray:
 
 def stream_inverse(memory: Memory, y: FloatArray, lower: float = -np.inf, upper: float = np.inf) -> FloatArray:
     return np.array([memory.inverse(x, lower, upper) for x in y.tolist()])
+
+
+def axis_model(case: Case, history: tuple[float, ...] = ()) -> AxisModel:
+    """Wrap a case as the model of an axis, identified on its span."""
+    kind = "pi" if isinstance(case.shape, PrandtlIshlinskii) else "slpi"
+    y_rest, (low, high) = case.rest[1], case.span
+    reach = (y_rest - 2 * case.height, y_rest + 2 * case.height)
+    quality = FitQuality(8.1e-9, 3.3e-8, 8.4e-9, 8e-9, 1234, 0.75, "bag/öffnung \N{MICRO SIGN}m")
+    return AxisModel(kind, case.shape, Start(*case.rest, history), (low, high), reach, quality)
+
+
+@st.composite
+def axis_models(draw: st.DrawFn) -> AxisModel:
+    """Draw the model of an axis that has never been moved, or whose drive turned at some voltages before."""
+    case = draw(cases())
+    turn = fractions(-0.2, 1.2).map(lambda share: case.span[0] + share * case.width)
+    return axis_model(case, tuple(draw(st.lists(turn, max_size=4))))
+
+
+# Rest at 0 V and 2 um, 0 to 100 V, 10 um of stroke with wide loops.
+FAMILY_CASE = Case(
+    LoopFamily(
+        np.array([0.0, 50.0, 100.0]),
+        1e-6 * np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [10.0, 5.0, 0.0]]),
+        1e-6 * np.array([0.0, 5.0, 12.0]),
+        1e-7,
+    ),
+    (0.0, 2e-6),
+    False,
+    (0.0, 100.0),
+    (0.0, 50.0, 100.0),
+)  # fmt: skip

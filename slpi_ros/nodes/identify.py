@@ -104,7 +104,7 @@ class Identify(Node):
 
     def __init__(self) -> None:
         super().__init__("identify")
-        self._parameters = Parameters(self, DECLARATIONS, IdentifySettings.of)
+        self._parameter_set = Parameters(self, DECLARATIONS, IdentifySettings.of)
         self._publisher = self.create_publisher(String, "stage_model", LATCHED)
         self._diagnostics = Diagnostics(self, "identify")
         self._job: FitProcess | None = None
@@ -113,9 +113,9 @@ class Identify(Node):
         # A simulated clock may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._poll = self.create_timer(POLL_PERIOD, self._look, clock=steady, autostart=False)
-        self.create_timer(self._parameters.settings.diagnostic_period, self._report, clock=steady)
-        self._parameters.follow(self._begin)
-        self._begin(self._parameters.settings)
+        self.create_timer(self._parameter_set.settings.diagnostic_period, self._report, clock=steady)
+        self._parameter_set.follow(self._begin)
+        self._begin(self._parameter_set.settings)
 
     def destroy_node(self) -> None:
         """End the identification under way, then destroy the node."""

@@ -22,8 +22,7 @@ def write_report(folder: Path, record: Record, model: StageModel) -> Path:
     page = Page(f"Model of {record.source}")
     for name, axis in model.axes.items():
         page.heading(f"Axis {name}")
-        for line in describe_axis(axis):
-            page.text(line)
+        page.lines(describe_axis(axis))
         driven = np.isfinite(record.voltage[name])
         t, v, y = record.t[driven], record.voltage[name][driven], record.displacement[name][driven]
         simulated = axis.simulate(v)

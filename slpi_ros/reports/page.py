@@ -48,6 +48,10 @@ class Page:
         """Add a paragraph."""
         self._parts.append(f"<p>{html.escape(text)}</p>")
 
+    def lines(self, lines: Sequence[str]) -> None:
+        """Add a list of short lines."""
+        self._parts.append(f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>")
+
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]], best: int | None = None) -> None:
         """Add a table; row `best` stands out."""
         head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)

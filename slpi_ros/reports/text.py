@@ -19,13 +19,13 @@ def describe_axis(axis: AxisModel) -> list[str]:
     (v_low, v_high), (y_low, y_high) = axis.voltage_range, axis.displacement_range
     size = len(getattr(axis.hysteresis, "grid", getattr(axis.hysteresis, "weights", ())))
     parts = "loop vertices" if axis.kind == "slpi" else "play operators"
-    began = "a memory assumed wiped" if start.history else "rest, never moved"
+    began = "a memory taken for wiped" if start.history else "rest"
     stroke = y_high - y_low
     return [
         f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {size} {parts}",
         f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} um "
         f"({quality.covered:.0%} of the model seen)",
-        f"starts from {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um",
+        f"memory starts where the record did: {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um",
         f"error on the record: {quality.rms * 1e9:.1f} nm rms ({quality.rms / stroke:.3%} of the displacement range), "
         f"{quality.maximum * 1e9:.1f} nm at most",
         f"error on blocks left out: {quality.held_out_rms * 1e9:.1f} nm rms; "

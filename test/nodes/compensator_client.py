@@ -63,7 +63,7 @@ class Client:
         """Return the voltages for one message."""
         before = len(self._answers)
         self.wish(names, displacements, stamp_ns)
-        self.graph.spin_until(lambda: len(self._answers) > before, f"an answer; it said: {self.node.stderr}")
+        self.graph.spin_until(lambda: len(self._answers) > before, "an answer")
         return self.answers[before]
 
     def follow(self, names: Sequence[str], path: np.ndarray, start_ns: int = START_NS) -> np.ndarray:
@@ -89,4 +89,5 @@ def compensator(
 ) -> Iterator[Client]:
     """Start a compensator and stand around it; `names` tells remapped topics."""
     with on_graph() as graph, started("compensator", {**QUICK, **parameters}, *arguments) as node:
+        graph.tested = node
         yield Client(graph, node, namespace, names or {}, desired)

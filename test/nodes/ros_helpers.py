@@ -82,6 +82,7 @@ class Graph:
     """A node that publishes, subscribes, calls services and waits."""
 
     def __init__(self, context: Context) -> None:
+        self.tested: NodeProcess | None = None
         self.node = rclpy.create_node(f"test_{time.monotonic_ns()}", context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
@@ -92,10 +93,12 @@ class Graph:
         self.node.destroy_node()
 
     def spin_until(self, done: Callable[[], Any], what: str) -> Any:
-        """Return what `done` returned once it is true."""
+        """Return what `done` returned once it is true, while the process under test lives."""
         deadline = time.monotonic() + PATIENCE_S
         while not (found := done()):
-            assert time.monotonic() < deadline, f"waited in vain for {what}"
+            said = self.tested.stderr if self.tested else ""
+            assert time.monotonic() < deadline, f"waited in vain for {what}; the node said: {said}"
+            assert not self.tested or self.tested.process.poll() is None, f"the node died: {said}"
             self._executor.spin_once(timeout_sec=0.02)
         return found
 

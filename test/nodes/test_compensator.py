@@ -153,6 +153,7 @@ def test_unnamed_displacements_go_by_the_order_of_axes(xy_file, kind):
             client.publish(message(data=row[0] if one else row))
         client.publish(message(data=math.nan if one else [1e-6]))
         _, values = client.report(received=len(path) + 1)
+        client.graph.spin_until(lambda: len(client.answers) >= len(path), "all answers")
         answers = np.array(client.answers)
     assert answers == pytest.approx(library(model, path, axes), abs=1e-9)
     assert values["rejected.not_finite" if one else "rejected.length"] == "1"

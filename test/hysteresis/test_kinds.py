@@ -1,0 +1,80 @@
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import loop_families, prandtl_ishlinskii
+
+from slpi_ros.errors import ModelError
+from slpi_ros.hysteresis.kinds import DESCRIPTIONS, from_document, to_document
+from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+
+FAMILY = {
+    "grid_V": [0.0, 10.0, 30.0],
+    "surface_m": [[0.0], [1.0, 0.0], [4.0, 2.5, 0.0]],
+    "first_rise_m": [5.0, 6.5, 9.0],
+    "edge_gain_m_per_V": 0.1,
+}
+
+
+@given(prandtl_ishlinskii() | loop_families())
+def test_documents_keep_every_bit(shape):
+    kind = "pi" if isinstance(shape, PrandtlIshlinskii) else "slpi"
+    document = to_document(shape)
+    again = from_document(kind, json.loads(json.dumps(document, allow_nan=False)))
+    assert type(again) is type(shape)
+    for name in ("thresholds", "weights") if kind == "pi" else ("grid", "surface", "rise", "edge_gain"):
+        assert np.array_equal(getattr(again, name), getattr(shape, name))
+    assert to_document(again) == document
+
+
+def test_every_kind_is_described():
+    assert set(DESCRIPTIONS) == {"pi", "slpi"}
+
+
+def test_whole_numbers_are_numbers():
+    family = from_document("slpi", {**FAMILY, "grid_V": [0, 10, 30], "first_rise_m": [5, 6, 9]})
+    assert family.grid.dtype == family.rise.dtype == np.float64
+    assert from_document("pi", {"thresholds_V": [0, 1], "weights_m_per_V": [1, 0]}).thresholds.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"surface_m": [[0.0], [1.0, 0.0]]},
+        {"surface_m": [[0.0], [1.0, 0.0], [4.0, 2.5]]},
+        {"surface_m": [[0.0], [1.0, 0.0], [4.0, 2.5, 0.0, 0.0]]},
+        {"surface_m": [[0.0, 0.0, 0.0]] * 3},
+        {"surface_m": [[0.0], [1.0, 0.0], [1.0, 2.5, 0.0]]},
+        {"surface_m": [[0.0], [-1.0, 0.0], [4.0, 2.5, 0.0]]},
+        {"first_rise_m": [5.0, 6.5]},
+        {"first_rise_m": [5.0, 6.5, 6.5]},
+        {"grid_V": [0.0], "surface_m": [[0.0]], "first_rise_m": [1.0]},
+    ],
+)
+def test_families_that_contradict_themselves(change):
+    with pytest.raises(ModelError):
+        from_document("slpi", {**FAMILY, **change})
+
+
+@pytest.mark.parametrize("huge", [10**30, 10**400, 2**63, -(2**63) - 1], ids=["1e30", "1e400", "2^63", "-2^63-1"])
+@pytest.mark.parametrize("key", FAMILY)
+def test_huge_whole_numbers_in_a_family(key, huge):
+    """JSON has whole numbers of any length; numpy makes objects of them, or wraps around."""
+    value = FAMILY[key]
+    rows = [*value[:-1], [*value[-1][:-1], huge]] if key == "surface_m" else [huge, *value[1:]] if key != "edge_gain_m_per_V" else -huge
+    with pytest.raises((ModelError, OverflowError)):
+        from_document("slpi", {**FAMILY, key: rows})
+
+
+@pytest.mark.parametrize("huge", [10**30, 10**400, 2**63], ids=["1e30", "1e400", "2^63"])
+def test_huge_whole_numbers_in_a_pi_model(huge):
+    for thresholds, weights in ([0, -huge], [1.0, 1.0]), ([huge, 5], [1, 1]), ([0, 5], [1, -huge]):
+        with pytest.raises((ModelError, OverflowError)):
+            from_document("pi", {"thresholds_V": thresholds, "weights_m_per_V": weights})
+
+
+def test_unknown_kind():
+    with pytest.raises(ModelError, match="unknown kind 'bouc-wen'.*slpi, pi"):
+        from_document("bouc-wen", {})

@@ -1,0 +1,214 @@
+"""The life of a compensator: how it starts, is told what to do, and ends."""
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from lifecycle_msgs.msg import State, Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from nodes.compensator_client import Client, compensator  # noqa: E402
+from nodes.ros_helpers import LATCHED, NodeProcess, on_graph, stage_model, started  # noqa: E402
+from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
+from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+from slpi_ros.model_file import format_model, save_model  # noqa: E402
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
+ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
+
+
+@pytest.fixture
+def x_file(tmp_path: Path) -> str:
+    path = tmp_path / "x.json"
+    save_model(stage_model(), path)
+    return str(path)
+
+
+def change_state(client: Client, transition: int) -> bool:
+    request = ChangeState.Request(transition=Transition(id=transition))
+    return client.graph.call(ChangeState, f"{client.name}/change_state", request).success
+
+
+def state(client: Client) -> int:
+    return client.graph.call(GetState, f"{client.name}/get_state", GetState.Request()).current_state.id
+
+
+def set_parameters(client: Client, **values: object) -> str:
+    """Return why the values were refused, or nothing."""
+    parameters: list[ParameterMessage] = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    request = SetParametersAtomically.Request(parameters=parameters)
+    result = client.graph.call(SetParametersAtomically, f"{client.name}/set_parameters_atomically", request).result
+    assert result.successful != bool(result.reason)
+    return result.reason
+
+
+def test_lifecycle_by_services(x_file):
+    with compensator(autostart=False, model_file=x_file) as client:
+        client.connect("unconfigured")
+        assert not client.graph.node.get_publishers_info_by_topic("/voltage_command")
+        assert change_state(client, CONFIGURE)
+        client.connect("inactive")
+        client.wish(["x"], [1e-6])
+        client.report("the rejection", **{"rejected.inactive": 1})
+        assert change_state(client, ACTIVATE)
+        status, _ = client.report(state="active")
+        before = client.ask(["x"], [5e-6])
+        assert change_state(client, DEACTIVATE) and change_state(client, ACTIVATE)
+        # Memory and voltage are still there: the same wish again moves nothing.
+        assert client.ask(["x"], [5e-6]) == before
+        assert change_state(client, DEACTIVATE) and change_state(client, CLEANUP)
+        client.report(state="unconfigured", **{"model.kind": ""})
+        assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
+        assert change_state(client, CONFIGURE) and change_state(client, ACTIVATE)
+        client.connect()
+        assert client.ask(["x"], [3e-6]) != before
+        assert change_state(client, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        client.report(state="finalized")
+        assert client.node.stop() == 0
+
+
+def test_impossible_transitions_are_refused_and_survived():
+    with compensator() as client:
+        client.connect()
+        for transition in (CONFIGURE, ACTIVATE, CLEANUP, 0, 97, 255):
+            assert not change_state(client, transition)
+        assert state(client) == State.PRIMARY_STATE_ACTIVE
+        assert "Traceback" not in client.node.stderr
+
+
+def test_a_wrong_model_file_keeps_it_unconfigured_until_it_is_right(x_file, tmp_path):
+    with compensator(autostart=False, model_file=str(tmp_path / "none.json")) as client:
+        client.connect("unconfigured")
+        assert not change_state(client, CONFIGURE)
+        status, values = client.report(models_refused=1)
+        assert status.level == b"\2" and "none.json: cannot read a model" in status.message
+        assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
+        assert set_parameters(client, model_file=x_file) == ""
+        assert change_state(client, CONFIGURE) and change_state(client, ACTIVATE)
+        client.connect()
+        assert client.ask(["x"], [0.0]) == [0.0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("executor", ["events", "default"])
+def test_a_signal_ends_it_in_order(number, executor):
+    with compensator(executor=executor) as client:
+        client.connect()
+        assert client.node.stop(number) == 0
+        assert client.node.stderr == ""
+
+
+WRONG = [
+    ({"axes": ["x", "x"]}, "axes"),
+    ({"axes": [""]}, "axes"),
+    ({"axes": "x"}, "axes"),
+    ({"voltage_min": 100}, "voltage_max"),
+    ({"axes": ["x", "y"], "voltage_min": [0.0, 90.0], "voltage_max": [100, 80]}, "axis 'y'"),
+    ({"voltage_max": [1.0, 2.0]}, "voltage_max"),
+    ({"voltage_max": float("nan")}, "voltage_max"),
+    ({"voltage_max": "high"}, "voltage_max"),
+    ({"voltage_min": False}, "voltage_min"),
+    ({"slew_limit": -1}, "slew_limit"),
+    ({"slew_limit": -1.0}, "slew_limit"),
+    ({"command_timeout": -0.5}, "command_timeout"),
+    ({"desired_type": "Pose"}, "desired_type"),
+    ({"desired_type": "Float64", "axes": ["x", "y"]}, "Float64"),
+    ({"executor": "fast"}, "executor"),
+    ({"diagnostic_period": 0}, "diagnostic_period"),
+]
+
+
+def test_wrong_parameters_are_refused_in_one_line(tmp_path):
+    nodes = []
+    try:
+        for parameters, _ in WRONG:
+            nodes.append(NodeProcess("compensator", parameters, ()))
+        for node, (parameters, named) in zip(nodes, WRONG, strict=True):
+            assert node.wait() == 2, (parameters, node.stderr)
+            assert node.stderr.count("\n") == 1 and named in node.stderr, (parameters, node.stderr)
+    finally:
+        for node in nodes:
+            node.kill()
+
+
+@pytest.mark.parametrize("text", [None, "garbage", format_model(stage_model(("y",)))])
+def test_a_wrong_model_file_ends_it_in_one_line(tmp_path, text):
+    path = tmp_path / "model.json"
+    if text is not None:
+        path.write_text(text)
+    with started("compensator", {"model_file": str(path)}) as node:
+        assert node.wait() == (2 if text and '"y"' in text else 1)
+        assert node.stderr.count("\n") == 1 and str(path) in node.stderr
+
+
+def test_parameters_change_together_or_not_at_all(x_file):
+    with compensator(model_file=x_file) as client:
+        client.connect()
+        assert 40.0 < client.ask(["x"], [5e-6])[0] < 60.0
+        assert set_parameters(client, voltage_min=10, voltage_max=[70], slew_limit=0) == ""
+        assert client.ask(["x"], [10e-6]) == [70.0]
+        for refused, why in (
+            ({"voltage_min": 20.0, "voltage_max": 15.0}, "not below"),
+            ({"voltage_max": 60.0}, "move it inside first"),
+            ({"voltage_max": float("inf")}, "voltage_max"),
+            ({"voltage_max": None}, "voltage_max"),
+            ({"voltage_min": 0.0, "axes": ["z"]}, "read-only"),
+            ({"executor": "default"}, "read-only"),
+        ):
+            assert why in set_parameters(client, **refused)
+        assert client.ask(["x"], [10.2e-6]) == [70.0]
+        request = DescribeParameters.Request(names=["voltage_max", "axes"])
+        described = client.graph.call(DescribeParameters, f"{client.name}/describe_parameters", request).descriptors
+        assert all(descriptor.description for descriptor in described) and described[1].read_only
+
+
+def test_silence_is_reported_and_the_voltage_held(x_file):
+    with compensator(model_file=x_file, command_timeout=0.3) as client:
+        client.connect()
+        client.ask(["x"], [5e-6])
+        status = client.graph.wait_for_status(
+            f"{client.name}: compensator", lambda status: "no command for" in status.message, "the silence"
+        )
+        assert status.level == b"\1" and len(client.answers) == 1
+        client.ask(["x"], [5e-6])
+        client.graph.wait_for_status(f"{client.name}: compensator", lambda s: s.level == b"\0", "health again")
+
+
+CONFIGS = {"one_axis": ["x"], "xy": ["x", "y"], "ros2_control": ["x", "y"]}
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("namespace", ["", "/left"])
+def test_config_files_start_a_compensator(config, namespace):
+    axes = CONFIGS[config]
+    arguments = ["--params-file", str(CHECKOUT / "config" / f"{config}.yaml"), "-r", f"__ns:={namespace or '/'}"]
+    with compensator(*arguments, namespace=namespace) as client:
+        client.connect()
+        models = client.graph.publisher(String, f"{namespace}/stage_model", LATCHED)
+        models.publish(String(data=format_model(stage_model(axes))))
+        client.report("the model", **{"model.kind": ", ".join(["slpi"] * len(axes))})
+        assert client.ask(axes, [0.0] * len(axes)) == [0.0] * len(axes)
+
+
+def test_topics_are_as_documented(x_file):
+    table = json.loads((CHECKOUT / "msg_schemas" / "topics.json").read_text())
+    with on_graph() as graph, started("compensator", {"model_file": x_file}):
+        for topic in table["topics"]:
+            for role, look in (
+                ("publishers", graph.node.get_publishers_info_by_topic),
+                ("subscribers", graph.node.get_subscriptions_info_by_topic),
+            ):
+                if "compensator" not in topic[role]:
+                    continue
+                name = topic["name"] if topic["name"].startswith("/") else f"/{topic['name']}"
+                (found,) = graph.spin_until(lambda look=look, name=name: look(name), name)
+                assert found.topic_type in topic["types"]
+                assert found.qos_profile.reliability.name.lower() == topic["qos"]["reliability"]
+                assert found.qos_profile.durability.name.lower() == topic["qos"]["durability"]

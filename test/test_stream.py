@@ -1,0 +1,183 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import FAMILY_CASE, Case, cases, fractions, paths
+
+from slpi_ros.errors import UnreachableError, UsageError
+from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.stream import TOLERATED_SHARE, AxisStream, Limits
+
+RANGE = (2e-6, 14e-6)
+
+
+def stream_of(case: Case = FAMILY_CASE, limits: Limits | None = None, reach: tuple[float, float] = RANGE) -> AxisStream:
+    return AxisStream(case.memory(), reach, limits or Limits(0.0, 100.0))
+
+
+@st.composite
+def streams(draw: st.DrawFn, slew: st.SearchStrategy[float]) -> tuple[Case, Limits, list[tuple[float, float]]]:
+    """Draw limits, and samples (s, m) in order."""
+    case = draw(cases())
+    low, high = sorted(draw(st.tuples(fractions(-0.1, 1.1), fractions(-0.1, 1.1))))
+    limits = Limits(case.span[0] + low * case.width, case.span[0] + high * case.width, draw(slew))
+    y = case.displacements(draw(paths(case))).tolist()
+    steps = draw(st.lists(fractions(0, 0.5), min_size=1, max_size=9))
+    t = draw(st.sampled_from((0.0, -3.0, 1.7e9))) + np.cumsum([steps[i % len(steps)] for i in range(len(y))])
+    return case, limits, list(zip(t.tolist(), y, strict=True))
+
+
+def everywhere(case: Case) -> tuple[float, float]:
+    reach = 100 * case.width * case.slopes[1]
+    return case.rest[1] - reach, case.rest[1] + reach
+
+
+@given(streams(st.just(np.inf)))
+def test_without_slew_limit_the_stream_is_the_inverse_within_limits(drawn):
+    case, limits, samples = drawn
+    stream, memory = stream_of(case, limits, everywhere(case)), case.memory()
+    memory.forward(min(max(memory.voltage, limits.lower), limits.upper))
+    for t, y in samples:
+        v = stream.step(t, y)
+        assert v == memory.inverse(y, limits.lower, limits.upper) == stream.voltage
+        assert limits.lower <= v <= limits.upper
+
+
+@given(streams(fractions(1, 1000)))
+def test_with_a_slew_limit_the_voltage_keeps_to_it_and_the_memory_to_the_voltage(drawn):
+    case, limits, samples = drawn
+    stream, twin = stream_of(case, limits, everywhere(case)), case.memory()
+    before, voltage = samples[0][0], stream.voltage
+    assert limits.lower <= voltage <= limits.upper
+    twin.forward(voltage)
+    for t, y in samples:
+        v = stream(t, y)
+        assert limits.lower <= v <= limits.upper
+        assert abs(v - voltage) <= limits.slew * (t - before) + 1e-12 * max(1.0, abs(v))
+        assert abs(twin.forward(v) - stream.memory.displacement) < 1e-9 * case.height
+        before, voltage = t, v
+    # Given time, it gets where it would have been told to go at once.
+    t += 100 * case.width / limits.slew
+    there = stream.step(t, y)
+    assert stream.step(t + 1, y) == there
+    assert there == pytest.approx(twin.inverse(y, limits.lower, limits.upper), abs=1e-9 * case.width)
+
+
+def test_at_the_first_sample_the_voltage_stays_and_catches_up_from_there():
+    stream = stream_of(limits=Limits(0.0, 100.0, 50.0))
+    goal = stream_of().step(0.0, 10e-6)
+    assert goal > 70
+    assert [stream.step(t, 10e-6) for t in (7.0, 7.5, 7.5, 8.0)] == pytest.approx([0.0, 25.0, 25.0, 50.0])
+    assert stream.step(9.0, 10e-6) == pytest.approx(goal)
+
+
+def test_without_slew_limit_the_first_sample_is_met_at_once():
+    stream = stream_of()
+    v = stream.step(0.0, 10e-6)
+    memory = FAMILY_CASE.memory()
+    assert memory.forward(v) == pytest.approx(10e-6, abs=1e-15)
+
+
+@pytest.mark.parametrize(("limits", "voltage"), [((10.0, 90.0), 10.0), ((-50.0, -20.0), -20.0), ((-5.0, 5.0), 0.0)])
+def test_an_axis_that_rests_outside_its_limits_goes_inside_first(limits, voltage):
+    stream = stream_of(limits=Limits(*limits))
+    assert stream.voltage == voltage
+    twin = FAMILY_CASE.memory()
+    assert twin.forward(voltage) == stream.memory.displacement
+
+
+def test_a_slewing_axis_never_leaves_its_limits_by_rounding():
+    stream = stream_of(limits=Limits(0.1, 0.7, 0.3))
+    for i in range(100):
+        assert 0.1 <= stream.step(0.1 * i, (14e-6, 2e-6)[i // 10 % 2]) <= 0.7
+
+
+@pytest.mark.parametrize("sample", [
+    (np.nan, 5e-6), (np.inf, 5e-6), (-np.inf, 5e-6), (2.0, np.nan), (2.0, np.inf), (2.0, -np.inf), (0.5, 5e-6),
+])  # fmt: skip
+def test_samples_that_make_no_sense_move_nothing(sample):
+    refused(sample, UsageError)
+
+
+margin = TOLERATED_SHARE * (RANGE[1] - RANGE[0])
+
+
+@pytest.mark.parametrize("y", [RANGE[0] - 1.01 * margin, RANGE[1] + 1.01 * margin, 10.0, -1e300])
+def test_wishes_far_out_of_range_move_nothing(y):
+    refused((2.0, y), UnreachableError)
+
+
+def refused(sample, error):
+    stream, twin = stream_of(limits=Limits(0.0, 100.0, 20.0)), stream_of(limits=Limits(0.0, 100.0, 20.0))
+    for one in (stream, twin):
+        one.step(0.0, 4e-6)
+        one.step(1.0, 4e-6)
+    for method in (stream.check, stream.step):
+        with pytest.raises(error, match="^[^\n]+$"):
+            method(*sample)
+        assert stream.memory.snapshot() == twin.memory.snapshot()
+    # Time has not moved on either.
+    assert stream.step(1.5, 8e-6) == twin.step(1.5, 8e-6)
+
+
+def test_wishes_just_out_of_range_are_held():
+    stream = stream_of()
+    assert stream.step(0.0, RANGE[1] + 0.99 * margin) == 100.0
+    assert stream.held
+    assert stream.step(1.0, RANGE[0] - 0.99 * margin) == 0.0
+    assert stream.held
+    stream.step(2.0, 8e-6)
+    assert not stream.held
+    twin = FAMILY_CASE.memory()
+    twin.forward(100.0)
+    twin.forward(0.0)
+    assert stream.voltage == twin.inverse(8e-6)
+
+
+def test_what_is_met_is_not_held():
+    """The axis rests at its limit, and may be asked to stay."""
+    stream = stream_of()
+    assert not stream.held
+    assert stream.step(0.0, 2e-6) == 0.0
+    assert not stream.held
+
+
+def test_check_agrees_with_step_on_what_no_voltage_reaches():
+    """A range as wide as that is in no record, but may be in a document."""
+    flat = Case(PrandtlIshlinskii(np.array([0.0]), np.array([1e-9])), (0.0, 0.0), False, (0.0, 100.0), ())
+    stream = AxisStream(flat.memory(), (-10.0, 10.0), Limits(-np.inf, np.inf))
+    before = stream.memory.snapshot()
+    with pytest.raises(UsageError):
+        stream.step(5.0, 9.0)
+    assert stream.memory.snapshot() == before
+    stream.step(1.0, 1e-9)
+
+
+def test_time_may_stand_still():
+    stream = stream_of()
+    assert stream.step(1.0, 5e-6) != stream.step(1.0, 6e-6)
+
+
+@pytest.mark.parametrize(
+    "limits", [(1.0, 0.0), (np.nan, 1.0), (0.0, np.nan), (0.0, 1.0, 0.0), (0.0, 1.0, -5.0), (0.0, 1.0, np.nan)]
+)
+def test_limits_that_leave_nothing(limits):
+    with pytest.raises(UsageError, match="^[^\n]+$"):
+        Limits(*limits)
+
+
+def test_limits_are_narrowed_never_widened():
+    limits = Limits(0.0, 100.0, 30.0)
+    assert limits.within((-20.0, 60.0)) == Limits(0.0, 60.0, 30.0)
+    assert limits.within((20.0, 160.0)) == Limits(20.0, 100.0, 30.0)
+    assert limits.within((100.0, 160.0)) == Limits(100.0, 100.0, 30.0)
+    for apart in (-9.0, -1.0), (101.0, 120.0):
+        with pytest.raises(UsageError, match=r"^[^\n]*identified from[^\n]+$"):
+            limits.within(apart)
+
+
+def test_a_single_voltage_is_a_limit_too():
+    stream = stream_of(limits=Limits(40.0, 40.0))
+    assert [stream.step(float(i), y) for i, y in enumerate((2e-6, 14e-6, 6e-6))] == [40.0] * 3
+    assert isinstance(stream.memory, Memory)

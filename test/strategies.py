@@ -1,6 +1,6 @@
 """Hypothesis strategies: random hysteresis models of every kind, and random paths for them.
 
-``HYPOTHESIS_PROFILE=explore`` looks for new counter-examples; without it every run tries the same examples.
+``HYPOTHESIS_EXAMPLES=5000`` looks longer for counter-examples.
 """
 
 import os
@@ -13,24 +13,21 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.family import LoopFamily
-from slpi_ros.hysteresis.kinds import Hysteresis
+from slpi_ros.hysteresis.kinds import Hysteresis, to_document
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii
-from slpi_ros.model import AxisModel, FitQuality, Start
+from slpi_ros.model import AxisModel, FitQuality, StageModel, Start
 
 FloatArray = NDArray[np.float64]
 
+# Drawing a model and a path takes a while; on a slow machine that is no mistake.
 settings.register_profile(
-    "repeatable",
-    deadline=None,
-    derandomize=True,
-    max_examples=80,
+    "models",
+    settings.default,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+    max_examples=int(os.environ.get("HYPOTHESIS_EXAMPLES", "80")),
 )
-settings.register_profile(
-    "explore", settings.get_profile("repeatable"), derandomize=False, max_examples=2000, print_blob=True
-)
-settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
+settings.load_profile("models")
 
 KINDS = ("pi", "slpi")
 # Displacement per volt: metres on a real stage, and micrometres, as the papers have it.
@@ -138,7 +135,9 @@ def cases(draw: st.DrawFn, kinds: tuple[str, ...] = KINDS) -> Case:
     width = span[1] - span[0]
     rest = draw(st.sampled_from(landmarks) | fractions(-0.3, 1.3).map(lambda share: span[0] + share * width))
     height = width * (shape.weights[0] if isinstance(shape, PrandtlIshlinskii) else shape.edge_gain)
-    return Case(shape, (rest, float(height) * draw(st.sampled_from((0.0, -1.0, 0.3)))), draw(st.booleans()), span, landmarks)
+    return Case(
+        shape, (rest, float(height) * draw(st.sampled_from((0.0, -1.0, 0.3)))), draw(st.booleans()), span, landmarks
+    )
 
 
 TARGETS = ("anywhere", "landmark", "revisit", "near", "mirror", "stay")
@@ -223,3 +222,22 @@ FAMILY_CASE = Case(
     (0.0, 100.0),
     (0.0, 50.0, 100.0),
 )  # fmt: skip
+PI_CASE = Case(
+    PrandtlIshlinskii(np.array([0.0, 4.0]), np.array([1e-7, 2e-8])), (0.0, 0.0), False, (0.0, 80.0), (0.0, 8.0)
+)
+
+
+def two_axes() -> StageModel:
+    """One of each kind."""
+    axes = {"x": axis_model(FAMILY_CASE, (0.0, 60.0, 20.0)), "y": axis_model(PI_CASE)}
+    return StageModel(axes, "stage 7 \N{GREEK SMALL LETTER MU}", "2024-05-06T07:08:09Z")
+
+
+def assert_same_model(one: StageModel, other: StageModel) -> None:
+    """Equal to the last bit."""
+    assert (one.hardware_id, one.created, list(one.axes)) == (other.hardware_id, other.created, list(other.axes))
+    for name, axis in one.axes.items():
+        again = other.axes[name]
+        for what in ("kind", "start", "voltage_range", "displacement_range", "quality"):
+            assert getattr(axis, what) == getattr(again, what)
+        assert to_document(axis.hysteresis) == to_document(again.hysteresis)

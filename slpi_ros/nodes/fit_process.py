@@ -79,7 +79,7 @@ class FitProcess:
 
     def end(self) -> None:
         """End it, done or not."""
-        self._process.terminate()
+        self._process.kill()
         self._process.join()
         self._receiver.close()
 

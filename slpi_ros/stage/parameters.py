@@ -33,6 +33,9 @@ class StageParameters:
         in the bias and the part even in it.
     curvature : float
         Cubic share of the reversible part; negative saturates towards the ends of the threshold range.
+    stiffening : float
+        Bow of the displacement over what relays and reversible part add up to, as a share of the stroke: the flexure
+        is stiffer (positive) or softer towards the upper end. With it, loops between the same two voltages differ.
     noise_rms : float, metres
         Gaussian sensor noise.
     quantisation : float, metres
@@ -57,6 +60,7 @@ class StageParameters:
     bias_slope: float = 0.3
     bias_bow: float = 0.2
     curvature: float = 0.1
+    stiffening: float = 0.0
     noise_rms: float = 8e-9
     quantisation: float = 1e-9
     offset: float = 0.0
@@ -77,6 +81,7 @@ class StageParameters:
             ("width_scale", self.width_scale > 0, "more than 0 V"),
             ("width_growth", abs(self.width_growth) < 1, "between -1 and 1"),
             ("curvature", self.curvature > -1 / 3, "more than -1/3, or the stage would turn back"),
+            ("stiffening", abs(self.stiffening) <= 0.1, "from -0.1 to 0.1"),
             ("noise_rms", self.noise_rms >= 0, "0 m or more"),
             ("quantisation", self.quantisation >= 0, "0 m or more"),
         ):
@@ -107,8 +112,9 @@ class StageParameters:
             hysteresis=draw(0.12, 0.17),
             width_scale=draw(30.0, 60.0),
             width_growth=draw(-0.4, 0.4),
-            bias_slope=draw(-0.2, 0.8),
+            bias_slope=draw(0.5, 1.4),
             bias_bow=draw(-0.4, 0.4),
             curvature=draw(-0.1, 0.2),
             offset=draw(-0.2e-6, 0.2e-6),
+            stiffening=draw(-0.01, 0.01),
         )

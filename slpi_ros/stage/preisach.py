@@ -1,4 +1,4 @@
-"""One axis of a simulated piezo stage: Preisach relays, a reversible curve and a sensor."""
+"""One axis of a simulated piezo stage: Preisach relays, a reversible curve, a flexure and a sensor."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 
 
 class PreisachStage:
-    """A stage whose displacement is a relay sum plus a reversible, monotone curve of the voltage.
+    """A stage whose displacement is a relay sum plus a reversible curve of the voltage, behind a flexure.
 
     Parameters
     ----------
@@ -43,6 +43,7 @@ class PreisachStage:
         self._relays = RelayTriangle(low, high, parameters.levels, self._density)
         self._reversible_gain = self._share_stroke()
         self._zero = 0.0
+        self._bottom = measure_loop(self._unbowed, 0.0, parameters.nominal_voltage).bottom
         self.rest()
         self._zero = self._displacement() - parameters.offset
 
@@ -107,8 +108,16 @@ class PreisachStage:
         return y_true, self._sensor.read(y_true)
 
     def _displacement(self) -> float:
-        reversible = self._reversible_gain * self._reversible(self._relays.voltage)
-        return self._relays.output + reversible - self._zero
+        force = self._sum() - self._bottom
+        bow = 4.0 * self.parameters.stiffening * force * (1.0 - force / self.parameters.stroke)
+        return self._bottom + force + bow - self._zero
+
+    def _sum(self) -> float:
+        return self._relays.output + self._reversible_gain * self._reversible(self._relays.voltage)
+
+    def _unbowed(self, voltage: float) -> float:
+        self._relays.step(voltage)
+        return self._sum()
 
     def _density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
         # The fall with width changes with bias too: a mere product of the two would be too easy a stage.

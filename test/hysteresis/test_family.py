@@ -91,7 +91,9 @@ def test_at_its_vertices_a_family_gives_its_parameters_back(family):
     height = surface[-1, 0]
     memory = Memory(family, grid[0], 0.0)
     risen = stream_forward(memory, grid)
-    np.testing.assert_allclose(risen, family.rise - family.rise[0], rtol=0, atol=1e-12 * height + 1e-15 * abs(family.rise[0]))
+    np.testing.assert_allclose(
+        risen, family.rise - family.rise[0], rtol=0, atol=1e-12 * height + 1e-15 * abs(family.rise[0])
+    )
     fallen = risen[-1] - stream_forward(memory, grid[::-1])
     np.testing.assert_allclose(fallen, surface[-1, ::-1], rtol=0, atol=1e-11 * height)
     bottom = memory.displacement

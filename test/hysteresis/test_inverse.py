@@ -89,7 +89,9 @@ def test_inverse_rises_and_falls_with_the_displacement(drawn):
 
 
 @pytest.mark.parametrize(
-    "shape", [play(5.0), PrandtlIshlinskii(np.array([0.0, 4.0, 9.0]), np.array([1.0, -1.0, 2.0]))], ids=["play", "level"]
+    "shape",
+    [play(5.0), PrandtlIshlinskii(np.array([0.0, 4.0, 9.0]), np.array([1.0, -1.0, 2.0]))],
+    ids=["play", "level"],
 )
 def test_what_lies_on_a_level_piece_is_still_reached(shape):
     """Such a model has no inverse, but every displacement some voltage that gives it."""

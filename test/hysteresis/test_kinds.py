@@ -3,7 +3,6 @@ import json
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 from strategies import loop_families, prandtl_ishlinskii
 
 from slpi_ros.errors import ModelError
@@ -58,17 +57,24 @@ def test_families_that_contradict_themselves(change):
         from_document("slpi", {**FAMILY, **change})
 
 
-@pytest.mark.parametrize("huge", [10**30, 10**400, 2**63, -(2**63) - 1], ids=["1e30", "1e400", "2^63", "-2^63-1"])
+# JSON has whole numbers of any length; numpy makes objects of them, or wraps around.
+HUGE = pytest.mark.parametrize("huge", [10**30, 10**400, 2**63], ids=["1e30", "1e400", "2^63"])
+
+
+@HUGE
 @pytest.mark.parametrize("key", FAMILY)
 def test_huge_whole_numbers_in_a_family(key, huge):
-    """JSON has whole numbers of any length; numpy makes objects of them, or wraps around."""
-    value = FAMILY[key]
-    rows = [*value[:-1], [*value[-1][:-1], huge]] if key == "surface_m" else [huge, *value[1:]] if key != "edge_gain_m_per_V" else -huge
+    values = {
+        "grid_V": [huge, 10, 30],
+        "surface_m": [[0], [1, 0], [4, huge, 0]],
+        "first_rise_m": [huge, 6, 9],
+        "edge_gain_m_per_V": -huge,
+    }
     with pytest.raises((ModelError, OverflowError)):
-        from_document("slpi", {**FAMILY, key: rows})
+        from_document("slpi", {**FAMILY, key: values[key]})
 
 
-@pytest.mark.parametrize("huge", [10**30, 10**400, 2**63], ids=["1e30", "1e400", "2^63"])
+@HUGE
 def test_huge_whole_numbers_in_a_pi_model(huge):
     for thresholds, weights in ([0, -huge], [1.0, 1.0]), ([huge, 5], [1, 1]), ([0, 5], [1, -huge]):
         with pytest.raises((ModelError, OverflowError)):

@@ -64,8 +64,8 @@ def test_back_in_reach_nothing_remains_of_having_been_held(drawn):
 
 
 # The first sample of the run lies beyond where the loop closes, and that lies beyond the limit.
-VIRGIN = Case(PrandtlIshlinskii(np.array([0.0, 5.0]), np.array([1.0, 1.0])), (0.0, 0.0), False, (0.0, 100.0), (0.0,))
-LEAP = np.concatenate([[150.0], np.linspace(-200.0, -210.0, 40), [0.0]])
+VIRGIN = Case(PrandtlIshlinskii(np.array([0.0, 30.0]), np.array([1.0, 1.0])), (0.0, 0.0), False, (0.0, 100.0), (0.0,))
+LEAP = np.concatenate([[125.0], np.linspace(-200.0, -210.0, 40), [0.0]])
 
 
 @given(limited())

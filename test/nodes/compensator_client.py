@@ -85,7 +85,11 @@ def wish(names: Sequence[str], displacements: Sequence[float], stamp_ns: int = 0
 
 @contextmanager
 def compensator(
-    *arguments: str, namespace: str = "", names: Mapping[str, str] | None = None, desired: Any = JointState, **parameters: Any
+    *arguments: str,
+    namespace: str = "",
+    names: Mapping[str, str] | None = None,
+    desired: Any = JointState,
+    **parameters: Any,
 ) -> Iterator[Client]:
     """Start a compensator and stand around it; `names` tells remapped topics."""
     with on_graph() as graph, started("compensator", {**QUICK, **parameters}, *arguments) as node:

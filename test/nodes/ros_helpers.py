@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from slpi_ros.hysteresis.family import LoopFamily
@@ -143,6 +145,14 @@ class Graph:
             return future.result()
         finally:
             self.node.destroy_client(client)
+
+    def set_parameters(self, node: str, **values: object) -> str:
+        """Set parameters of a node, all or none; return why they were refused, or nothing."""
+        parameters: Any = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        request = SetParametersAtomically.Request(parameters=parameters)
+        result = self.call(SetParametersAtomically, f"{node}/set_parameters_atomically", request).result
+        assert result.successful != bool(result.reason)
+        return result.reason
 
 
 @contextmanager

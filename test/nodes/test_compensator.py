@@ -88,7 +88,7 @@ def test_bad_messages_are_rejected_whole_counted_by_cause_and_forgotten(xy_file)
             # A whole message is rejected for one axis, and for one nanosecond.
             client.wish(axes, row[::-1], stamp - 1)
             client.graph.spin_until(lambda sent=i: len(client.answers) > sent, f"answer {i}")
-        expected = {cause: 0 for cause in CAUSES} | {"time_backwards": len(path)}
+        expected = dict.fromkeys(CAUSES, 0) | {"time_backwards": len(path)}
         for i in range(len(path)):
             for cause, _, _ in floods[i % len(floods) : i % len(floods) + 2]:
                 expected[cause] += 1

@@ -12,9 +12,7 @@ from lifecycle_msgs.msg import State, Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
 from nodes.compensator_client import Client, compensator  # noqa: E402
 from nodes.ros_helpers import LATCHED, NodeProcess, on_graph, stage_model, started  # noqa: E402
-from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
-from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
+from rcl_interfaces.srv import DescribeParameters  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
 from slpi_ros.model_file import format_model, save_model  # noqa: E402
@@ -38,15 +36,6 @@ def change_state(client: Client, transition: int) -> bool:
 
 def state(client: Client) -> int:
     return client.graph.call(GetState, f"{client.name}/get_state", GetState.Request()).current_state.id
-
-
-def set_parameters(client: Client, **values: object) -> str:
-    """Return why the values were refused, or nothing."""
-    parameters: list[ParameterMessage] = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-    request = SetParametersAtomically.Request(parameters=parameters)
-    result = client.graph.call(SetParametersAtomically, f"{client.name}/set_parameters_atomically", request).result
-    assert result.successful != bool(result.reason)
-    return result.reason
 
 
 def test_lifecycle_by_services(x_file):
@@ -90,7 +79,7 @@ def test_a_wrong_model_file_keeps_it_unconfigured_until_it_is_right(x_file, tmp_
         status, values = client.report(models_refused=1)
         assert status.level == b"\2" and "none.json: cannot read a model" in status.message
         assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
-        assert set_parameters(client, model_file=x_file) == ""
+        assert client.graph.set_parameters(client.name, model_file=x_file) == ""
         assert change_state(client, CONFIGURE) and change_state(client, ACTIVATE)
         client.connect()
         assert client.ask(["x"], [0.0]) == [0.0]
@@ -152,7 +141,7 @@ def test_parameters_change_together_or_not_at_all(x_file):
     with compensator(model_file=x_file) as client:
         client.connect()
         assert 40.0 < client.ask(["x"], [5e-6])[0] < 60.0
-        assert set_parameters(client, voltage_min=10, voltage_max=[70], slew_limit=0) == ""
+        assert client.graph.set_parameters(client.name, voltage_min=10, voltage_max=[70], slew_limit=0) == ""
         assert client.ask(["x"], [10e-6]) == [70.0]
         for refused, why in (
             ({"voltage_min": 20.0, "voltage_max": 15.0}, "not below"),
@@ -161,8 +150,9 @@ def test_parameters_change_together_or_not_at_all(x_file):
             ({"voltage_max": None}, "voltage_max"),
             ({"voltage_min": 0.0, "axes": ["z"]}, "read-only"),
             ({"executor": "default"}, "read-only"),
+            ({"nonsense": 1.0}, "undeclared"),
         ):
-            assert why in set_parameters(client, **refused)
+            assert why in client.graph.set_parameters(client.name, **refused)
         assert client.ask(["x"], [10.2e-6]) == [70.0]
         request = DescribeParameters.Request(names=["voltage_max", "axes"])
         described = client.graph.call(DescribeParameters, f"{client.name}/describe_parameters", request).descriptors

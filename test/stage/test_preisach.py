@@ -155,3 +155,18 @@ def test_more_hysteresis_than_the_relays_can_give():
 def test_a_run_needs_one_time_for_each_voltage():
     with pytest.raises(UsageError, match="one time for each voltage"):
         PreisachStage(QUIET).run(np.zeros(3), np.zeros(4))
+
+
+def test_stiffening_makes_loops_between_the_same_voltages_differ():
+    """Without it they are congruent, as in every Preisach model; a real stage is not so kind."""
+    v = np.concatenate(
+        [np.linspace(0, 100, 300), np.linspace(100, 40, 200), np.linspace(40, 60, 100), np.linspace(60, 40, 100)]
+    )
+    v = np.concatenate([v, np.linspace(40, 0, 100), np.linspace(0, 60, 100), np.linspace(60, 40, 100)])
+    heights = []
+    for stiffening in (0.0, 0.05):
+        stage = PreisachStage(replace(QUIET, stiffening=stiffening))
+        y, _ = stage.run(np.zeros(v.size), v)
+        heights.append((y[599] - y[699], y[899] - y[999]))
+    assert heights[0][0] == pytest.approx(heights[0][1], rel=1e-9)
+    assert abs(heights[1][0] - heights[1][1]) > 1e-3 * heights[1][0]

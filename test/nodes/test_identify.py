@@ -1,0 +1,223 @@
+"""The node identify as a process of its own, over DDS: a bag in, a latched model out."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from nodes.ros_helpers import (  # noqa: E402
+    LATCHED,
+    PATIENCE_S,
+    Graph,
+    NodeProcess,
+    on_graph,
+    stage_model,
+    started,
+    values_of,
+    voltage_path,
+)  # fmt: skip
+from std_msgs.msg import String  # noqa: E402
+
+from slpi_ros.bags import read_bag, write_bag  # noqa: E402
+from slpi_ros.identification.fit import identify  # noqa: E402
+from slpi_ros.identification.record import Record  # noqa: E402
+from slpi_ros.model_file import load_model, parse_model  # noqa: E402
+from slpi_ros.nodes.fit_process import FitProcess, FitRequest  # noqa: E402
+
+NAME = "/identify: identify"
+# Quick to fit, and needs no better.
+QUICK = {"kind": "pi", "diagnostic_period": 0.2}
+
+
+def write_calibration(path: Path, seed: int = 1, samples: int = 600) -> str:
+    v = voltage_path(samples, seed)
+    y = stage_model().axis("x").simulate(v) + np.random.default_rng(seed).normal(0.0, 5e-9, samples)
+    stamps = 1_700_000_000_000_000_000 + np.arange(samples, dtype=np.int64) * 5_000_000
+    write_bag(path, Record(stamps, {"x": v}, {"x": y}, hardware_id="stage 7"))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> str:
+    return write_calibration(tmp_path_factory.mktemp("bags") / "calibration")
+
+
+@dataclass
+class Client:
+    graph: Graph
+    node: NodeProcess
+    models: list[Any]
+
+    def status(self, wanted, what: str):
+        return self.graph.wait_for_status(NAME, wanted, what)
+
+    def identified(self, count: int = 1) -> str:
+        """Return the document that is published as the `count`-th."""
+        self.graph.spin_until(lambda: len(self.models) >= count, f"model {count}")
+        return self.models[count - 1].data
+
+    def failed(self, text: str) -> None:
+        status = self.status(lambda status: status.level == b"\2" and text in status.message, text)
+        assert "\n" not in status.message
+
+    def set(self, **values: object) -> str:
+        """Set parameters; return why they were refused, or nothing."""
+        return self.graph.set_parameters("/identify", **values)
+
+
+@contextmanager
+def identifying(**parameters: object) -> Iterator[Client]:
+    with on_graph() as graph, started("identify", {**QUICK, **parameters}) as node:
+        graph.tested = node
+        models = graph.record(String, "/stage_model", LATCHED)
+        graph.watch_diagnostics()
+        yield Client(graph, node, models)
+
+
+def without_time(document: str) -> dict[str, Any]:
+    return {**json.loads(document), "created": ""}
+
+
+def test_a_bag_becomes_the_model_that_the_library_identifies(bag, tmp_path):
+    output = tmp_path / "model.json"
+    with identifying(bags=[bag], output=str(output), start=0, stop=2.5) as client:
+        document = client.identified()
+        status = client.status(lambda status: "identified" in status.message, "its quality")
+        # Whoever comes late hears it too.
+        with on_graph() as late:
+            heard = late.record(String, "/stage_model", LATCHED)
+            late.spin_until(lambda: heard, "the latched model")
+            assert heard[0].data == document
+        assert client.node.stop() == 0
+    model = identify(read_bag(bag), "pi", start=0.0, stop=2.5)
+    found = parse_model(document, "test")
+    assert found.hardware_id == status.hardware_id == "stage 7"
+    path = voltage_path(300, 9)
+    assert found.simulate(np.arange(300), path) == pytest.approx(model.simulate(np.arange(300), path), abs=1e-12)
+    assert without_time(output.read_text()) == without_time(document)
+    values = values_of(status)
+    assert status.level == b"\0" and " nm" in status.message and "um" in status.message
+    assert float(values["x.rms_nm"]) == pytest.approx(model.axes["x"].quality.rms * 1e9, rel=1e-2)
+    assert values["x.samples"] == str(model.axes["x"].quality.samples)
+
+
+def test_without_a_bag_it_waits_until_it_is_given_one(bag):
+    with identifying() as client:
+        status = client.status(lambda status: True, "a report")
+        assert status.level == b"\1" and "no bag" in status.message
+        assert client.set(bags=[bag]) == ""
+        client.identified()
+        assert client.set(start=0.5) == ""
+        client.identified(2)
+        client.status(lambda status: status.level == b"\0", "health")
+
+
+def test_a_failing_bag_is_reported_and_the_last_good_model_stays(bag, tmp_path):
+    truncated = tmp_path / "truncated.mcap"
+    (source,) = Path(bag).glob("*.mcap")
+    truncated.write_bytes(source.read_bytes()[:2000])
+    still = tmp_path / "still"
+    stamps = np.arange(500, dtype=np.int64) * 5_000_000 + 1
+    write_bag(still, Record(stamps, {"x": np.full(500, 3.0)}, {"x": np.zeros(500)}))
+    with identifying(bags=[str(tmp_path / "none")]) as client:
+        client.failed("none: no such bag")
+        for path in (str(truncated), str(still)):
+            assert client.set(bags=[path]) == ""
+            client.failed(Path(path).name)
+        assert client.set(bags=[bag], topic="other") == ""
+        client.failed("other")
+        assert client.set(topic="stage_state", output=str(tmp_path / "no" / "folder.json")) == ""
+        client.failed("cannot write the model")
+        # That a file cannot be written does not keep the model from those who listen.
+        document = client.identified()
+        assert client.set(bags=["/nowhere"]) == ""
+        client.failed("/nowhere")
+        with on_graph() as late:
+            heard = late.record(String, "/stage_model", LATCHED)
+            late.spin_until(lambda: heard, "the last good model")
+            assert heard[0].data == document
+        assert "Traceback" not in client.node.stderr
+
+
+def test_wrong_parameters_change_nothing(bag):
+    with identifying() as client:
+        client.status(lambda status: True, "a report")
+        for refused, why in (
+            ({"kind": "magic"}, "kind"),
+            ({"bags": ["a", "b"]}, "one bag at a time"),
+            ({"start": 5, "stop": 2.0}, "start before you stop"),
+            ({"topic": ""}, "topic"),
+            ({"diagnostic_period": 3.0}, "read-only"),
+            ({"nonsense": 3.0}, "undeclared"),
+        ):
+            assert why in client.set(**refused)
+        assert client.set(bags=[bag], start=-1, stop=float("nan")) == ""
+        client.identified()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "named"),
+    [({"kind": "magic"}, "kind"), ({"bags": ["a", "b"]}, "one bag at a time"), ({"start": "x"}, "start")],
+)
+def test_wrong_parameters_end_it_in_one_line(parameters, named):
+    with started("identify", parameters) as node:
+        assert node.wait() == 2
+        assert node.stderr.count("\n") == 1 and named in node.stderr
+
+
+def children(pid: int) -> list[int]:
+    """Return the processes that identify for process `pid`."""
+    found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [int(child) for child in found if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds processes in /proc")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_an_endless_identification_blocks_nothing_and_leaves_nothing(bag, number):
+    with identifying() as client:
+        client.status(lambda status: True, "a report")
+        assert client.set(bags=[bag], kind="slpi") == ""
+        (worker,) = client.graph.spin_until(lambda: children(client.node.process.pid), "the worker")
+        os.kill(worker, signal.SIGSTOP)
+        client.status(lambda status: "identifying" in status.message, "a report while it works")
+        assert client.set(kind="magic") != ""
+        # Another bag replaces what is under way.
+        assert client.set(bags=[bag], kind="pi") == ""
+        client.identified()
+        assert client.set(kind="slpi") == ""
+        (worker,) = client.graph.spin_until(lambda: children(client.node.process.pid), "the second worker")
+        os.kill(worker, signal.SIGSTOP)
+        assert client.node.stop(number) == 0
+        assert not Path(f"/proc/{worker}").exists()
+        assert "Traceback" not in client.node.stderr
+
+
+def test_a_worker_that_dies_is_an_error_not_a_hang(bag):
+    job = FitProcess(FitRequest(bag, "stage_state", "pi", None, None, ""))
+    job._process.kill()
+    deadline = time.monotonic() + PATIENCE_S
+    while (outcome := job.outcome()) is None:
+        assert time.monotonic() < deadline
+    assert not outcome.document and "exit code -9" in outcome.error
+
+
+def test_the_compensator_takes_the_model_over(bag, tmp_path):
+    output = tmp_path / "model.json"
+    with identifying(bags=[bag], output=str(output)) as client, started("compensator") as node:
+        client.graph.tested = node
+        client.graph.wait_for_status(
+            "/compensator: compensator", lambda status: values_of(status)["model.kind"] == "pi", "the model"
+        )
+        model = load_model(output)
+        status = client.graph.statuses("/compensator: compensator")[-1]
+        assert values_of(status)["model.created"] == model.created

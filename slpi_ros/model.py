@@ -12,10 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from slpi_ros.errors import RecordError, SlpiError, UnreachableError, UsageError
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.runs import require_finite
 from slpi_ros.stream import TOLERATED_SHARE, AxisStream, Limits, refusal
 
 FloatArray = NDArray[np.float64]
 Signal = ArrayLike | Mapping[str, ArrayLike]
+
+
+# A displacement missed by less than this share of the range is met: it is rounding.
+ROUNDING = 1e-9
 
 
 class HeldAtLimitWarning(UserWarning):
@@ -119,6 +124,7 @@ class AxisModel:
         UsageError
             If a displacement is not finite.
         """
+        require_finite(y)
         low, high = self.displacement_range
         margin = TOLERATED_SHARE * (high - low)
         far = (y < low - margin) | (y > high + margin)
@@ -128,7 +134,12 @@ class AxisModel:
         stream = self.stream(limits)
         lower, upper = stream.limits.lower, stream.limits.upper
         v = stream.memory.inverse_array(y, lower, upper)
-        return v, (v <= lower) | (v >= upper)
+        held = (v <= lower) | (v >= upper)
+        if held.any():
+            # At a limit a wish may just be met.
+            missed = self.stream(limits).memory.forward_array(v) - y
+            held &= np.abs(missed) > ROUNDING * (high - low)
+        return v, held
 
 
 @dataclass(frozen=True)
@@ -216,7 +227,10 @@ class StageModel:
     ) -> Any:
         time = check_time(t)
         if isinstance(signal, Mapping):
-            return {name: self._one(name, time, values, what, convert) for name, values in signal.items()}
+            converted = {}
+            for name, values in signal.items():
+                converted[name] = self._one(name, time, values, what, convert)
+            return converted
         if len(self.axes) != 1:
             raise UsageError(
                 f"the model holds axes {', '.join(self.axes)}; give {what} as a mapping of axis name to array"
@@ -232,7 +246,7 @@ class StageModel:
         convert: Callable[[AxisModel, FloatArray], FloatArray],
     ) -> FloatArray:
         axis = self.axis(name)
-        signal = np.asarray(values, dtype=np.float64)
+        signal = _as_array(values, f"axis '{name}': {what}")
         if signal.shape != t.shape:
             raise UsageError(
                 f"axis '{name}': {what} has shape {signal.shape}, time has {t.shape}; give one value for each time"
@@ -245,7 +259,7 @@ class StageModel:
 
 def check_time(t: ArrayLike) -> FloatArray:
     """Return `t` as an array, shape (N,), seconds; RecordError unless it is finite and does not decrease."""
-    time = np.asarray(t, dtype=np.float64)
+    time = _as_array(t, "time")
     if time.ndim != 1 or not np.isfinite(time).all():
         raise RecordError(f"time has shape {time.shape}; give one finite value for each sample")
     back = np.flatnonzero(np.diff(time) < 0)
@@ -257,9 +271,16 @@ def check_time(t: ArrayLike) -> FloatArray:
     return time
 
 
+def _as_array(values: ArrayLike, what: str) -> FloatArray:
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UsageError(f"{what} is no array of numbers: {error}") from None
+
+
 def held_message(held: NDArray[np.bool_]) -> str:
     """Say how many displacements are out of reach, and from where on."""
     return (
-        f"{np.count_nonzero(held)} of {held.size} desired displacements need a voltage at or beyond the limits, "
+        f"{np.count_nonzero(held)} of {held.size} desired displacements need a voltage beyond the limits, "
         f"first sample {int(np.argmax(held))}; held at the limit"
     )

@@ -2,6 +2,8 @@
 
 import json
 import os
+from contextlib import suppress
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +33,8 @@ def load_model(path: str | os.PathLike[str]) -> StageModel:
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text, or the name is no file's"
         raise ModelError(f"{path}: cannot read a model: {reason}; give a file written by 'slpi identify'") from None
     return parse_model(text, str(path))
 
@@ -46,13 +48,15 @@ def save_model(model: StageModel, path: str | os.PathLike[str]) -> None:
         If the file cannot be written.
     """
     target = Path(path)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    partial = target.parent / f".{target.name}.{os.getpid()}.partial"
     try:
         partial.write_text(format_model(model), encoding="utf-8")
         os.replace(partial, target)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise ModelError(f"{path}: cannot write the model: {error.strerror}; choose another place") from None
+    except (OSError, ValueError) as error:
+        with suppress(OSError, ValueError):
+            partial.unlink(missing_ok=True)
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ModelError(f"{path}: cannot write the model: {reason}; choose another place") from None
 
 
 def parse_model(text: str, source: str) -> StageModel:
@@ -64,14 +68,17 @@ def parse_model(text: str, source: str) -> StageModel:
         If the text is not a valid model document of this version.
     """
     try:
-        # The engine works with finite numbers only: JSON's informal NaN and Infinity are refused where they are read.
-        document = json.loads(text, parse_constant=_refuse_constant)
+        # The engine works with finite numbers only: NaN, Infinity and 1e400 are refused where they are read.
+        document = json.loads(text, parse_float=_finite, parse_int=_whole, parse_constant=_finite)
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{source}: not a model document: {error}; give a file written by 'slpi identify'") from None
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema != SCHEMA:
         raise ModelError(f"{source}: schema is {schema!r}, this version reads {SCHEMA!r}; identify the stage again")
-    validate(document, "model", source)
+    try:
+        validate(document, "model", source)
+    except RecursionError:
+        raise ModelError(f"{source}: not a model document: nested too deeply; identify the stage again") from None
     try:
         axes = {name: _axis_from(axis) for name, axis in document["axes"].items()}
     except (ModelError, OverflowError) as error:
@@ -90,8 +97,16 @@ def format_model(model: StageModel) -> str:
     return json.dumps(document, allow_nan=False)
 
 
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number")
+def _finite(text: str) -> float:
+    number = float(text)
+    if not isfinite(number):
+        raise ValueError(f"{text[:20]} is not a finite number")
+    return number
+
+
+def _whole(text: str) -> int:
+    _finite(text)
+    return int(text)
 
 
 def _axis_from(axis: dict[str, Any]) -> AxisModel:

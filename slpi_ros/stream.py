@@ -58,6 +58,7 @@ class AxisStream:
         margin = TOLERATED_SHARE * (high - low)
         self._accepted = (low - margin, high + margin)
         self._t = -inf
+        self._wish = memory.displacement
         # The axis may rest outside its limits; the first voltage it is given is inside.
         memory.forward(min(max(memory.voltage, limits.lower), limits.upper))
 
@@ -100,15 +101,17 @@ class AxisStream:
             reach = limits.slew * (t - self._t) if self._t > -inf else 0.0
             present = self.memory.voltage
             lower, upper = max(limits.lower, present - reach), min(limits.upper, present + reach)
-        self._t = t
-        return self.memory.inverse(y, lower, upper)
+        v = self.memory.inverse(y, lower, upper)
+        self._t, self._wish = t, y
+        return v
 
     __call__ = step
 
     @property
     def held(self) -> bool:
         """Whether the last wish could not be met: the voltage waits at one of its limits."""
-        return self.memory.voltage in (self.limits.lower, self.limits.upper)
+        at_limit = self.memory.voltage in (self.limits.lower, self.limits.upper)
+        return at_limit and self.memory.displacement != self._wish
 
 
 def refusal(y: float, accepted: tuple[float, float]) -> str:

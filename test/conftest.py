@@ -3,6 +3,7 @@
 import atexit
 import fcntl
 import os
+import signal
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -32,6 +33,9 @@ def _reserve_ros_domain() -> int:
 # Set before any test module imports rclpy; the nodes that tests start inherit both.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_DOMAIN_ID"] = str(_reserve_ros_domain())
+
+# A shell starts background jobs with SIGINT ignored, and the nodes that tests start and interrupt inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No verdict depends on the clock, and CI draws the same examples every time.
 hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize="CI" in os.environ)

@@ -140,12 +140,12 @@ def cases(draw: st.DrawFn, kinds: tuple[str, ...] = KINDS) -> Case:
     )
 
 
-TARGETS = ("anywhere", "landmark", "revisit", "near", "mirror", "stay")
+TARGETS = ("anywhere", "nested", "nested", "landmark", "revisit", "near", "mirror", "stay")
 
 
 @st.composite
 def paths(
-    draw: st.DrawFn, case: Case, low: float | None = None, high: float | None = None, max_size: int = 12
+    draw: st.DrawFn, case: Case, low: float | None = None, high: float | None = None, max_size: int = 16
 ) -> FloatArray:
     """Draw a path of voltages, shape (N,), N >= 1: jumps, walks and long smooth runs, by and beyond the grid.
 
@@ -164,6 +164,8 @@ def paths(
             goal = case.landmarks[int(share * (len(case.landmarks) - 1))]
         elif target == "revisit":
             goal = stops[int(share * (len(stops) - 1))]
+        elif target == "nested" and len(stops) > 1:
+            goal = last + share * (stops[-2] - last)
         elif target == "near":
             goal = last + np.copysign(case.width * 10 ** (-20 * abs(share - 0.5)), share - 0.5)
         elif target == "mirror":

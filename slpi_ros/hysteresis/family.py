@@ -52,16 +52,20 @@ class LoopFamily:
 
     def __post_init__(self) -> None:
         """Check the surface and lay its rows and columns out in the order in which branches run through them."""
+        for name in ("grid", "surface", "rise"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         n = self.grid.size
-        if n < 2 or self.surface.shape != (n, n) or self.rise.shape != (n,):
+        if n < 2 or self.grid.shape != (n,) or self.surface.shape != (n, n) or self.rise.shape != (n,):
             raise ModelError(
                 f"loop family: {n} vertices, surface {self.surface.shape}, first rise {self.rise.shape}; "
                 "the surface must be square and as long as the grid"
             )
+        if np.any(np.diag(self.surface) != 0.0):
+            raise ModelError("loop family: the diagonal of the surface must be zero: no voltage lies between there")
         triangle = np.where(np.tri(n, dtype=bool), self.surface, 0.0)
         below, beside = np.tri(n - 1, dtype=bool), np.diff(triangle, axis=1)[1:]
         up, down = np.diff(triangle, axis=0)[:, :-1][below], -beside[below]
-        steps = (np.diff(self.grid), np.diff(self.rise), up, down, np.array([self.edge_gain]))
+        steps = (np.diff(self.grid), np.diff(self.rise), up, down, np.array([self.edge_gain], dtype=np.float64))
         if not all(np.isfinite(step).all() and np.min(step) > 0 for step in steps):
             raise ModelError("loop family: grid, first rise and every row and column of the surface must rise strictly")
         far = END * self.edge_gain

@@ -41,6 +41,8 @@ class PrandtlIshlinskii:
 
     def __post_init__(self) -> None:
         """Check the operators and lay out the two shapes that all branches have."""
+        for name in ("thresholds", "weights"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         r, w = self.thresholds, self.weights
         if r.ndim != 1 or r.shape != w.shape or r.size == 0:
             raise ModelError(f"PI: {r.shape} thresholds and {w.shape} weights; give as many of each, at least one")

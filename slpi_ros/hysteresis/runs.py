@@ -1,27 +1,40 @@
 """Monotone runs of a signal: between two of its reversals a hysteresis model is one monotone function."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
+
+from slpi_ros.errors import UsageError
 
 FloatArray = NDArray[np.float64]
 
 
 def monotone_runs(x: FloatArray) -> list[tuple[int, int]]:
-    """Cut `x`, shape (N,), into stretches ``start:stop`` that go one way; the first sample is on its own.
+    """Cut `x`, shape (N,), into stretches ``start:stop`` that go one way.
 
-    Equal neighbours belong to the stretch before them.
+    The first sample, with those equal to it that follow at once, is a stretch of its own; later equal neighbours belong
+    to the stretch before them.
     """
-    if x.size < 2:
-        return [(0, x.size)] if x.size else []
-    rising = x[1:] > x[:-1]
-    level = x[1:] == x[:-1]
+    if not x.size:
+        return []
+    rising, level = x[1:] > x[:-1], x[1:] == x[:-1]
+    first = 1
     if level.any():
+        first += int(np.argmin(level)) if not level.all() else level.size
         # A level stretch inherits the direction of the last move before it.
-        last_move = np.where(level, 0, np.arange(level.size))
-        rising = rising[np.maximum.accumulate(last_move)]
-    bounds = np.flatnonzero(rising[1:] != rising[:-1]) + 2
-    edges = [0, 1, *bounds.tolist(), x.size]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+        rising = rising[np.maximum.accumulate(np.where(level, 0, np.arange(level.size)))]
+    bounds = np.flatnonzero(rising[first:] != rising[first - 1 : -1]) + first + 1
+    edges = [0, first, *bounds.tolist(), x.size]
+    return [(start, stop) for start, stop in pairwise(edges) if start < stop]
+
+
+def require_finite(x: FloatArray) -> None:
+    """Raise UsageError, which names the first one, when samples are not finite."""
+    finite = np.isfinite(x)
+    if not finite.all():
+        at = int(np.argmin(finite))
+        raise UsageError(f"sample {at} is {x[at]}; leave samples that are not finite out")
 
 
 def count_before(x: FloatArray, direction: int, bound: float) -> int:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# No voltage lies farther than this from rest (V); the last knot of every branch lies `END` beyond the others.
+# No voltage may lie farther than this from rest (V); the last knot of every branch lies `END` beyond the others.
 FAR = 1e5
 END = 4 * FAR
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.runs import monotone_runs
 from slpi_ros.hysteresis.shape import END, Curve
+from slpi_ros.hysteresis.stack import TurningPoints
 
 FloatArray = NDArray[np.float64]
 
@@ -51,9 +51,9 @@ def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> list[
     v : ndarray, shape (N,), volts
         The axis rests at the first value, which may be repeated.
     symmetric_rest : bool
-        As in `slpi_ros.hysteresis.memory.Shape`.
+        As in `slpi_ros.hysteresis.shape.Shape`.
     primed : bool
-        As in `slpi_ros.hysteresis.memory.Memory`.
+        As in `slpi_ros.hysteresis.stack.TurningPoints`.
 
     Returns
     -------
@@ -62,11 +62,11 @@ def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> list[
     """
     if not v.size:
         return []
-    memory = Memory(_Straight(symmetric_rest), float(v[0]), float(v[0]), primed=primed)
+    memory = TurningPoints(_Straight(symmetric_rest), float(v[0]), float(v[0]), primed=primed)
     origins = [LONG_FALL] if primed else []
     pieces: list[Piece] = []
     for start, stop in monotone_runs(v):
-        if not start or v[stop - 1] == v[start - 1]:
+        if not start:
             continue
         for begin, end in memory.pieces(v, start, stop, 0):
             if memory.depth > len(origins):

@@ -10,7 +10,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
 
-from slpi_ros.errors import SlpiError
+from slpi_ros.errors import ModelError, SlpiError
 from slpi_ros.model import StageModel
 from slpi_ros.model_file import format_model, load_model, parse_model
 from slpi_ros.nodes.compensation import Compensation, RejectedError
@@ -38,7 +38,7 @@ class Compensator(LifecycleNode):
     UsageError
         If the parameters make no sense.
     ModelError
-        If ``model_file`` holds no model.
+        If ``model_file`` holds no model for these axes and limits.
     """
 
     def __init__(self) -> None:
@@ -187,7 +187,7 @@ class Compensator(LifecycleNode):
             try:
                 self._compensation.use_model(model)
             except SlpiError as error:
-                raise type(error)(f"{source}: {error}") from None
+                raise ModelError(f"{source}: {error}") from None
             self.get_logger().info(f"using the model of {source}, identified {model.created or 'at an unknown time'}")
         self._model_error = ""
         self._report()

@@ -91,6 +91,8 @@ def test_a_batch_with_limits_leaves_the_memory_where_its_voltages_lead(drawn):
 
 @given(limited(inside=False))
 @example((VIRGIN, np.array([0.0]), 10.0, 100.0, np.array([1.0, 30.0])))
+@example((VIRGIN, np.array([5.0]), 10.0, 100.0, np.array([7.0, 30.0])))
+@example((VIRGIN, np.array([5.0]), -100.0, 0.0, np.array([7.0, -30.0])))
 @example((VIRGIN, np.array([0.0]), 10.0, 100.0, np.array([0.0, *np.linspace(0.1, 60.0, 60)])))
 def test_from_outside_the_limits_the_first_voltage_is_inside(drawn):
     case, before, lower, upper, wishes = drawn
@@ -102,6 +104,20 @@ def test_from_outside_the_limits_the_first_voltage_is_inside(drawn):
         np.testing.assert_allclose(memory.displacement, y[-1], rtol=0, atol=1e-9 * case.height)
         missed = np.abs(y - wishes) > 1e-9 * case.height
         assert (v == np.where(wishes > y, upper, lower))[missed].all()
+
+
+@given(limited(), st.sampled_from((1, 80)), st.floats(0.01, 10))
+def test_waiting_at_a_limit_moves_nothing(drawn, samples, excess):
+    case, before, lower, upper, _ = drawn
+    memory = after(case, before)
+    for limit, sign in ((upper, 1), (lower, -1)):
+        memory.forward(limit)
+        kept = memory.snapshot()
+        beyond = kept.displacement + sign * case.height * np.linspace(0, excess, samples + 1)
+        assert (memory.inverse_array(beyond, lower, upper) == limit).all()
+        assert memory.snapshot() == kept
+        assert (stream_inverse(memory, beyond, lower, upper) == limit).all()
+        assert memory.snapshot() == kept
 
 
 @given(limited(), st.integers(1, 3))

@@ -1,13 +1,14 @@
 """The memory as an object: batches, snapshots, and what it refuses."""
 
 import json
+import sys
 from dataclasses import asdict
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import Case, cases, cases_and_paths, paths, stream_forward, stream_inverse
+from strategies import FAMILY_CASE, Case, cases, cases_and_paths, paths, stream_forward, stream_inverse
 
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.memory import Memory, MemoryState
@@ -160,3 +161,32 @@ def test_the_memory_never_goes_where_a_voltage_is_refused(drawn):
             twin = case.memory()
             stream_forward(twin, path)
             assert abs(twin.forward(v) - memory.displacement) < 1e-6 * case.height
+
+
+@pytest.mark.parametrize("method", ["forward", "inverse"])
+def test_sliding_costs_as_little_down_as_up(method):
+    """Counted in calls: the quick path must be open in both directions, on the first branch and on later ones."""
+    memory = Memory(FAMILY_CASE.shape, primed=True)
+    for turn in (0.0, 90.0, 10.0, 80.0, 20.0):
+        memory.forward(turn)
+    counts = []
+    for rise in (True, False, True, False):
+        ends = (25.0, 75.0) if rise else (70.0, 30.0)
+        memory.forward(ends[0])
+        low, high = memory.displacement, Memory.forward(memory, ends[1])
+        memory.forward(ends[0])
+        path = np.linspace(*(ends if method == "forward" else (low, high)), 40)[1:-1].tolist()
+        step = getattr(memory, method)
+        step(path[0])
+        counts.append(_calls(lambda step=step, path=path: [step(x) for x in path[1:]]))
+    assert len(set(counts)) == 1
+
+
+def _calls(work) -> int:
+    events = []
+    sys.setprofile(lambda frame, event, argument: events.append(event))
+    try:
+        work()
+    finally:
+        sys.setprofile(None)
+    return events.count("call")

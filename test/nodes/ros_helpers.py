@@ -89,6 +89,7 @@ class Graph:
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
         self._statuses: list[Any] = []
+        self._read = 0
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -121,13 +122,16 @@ class Graph:
         return [status for status in self._statuses if status.name == name]
 
     def wait_for_status(self, name: str, wanted: Callable[[Any], Any], what: str) -> Any:
-        """Return the first status of that name, from now on or the latest before, that is wanted."""
-        at = max(len(self._statuses) - 1, 0)
+        """Return the first status of that name, since the one last waited for, that is wanted."""
 
         def find() -> Any:
-            return next((s for s in self._statuses[at:] if s.name == name and wanted(s)), None)
+            for i in range(self._read, len(self._statuses)):
+                if self._statuses[i].name == name and wanted(self._statuses[i]):
+                    self._read = i
+                    return self._statuses[i]
+            return None
 
-        return self.spin_until(find, f"{what}; last status: {self._statuses[-1:]}")
+        return self.spin_until(find, what)
 
     def publisher(self, kind: Any, topic: str, qos: QoSProfile = RELIABLE) -> Any:
         """Return a publisher that somebody listens to."""

@@ -130,10 +130,13 @@ class Memory(TurningPoints):
     def _through(self, x: FloatArray, coordinate: int, lower: float, upper: float) -> FloatArray:
         """Drive one coordinate (0 voltage, 1 displacement) through `x` and return the other."""
         x = np.ascontiguousarray(x, dtype=np.float64)
-        require_finite(x)
-        far = np.abs(x - self._rest[coordinate]) >= self._far[coordinate]
-        if far.any():
-            at = int(np.argmax(far))
+        if not x.size:
+            return np.empty_like(x)
+        rest, far = self._rest[coordinate], self._far[coordinate]
+        # Two passes without a copy; NaN fails both comparisons.
+        if not (rest - far < x.min() and x.max() < rest + far):
+            require_finite(x)
+            at = int(np.argmax(np.abs(x - rest)))
             raise UsageError(f"sample {at} is {x[at]} {'Vm'[coordinate]}, none of a stage; leave such samples out")
         out = np.empty_like(x)
         for start, stop in monotone_runs(x):

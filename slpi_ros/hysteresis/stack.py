@@ -127,8 +127,8 @@ class TurningPoints:
         self._u, self._f, _ = self._curve
         # Beyond its closing, or far away, a branch is no longer to be followed without a second look.
         (v_rest, y_rest), (v_far, y_far) = self._rest, self._far
-        self._reach_u = s * (min(s * self._close[0], s * v_rest + v_far) - s * self._v0)
-        self._reach_f = s * (min(s * self._close[1], s * y_rest + y_far) - s * self._y0)
+        self._reach_u = min(s * self._close[0], s * v_rest + v_far) - s * self._v0
+        self._reach_f = min(s * self._close[1], s * y_rest + y_far) - s * self._y0
 
     def _first_closing(self, s: int) -> tuple[float, float]:
         """Where the branch from the very first turning point meets the one that leaves rest again."""

@@ -15,6 +15,7 @@ import numpy as np
 from slpi_ros import bags, tables
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.fit import KINDS, identify
+from slpi_ros.identification.record import FloatArray
 from slpi_ros.model import StageModel, check_time, held_message
 from slpi_ros.model_file import load_model, save_model
 from slpi_ros.reports.text import describe_model
@@ -147,7 +148,7 @@ def _compensate(options: argparse.Namespace) -> None:
     tables.write_table(options.output, t, voltage, "V")
 
 
-def _known(columns: dict[str, np.ndarray], model: StageModel, table: str) -> dict[str, np.ndarray]:
+def _known(columns: dict[str, FloatArray], model: StageModel, table: str) -> dict[str, FloatArray]:
     """Return the columns of a table if the model holds all their axes."""
     for axis in columns:
         if axis not in model.axes:

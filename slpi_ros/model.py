@@ -13,14 +13,10 @@ from slpi_ros.errors import RecordError, SlpiError, UnreachableError, UsageError
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.runs import require_finite
-from slpi_ros.stream import TOLERATED_SHARE, AxisStream, Limits, refusal
+from slpi_ros.stream import ROUNDING, TOLERATED_SHARE, AxisStream, Limits, refusal
 
 FloatArray = NDArray[np.float64]
 Signal = ArrayLike | Mapping[str, ArrayLike]
-
-
-# A displacement missed by less than this share of the range is met: it is rounding.
-ROUNDING = 1e-9
 
 
 class HeldAtLimitWarning(UserWarning):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import textwrap
 from contextlib import suppress
 from math import isfinite
 from pathlib import Path
@@ -74,7 +75,8 @@ def parse_model(text: str, source: str) -> StageModel:
         raise ModelError(f"{source}: not a model document: {error}; give a file written by 'slpi identify'") from None
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema != SCHEMA:
-        raise ModelError(f"{source}: schema is {schema!r}, this version reads {SCHEMA!r}; identify the stage again")
+        found = textwrap.shorten(repr(schema), 80)
+        raise ModelError(f"{source}: schema is {found}, this version reads {SCHEMA!r}; identify the stage again")
     try:
         validate(document, "model", source)
     except RecursionError:

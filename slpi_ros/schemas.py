@@ -35,7 +35,8 @@ def load_schema(name: str) -> dict[str, Any]:
     try:
         text = (folder / f"{name}.schema.json").read_text(encoding="utf-8")
     except FileNotFoundError:
-        known = ", ".join(sorted(entry.name.removesuffix(".schema.json") for entry in folder.iterdir()))
+        names = sorted(entry.name for entry in folder.iterdir())
+        known = ", ".join(each.removesuffix(".schema.json") for each in names if each.endswith(".schema.json"))
         raise UsageError(f"there is no schema {name!r} in {folder}; use one of: {known}") from None
     schema: dict[str, Any] = json.loads(text)
     return schema
@@ -60,8 +61,9 @@ def validate(document: object, name: str, source: str) -> None:
     """
     error = best_match(_validator(name).iter_errors(document))
     if error is not None:
+        place = textwrap.shorten(error.json_path.replace("\\n", " "), width=200, placeholder=" ...")
         reason = textwrap.shorten(error.message, width=200, placeholder=" ...")
-        raise ModelError(f"{source}: not a valid {name} document: at {error.json_path}: {reason}; write it anew")
+        raise ModelError(f"{source}: not a valid {name} document: at {place}: {reason}; write it anew")
 
 
 @cache

@@ -9,6 +9,8 @@ from slpi_ros.hysteresis.memory import Memory
 # A wish farther outside the identified displacements than this share of their span is taken for a mistake (a wrong
 # unit, another stage) and refused; nearer ones are held at the voltage limit.
 TOLERATED_SHARE = 0.2
+# A displacement missed by less than this share of the range is met: it is rounding.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,10 @@ class AxisStream:
         margin = TOLERATED_SHARE * (high - low)
         self._accepted = (low - margin, high + margin)
         self._t = -inf
-        self._wish = memory.displacement
         # The axis may rest outside its limits; the first voltage it is given is inside.
         memory.forward(min(max(memory.voltage, limits.lower), limits.upper))
+        self._wish = memory.displacement
+        self._rounding = ROUNDING * (high - low)
 
     @property
     def voltage(self) -> float:
@@ -111,7 +114,7 @@ class AxisStream:
     def held(self) -> bool:
         """Whether the last wish could not be met: the voltage waits at one of its limits."""
         at_limit = self.memory.voltage in (self.limits.lower, self.limits.upper)
-        return at_limit and self.memory.displacement != self._wish
+        return at_limit and abs(self.memory.displacement - self._wish) > self._rounding
 
 
 def refusal(y: float, accepted: tuple[float, float]) -> str:

@@ -120,6 +120,20 @@ def test_stream_gives_what_compensate_gives(drawn):
     assert ((low <= batch) & (batch <= high)).all()
 
 
+@given(models_and_paths())
+def test_what_the_model_gives_within_its_range_is_never_held(drawn):
+    """Not even by rounding, where the path touches the limits."""
+    axis, v = drawn
+    v = np.concatenate([[np.clip(axis.start.voltage, *axis.voltage_range)], v, axis.voltage_range, v[::-1]])
+    y = axis.simulate(v)
+    axis = replace(axis, displacement_range=(y.min(), y.max()))
+    assert not axis.compensate(y)[1].any()
+    stream = axis.stream()
+    for t, wish in enumerate(y.tolist()):
+        stream.step(t, wish)
+        assert not stream.held
+
+
 def test_limits_narrow_the_identified_voltages():
     assert X.stream().limits == Limits(0.0, 100.0)
     assert X.stream(Limits(-50.0, 60.0, 5.0)).limits == Limits(0.0, 60.0, 5.0)

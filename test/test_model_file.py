@@ -192,8 +192,17 @@ def test_deep_nesting(place, depth):
 
 
 def test_nesting_at_the_edge_of_what_python_reads():
-    for depth in range(850, 1000):
-        refused(changed("hardware_id", to="HERE").replace('"HERE"', "[" * depth + "]" * depth))
+    for key in ("hardware_id", "schema"):
+        for depth in range(850, 1000):
+            refused(changed(key, to="HERE").replace('"HERE"', "[" * depth + "]" * depth))
+
+
+@pytest.mark.parametrize("key", ["schema", "hardware_id", "axes", "a" * 100_000, "a\nb"])
+def test_messages_are_one_short_line_whatever_the_document_holds(key):
+    for value in (["long\n" * 100_000], {"a\nb": "long\n" * 100_000}):
+        with pytest.raises(ModelError, match="^here.json: [^\n]+$") as refusal:
+            parse_model(changed(key, to=value), "here.json")
+        assert len(str(refusal.value)) < 1000
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,7 @@ def test_without_slew_limit_the_first_sample_is_met_at_once():
 def test_an_axis_that_rests_outside_its_limits_goes_inside_first(limits, voltage):
     stream = stream_of(limits=Limits(*limits))
     assert stream.voltage == voltage
+    assert not stream.held
     twin = FAMILY_CASE.memory()
     assert twin.forward(voltage) == stream.memory.displacement
 

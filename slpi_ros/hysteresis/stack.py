@@ -57,7 +57,8 @@ class TurningPoints:
         self._shape = shape
         self._rest = (rest_voltage, rest_displacement)
         # What `FAR` is for voltages; half of it leaves room for the loops, whose branches differ a little out there.
-        self._far = (FAR, float(np.interp(FAR / 2, *shape.first_rise(rest_voltage).knots)))
+        far_out = (shape.first_rise(rest_voltage), shape.branch(1, rest_voltage), shape.branch(-1, rest_voltage))
+        self._far = (FAR, min(float(np.interp(FAR / 2, *curve.knots)) for curve in far_out))
         self.restore(MemoryState(0, rest_voltage, rest_displacement, (), ()))
         if primed:
             top = rest_voltage + FAR

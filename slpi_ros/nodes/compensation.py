@@ -22,8 +22,6 @@ CAUSES = (
     NO_MODEL, INACTIVE, EMPTY, LENGTH, DUPLICATE_AXIS, UNKNOWN_AXIS, NOT_FINITE, TIME_BACKWARDS, OUT_OF_RANGE,
 )  # fmt: skip
 
-# A voltage limit keeps a displacement from being reached only if it misses by more than rounding, metres.
-MISSED = 1e-12
 NEVER_NS = -(2**63)
 
 
@@ -186,7 +184,7 @@ class Compensation:
             stream = self._streams[i]
             self.voltages[i] = stream.step(t, y)
             self._last_ns[i] = stamp_ns
-            missed = missed or (stream.held and abs(stream.memory.displacement - y) > MISSED)
+            missed = missed or stream.held
         self.counts.accepted += 1
         self.counts.held_at_limit += missed
         return missed

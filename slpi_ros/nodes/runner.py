@@ -105,7 +105,7 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
     make_node : callable
         Creates the node; a SlpiError raised in it ends the process with that error's line and exit code.
     executor : {"events", "default"}
-        Which executor spins the node.
+        Which executor spins the node, unless the node's own `executor_kind` says so.
 
     Returns
     -------
@@ -131,7 +131,7 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
     """Create, spin and destroy the node; raise what made it fail."""
     node = _start(make_node)
     try:
-        executor = make_executor(kind)
+        executor = make_executor(getattr(node, "executor_kind", kind))
         executor.add_node(node)
         try:
             _stop.spinning = True

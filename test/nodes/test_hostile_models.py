@@ -36,7 +36,8 @@ def places(document: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...
             yield from places(value, (*path, key))
 
 
-WRONG = [0, -1, 1, 0.5, -1e-9, 1e-300, 5e-324, 1e-7, 100.0, -100.0, 9999.0, 1e308, 1e-308, 10**400, True, None, "x", [], {}, [[]]]
+WRONG = [0, -1, 1, 0.5, -1e-9, 1e-300, 5e-324, 1e-7, 100.0, -100.0, 9999.0, 1e308, 1e-308, 10**400]
+WRONG += [True, None, "x", [], {}, [[]]]
 FACTORS = [-1.0, 0.0, 1e-12, 1e-3, 0.5, 1.0 + 1e-9, 2.0, 100.0]
 
 

@@ -1,0 +1,48 @@
+"""A measured record's desired path at its own pace, through the node and through the command line."""
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from nodes.compensator_client import PERIOD_NS, START_NS, compensator  # noqa: E402
+
+import slpi_ros  # noqa: E402
+from slpi_ros.tables import import_csv, read_table, write_table  # noqa: E402
+
+
+@pytest.fixture
+def shifted(measured_data, tmp_path):
+    """Identify the PICMA record; write its desired path, moved into the identified displacements, as a table."""
+    table = measured_data / "picma_1hz_decay_grow.csv"
+    model = slpi_ros.identify(import_csv(table), start=2.0, stop=25.0)
+    slpi_ros.save_model(model, tmp_path / "model.json")
+    desired = np.genfromtxt(table, delimiter=",", names=True)["desired_um"] * 1e-6
+    low, high = model.axes["x"].displacement_range
+    desired += (low + high - desired.min() - desired.max()) / 2
+    write_table(tmp_path / "desired.csv", np.arange(desired.size) * PERIOD_NS * 1e-9, {"x": desired}, "m")
+    return tmp_path, desired
+
+
+def test_the_node_answers_at_200_hz_what_the_command_line_gives(shifted):
+    folder, desired = shifted
+    command = [sys.executable, "-m", "slpi_ros.cli", "compensate", folder / "model.json", folder / "desired.csv"]
+    subprocess.run([*command, "-o", folder / "voltage.csv"], check=True, capture_output=True)
+    expected = read_table(folder / "voltage.csv", "V")[1]["x"]
+    with compensator(model_file=str(folder / "model.json")) as client:
+        client.connect()
+        start = time.monotonic()
+        for i, y in enumerate(desired.tolist()):
+            client.graph.spin_until(lambda due=start + i * 5e-3: time.monotonic() >= due, "the next sample")
+            client.wish(["x"], [y], START_NS + i * PERIOD_NS)
+        client.graph.spin_until(lambda: len(client.answers) >= desired.size, "every answer")
+        answers = np.array(client.answers)[:, 0]
+    assert answers.size == desired.size
+    difference = np.abs(answers - expected)
+    print(f"{answers.size} samples, largest difference {difference.max():.3g} V")
+    assert difference.max() <= 1e-9
+    assert np.mean((expected > expected.min()) & (expected < expected.max())) > 0.8, "the path is within reach"

@@ -25,7 +25,7 @@ settings.register_profile(
     "models",
     settings.default,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
-    max_examples=int(os.environ.get("HYPOTHESIS_EXAMPLES", "80")),
+    max_examples=int(os.environ.get("HYPOTHESIS_EXAMPLES", "100")),
 )
 settings.load_profile("models")
 
@@ -140,7 +140,7 @@ def cases(draw: st.DrawFn, kinds: tuple[str, ...] = KINDS) -> Case:
     )
 
 
-TARGETS = ("anywhere", "nested", "nested", "landmark", "revisit", "near", "mirror", "stay")
+TARGETS = ("anywhere", "nested", "spiral", "landmark", "revisit", "near", "mirror", "stay")
 
 
 @st.composite
@@ -157,7 +157,7 @@ def paths(
     move = st.tuples(st.sampled_from(TARGETS), fractions(0, 1), st.sampled_from((1, 1, 1, 2, 7, 40, 75)))
     stops = [min(max(case.rest[0], bottom), top)]
     stretches = []
-    for target, share, count in draw(st.lists(move, min_size=1, max_size=max_size)):
+    for target, share, count in draw(st.lists(move, min_size=3, max_size=max_size)):
         last = stops[-1]
         goal = bottom + share * (top - bottom)
         if target == "landmark":
@@ -172,6 +172,12 @@ def paths(
             goal = 2 * case.rest[0] - last
         elif target == "stay":
             goal = last
+        elif target == "spiral":
+            # Loops within loops, until the memory is deep.
+            turns = goal + (last - goal) * (-0.8) ** np.arange(1, 3 + count % 9)
+            stops.extend(np.clip(turns, bottom, top).tolist())
+            stretches.append(np.array(stops[-turns.size :]))
+            continue
         goal = float(min(max(goal, bottom), top))
         stretch = np.linspace(last, goal, count + 1)[1:]
         stretch[-1] = goal

@@ -38,6 +38,11 @@ class Client:
         """All voltages so far, volts."""
         return [list(message.data) for message in self._answers]
 
+    @property
+    def answered(self) -> int:
+        """Number of answers so far."""
+        return len(self._answers)
+
     def report(self, what: str = "a report", **wanted: object) -> tuple[Any, dict[str, str]]:
         """Wait for a report with these key-values; return it and all its values."""
         texts = {key: str(value) for key, value in wanted.items()}

@@ -39,7 +39,7 @@ def test_the_node_answers_at_200_hz_what_the_command_line_gives(shifted):
         for i, y in enumerate(desired.tolist()):
             client.graph.spin_until(lambda due=start + i * 5e-3: time.monotonic() >= due, "the next sample")
             client.wish(["x"], [y], START_NS + i * PERIOD_NS)
-        client.graph.spin_until(lambda: len(client.answers) >= desired.size, "every answer")
+        client.graph.spin_until(lambda: client.answered >= desired.size, "every answer")
         answers = np.array(client.answers)[:, 0]
     assert answers.size == desired.size
     difference = np.abs(answers - expected)

@@ -3,12 +3,12 @@
 import json
 import os
 import textwrap
-from contextlib import suppress
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from slpi_ros.errors import ModelError
+from slpi_ros.files import all_or_nothing
 from slpi_ros.hysteresis import kinds
 from slpi_ros.model import AxisModel, FitQuality, StageModel, Start
 from slpi_ros.schemas import validate
@@ -48,16 +48,9 @@ def save_model(model: StageModel, path: str | os.PathLike[str]) -> None:
     ModelError
         If the file cannot be written.
     """
-    target = Path(path)
-    partial = target.parent / f".{target.name}.{os.getpid()}.partial"
-    try:
-        partial.write_text(format_model(model), encoding="utf-8")
-        os.replace(partial, target)
-    except (OSError, ValueError) as error:
-        with suppress(OSError, ValueError):
-            partial.unlink(missing_ok=True)
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise ModelError(f"{path}: cannot write the model: {reason}; choose another place") from None
+    text = format_model(model)
+    with all_or_nothing(path, ModelError) as file:
+        file.write(text)
 
 
 def parse_model(text: str, source: str) -> StageModel:

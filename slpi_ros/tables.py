@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.csv_table import CsvTable, load_csv
 from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.files import all_or_nothing
 from slpi_ros.identification.record import FloatArray, Record
 
 _METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
@@ -146,17 +146,9 @@ def write_table(
     header = ",".join(["time_s", *(f"{axis}{_ending(suffix)}" for axis in columns)])
     texts: list[Iterable[str]] = [(f"{second:.9f}" for second in np.asarray(t, float).tolist())]
     texts += [map(repr, np.asarray(values, float).tolist()) for values in columns.values()]
-    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with draft.open("w", encoding="utf-8") as file:
-            file.write(f"{header}\n")
-            file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
-        draft.replace(path)
-    except OSError as error:
-        raise RecordError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
-    finally:
-        with suppress(OSError):
-            draft.unlink()
+    with all_or_nothing(path, RecordError) as file:
+        file.write(f"{header}\n")
+        file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
 
 
 def _displacement_columns(table: CsvTable) -> tuple[str, ...]:

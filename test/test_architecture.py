@@ -21,7 +21,7 @@ LAYERS = (
     {"model", "model_file", "schemas", "stream"},
     {"effects"},
     {"hysteresis"},
-    {"errors"},
+    {"errors", "files"},
 )
 
 # The simulated stage stands beside the layers: it knows nothing of the compensator, and only these know it.

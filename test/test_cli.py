@@ -162,7 +162,7 @@ def existing_bag(folder, tmp_path):
 
 
 def unwritable_model(folder, tmp_path):
-    return ("identify", folder / "bag", "-o", tmp_path / "no" / "m.json", "--kind", "pi"), 1, "cannot write"
+    return ("identify", folder / "bag", "-o", tmp_path / "no" / "m.json", "--kind", "pi"), 1, "cannot be written"
 
 
 def two_bags(folder, tmp_path):

@@ -3,7 +3,6 @@
 import base64
 import html
 import io
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from slpi_ros.errors import SlpiError
+from slpi_ros.files import all_or_nothing
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1b2733; background: #fff; }
@@ -83,13 +83,12 @@ class Page:
             f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>'
             f"<body><h1>{title}</h1>{''.join(self._parts)}</body></html>"
         )
-        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            partial.write_text(document, encoding="utf-8")
-            os.replace(partial, path)
         except OSError as error:
-            raise SlpiError(f"{path}: cannot write the page: {error.strerror}; choose another place") from None
+            raise SlpiError(f"{path.parent}: cannot make the folder: {error.strerror}; choose another place") from None
+        with all_or_nothing(path) as file:
+            file.write(document)
 
 
 def png(figure: Figure) -> bytes:

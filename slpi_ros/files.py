@@ -1,0 +1,45 @@
+"""Writing files: all of it or nothing."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TextIO
+
+from slpi_ros.errors import SlpiError
+
+
+@contextmanager
+def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = SlpiError) -> Iterator[TextIO]:
+    """Open a text file to write, which appears under its name when the block has ended without an error.
+
+    Parameters
+    ----------
+    path : path-like
+        Where; a file of the same name is replaced.
+    failure : type
+        What to raise.
+
+    Yields
+    ------
+    file
+        UTF-8.
+
+    Raises
+    ------
+    SlpiError
+        Of the type `failure`, if the file cannot be written.
+    """
+    target = Path(path)
+    draft = target.parent / f".{target.name}.{os.getpid()}.partial"
+    try:
+        with draft.open("w", encoding="utf-8") as file:
+            yield file
+        os.replace(draft, target)
+    except (OSError, ValueError) as error:
+        # A name that no file can have, such as one with a NUL, is a ValueError.
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise failure(f"{path}: cannot be written: {reason}; choose another place") from None
+    finally:
+        with suppress(OSError, ValueError):
+            draft.unlink(missing_ok=True)

@@ -35,6 +35,7 @@ setup(
         "osqp>=1.0,<2",
         "rosbags>=0.11",
         "scipy>=1.11",
+        "threadpoolctl>=3.1",
     ],
     extras_require={
         "test": [

@@ -7,13 +7,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
 from slpi_ros import bags, tables
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import ModelError, SlpiError, UsageError
 from slpi_ros.identification.fit import KINDS, identify
 from slpi_ros.identification.record import FloatArray
 from slpi_ros.model import StageModel, check_time, held_message
@@ -32,6 +33,10 @@ class _Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code."""
     options = _parser().parse_args(arguments)
+    for output in (sys.stdout, sys.stderr):
+        # A terminal that cannot show a character gets its number.
+        if isinstance(output, TextIOWrapper):
+            output.reconfigure(errors="backslashreplace")
     try:
         options.run(options)
     except SlpiError as error:
@@ -115,6 +120,9 @@ def _import(options: argparse.Namespace) -> None:
 def _identify(options: argparse.Namespace) -> None:
     if len(options.bags) > 1:
         raise UsageError(f"{len(options.bags)} bags given; this version fits one bag at a time")
+    target = Path(options.output)
+    if target.is_dir() or not target.parent.is_dir():
+        raise ModelError(f"{target}: cannot be written: no file can be there; choose another place")
     record = bags.read_bag(options.bags[0], options.topic, axes=options.axis)
     model = identify(record, options.kind, start=options.start, stop=options.stop)
     save_model(model, options.output)

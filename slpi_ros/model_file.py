@@ -14,6 +14,8 @@ from slpi_ros.model import AxisModel, FitQuality, StageModel, Start
 from slpi_ros.schemas import validate
 
 SCHEMA = "slpi_ros/model/1"
+# Characters; a model of many axes has a few hundred thousand.
+LONGEST = 50_000_000
 
 
 def load_model(path: str | os.PathLike[str]) -> StageModel:
@@ -33,10 +35,13 @@ def load_model(path: str | os.PathLike[str]) -> StageModel:
         If there is no such file, or it is not a valid model document of this version.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        with Path(path).open(encoding="utf-8") as file:
+            text = file.read(LONGEST + 1)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not text, or the name is no file's"
         raise ModelError(f"{path}: cannot read a model: {reason}; give a file written by 'slpi identify'") from None
+    if len(text) > LONGEST:
+        raise ModelError(f"{path}: longer than any model document; give a file written by 'slpi identify'")
     return parse_model(text, str(path))
 
 
@@ -89,6 +94,7 @@ def format_model(model: StageModel) -> str:
         "created": model.created,
         "axes": {name: _axis_document(axis) for name, axis in model.axes.items()},
     }
+    validate(document, "model", "the new model")
     return json.dumps(document, allow_nan=False)
 
 

@@ -35,7 +35,7 @@ class Limits:
         if lower > upper:
             raise UsageError(
                 f"the model was identified from {voltage_range[0]:g} to {voltage_range[1]:g} V, outside the voltage "
-                f" limits {self.lower:g}..{self.upper:g} V; identify it again within them, or correct the limits"
+                f"limits {self.lower:g}..{self.upper:g} V; identify it again within them, or correct the limits"
             )
         return Limits(lower, upper, self.slew)
 

@@ -101,6 +101,7 @@ def test_text_that_is_no_document(text):
         ("quality", "maximum_m"),
         ("quality", "held_out_rms_m"),
         ("quality", "floor_rms_m"),
+        ("quality", "samples"),
         ("quality", "covered"),
         ("hysteresis", "grid_V", 0),
         ("hysteresis", "grid_V", 2),

@@ -6,8 +6,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
 from slpi_ros.identification.qp import solve_free, solve_qp
 from slpi_ros.identification.record import Record
@@ -29,6 +30,8 @@ FOLDS, BLOCKS_OF_FOLD = 5, 8
 # Errors beyond this many (robust) standard deviations count linearly, not squared (Huber).
 HUBER = 1.5
 REWEIGHTINGS = 3
+# A model that leaves more than this share of the displacement's rms unexplained is none.
+SENSELESS = 0.5
 # Keeps the equations definite where neither record nor roughness says anything.
 RIDGE = 1e-9
 
@@ -67,11 +70,15 @@ def identify(
     """
     if kind not in KINDS:
         raise UsageError(f"unknown kind '{kind}'; this version identifies {', '.join(KINDS)}")
+    if not (-np.inf if start is None else start) < (np.inf if stop is None else stop):
+        raise UsageError(f"start {start} s is not before stop {stop} s; give seconds from the first stamp, in order")
     models = {}
     for axis in axes or record.axes:
         samples = select_samples(record, axis, start, stop)
         try:
-            models[axis] = _identify_axis(samples, kind, record.source)
+            # The matrices are small: more threads than one only stand in each other's way.
+            with threadpool_limits(1):
+                models[axis] = _identify_axis(samples, kind, record.source)
         except SlpiError as error:
             raise type(error)(f"{record.source}: axis '{axis}': {error}") from None
     return StageModel(models, record.hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))
@@ -130,18 +137,31 @@ class _Problem:
             problem = replace(self, weights=weights)
         return problem
 
-    def held_out(self, smoothness: Sequence[float]) -> FloatArray:
-        """Return the rms error (m) on blocks left out of the fit, one for each smoothness.
+    def folds(self) -> list[NDArray[np.int64]]:
+        """Return the samples that are left out together: blocks spread over the record.
 
         The first rise is never left out: a record shows it once, and no other part can predict it.
         """
-        matrix, vector = self.design.normal_equations(self.y, self.weights)
         candidates = np.flatnonzero((self.weights > 0) & ~self.design.walk.first_rise)
         blocks = np.array_split(candidates, FOLDS * BLOCKS_OF_FOLD)
+        return [np.concatenate(blocks[fold::FOLDS]) for fold in range(FOLDS)]
+
+    def held_out(self, smoothness: float) -> float:
+        """Return the rms error (m) on blocks left out of the fit: every sample counts alike, and every branch rises."""
+        errors = []
+        for chosen in self.folds():
+            weights = self.weights.copy()
+            weights[chosen] = 0.0
+            part = replace(self, weights=weights)
+            errors.append((self.design.predict(part.solve(smoothness)) - self.y)[chosen])
+        return float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) * self.scale
+
+    def scores(self, smoothness: Sequence[float]) -> FloatArray:
+        """Return the robust rms error (m) on blocks left out, one for each smoothness; quick, so branches may fall."""
+        matrix, vector = self.design.normal_equations(self.y, self.weights)
         squares, total = np.zeros(len(smoothness)), 0.0
-        for fold in range(FOLDS):
+        for chosen in self.folds():
             left_out = np.zeros_like(self.weights)
-            chosen = np.concatenate(blocks[fold::FOLDS])
             left_out[chosen] = self.weights[chosen]
             fold_matrix, fold_vector = self.design.normal_equations(self.y, left_out)
             energy, total = float(left_out @ self.y**2), total + float(left_out.sum())
@@ -159,14 +179,17 @@ def _identify_axis(samples: Samples, kind: str, source: str) -> AxisModel:
     for basis in _bases(samples, kind):
         problem = _pose(samples, basis).reweighted()
         smoothness = SMOOTHNESS if kind == "slpi" else SMOOTHNESS[:1]
-        scores = problem.held_out(smoothness)
+        scores = problem.scores(smoothness)
         k = int(np.argmin(scores))
         if best is None or scores[k] < best[0]:
             best = float(scores[k]), smoothness[k], problem
     assert best is not None
-    held_out, chosen, problem = best
+    _, chosen, problem = best
     x = problem.solve(chosen)
     errors = problem.errors(x)
+    held_out = problem.held_out(chosen)
+    covered = problem.basis.covered(problem.design.local[samples.fitted])
+    _require_sense(samples, held_out, covered)
     fitted_y = samples.y[samples.fitted]
     at_start = problem.design.predict(x)[len(history)] * problem.scale
     return AxisModel(
@@ -181,10 +204,22 @@ def _identify_axis(samples: Samples, kind: str, source: str) -> AxisModel:
             held_out_rms=held_out,
             floor_rms=_noise(errors),
             samples=problem.count,
-            covered=problem.basis.covered(problem.design.local[samples.fitted]),
+            covered=covered,
             source=source,
         ),
     )
+
+
+def _require_sense(samples: Samples, held_out: float, covered: float) -> None:
+    """Refuse a model that says nothing."""
+    if covered == 0.0:
+        raise IdentificationError("the voltage never turns back; drive it up and down over the range to be used")
+    spread = float(np.std(samples.y[samples.fitted]))
+    if held_out > SENSELESS * spread:
+        raise IdentificationError(
+            f"the voltage does not explain the displacement: error {held_out * 1e9:.4g} nm rms on blocks left out, of "
+            f"{spread * 1e9:.4g} nm rms in all; check that both signals belong to this axis, and their clocks"
+        )
 
 
 def _noise(errors: FloatArray) -> float:

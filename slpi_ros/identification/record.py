@@ -49,6 +49,8 @@ class Record:
                 f"{sorted(self.displacement)}; each axis needs both"
             )
         for axis in self.voltage:
+            if not axis or not axis.isprintable():
+                raise RecordError(f"{self.source}: {axis!r} is no name of an axis; give it a printable one")
             for name, signal in (("voltage", self.voltage[axis]), ("displacement", self.displacement[axis])):
                 if signal.shape != self.time_ns.shape:
                     raise RecordError(

@@ -101,9 +101,15 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
         raise RecordError(
             f"{where}: {count} usable samples of {len(record)} between start and stop; at least {FEWEST} are needed"
         )
-    for name, unit, signal in (("voltage", "V", v[fitted]), ("displacement", "m", y[fitted])):
-        if np.ptp(signal) <= 1e-9 * np.max(np.abs(signal)):
+    for name, unit, most, signal in (("voltage", "V", 1e4, v), ("displacement", "m", 1.0, y[fitted])):
+        largest = np.max(np.abs(signal))
+        if largest > most:
+            raise RecordError(f"{where}: {name} of {largest:g} {unit} is none of a stage; check the unit")
+    for name, unit, least, signal in (("voltage", "V", 1e-6, v[fitted]), ("displacement", "m", 1e-12, y[fitted])):
+        if np.ptp(signal) < least or np.ptp(signal) <= 1e-9 * np.max(np.abs(signal)):
             raise RecordError(
                 f"{where}: {name} stays at {signal[0]:g} {unit}; record a drive over the range to be used"
             )
+    if np.corrcoef(v[fitted], y[fitted])[0, 1] < 0:
+        raise RecordError(f"{where}: displacement falls where voltage rises; change the sign of one of them")
     return Samples(v, np.where(fitted, y, 0.0), fitted)

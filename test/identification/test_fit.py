@@ -5,7 +5,7 @@ import pytest
 from identification.records import calibration, record_of, rms, stage
 
 import slpi_ros
-from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii
 from slpi_ros.stage.drive import scan_path
@@ -154,3 +154,38 @@ def test_axes_of_different_length_are_refused():
         slpi_ros.Record(np.arange(5), {"x": np.zeros(4)}, {"x": np.zeros(5)})
     with pytest.raises(RecordError, match="each axis needs both"):
         slpi_ros.Record(np.arange(5), {"x": np.zeros(5)}, {"y": np.zeros(5)})
+
+
+def test_a_wrong_sign_and_noise_are_told(recorded):
+    record, _ = recorded
+    with pytest.raises(RecordError, match="displacement falls where voltage rises"):
+        slpi_ros.identify(spoil(record, y=lambda y: -y))
+    noise = np.random.default_rng(1).normal(0, 1e-6, len(record)) + 1e-9 * record.voltage["x"]
+    with pytest.raises(IdentificationError, match="does not explain"):
+        slpi_ros.identify(spoil(record, y=lambda y: noise))
+
+
+def test_a_mere_ramp_is_told():
+    t = np.linspace(0, 10, 500)
+    with pytest.raises(IdentificationError, match="never turns back"):
+        slpi_ros.identify(record_of(t, 10 * t, 2e-6 * t))
+
+
+@pytest.mark.parametrize(("key", "factor", "what"), [("v", 1e6, "voltage of"), ("y", 1e6, "displacement of")])
+def test_wrong_units_are_told(recorded, key, factor, what):
+    with pytest.raises(RecordError, match=f"{what}.*check the unit"):
+        slpi_ros.identify(spoil(recorded[0], **{key: lambda signal: signal * factor}))
+
+
+def test_the_window_must_be_in_order(recorded):
+    with pytest.raises(UsageError, match="not before stop"):
+        slpi_ros.identify(recorded[0], start=3.0, stop=2.0)
+
+
+def test_outliers_count_in_the_held_out_error(recorded):
+    record, _ = recorded
+    y = record.displacement["x"].copy()
+    spikes = np.random.default_rng(2).random(y.size) < 0.02
+    y[spikes] += 1e-6
+    quality = slpi_ros.identify(record_of(record.t, record.voltage["x"], y), "slpi").axes["x"].quality
+    assert quality.held_out_rms == pytest.approx(1e-6 * np.sqrt(0.02), rel=0.2)

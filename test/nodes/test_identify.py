@@ -137,7 +137,7 @@ def test_a_failing_bag_is_reported_and_the_last_good_model_stays(bag, tmp_path):
         assert client.set(bags=[bag], topic="other") == ""
         client.failed("other")
         assert client.set(topic="stage_state", output=str(tmp_path / "no" / "folder.json")) == ""
-        client.failed("cannot write the model")
+        client.failed("cannot be written")
         # That a file cannot be written does not keep the model from those who listen.
         document = client.identified()
         assert client.set(bags=["/nowhere"]) == ""

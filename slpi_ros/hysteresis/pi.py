@@ -71,9 +71,9 @@ class PrandtlIshlinskii:
     def inverse(self) -> "PrandtlIshlinskii":
         """Return the analytic inverse, a PI model from displacement (m) to voltage (V).
 
-        ``r'_i = sum_{j<=i} w_j (r_i - r_j)``, ``w'_1 = 1 / w_1``, ``w'_i = -w_i / (W_{i-1} W_i)`` with
-        ``W_i`` the sum of the
-        first i weights (Eq. 12, the linear weight being that of threshold 0).
+        ``r'_i = sum_{j<=i} w_j (r_i - r_j)``, ``w'_1 = 1 / w_1`` and ``w'_i = -w_i / (W_{i-1} W_i)``, where ``W_i`` is
+        the sum of the first i weights (Eq. 12, the linear weight being that of threshold 0). It serves a virgin memory;
+        for a primed one use `Memory.inverse`.
 
         Raises
         ------

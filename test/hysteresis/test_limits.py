@@ -38,7 +38,7 @@ def test_voltage_stays_within_limits_and_the_memory_follows_it(drawn):
         v = memory.inverse(y, lower, upper)
         assert lower <= v <= upper
         assert memory.voltage == v
-        if memory.displacement == y:
+        if abs(memory.displacement - y) < 1e-9 * case.height:
             continue
         # Held: as near as the limits allow.
         assert v == (upper if y > memory.displacement else lower)

@@ -86,6 +86,8 @@ class Memory(TurningPoints):
         s, u_knots, f_knots = self._direction, self._u, self._f
         f = s * (y - self._y0)
         i = bisect_right(f_knots, f, 1)
+        if i == len(f_knots):
+            raise UsageError(f"displacement {y} m is none that this model can take; leave such samples out")
         u_a, f_a = u_knots[i - 1], f_knots[i - 1]
         v = self._v0 + s * (u_a + (f - f_a) * ((u_knots[i] - u_a) / (f_knots[i] - f_a)))
         if lower <= v <= upper:

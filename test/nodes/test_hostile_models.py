@@ -1,6 +1,7 @@
 """Model documents with wrong values in them: refused with a message, or harmless."""
 
 import copy
+import copy
 import json
 from collections.abc import Iterator
 from typing import Any
@@ -54,7 +55,7 @@ def spoilt(draw: st.DrawFn) -> str:
         if isinstance(value, int | float) and abs(value) < 1e300 and draw(st.booleans()):
             inside[last] = value * draw(st.sampled_from(FACTORS))
         else:
-            inside[last] = draw(st.sampled_from(WRONG))
+            inside[last] = copy.deepcopy(draw(st.sampled_from(WRONG)))
     return json.dumps(document)
 
 

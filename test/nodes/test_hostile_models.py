@@ -1,7 +1,6 @@
 """Model documents with wrong values in them: refused with a message, or harmless."""
 
 import copy
-import copy
 import json
 from collections.abc import Iterator
 from typing import Any

@@ -13,7 +13,7 @@ from slpi_ros.errors import RecordError, SlpiError, UnreachableError, UsageError
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.runs import require_finite
-from slpi_ros.stream import ROUNDING, TOLERATED_SHARE, AxisStream, Limits, refusal
+from slpi_ros.stream import ROUNDING, AxisStream, Limits, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]
 Signal = ArrayLike | Mapping[str, ArrayLike]
@@ -122,11 +122,11 @@ class AxisModel:
         """
         require_finite(y)
         low, high = self.displacement_range
-        margin = TOLERATED_SHARE * (high - low)
-        far = (y < low - margin) | (y > high + margin)
+        accepted = accepted_range(self.displacement_range)
+        far = (y < accepted[0]) | (y > accepted[1])
         if far.any():
             at = int(np.argmax(far))
-            raise UnreachableError(f"sample {at}: {refusal(float(y[at]), (low - margin, high + margin))}")
+            raise UnreachableError(f"sample {at}: {refusal(float(y[at]), accepted)}")
         stream = self.stream(limits)
         lower, upper = stream.limits.lower, stream.limits.upper
         v = stream.memory.inverse_array(y, lower, upper)

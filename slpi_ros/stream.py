@@ -56,14 +56,12 @@ class AxisStream:
     def __init__(self, memory: Memory, displacement_range: tuple[float, float], limits: Limits) -> None:
         self.memory = memory
         self.limits = limits
-        low, high = displacement_range
-        margin = TOLERATED_SHARE * (high - low)
-        self._accepted = (low - margin, high + margin)
+        self._accepted = accepted_range(displacement_range)
         self._t = -inf
         # The axis may rest outside its limits; the first voltage it is given is inside.
         memory.forward(min(max(memory.voltage, limits.lower), limits.upper))
         self._wish = memory.displacement
-        self._rounding = ROUNDING * (high - low)
+        self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
 
     @property
     def voltage(self) -> float:
@@ -115,6 +113,13 @@ class AxisStream:
         """Whether the last wish could not be met: the voltage waits at one of its limits."""
         at_limit = self.memory.voltage in (self.limits.lower, self.limits.upper)
         return at_limit and abs(self.memory.displacement - self._wish) > self._rounding
+
+
+def accepted_range(displacement_range: tuple[float, float]) -> tuple[float, float]:
+    """Return the smallest and largest displacement (m) that may be wished for, given the identified ones (m)."""
+    low, high = displacement_range
+    margin = TOLERATED_SHARE * (high - low)
+    return low - margin, high + margin
 
 
 def refusal(y: float, accepted: tuple[float, float]) -> str:

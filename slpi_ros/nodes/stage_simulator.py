@@ -7,15 +7,14 @@ from collections.abc import Sequence
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from slpi_ros.errors import UsageError
+from slpi_ros.nodes.qos import COMMANDS
 from slpi_ros.nodes.runner import run
 from slpi_ros.stage.stage import Stage
 
-QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 LOG_PERIOD = 5.0
 RATE_MAX = 10e3
 _READ_ONLY = ParameterDescriptor(read_only=True)
@@ -55,10 +54,10 @@ class StageSimulator(Node):
         self._answers = bool(self.declare_parameter("answer_commands", True, _READ_ONLY).value)
         rate = self._rate()
         self._apply([self._clip(0.0)] * len(axes))
-        self._publisher = self.create_publisher(JointState, "stage_state", QOS)
+        self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
         if not self._answers:
             self.create_timer(1.0 / rate, self._publish)
-        self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, QOS)
+        self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, COMMANDS)
 
     def _on_command(self, command: Float64MultiArray) -> None:
         voltages = command.data

@@ -5,8 +5,10 @@ Exit codes: 0 done, 1 the data do not allow it, 2 wrong usage; what is wrong is 
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
@@ -37,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A terminal that cannot show a character gets its number.
         if isinstance(output, TextIOWrapper):
             output.reconfigure(errors="backslashreplace")
+    warnings.showwarning = partial(_show_warning, options.command)
     try:
         options.run(options)
     except SlpiError as error:
@@ -48,6 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return 0
+
+
+def _show_warning(command: str, message: Warning | str, *_: object) -> None:
+    print(f"slpi {command}: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _one_line(error: BaseException) -> str:
@@ -77,6 +84,11 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a lone mcap or sqlite3 file")
     command.add_argument("-o", "--output", metavar="MODEL.json", required=True)
     command.add_argument("--kind", choices=KINDS, default="slpi")
+    command.add_argument(
+        "--loops-at-rest",
+        action="store_true",
+        help="slpi-published: operators start at rest, as published",
+    )
     command.add_argument("--topic", default="stage_state")
     command.add_argument("--axis", metavar="NAME", nargs="+", help="default: every axis of the bag")
     command.add_argument("--start", metavar="S", type=float, help="fit only from here on, seconds from the first stamp")
@@ -124,7 +136,7 @@ def _identify(options: argparse.Namespace) -> None:
     if target.is_dir() or not target.parent.is_dir():
         raise ModelError(f"{target}: cannot be written: no file can be there; choose another place")
     record = bags.read_bag(options.bags[0], options.topic, axes=options.axis)
-    model = identify(record, options.kind, start=options.start, stop=options.stop)
+    model = identify(record, options.kind, start=options.start, stop=options.stop, loops_at_rest=options.loops_at_rest)
     save_model(model, options.output)
     if options.report:
         # Plotting is slow to load, and most commands do without.

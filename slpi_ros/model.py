@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.errors import RecordError, SlpiError, UnreachableError, UsageError
-from slpi_ros.hysteresis.kinds import Hysteresis
+from slpi_ros.hysteresis import slpi, smpi
+from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.runs import require_finite
 from slpi_ros.stream import ROUNDING, AxisStream, Limits, accepted_range, refusal
@@ -88,9 +89,25 @@ class AxisModel:
     displacement_range: tuple[float, float]
     quality: FitQuality
 
+    @property
+    def causal(self) -> bool:
+        """Whether the model can follow a path that is not known in advance."""
+        return not isinstance(self.hysteresis, PathModel)
+
     def memory(self) -> Memory:
-        """Return a fresh memory at the start."""
+        """Return a fresh memory at the start.
+
+        Raises
+        ------
+        UsageError
+            If the model is not causal.
+        """
         start = self.start
+        if isinstance(self.hysteresis, PathModel):
+            raise UsageError(
+                f"kind '{self.kind}' needs the whole path in advance and cannot follow it sample by sample; "
+                "give it a whole path, or identify kind 'slpi'"
+            )
         if not start.history:
             return Memory(self.hysteresis, start.voltage, start.displacement)
         first, *turns = (*start.history, start.voltage)
@@ -108,7 +125,13 @@ class AxisModel:
 
     def simulate(self, v: FloatArray) -> FloatArray:
         """Return the displacement, shape (N,), metres, for the voltage `v`, shape (N,), volts."""
-        return self.memory().forward_array(v)
+        return (self._known_path() or self.memory()).forward_array(v)
+
+    def _known_path(self) -> slpi.KnownPath | smpi.KnownPath | None:
+        """Return what moves a model that is not causal along whole paths."""
+        if isinstance(self.hysteresis, PathModel):
+            return self.hysteresis.along(self.start.voltage, self.start.displacement)
+        return None
 
     def compensate(self, y: FloatArray, limits: Limits | None = None) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return the voltage for a desired displacement `y`, shape (N,), metres, and where it waits at a limit.
@@ -127,13 +150,13 @@ class AxisModel:
         if far.any():
             at = int(np.argmax(far))
             raise UnreachableError(f"sample {at}: {refusal(float(y[at]), accepted)}")
-        stream = self.stream(limits)
-        lower, upper = stream.limits.lower, stream.limits.upper
-        v = stream.memory.inverse_array(y, lower, upper)
+        allowed = (limits or Limits(-inf, inf)).within(self.voltage_range)
+        lower, upper = allowed.lower, allowed.upper
+        v = (self._known_path() or self.stream(limits).memory).inverse_array(y, lower, upper)
         held = (v <= lower) | (v >= upper)
         if held.any():
             # At a limit a wish may just be met.
-            missed = self.stream(limits).memory.forward_array(v) - y
+            missed = (self._known_path() or self.stream(limits).memory).forward_array(v) - y
             held &= np.abs(missed) > ROUNDING * (high - low)
         return v, held
 

@@ -18,10 +18,10 @@ LAYERS = (
     {"diagnosis"},
     {"bags", "bag_files", "csv_table", "joint_state", "tables"},
     {"identification"},
-    {"model", "model_file", "schemas", "stream"},
+    {"control", "model", "model_file", "schemas", "stream"},
     {"effects"},
     {"hysteresis"},
-    {"errors", "files"},
+    {"errors", "files", "metrics"},
 )
 
 # The simulated stage stands beside the layers: it knows nothing of the compensator, and only these know it.

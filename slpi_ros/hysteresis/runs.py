@@ -42,3 +42,35 @@ def count_before(x: FloatArray, direction: int, bound: float) -> int:
     if direction > 0:
         return int(np.searchsorted(x, bound, side="left"))
     return x.size - int(np.searchsorted(x[::-1], bound, side="right"))
+
+
+def without_small_reversals(x: FloatArray, dead_band: float) -> FloatArray:
+    """Return `x`, shape (N,), with every reversal of at most `dead_band` flattened; larger turns keep their values."""
+    if not dead_band > 0.0:
+        return x
+    extremes = _large_turns(x, dead_band)
+    flattened = np.full_like(x, x[extremes[0]])
+    for start, stop in pairwise(extremes):
+        accumulate = np.maximum.accumulate if x[stop] >= x[start] else np.minimum.accumulate
+        flattened[start : stop + 1] = accumulate(x[start : stop + 1])
+    flattened[extremes[-1] :] = x[extremes[-1]]
+    return flattened
+
+
+def _large_turns(x: FloatArray, dead_band: float) -> list[int]:
+    """Return the samples between which `x` moves by more than `dead_band`, alternately up and down."""
+    lowest = highest = 0
+    extremes: list[int] = []
+    way = 0
+    for turn in [0, *(stop - 1 for _, stop in monotone_runs(x))]:
+        if x[turn] < x[lowest]:
+            lowest = turn
+        if x[turn] > x[highest]:
+            highest = turn
+        if way <= 0 and x[turn] - x[lowest] > dead_band:
+            extremes.append(lowest)
+            way, highest = 1, turn
+        elif way >= 0 and x[highest] - x[turn] > dead_band:
+            extremes.append(highest)
+            way, lowest = -1, turn
+    return [*extremes, highest if way > 0 else lowest if way < 0 else 0]

@@ -12,9 +12,18 @@ FloatArray = NDArray[np.float64]
 
 # A constraint may be missed by this much, in units of the scaled problem; the least gain is far above it.
 TOLERANCE = 1e-7
+# The solver's own habit.
+CHECKED_EVERY = 25
 
 
-def solve_qp(matrix: FloatArray, vector: FloatArray, constraints: sp.csr_array, bound: FloatArray) -> FloatArray:
+def solve_qp(
+    matrix: FloatArray,
+    vector: FloatArray,
+    constraints: sp.csr_array,
+    bound: FloatArray,
+    *,
+    least_iterations: int = CHECKED_EVERY,
+) -> FloatArray:
     """Minimise ``x' M x / 2 - b' x`` subject to ``C x >= bound``.
 
     Parameters
@@ -26,6 +35,8 @@ def solve_qp(matrix: FloatArray, vector: FloatArray, constraints: sp.csr_array, 
     constraints : sparse array, shape (m, p)
         C.
     bound : ndarray, shape (m,)
+    least_iterations : int
+        The solver does not stop before; convergence is checked each time so many have been done.
 
     Returns
     -------
@@ -43,6 +54,7 @@ def solve_qp(matrix: FloatArray, vector: FloatArray, constraints: sp.csr_array, 
     solver.setup(
         sp.csc_matrix(np.triu(matrix)), -vector, sp.csc_matrix(constraints), bound, np.full(bound.size, np.inf),
         verbose=False, eps_abs=TOLERANCE, eps_rel=TOLERANCE, max_iter=50_000, polishing=True,
+        check_termination=least_iterations,
     )  # fmt: skip
     solver.warm_start(x=free)
     result = solver.solve(raise_error=False)

@@ -1,6 +1,9 @@
 """What a model holds, in words."""
 
-from slpi_ros.hysteresis.kinds import DESCRIPTIONS
+from slpi_ros.hysteresis.family import LoopFamily
+from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
+from slpi_ros.hysteresis.slpi import SeparatedLoops
+from slpi_ros.hysteresis.smpi import AmplitudeScaled
 from slpi_ros.model import AxisModel, StageModel
 
 
@@ -17,12 +20,10 @@ def describe_axis(axis: AxisModel) -> list[str]:
     """Return lines that say what one axis holds."""
     quality, start = axis.quality, axis.start
     (v_low, v_high), (y_low, y_high) = axis.voltage_range, axis.displacement_range
-    size = len(getattr(axis.hysteresis, "grid", getattr(axis.hysteresis, "weights", ())))
-    parts = "loop vertices" if axis.kind == "slpi" else "play operators"
     began = "a memory taken for wiped" if start.history else "rest"
     stroke = y_high - y_low
     return [
-        f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {size} {parts}",
+        f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {_parts(axis.hysteresis)}",
         f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} um "
         f"({quality.covered:.0%} of the model seen)",
         f"memory starts where the record did: {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um",
@@ -33,3 +34,18 @@ def describe_axis(axis: AxisModel) -> list[str]:
         f"from {quality.samples} samples of {quality.source}",
         "effects: none",
     ]
+
+
+def _parts(model: Hysteresis) -> str:
+    """Say what a model is made of."""
+    match model:
+        case LoopFamily():
+            return f"{model.grid.size} loop vertices"
+        case SeparatedLoops():
+            levels = max(loop.level for loop in model.loops)
+            closing = "that close" if any(loop.run_in is not None for loop in model.loops) else "at rest"
+            return f"{len(model.loops)} loops {closing}, up to level {levels}"
+        case AmplitudeScaled():
+            return f"{model.base.weights.size} play operators, peaks at {model.peak_voltages.size} amplitudes"
+        case _:
+            return f"{model.weights.size} play operators"

@@ -28,8 +28,30 @@ def test_documents_keep_every_bit(shape):
     assert to_document(again) == document
 
 
-def test_every_kind_is_described():
-    assert set(DESCRIPTIONS) == {"pi", "slpi"}
+PLAYS = {"thresholds_V": [0.0, 5.0, 20.0], "weights_m_per_V": [1e-7, 2e-8, 0.0]}
+LOOP = {
+    "level": 0, "direction": 1, "vertex_V": 0.0, "vertex_m": 1e-7, "span_V": 100.0, "span_m": 2e-5,
+    "offset_V": 0.5, "offset_m": 1e-7, "run_in_V": None, **PLAYS,
+}  # fmt: skip
+SLOPES = {"origin_V": -5.0, "amplitude_V": 120.0, **PLAYS}
+DOCUMENTS = {
+    "slpi": FAMILY,
+    "slpi-published": {"loops": [LOOP, {**LOOP, "level": 1, "direction": -1, "run_in_V": 0.0}]},
+    "pi": PLAYS,
+    "mpi": SLOPES,
+    "smpi": {**SLOPES, "peak_voltages_V": [20.0, 120.0], "peak_displacements_m": [1e-6, 8e-6]},
+}
+
+
+@pytest.mark.parametrize("kind", DESCRIPTIONS)
+def test_document_of_every_kind_comes_back(kind):
+    assert to_document(from_document(kind, DOCUMENTS[kind])) == DOCUMENTS[kind]
+
+
+def test_published_loops_that_contradict_themselves():
+    for change in ({"direction": 0}, {"span_V": 0.0}, {"run_in_V": -1.0}, {"weights_m_per_V": [0.0, 1e-7, 0.0]}):
+        with pytest.raises(ModelError, match="loop 1"):
+            from_document("slpi-published", {"loops": [LOOP, {**LOOP, **change}]})
 
 
 def test_whole_numbers_are_numbers():
@@ -82,5 +104,5 @@ def test_huge_whole_numbers_in_a_pi_model(huge):
 
 
 def test_unknown_kind():
-    with pytest.raises(ModelError, match="unknown kind 'bouc-wen'.*slpi, pi"):
+    with pytest.raises(ModelError, match="unknown kind 'bouc-wen'.*slpi, slpi-published, pi"):
         from_document("bouc-wen", {})

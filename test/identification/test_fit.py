@@ -6,8 +6,10 @@ from identification.records import calibration, record_of, rms, stage
 
 import slpi_ros
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
+from slpi_ros.hysteresis.kinds import DESCRIPTIONS
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.identification.fit import KINDS
 from slpi_ros.stage.drive import scan_path
 
 
@@ -189,3 +191,7 @@ def test_outliers_count_in_the_held_out_error(recorded):
     y[spikes] += 1e-6
     quality = slpi_ros.identify(record_of(record.t, record.voltage["x"], y), "slpi").axes["x"].quality
     assert quality.held_out_rms == pytest.approx(1e-6 * np.sqrt(0.02), rel=0.2)
+
+
+def test_every_kind_of_model_can_be_identified():
+    assert tuple(DESCRIPTIONS) == KINDS

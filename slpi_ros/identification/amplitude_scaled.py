@@ -1,0 +1,74 @@
+"""The SMPI model: the multi-slope model of the largest cycles of a record, and the line of all cycles' peaks."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.errors import IdentificationError
+from slpi_ros.hysteresis.mpi import MultiSlope
+from slpi_ros.hysteresis.smpi import BACK, AmplitudeScaled, cycles
+from slpi_ros.identification.fitted import Fitted
+from slpi_ros.identification.multi_slope import SAME_AMPLITUDE, MultiSlopeBasis, peak_line
+from slpi_ros.identification.problem import FIRST_SMOOTHNESS, Problem, held_out_rms
+from slpi_ros.identification.samples import FEWEST, Samples
+from slpi_ros.model import Start
+
+FloatArray = NDArray[np.float64]
+
+
+def fit_amplitude_scaled(samples: Samples) -> Fitted:
+    """Fit the SMPI model.
+
+    Raises
+    ------
+    IdentificationError
+        If too few samples belong to cycles of the largest amplitude.
+    """
+    largest = in_largest_cycles(samples.v)
+    count = int(np.count_nonzero(samples.fitted & largest))
+    if count < FEWEST:
+        raise IdentificationError(
+            f"{count} samples in cycles up to the highest voltage; at least {FEWEST} are needed: "
+            "drive from the lowest voltage to the highest and back"
+        )
+
+    def predict(kept: NDArray[np.bool_]) -> FloatArray:
+        model, offset = _fit(samples, kept, largest)
+        return model.along(float(samples.v[0]), offset).forward_array(samples.v)
+
+    model, offset = _fit(samples, samples.fitted, largest)
+    y = model.along(float(samples.v[0]), offset).forward_array(samples.v)
+    problem = Problem.pose(samples.only(largest), MultiSlopeBasis.over(*_ends(samples)))
+    return Fitted(
+        hysteresis=model,
+        start=Start(float(samples.v[0]), offset),
+        samples=samples,
+        errors=(y - samples.y)[samples.fitted],
+        held_out_rms=held_out_rms(samples, samples.fitted, predict),
+        covered=problem.basis.covered(problem.design.local[problem.weights > 0]),
+    )
+
+
+def in_largest_cycles(v: FloatArray) -> NDArray[np.bool_]:
+    """Return which samples belong to a cycle that reaches the highest voltage of a record, shape (N,)."""
+    low, high = float(v.min()), float(v.max())
+    chosen = np.zeros(v.size, dtype=bool)
+    for first, last in cycles(v, low + BACK * (high - low)):
+        chosen[first : last + 1] |= v[first : last + 1].max() >= high - SAME_AMPLITUDE * (high - low)
+    return chosen
+
+
+def _ends(samples: Samples) -> tuple[float, float]:
+    return float(samples.v.min()), float(samples.v.max())
+
+
+def _fit(samples: Samples, kept: NDArray[np.bool_], largest: NDArray[np.bool_]) -> tuple[AmplitudeScaled, float]:
+    """Return the model fitted to the samples `kept`, and the displacement at the start (m)."""
+    part = Samples(samples.v, samples.y, kept & largest, samples.primed)
+    problem = Problem.pose(part, MultiSlopeBasis.over(*_ends(samples))).reweighted()
+    x = problem.solve(FIRST_SMOOTHNESS) * problem.scale
+    base = problem.basis.shape(x, problem.gain)
+    assert isinstance(base, MultiSlope)
+    model = AmplitudeScaled(base, *peak_line(samples.v, np.where(kept, samples.y, np.nan)))
+    # Displacement at the start: the largest cycles alone say little about it.
+    relative = model.along(float(samples.v[0]), 0.0).forward_array(samples.v)
+    return model, float(np.median((samples.y - relative)[kept]))

@@ -1,0 +1,38 @@
+"""What every fit hands back."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.hysteresis.kinds import Hysteresis
+from slpi_ros.identification.samples import Samples
+from slpi_ros.model import Start
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted hysteresis model.
+
+    Parameters
+    ----------
+    hysteresis : Hysteresis
+    start : Start
+    samples : Samples
+        Those it was fitted to.
+    errors : ndarray, shape (number fitted,), metres
+        Model minus measurement, free-run, on the samples fitted.
+    held_out_rms : float, metres
+        Error on blocks left out of the fit.
+    covered : float
+        Share of the model that the samples determine, 0..1.
+    """
+
+    hysteresis: Hysteresis
+    start: Start
+    samples: Samples
+    errors: FloatArray
+    held_out_rms: float
+    covered: float

@@ -1,0 +1,76 @@
+"""The kinds that are linear in their parameters: one convex fit, as smooth and fine as held-out blocks say."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
+from slpi_ros.identification.fitted import Fitted
+from slpi_ros.identification.multi_slope import MultiSlopeBasis
+from slpi_ros.identification.problem import Problem
+from slpi_ros.identification.samples import Samples
+from slpi_ros.identification.start import choose_start
+from slpi_ros.model import Start
+
+FloatArray = NDArray[np.float64]
+
+# Vertices of the loop family's grid, and weights of its roughness, that cross-validation chooses from.
+VERTICES = (21, 31, 41)
+SMOOTHNESS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+PLAY_OPERATORS = 30
+
+
+def fit_family(samples: Samples) -> Fitted:
+    """Fit the loop family."""
+    low, high = float(samples.v.min()), float(samples.v.max())
+    return fit_linear(samples, [SurfaceBasis(np.linspace(low, high, n)) for n in VERTICES], SMOOTHNESS)
+
+
+def fit_plays(samples: Samples) -> Fitted:
+    """Fit the classical PI model."""
+    half_range = float(np.ptp(samples.v)) / 2
+    return fit_linear(samples, [PlayBasis(np.linspace(0.0, half_range, PLAY_OPERATORS, endpoint=False))])
+
+
+def fit_linear(samples: Samples, bases: Sequence[Basis], smoothness: Sequence[float] = SMOOTHNESS[:1]) -> Fitted:
+    """Fit the basis, with the roughness weight, that predicts blocks left out best.
+
+    Parameters
+    ----------
+    samples : Samples
+    bases : sequence of Basis
+        Those that compete, the simplest one first.
+    smoothness : sequence of float
+        Roughness weights that compete.
+
+    Raises
+    ------
+    IdentificationError
+        If the samples do not determine the model.
+    """
+    samples, history = choose_start(samples, lambda candidate: Problem.pose(candidate, bases[0]))
+    best: tuple[float, float, Problem] | None = None
+    for basis in bases:
+        problem = Problem.pose(samples, basis).reweighted()
+        scores = problem.scores(smoothness)
+        k = int(np.argmin(scores))
+        if best is None or scores[k] < best[0]:
+            best = float(scores[k]), smoothness[k], problem
+    assert best is not None
+    _, chosen, problem = best
+    x = problem.solve(chosen)
+    at_start = problem.design.predict(x)[len(history)] * problem.scale
+    return Fitted(
+        hysteresis=problem.basis.shape(x * problem.scale, problem.gain),
+        start=Start(float(samples.v[len(history)]), float(at_start), history),
+        samples=samples,
+        errors=problem.errors(x),
+        held_out_rms=problem.held_out(chosen),
+        covered=problem.basis.covered(problem.design.local[samples.fitted]),
+    )
+
+
+def fit_multi_slope(samples: Samples) -> Fitted:
+    """Fit the MPI model of the amplitude that the record covers."""
+    return fit_linear(samples, [MultiSlopeBasis.over(float(samples.v.min()), float(samples.v.max()))])

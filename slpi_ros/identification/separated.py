@@ -1,0 +1,207 @@
+"""The published SLPI model: a classical PI model for each separated loop, each by its own quadratic program."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from slpi_ros.errors import IdentificationError
+from slpi_ros.hysteresis.loops import Loop, separate
+from slpi_ros.hysteresis.pi import PrandtlIshlinskii, play
+from slpi_ros.hysteresis.slpi import SeparatedLoops, SingleLoop, UnidentifiedLoopWarning, at_vertex
+from slpi_ros.identification.bases import LEAST_GAIN
+from slpi_ros.identification.fitted import Fitted
+from slpi_ros.identification.problem import RIDGE, held_out_rms
+from slpi_ros.identification.qp import solve_qp
+from slpi_ros.identification.samples import Samples
+from slpi_ros.model import Start
+
+FloatArray = NDArray[np.float64]
+
+OPERATORS = 10
+# Spacing of the thresholds (V), where it suits the outer loop: 10 to 40 of it in the span.
+SPACING = 5.0
+# A loop needs this many samples of its own; shorter ones are left to the nearest loop that is identified.
+FEWEST_OF_LOOP = 4
+
+
+def fit_primed(samples: Samples) -> Fitted:
+    """Fit loops that close: those of level 1 and more are primed; the outer one too where the record returns to it."""
+    return _fit(samples, at_rest=False)
+
+
+def fit_at_rest(samples: Samples) -> Fitted:
+    """Fit loops whose play operators start at rest, as published."""
+    return _fit(samples, at_rest=True)
+
+
+def default_thresholds(span: float) -> FloatArray:
+    """Return the paper's thresholds 0, 5, ..., 45 V (Tables 2 to 5), shape (10,), volts.
+
+    They are made for an outer loop of 100 V. Where its `span` (V) is below 50 or above 200, they are 0, 5, ..., 45 % of
+    it.
+    """
+    spacing = SPACING if 10 <= span / SPACING <= 40 else span / 20
+    return spacing * np.arange(OPERATORS, dtype=np.float64)
+
+
+def least_iterations(samples: int, all_samples: int) -> int:
+    """Return the least number of iterations of the quadratic program of a loop of `samples`, Eq. 9, rounded up."""
+    return int(np.ceil(10.0 * np.sqrt(4.0 * samples / all_samples + 1.0)))
+
+
+def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
+    def predict(kept: NDArray[np.bool_]) -> FloatArray:
+        return _predict(*fit_loops(samples, kept, at_rest=at_rest), samples.v)
+
+    loops, offset = fit_loops(samples, samples.fitted, at_rest=at_rest)
+    # The first rise is never left out: a record shows it once.
+    after_first_rise = np.arange(samples.v.size) > int(np.argmax(samples.v))
+    return Fitted(
+        hysteresis=loops,
+        start=Start(float(samples.v[0]), offset),
+        samples=samples,
+        errors=(_predict(loops, offset, samples.v) - samples.y)[samples.fitted],
+        held_out_rms=held_out_rms(samples, samples.fitted & after_first_rise, predict),
+        covered=len(loops.loops) / len(separate(samples.v).loops),
+    )
+
+
+def _predict(loops: SeparatedLoops, offset: float, v: FloatArray) -> FloatArray:
+    with warnings.catch_warnings():
+        # Loops too short to be identified are no news here.
+        warnings.simplefilter("ignore", UnidentifiedLoopWarning)
+        return loops.along(float(v[0]), offset).forward_array(v)
+
+
+def fit_loops(
+    samples: Samples, fitted: NDArray[np.bool_], *, at_rest: bool, thresholds: FloatArray | None = None
+) -> tuple[SeparatedLoops, float]:
+    """Fit a PI model to each separated loop of a record.
+
+    Parameters
+    ----------
+    samples : Samples
+    fitted : ndarray of bool, shape (N,)
+        Samples whose displacement counts.
+    at_rest : bool
+        As published; else primed.
+    thresholds : ndarray, shape (n,), volts, optional
+        Of every loop; see `default_thresholds`.
+
+    Returns
+    -------
+    SeparatedLoops
+    float, metres
+        Displacement at rest.
+
+    Raises
+    ------
+    IdentificationError
+        If the outer loop has too few samples.
+    """
+    separation = separate(samples.v)
+    if thresholds is None:
+        thresholds = default_thresholds(float(np.ptp(samples.v[separation.loops[0].samples])))
+    identified: dict[int, SingleLoop] = {}
+    below = _owners(separation.loops, samples.v.size)
+    for number, loop in enumerate(separation.loops):
+        count = int(np.count_nonzero(fitted[loop.samples]))
+        if count < FEWEST_OF_LOOP:
+            if not loop.level:
+                raise IdentificationError(
+                    f"the outer loop has {count} usable samples; record a rise to the highest voltage and the way back"
+                )
+            continue
+        single = _SingleLoopFit(loop, samples, fitted, thresholds)
+        fits = [single.solve(run_in) for run_in in _run_ins(loop.level, thresholds, at_rest)]
+        best = min(fits, key=lambda fit: fit.rms)
+        identified[number] = single.loop(best, identified.get(below[loop.vertex]) if loop.level else None)
+    return SeparatedLoops(tuple(identified.values())), identified[0].vertex[1]
+
+
+def _owners(loops: tuple[Loop, ...], count: int) -> NDArray[np.int64]:
+    """Return the number of the loop that each sample belongs to, shape (count,)."""
+    owners = np.zeros(count, dtype=np.int64)
+    for number, loop in enumerate(loops):
+        owners[loop.samples] = number
+    return owners
+
+
+def _run_ins(level: int, thresholds: FloatArray, at_rest: bool) -> list[float | None]:
+    """Return the states in which the operators of a loop may start; see `SingleLoop`."""
+    if at_rest:
+        return [None]
+    return [0.0] if level else [*thresholds.tolist(), None]
+
+
+class _Solution(NamedTuple):
+    """Weights (m/V), displacement at the vertex above the measured one (m, in the loop's direction), error (m)."""
+
+    weights: FloatArray
+    start: float
+    run_in: float | None
+    rms: float
+
+
+class _SingleLoopFit:
+    """The quadratic program of one loop, in the loop's own coordinates."""
+
+    def __init__(self, loop: Loop, samples: Samples, fitted: NDArray[np.bool_], thresholds: FloatArray) -> None:
+        self._loop, self._thresholds = loop, thresholds
+        path = loop.path
+        self._v = loop.direction * (samples.v[path] - samples.v[loop.vertex])
+        self._vertex = float(samples.v[loop.vertex]), float(samples.y[loop.vertex])
+        # The vertex is where it was measured; only where it was not, it is found.
+        self._vertex_known = bool(fitted[loop.vertex])
+        self._used = fitted[path]
+        self._y = (loop.direction * (samples.y[path] - self._vertex[1]))[self._used]
+        self._all_samples = samples.v.size
+
+    def solve(self, run_in: float | None) -> _Solution:
+        """Minimise the squared error; no weight is negative, and that of threshold 0 is positive."""
+        plays = [at_vertex(play(r), run_in).forward_array(self._v)[self._used] for r in self._thresholds.tolist()]
+        design = np.column_stack(plays if self._vertex_known else [*plays, np.ones(self._y.size)])
+        scale = float(np.ptp(self._y)) or 1.0
+        matrix = design.T @ design
+        matrix[np.diag_indices_from(matrix)] += RIDGE * float(np.trace(matrix))
+        bound = np.zeros(self._thresholds.size)
+        bound[0] = LEAST_GAIN / float(np.ptp(self._v))
+        x = scale * solve_qp(
+            matrix,
+            design.T @ self._y / scale,
+            sp.csr_array(sp.eye_array(bound.size, matrix.shape[0])),
+            bound,
+            least_iterations=least_iterations(self._v.size, self._all_samples),
+        )
+        weights = np.maximum(x[: bound.size], 0.0)
+        rms = float(np.sqrt(np.mean((design @ x - self._y) ** 2)))
+        return _Solution(weights, 0.0 if self._vertex_known else float(x[-1]), run_in, rms)
+
+    def loop(self, solution: _Solution, below: SingleLoop | None) -> SingleLoop:
+        """Return the loop with a solution's weights, on the loop `below`."""
+        loop = self._loop
+        vertex = self._vertex[0], self._vertex[1] + loop.direction * solution.start
+        return SingleLoop(
+            level=loop.level,
+            direction=loop.direction,
+            vertex=vertex,
+            span=(float(np.max(self._v)), float(np.max(np.abs(self._y - solution.start)))),
+            offset=_offset(vertex, loop.direction, below) if below else (0.0, 0.0),
+            model=PrandtlIshlinskii(self._thresholds, solution.weights),
+            run_in=solution.run_in,
+        )
+
+
+def _offset(vertex: tuple[float, float], direction: int, below: SingleLoop) -> tuple[float, float]:
+    """Return how far a vertex (V, m) lies from where the model of the loop `below` leads (V, m)."""
+    v, y = (below.direction * (vertex[k] - below.vertex[k]) for k in (0, 1))
+    by_voltage, by_displacement = below.memory(), below.memory()
+    if direction == below.direction:
+        # The vertex lies on the way back.
+        by_voltage.forward(below.span[0])
+        by_displacement.inverse(below.span[1])
+    missed = v - by_displacement.inverse(y), y - by_voltage.forward(v)
+    return below.direction * missed[0], below.direction * missed[1]

@@ -64,7 +64,7 @@ def _ends(samples: Samples) -> tuple[float, float]:
 def _fit(samples: Samples, kept: NDArray[np.bool_], largest: NDArray[np.bool_]) -> tuple[AmplitudeScaled, float]:
     """Return the model fitted to the samples `kept`, and the displacement at the start (m)."""
     part = Samples(samples.v, samples.y, kept & largest, samples.primed)
-    problem = Problem.pose(part, MultiSlopeBasis.over(*_ends(samples))).reweighted()
+    problem = Problem.pose(part, MultiSlopeBasis.over(*_ends(samples)))
     x = problem.solve(FIRST_SMOOTHNESS) * problem.scale
     base = problem.basis.shape(x, problem.gain)
     assert isinstance(base, MultiSlope)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
 from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.multi_slope import MultiSlopeBasis
-from slpi_ros.identification.problem import Problem
+from slpi_ros.identification.problem import FIRST_SMOOTHNESS, Problem
 from slpi_ros.identification.samples import Samples
 from slpi_ros.identification.start import choose_start
 from slpi_ros.model import Start
@@ -59,18 +59,23 @@ def fit_linear(samples: Samples, bases: Sequence[Basis], smoothness: Sequence[fl
             best = float(scores[k]), smoothness[k], problem
     assert best is not None
     _, chosen, problem = best
-    x = problem.solve(chosen)
+    return _solved(samples, problem, chosen, history)
+
+
+def fit_multi_slope(samples: Samples) -> Fitted:
+    """Fit the MPI model of the amplitude that the record covers, from rest, by plain least squares as published."""
+    problem = Problem.pose(samples, MultiSlopeBasis.over(float(samples.v.min()), float(samples.v.max())))
+    return _solved(samples, problem, FIRST_SMOOTHNESS, ())
+
+
+def _solved(samples: Samples, problem: Problem, smoothness: float, history: tuple[float, ...]) -> Fitted:
+    x = problem.solve(smoothness)
     at_start = problem.design.predict(x)[len(history)] * problem.scale
     return Fitted(
         hysteresis=problem.basis.shape(x * problem.scale, problem.gain),
         start=Start(float(samples.v[len(history)]), float(at_start), history),
         samples=samples,
         errors=problem.errors(x),
-        held_out_rms=problem.held_out(chosen),
+        held_out_rms=problem.held_out(smoothness),
         covered=problem.basis.covered(problem.design.local[samples.fitted]),
     )
-
-
-def fit_multi_slope(samples: Samples) -> Fitted:
-    """Fit the MPI model of the amplitude that the record covers."""
-    return fit_linear(samples, [MultiSlopeBasis.over(float(samples.v.min()), float(samples.v.max()))])

@@ -50,11 +50,11 @@ def solve_qp(
     free = solve_free(matrix, vector)
     if np.all(constraints @ free >= bound):
         return free
+    # Without the polishing step: it gains nothing at this tolerance, and writes on standard output.
     solver = osqp.OSQP()
     solver.setup(
         sp.csc_matrix(np.triu(matrix)), -vector, sp.csc_matrix(constraints), bound, np.full(bound.size, np.inf),
-        verbose=False, eps_abs=TOLERANCE, eps_rel=TOLERANCE, max_iter=50_000, polishing=True,
-        check_termination=least_iterations,
+        verbose=False, eps_abs=TOLERANCE, eps_rel=TOLERANCE, max_iter=50_000, check_termination=least_iterations,
     )  # fmt: skip
     solver.warm_start(x=free)
     result = solver.solve(raise_error=False)

@@ -1,0 +1,1 @@
+"""The two papers' tables and figures, computed anew on simulated and measured stages."""

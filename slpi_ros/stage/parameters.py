@@ -42,6 +42,24 @@ class StageParameters:
         Step of the sensor's digits; 0 for none.
     offset : float, metres
         What the sensor reads at rest.
+    exponent : float
+        Of the power-law material (see PowerLawMaterial), whose loops of every amplitude look alike: peaks grow as
+        voltage to this power. 0 for the exponential material, which `width_scale`, `width_growth`, `bias_slope`,
+        `bias_bow` and `curvature` describe; they mean nothing to the other one.
+    origin : float, volts
+        From where the power law counts voltages.
+    width_exponent : float
+        How much rarer wide relays are than narrow ones in the power law.
+    creep_gain : float
+        Creep in one decade of time, as a share of the displacement; 0 for none.
+    creep_shortest, creep_longest : float, seconds
+        Shortest and longest time constant of creep.
+    resonance_frequency : float, hertz
+        Of the flexure mode; 0 for none.
+    resonance_damping : float
+        Damping ratio of the flexure mode.
+    amplifier_lag : float, seconds
+        Time constant of the amplifier; 0 for none. The relays see the lagged voltage.
 
     Raises
     ------
@@ -64,6 +82,15 @@ class StageParameters:
     noise_rms: float = 8e-9
     quantisation: float = 1e-9
     offset: float = 0.0
+    exponent: float = 0.0
+    origin: float = 0.0
+    width_exponent: float = 1.0
+    creep_gain: float = 0.0
+    creep_shortest: float = 1e-3
+    creep_longest: float = 100.0
+    resonance_frequency: float = 0.0
+    resonance_damping: float = 0.04
+    amplifier_lag: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what is no stage."""
@@ -84,9 +111,23 @@ class StageParameters:
             ("stiffening", abs(self.stiffening) <= 0.1, "from -0.1 to 0.1"),
             ("noise_rms", self.noise_rms >= 0, "0 m or more"),
             ("quantisation", self.quantisation >= 0, "0 m or more"),
+            ("exponent", self.exponent == 0 or 1 <= self.exponent <= 1.5, "from 1 to 1.5, or 0 for none"),
+            ("origin", self.threshold_min <= self.origin <= 0, "from threshold_min to 0 V"),
+            ("width_exponent", 1 <= self.width_exponent <= 10, "from 1 to 10"),
+            ("creep_gain", 0 <= self.creep_gain <= 0.2, "from 0 to 0.2 for one decade"),
+            ("creep_shortest", self.creep_shortest > 0, "more than 0 s"),
+            ("creep_longest", self.creep_longest > self.creep_shortest, "more than creep_shortest"),
+            ("resonance_frequency", self.resonance_frequency >= 0, "0 Hz or more"),
+            ("resonance_damping", 0 < self.resonance_damping < 1, "between 0 and 1"),
+            ("amplifier_lag", self.amplifier_lag >= 0, "0 s or more"),
         ):
             if not holds:
                 raise UsageError(f"stage: {name} is {getattr(self, name)}; it must be {need}")
+
+    @property
+    def has_dynamics(self) -> bool:
+        """Whether the displacement depends on time and not only on the order of the voltages."""
+        return bool(self.creep_gain or self.resonance_frequency or self.amplifier_lag)
 
     @classmethod
     def random(cls, seed: int) -> "StageParameters":

@@ -1,9 +1,11 @@
-"""One axis of a simulated piezo stage: Preisach relays, a reversible curve, a flexure and a sensor."""
+"""One axis of a simulated piezo stage: amplifier, Preisach relays, a reversible curve, creep, a flexure, a sensor."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import UsageError
+from slpi_ros.stage.density import material
+from slpi_ros.stage.dynamics import Dynamics
 from slpi_ros.stage.figures import measure_loop
 from slpi_ros.stage.parameters import StageParameters
 from slpi_ros.stage.relays import RelayTriangle
@@ -16,6 +18,8 @@ FloatArray = NDArray[np.float64]
 
 class PreisachStage:
     """A stage whose displacement is a relay sum plus a reversible curve of the voltage, behind a flexure.
+
+    Where its parameters say so, the voltage passes a slow amplifier first, and the displacement creeps and rings.
 
     Parameters
     ----------
@@ -38,9 +42,10 @@ class PreisachStage:
     def __init__(self, parameters: StageParameters | None = None, seed: int = 0) -> None:
         self.parameters = parameters = parameters or StageParameters()
         low, high = parameters.threshold_min, parameters.threshold_max
-        self._centre, self._half_range = (low + high) / 2, (high - low) / 2
+        self._material = material(parameters)
+        self._dynamics = Dynamics(parameters) if parameters.has_dynamics else None
         self._sensor = Sensor(parameters.noise_rms, parameters.quantisation, seed)
-        self._relays = RelayTriangle(low, high, parameters.levels, self._density)
+        self._relays = RelayTriangle(low, high, parameters.levels, self._material.density)
         self._reversible_gain = self._share_stroke()
         self._zero = 0.0
         self._bottom = measure_loop(self._unbowed, 0.0, parameters.nominal_voltage).bottom
@@ -48,9 +53,11 @@ class PreisachStage:
         self._zero = self._displacement() - parameters.offset
 
     def rest(self) -> None:
-        """Forget the past: all relays down at the lowest voltage, then 0 V."""
+        """Forget the past and the time: all relays down at the lowest voltage, then 0 V for long."""
         self._relays.all_down()
         self._relays.step(0.0)
+        if self._dynamics:
+            self._dynamics.rest()
 
     def step(self, t: float, v: float) -> float:
         """Apply one voltage.
@@ -58,7 +65,8 @@ class PreisachStage:
         Parameters
         ----------
         t : float, seconds
-            When. The stage is rate independent; dynamics added to it will need the time.
+            When. Without dynamics it means nothing. With them, voltage and displacement are taken as linear since
+            the last call; no time passes before the first one after rest.
         v : float, volts
             Within the threshold range.
 
@@ -70,8 +78,10 @@ class PreisachStage:
         Raises
         ------
         UsageError
-            If `v` is not a number within the threshold range.
+            If `v` is not a number within the threshold range or, with dynamics, `t` goes back.
         """
+        if self._dynamics:
+            return self._step_in_time(self._dynamics, t, v)
         self._relays.step(v)
         return self._displacement()
 
@@ -99,7 +109,8 @@ class PreisachStage:
         Raises
         ------
         UsageError
-            If the lengths differ or a voltage is not a number within the threshold range.
+            If the lengths differ, a voltage is not a number within the threshold range or, with dynamics, a time goes
+            back.
         """
         if t.shape != v.shape:
             raise UsageError(f"stage: {t.shape} times for {v.shape} voltages; give one time for each voltage")
@@ -107,28 +118,26 @@ class PreisachStage:
         y_true = np.array([self.step(*sample) for sample in samples], dtype=np.float64)
         return y_true, self._sensor.read(y_true)
 
+    def _step_in_time(self, dynamics: Dynamics, t: float, v: float) -> float:
+        self._relays.check(v)
+        duration = dynamics.advance(t)
+        lagged = dynamics.amplify(duration, v)
+        # Rounding must not carry the lagged voltage over the last threshold.
+        self._relays.step(min(max(lagged, self.parameters.threshold_min), self.parameters.threshold_max))
+        offset = self.parameters.offset
+        return offset + dynamics.follow(duration, self._displacement() - offset)
+
     def _displacement(self) -> float:
         force = self._sum() - self._bottom
         bow = 4.0 * self.parameters.stiffening * force * (1.0 - force / self.parameters.stroke)
         return self._bottom + force + bow - self._zero
 
     def _sum(self) -> float:
-        return self._relays.output + self._reversible_gain * self._reversible(self._relays.voltage)
+        return self._relays.output + self._reversible_gain * self._material.reversible(self._relays.voltage)
 
     def _unbowed(self, voltage: float) -> float:
         self._relays.step(voltage)
         return self._sum()
-
-    def _density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
-        # The fall with width changes with bias too: a mere product of the two would be too easy a stage.
-        b = (bias - self._centre) / self._half_range
-        scale = self.parameters.width_scale * (1 + self.parameters.width_growth * b)
-        density = np.exp(self.parameters.bias_slope * b + self.parameters.bias_bow * b**2 - width / scale)
-        return np.asarray(density, dtype=np.float64)
-
-    def _reversible(self, voltage: float) -> float:
-        x = (voltage - self._centre) / self._half_range
-        return x + self.parameters.curvature * x**3
 
     def _share_stroke(self) -> float:
         """Weight the relays for the wanted hysteresis; return the gain that gives the other part the rest."""
@@ -141,4 +150,4 @@ class PreisachStage:
                 f"give at most {relays.hysteresis:.3f}; lower it or raise width_scale"
             )
         self._relays.scale(share * wanted.stroke / relays.stroke)
-        return (1 - share) * wanted.stroke / (self._reversible(nominal) - self._reversible(0.0))
+        return (1 - share) * wanted.stroke / (self._material.reversible(nominal) - self._material.reversible(0.0))

@@ -68,6 +68,11 @@ class RelayTriangle:
         """Share of relays up in each bundle, shape (levels, levels), 0 where there is none; a copy."""
         return np.tril(self._state)
 
+    def check(self, voltage: float) -> None:
+        """Refuse a voltage (V) that is not a number between the lowest and the highest threshold: UsageError."""
+        if not self._low <= voltage <= self._high:
+            raise UsageError(f"stage: {voltage} V is not within {self._low} to {self._high} V; clip it")
+
     def step(self, voltage: float) -> float:
         """Apply a voltage and switch the relays it passes.
 
@@ -86,8 +91,7 @@ class RelayTriangle:
         UsageError
             If the voltage is not a number between the lowest and the highest threshold.
         """
-        if not self._low <= voltage <= self._high:
-            raise UsageError(f"stage: {voltage} V is not within {self._low} to {self._high} V; clip it")
+        self.check(voltage)
         position = (voltage - self._low) / self._spacing
         if position > self._position:
             self._rise(position)

@@ -21,6 +21,9 @@ FloatArray = NDArray[np.float64]
 # A loop of a path counts as identified when level and direction are the same, and vertex and span within this share
 # of the outer loop's span: a path of displacements turns at slightly other places than the path of voltages did.
 SAME_LOOP = 0.2
+# How far away a loop of another level, or of the other direction, is (share of the outer loop's span). More for two
+# levels than for one would be wrong: how levels count depends on how a record is cut.
+OTHER = 0.5
 
 
 class UnidentifiedLoopWarning(UserWarning):
@@ -119,7 +122,7 @@ class SeparatedLoops:
         Parameters
         ----------
         level, direction : int
-            One level, or the other direction, weighs as much as the outer loop's span.
+            Another level, and the other direction, weigh as much as half the outer loop's span each.
         vertex, span : float
             In volts (`coordinate` 0) or metres (1).
         coordinate : int
@@ -129,7 +132,7 @@ class SeparatedLoops:
 
         def distance(loop: SingleLoop) -> float:
             apart = abs(loop.vertex[coordinate] - vertex) + abs(loop.span[coordinate] - span)
-            return abs(loop.level - level) + (loop.direction != direction) + apart / scale
+            return OTHER * ((loop.level != level) + (loop.direction != direction)) + apart / scale
 
         return min(self.loops, key=distance)
 

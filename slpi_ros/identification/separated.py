@@ -25,6 +25,8 @@ OPERATORS = 10
 SPACING = 5.0
 # A loop needs this many samples of its own; shorter ones are left to the nearest loop that is identified.
 FEWEST_OF_LOOP = 4
+# The same goes for an inner loop of which less than this share is to be fitted: the rest would be a guess.
+LEAST_SHARE = 0.4
 
 
 def fit_primed(samples: Samples) -> Fitted:
@@ -109,7 +111,8 @@ def fit_loops(
     below = _owners(separation.loops, samples.v.size)
     for number, loop in enumerate(separation.loops):
         count = int(np.count_nonzero(fitted[loop.samples]))
-        if count < FEWEST_OF_LOOP:
+        seen = LEAST_SHARE * loop.samples.size if loop.level else 0
+        if count < max(FEWEST_OF_LOOP, seen):
             if not loop.level:
                 raise IdentificationError(
                     f"the outer loop has {count} usable samples; record a rise to the highest voltage and the way back"
@@ -137,8 +140,19 @@ def _run_ins(level: int, thresholds: FloatArray, at_rest: bool) -> list[float | 
     return [0.0] if level else [*thresholds.tolist(), None]
 
 
-class _Solution(NamedTuple):
-    """Weights (m/V), displacement at the vertex above the measured one (m, in the loop's direction), error (m)."""
+class Plays(NamedTuple):
+    """Play operators fitted to one loop.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (n,), metres per volt
+    start : float, metres
+        Displacement at the vertex.
+    run_in : float or None, volts
+        As in `SingleLoop`.
+    rms : float, metres
+        Error of the fit.
+    """
 
     weights: FloatArray
     start: float
@@ -146,41 +160,75 @@ class _Solution(NamedTuple):
     rms: float
 
 
+def fit_plays(
+    drive: FloatArray,
+    y: FloatArray,
+    used: NDArray[np.bool_],
+    thresholds: FloatArray,
+    run_in: float | None,
+    *,
+    through_zero: bool,
+    iterations: int,
+) -> Plays:
+    """Fit a PI model (Eq. 8) by a quadratic program: least squares, no weight negative, the first one positive.
+
+    Parameters
+    ----------
+    drive : ndarray, shape (m,), volts
+        From 0 on.
+    y : ndarray, shape (m,), metres
+    used : ndarray of bool, shape (m,)
+        Samples whose displacement counts.
+    thresholds : ndarray, shape (n,), volts
+    run_in : float or None, volts
+        As in `SingleLoop`.
+    through_zero : bool
+        Whether the displacement is 0 at the start; else that is found too.
+    iterations : int
+        At least so many; see `least_iterations`.
+    """
+    plays = [at_vertex(play(r), run_in).forward_array(drive)[used] for r in thresholds.tolist()]
+    design = np.column_stack(plays if through_zero else [*plays, np.ones(np.count_nonzero(used))])
+    scale = float(np.ptp(y[used])) or 1.0
+    matrix = design.T @ design
+    matrix[np.diag_indices_from(matrix)] += RIDGE * float(np.trace(matrix))
+    bound = np.zeros(thresholds.size)
+    bound[0] = LEAST_GAIN / float(np.ptp(drive))
+    not_negative = sp.csr_array(sp.eye_array(bound.size, matrix.shape[0]))
+    vector = design.T @ y[used] / scale
+    x = scale * solve_qp(matrix, vector, not_negative, bound, least_iterations=iterations)
+    weights = np.maximum(x[: bound.size], 0.0)
+    rms = float(np.sqrt(np.mean((design @ x - y[used]) ** 2)))
+    return Plays(weights, 0.0 if through_zero else float(x[-1]), run_in, rms)
+
+
 class _SingleLoopFit:
-    """The quadratic program of one loop, in the loop's own coordinates."""
+    """One loop in its own coordinates."""
 
     def __init__(self, loop: Loop, samples: Samples, fitted: NDArray[np.bool_], thresholds: FloatArray) -> None:
         self._loop, self._thresholds = loop, thresholds
         path = loop.path
         self._v = loop.direction * (samples.v[path] - samples.v[loop.vertex])
         self._vertex = float(samples.v[loop.vertex]), float(samples.y[loop.vertex])
+        self._y = loop.direction * (samples.y[path] - self._vertex[1])
+        self._used = fitted[path]
         # The vertex is where it was measured; only where it was not, it is found.
         self._vertex_known = bool(fitted[loop.vertex])
-        self._used = fitted[path]
-        self._y = (loop.direction * (samples.y[path] - self._vertex[1]))[self._used]
-        self._all_samples = samples.v.size
+        self._iterations = least_iterations(self._v.size, samples.v.size)
 
-    def solve(self, run_in: float | None) -> _Solution:
-        """Minimise the squared error; no weight is negative, and that of threshold 0 is positive."""
-        plays = [at_vertex(play(r), run_in).forward_array(self._v)[self._used] for r in self._thresholds.tolist()]
-        design = np.column_stack(plays if self._vertex_known else [*plays, np.ones(self._y.size)])
-        scale = float(np.ptp(self._y)) or 1.0
-        matrix = design.T @ design
-        matrix[np.diag_indices_from(matrix)] += RIDGE * float(np.trace(matrix))
-        bound = np.zeros(self._thresholds.size)
-        bound[0] = LEAST_GAIN / float(np.ptp(self._v))
-        x = scale * solve_qp(
-            matrix,
-            design.T @ self._y / scale,
-            sp.csr_array(sp.eye_array(bound.size, matrix.shape[0])),
-            bound,
-            least_iterations=least_iterations(self._v.size, self._all_samples),
+    def solve(self, run_in: float | None) -> Plays:
+        """Fit the loop's operators, which start as `run_in` says."""
+        return fit_plays(
+            self._v,
+            self._y,
+            self._used,
+            self._thresholds,
+            run_in,
+            through_zero=self._vertex_known,
+            iterations=self._iterations,
         )
-        weights = np.maximum(x[: bound.size], 0.0)
-        rms = float(np.sqrt(np.mean((design @ x - self._y) ** 2)))
-        return _Solution(weights, 0.0 if self._vertex_known else float(x[-1]), run_in, rms)
 
-    def loop(self, solution: _Solution, below: SingleLoop | None) -> SingleLoop:
+    def loop(self, solution: Plays, below: SingleLoop | None) -> SingleLoop:
         """Return the loop with a solution's weights, on the loop `below`."""
         loop = self._loop
         vertex = self._vertex[0], self._vertex[1] + loop.direction * solution.start
@@ -188,7 +236,7 @@ class _SingleLoopFit:
             level=loop.level,
             direction=loop.direction,
             vertex=vertex,
-            span=(float(np.max(self._v)), float(np.max(np.abs(self._y - solution.start)))),
+            span=(float(np.max(self._v)), float(np.max(np.abs(self._y[self._used] - solution.start)))),
             offset=_offset(vertex, loop.direction, below) if below else (0.0, 0.0),
             model=PrandtlIshlinskii(self._thresholds, solution.weights),
             run_in=solution.run_in,

@@ -3,7 +3,7 @@
 import base64
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +16,11 @@ _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1b2733; background: #fff; }
 body { max-width: 1040px; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.7rem; margin-bottom: .2rem; }
-h2 { font-size: 1.2rem; margin-top: 2rem; }
+h2 { font-size: 1.3rem; margin-top: 2.2rem; }
+h3 { font-size: 1.1rem; margin-top: 2.2rem; border-top: 1px solid #d5dde5; padding-top: .8rem; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1rem; margin: .6rem 0; }
+dt { color: #51606e; }
+dd { margin: 0; }
 table { border-collapse: collapse; margin: 1rem 0; }
 th, td { padding: .35rem .9rem; text-align: right; border-bottom: 1px solid #d5dde5; }
 th { background: #f2f5f8; }
@@ -44,9 +48,18 @@ class Page:
         """Add a heading."""
         self._parts.append(f"<h2>{html.escape(text)}</h2>")
 
+    def section(self, text: str) -> None:
+        """Add a heading below a heading."""
+        self._parts.append(f"<h3>{html.escape(text)}</h3>")
+
     def text(self, text: str) -> None:
         """Add a paragraph."""
         self._parts.append(f"<p>{html.escape(text)}</p>")
+
+    def definitions(self, texts: Mapping[str, str]) -> None:
+        """Add terms, each with what it is."""
+        items = (f"<dt>{html.escape(term)}</dt><dd>{html.escape(text)}</dd>" for term, text in texts.items())
+        self._parts.append(f"<dl>{''.join(items)}</dl>")
 
     def lines(self, lines: Sequence[str]) -> None:
         """Add a list of short lines."""

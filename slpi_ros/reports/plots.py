@@ -48,56 +48,58 @@ def loops(v: FloatArray, y: FloatArray, simulated: FloatArray) -> Figure:
     v : ndarray, shape (N,), volts
     y, simulated : ndarray, shape (N,), metres
     """
-    figure, (left, right) = _panels(1, 2, (11, 4.6))
+    figure, (left, right) = panels(1, 2, (11, 4.6))
     left.plot(v, y * 1e6, ".", color=MEASURED, markersize=2.5, label="measured")
     left.plot(v, simulated * 1e6, color=COLOURS[2], linewidth=0.8, label="model")
-    _label(left, "voltage (V)", "displacement (µm)")
+    label(left, "voltage (V)", "displacement (µm)")
     left.legend(frameon=False)
     right.plot(v, (simulated - y) * 1e9, ".", color=COLOURS[2], markersize=2)
-    _label(right, "voltage (V)", "model less measured (nm)")
+    label(right, "voltage (V)", "model less measured (nm)")
     return figure
 
 
 def residual(t: FloatArray, error: FloatArray) -> Figure:
     """Draw an error, shape (N,), metres, over time, shape (N,), seconds, and its histogram."""
-    figure, (left, right) = _panels(1, 2, (11, 3.2), width_ratios=(3, 1))
+    figure, (left, right) = panels(1, 2, (11, 3.2), width_ratios=(3, 1))
     left.plot(t, error * 1e9, color=COLOURS[2], linewidth=0.6)
-    _label(left, "time (s)", "model less measured (nm)")
+    label(left, "time (s)", "model less measured (nm)")
     right.hist(error[np.isfinite(error)] * 1e9, bins=60, orientation="horizontal", color=COLOURS[2])
-    _label(right, "samples", "")
+    label(right, "samples", "")
     return figure
 
 
 def tracking(runs: Mapping[str, Run]) -> Figure:
     """Draw what was desired and what each way of driving made of it, and the errors below."""
-    figure, (upper, lower) = _panels(2, 1, (11, 6.4), height_ratios=(3, 2), sharex=True)
+    figure, (upper, lower) = panels(2, 1, (11, 6.4), height_ratios=(3, 2), sharex=True)
     for colour, run in zip(COLOURS, runs.values(), strict=False):
         upper.plot(run.t, run.displacement * 1e6, color=colour, linewidth=1.1, label=run.name)
         lower.plot(run.t, run.error * 1e6, color=colour, linewidth=0.9, label=run.name)
     first = next(iter(runs.values()))
     upper.plot(first.t, first.desired * 1e6, color=DESIRED, linewidth=0.9, linestyle=(0, (4, 3)), label="desired")
-    _label(upper, "", "displacement (µm)")
+    label(upper, "", "displacement (µm)")
     upper.legend(frameon=False, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    _label(lower, "time (s)", "error (µm)")
+    label(lower, "time (s)", "error (µm)")
     return figure
 
 
 def linearity(runs: Mapping[str, Run]) -> Figure:
     """Draw achieved over desired displacement, one panel for each way of driving: a straight line is the aim."""
-    figure, panels = _panels(1, len(runs), (11, 3.9), sharex=True, sharey=True)
-    for panel, colour, run in zip(panels, COLOURS, runs.values(), strict=False):
+    figure, drawn = panels(1, len(runs), (11, 3.9), sharex=True, sharey=True)
+    for panel, colour, run in zip(drawn, COLOURS, runs.values(), strict=False):
         panel.plot(run.desired * 1e6, run.displacement * 1e6, color=colour, linewidth=0.9)
         panel.set_title(run.name, fontsize=11)
-        _label(panel, "desired (µm)", "achieved (µm)" if panel is panels[0] else "")
+        label(panel, "desired (µm)", "achieved (µm)" if panel is drawn[0] else "")
     return figure
 
 
-def _panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
+def panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
+    """Return a figure of a size (inches), and its panels row by row; `options` as in ``Figure.subplots``."""
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options).ravel()
 
 
-def _label(panel: Axes, x: str, y: str) -> None:
+def label(panel: Axes, x: str, y: str) -> None:
+    """Name the axes of a panel and give it a grid."""
     panel.set_xlabel(x)
     panel.set_ylabel(y)
     panel.grid(color="#e4e9ee", linewidth=0.7)

@@ -155,7 +155,9 @@ def test_nearest_by_level_vertex_and_span() -> None:
     ))  # fmt: skip
     assert loops.nearest(1, -1, 45.0, 20.0, 0) is loops.loops[2]
     assert loops.nearest(1, -1, 75.0, 50.0, 0) is loops.loops[1]
-    assert loops.nearest(2, -1, 75.0, 50.0, 0) is loops.loops[3]
+    assert loops.nearest(2, -1, 45.0, 20.0, 0) is loops.loops[3]
+    # Of another level, but much nearer.
+    assert loops.nearest(2, -1, 80.0, 60.0, 0) is loops.loops[1]
     assert loops.nearest(1, -1, 75.0 * 2e-7, 50.0 * 2e-7, 1) is loops.loops[1]
 
 

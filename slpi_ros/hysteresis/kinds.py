@@ -39,7 +39,7 @@ def to_document(model: Hysteresis) -> dict[str, Any]:
                 "edge_gain_m_per_V": model.edge_gain,
             }
         case SeparatedLoops():
-            return {"loops": [_loop_document(loop) for loop in model.loops]}
+            return {"dead_band_V": model.dead_band, "loops": [_loop_document(loop) for loop in model.loops]}
         case MultiSlope():
             return {
                 "origin_V": model.origin,
@@ -66,7 +66,7 @@ def from_document(kind: str, parameters: Mapping[str, Any]) -> Hysteresis:
         case "slpi":
             return _family_from(parameters)
         case "slpi-published":
-            return SeparatedLoops(tuple(_loop_from(loop) for loop in parameters["loops"]))
+            return SeparatedLoops(tuple(_loop_from(loop) for loop in parameters["loops"]), parameters["dead_band_V"])
         case "pi":
             return _plays_from(parameters)
         case "mpi":

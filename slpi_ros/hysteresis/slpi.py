@@ -84,6 +84,8 @@ class SeparatedLoops:
     ----------
     loops : tuple of SingleLoop
         At least one of level 0.
+    dead_band : float, volts
+        Smaller reversals of the voltage are noise of its measurement.
 
     Raises
     ------
@@ -92,9 +94,12 @@ class SeparatedLoops:
     """
 
     loops: tuple[SingleLoop, ...]
+    dead_band: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the loops."""
+        if not self.dead_band >= 0.0:
+            raise ModelError(f"published SLPI: dead band of {self.dead_band} V; give 0 or more")
         if not any(loop.level == 0 for loop in self.loops):
             raise ModelError("published SLPI: no loop of level 0; the outer loop is needed")
         for number, loop in enumerate(self.loops):
@@ -185,7 +190,9 @@ class KnownPath:
         path = np.concatenate([[self._start[coordinate]], x])
         answer = np.full_like(path, self._start[1 - coordinate])
         replaced = []
-        for loop in separate(path).loops:
+        separation = separate(path, dead_band=0.0 if coordinate else self._model.dead_band)
+        path = separation.voltage
+        for loop in separation.loops:
             drive = loop.direction * (path[loop.samples] - path[loop.vertex])
             place = loop.level, loop.direction, float(path[loop.vertex]), float(np.max(np.abs(drive), initial=0.0))
             model, vertex = self._model.nearest(*place, coordinate), answer[loop.vertex]

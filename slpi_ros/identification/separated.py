@@ -1,6 +1,7 @@
 """The published SLPI model: a classical PI model for each separated loop, each by its own quadratic program."""
 
 import warnings
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from slpi_ros.identification.bases import LEAST_GAIN
 from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.problem import RIDGE, held_out_rms
 from slpi_ros.identification.qp import solve_qp
-from slpi_ros.identification.samples import Samples
+from slpi_ros.identification.samples import FEWEST, Samples
 from slpi_ros.model import Start
 
 FloatArray = NDArray[np.float64]
@@ -27,6 +28,10 @@ SPACING = 5.0
 FEWEST_OF_LOOP = 4
 # The same goes for an inner loop of which less than this share is to be fitted: the rest would be a guess.
 LEAST_SHARE = 0.4
+# Within the dead band lie the peaks of the noise of a measured voltage, in standard deviations; never more than this
+# share of the voltage range.
+NOISE_PEAK_TO_PEAK = 8.0
+LARGEST_DEAD_BAND = 0.02
 
 
 def fit_primed(samples: Samples) -> Fitted:
@@ -49,6 +54,18 @@ def default_thresholds(span: float) -> FloatArray:
     return spacing * np.arange(OPERATORS, dtype=np.float64)
 
 
+def voltage_dead_band(v: FloatArray) -> float:
+    """Return the dead band (V) that the noise of a measured voltage, shape (N,), volts, asks for.
+
+    Noise is what changes from sample to sample otherwise than smoothly; a commanded voltage has next to none.
+    """
+    if v.size < FEWEST:
+        return 0.0
+    # Third differences of white noise are sqrt(20) as large as the noise.
+    noise = float(1.4826 * np.median(np.abs(np.diff(v, 3))) / np.sqrt(20))
+    return min(NOISE_PEAK_TO_PEAK * noise, LARGEST_DEAD_BAND * float(np.ptp(v)))
+
+
 def least_iterations(samples: int, all_samples: int) -> int:
     """Return the least number of iterations of the quadratic program of a loop of `samples`, Eq. 9, rounded up."""
     return int(np.ceil(10.0 * np.sqrt(4.0 * samples / all_samples + 1.0)))
@@ -67,7 +84,7 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
         samples=samples,
         errors=(_predict(loops, offset, samples.v) - samples.y)[samples.fitted],
         held_out_rms=held_out_rms(samples, samples.fitted & after_first_rise, predict),
-        covered=len(loops.loops) / len(separate(samples.v).loops),
+        covered=len(loops.loops) / len(separate(samples.v, dead_band=loops.dead_band).loops),
     )
 
 
@@ -104,7 +121,9 @@ def fit_loops(
     IdentificationError
         If the outer loop has too few samples.
     """
-    separation = separate(samples.v)
+    dead_band = voltage_dead_band(samples.v)
+    separation = separate(samples.v, dead_band=dead_band)
+    samples = replace(samples, v=separation.voltage)
     if thresholds is None:
         thresholds = default_thresholds(float(np.ptp(samples.v[separation.loops[0].samples])))
     identified: dict[int, SingleLoop] = {}
@@ -122,7 +141,7 @@ def fit_loops(
         fits = [single.solve(run_in) for run_in in _run_ins(loop.level, thresholds, at_rest)]
         best = min(fits, key=lambda fit: fit.rms)
         identified[number] = single.loop(best, identified.get(below[loop.vertex]) if loop.level else None)
-    return SeparatedLoops(tuple(identified.values())), identified[0].vertex[1]
+    return SeparatedLoops(tuple(identified.values()), dead_band), identified[0].vertex[1]
 
 
 def _owners(loops: tuple[Loop, ...], count: int) -> NDArray[np.int64]:

@@ -36,7 +36,7 @@ LOOP = {
 SLOPES = {"origin_V": -5.0, "amplitude_V": 120.0, **PLAYS}
 DOCUMENTS = {
     "slpi": FAMILY,
-    "slpi-published": {"loops": [LOOP, {**LOOP, "level": 1, "direction": -1, "run_in_V": 0.0}]},
+    "slpi-published": {"dead_band_V": 0.1, "loops": [LOOP, {**LOOP, "level": 1, "direction": -1, "run_in_V": 0.0}]},
     "pi": PLAYS,
     "mpi": SLOPES,
     "smpi": {**SLOPES, "peak_voltages_V": [20.0, 120.0], "peak_displacements_m": [1e-6, 8e-6]},
@@ -51,7 +51,7 @@ def test_document_of_every_kind_comes_back(kind):
 def test_published_loops_that_contradict_themselves():
     for change in ({"direction": 0}, {"span_V": 0.0}, {"run_in_V": -1.0}, {"weights_m_per_V": [0.0, 1e-7, 0.0]}):
         with pytest.raises(ModelError, match="loop 1"):
-            from_document("slpi-published", {"loops": [LOOP, {**LOOP, **change}]})
+            from_document("slpi-published", {"dead_band_V": 0.0, "loops": [LOOP, {**LOOP, **change}]})
 
 
 def test_whole_numbers_are_numbers():

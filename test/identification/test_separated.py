@@ -130,3 +130,13 @@ def test_separates_as_many_loops_as_it_identifies():
     model = identify(stage_record(), "slpi-published")
     assert len(model.axes["x"].hysteresis.loops) == len(separate(PATH).loops)
     assert model.axes["x"].quality.covered == 1.0
+
+
+def test_noise_of_the_measured_voltage_makes_no_loops():
+    record = stage_record()
+    noisy = PATH + np.random.default_rng(0).normal(0.0, 0.05, PATH.size)
+    axis = identify(record_of(record.t, noisy, record.displacement["x"]), "slpi-published").axes["x"]
+    assert len(axis.hysteresis.loops) == len(separate(PATH).loops)
+    clean = identify(record, "slpi-published").axes["x"]
+    assert rms(axis.simulate(noisy) - record.displacement["x"]) < 1.2 * clean.quality.rms + 3 * 0.05 * 0.25e-6
+    assert clean.hysteresis.dead_band < 1e-9

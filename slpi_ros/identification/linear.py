@@ -19,6 +19,9 @@ FloatArray = NDArray[np.float64]
 VERTICES = (21, 31, 41)
 SMOOTHNESS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PLAY_OPERATORS = 30
+# A long record is thinned to about so many samples to choose start, grid and smoothness by, and to be fitted at last:
+# more of them cost time and memory, and tell nothing new.
+SELECTION_SAMPLES, FIT_SAMPLES = 100_000, 1_000_000
 
 
 def fit_family(samples: Samples) -> Fitted:
@@ -49,17 +52,22 @@ def fit_linear(samples: Samples, bases: Sequence[Basis], smoothness: Sequence[fl
     IdentificationError
         If the samples do not determine the model.
     """
-    samples, history = choose_start(samples, lambda candidate: Problem.pose(candidate, bases[0]))
-    best: tuple[float, float, Problem] | None = None
+    thin = samples.thinned(SELECTION_SAMPLES)
+    beginning = choose_start(thin, lambda candidate: Problem.pose(candidate, bases[0]))
+    thin = beginning.of(thin)
+    candidates = []
     for basis in bases:
-        problem = Problem.pose(samples, basis).reweighted()
+        problem = Problem.pose(thin, basis).reweighted()
         scores = problem.scores(smoothness)
         k = int(np.argmin(scores))
-        if best is None or scores[k] < best[0]:
-            best = float(scores[k]), smoothness[k], problem
-    assert best is not None
-    _, chosen, problem = best
-    return _solved(samples, problem, chosen, history)
+        candidates.append((float(scores[k]), smoothness[k], problem))
+    _, chosen, problem = min(candidates, key=lambda candidate: candidate[0])
+    if samples.v.size > thin.v.size:
+        samples = beginning.of(samples.thinned(FIT_SAMPLES))
+        problem = Problem.pose(samples, problem.basis).reweighted()
+    else:
+        samples = thin
+    return _solved(samples, problem, chosen, beginning.history)
 
 
 def fit_multi_slope(samples: Samples) -> Fitted:

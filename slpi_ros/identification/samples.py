@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError
+from slpi_ros.hysteresis.runs import monotone_runs
 from slpi_ros.identification.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -50,6 +51,18 @@ class Samples:
     def only(self, chosen: NDArray[np.bool_]) -> "Samples":
         """Return the samples with only those fitted that are `chosen`, shape (N,)."""
         return replace(self, fitted=self.fitted & chosen)
+
+    def thinned(self, most: int) -> "Samples":
+        """Return every so manieth sample, about `most` of them, and all at which the voltage turns: the same memory."""
+        every = -(-self.v.size // most)
+        if every == 1:
+            return self
+        kept = np.zeros(self.v.size, dtype=bool)
+        kept[::every] = True
+        # Of equal samples in a row both ends: the memory does not tell which one is the turn.
+        ends = np.array(monotone_runs(self.v)).ravel()
+        kept[ends[ends < self.v.size]] = kept[np.maximum(ends - 1, 0)] = True
+        return Samples(self.v[kept], self.y[kept], self.fitted[kept], self.primed)
 
     @property
     def voltage_range(self) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """What moved the stage before the record began? Nobody knows; the record tells which assumption explains it best."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -40,7 +41,27 @@ def histories(samples: Samples) -> list[tuple[float, ...]]:
     return [(), (v0,), (low,), tuple(middle)]
 
 
-def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> tuple[Samples, tuple[float, ...]]:
+@dataclass(frozen=True)
+class Beginning:
+    """What a fit takes for granted about the beginning of a record.
+
+    Parameters
+    ----------
+    history : tuple of float, volts
+        As in `slpi_ros.model.Start`.
+    only_wiped : bool
+        Whether what came before the memory was wiped is left out: no history explains it.
+    """
+
+    history: tuple[float, ...]
+    only_wiped: bool
+
+    def of(self, samples: Samples) -> Samples:
+        """Return the samples to be fitted, with the history before them."""
+        return (samples.only(samples.wiped) if self.only_wiped else samples).after(self.history)
+
+
+def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> Beginning:
     """Choose the history that explains the record best.
 
     Parameters
@@ -52,10 +73,7 @@ def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> tuple[Samp
 
     Returns
     -------
-    Samples
-        With the history before them; without what came before the memory was wiped, where no history explains that.
-    tuple of float, volts
-        The history.
+    Beginning
     """
     wiped = samples.fitted & samples.wiped
     enough = np.count_nonzero(wiped) >= max(FEWEST, 0.5 * np.count_nonzero(samples.fitted))
@@ -69,13 +87,13 @@ def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> tuple[Samp
     if unseen:
         best = len(candidates) - 1
     history = candidates[best]
-    kept = samples
+    only_wiped = False
     if enough and not unseen:
         alone = _residual(pose(samples.only(samples.wiped).after(candidates[-1])), samples)
         if np.sqrt(np.mean(residuals[best][wiped] ** 2)) > MISLEADING * np.sqrt(np.mean(alone[wiped] ** 2)):
-            kept = samples.only(samples.wiped)
+            only_wiped = True
             history = history or candidates[-1]
-    return kept.after(history), history
+    return Beginning(history, only_wiped)
 
 
 def _residual(fit: Fit, samples: Samples) -> FloatArray:

@@ -93,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--axis", metavar="NAME", nargs="+", help="default: every axis of the bag")
     command.add_argument("--start", metavar="S", type=float, help="fit only from here on, seconds from the first stamp")
     command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
-    command.add_argument("--report", metavar="DIR", help="also write a page with plots")
+    command.add_argument("--report", metavar="DIR", help="also write a page with plots, of the first bag")
 
     command = commands.add_parser("simulate", help="voltage to displacement")
     command.set_defaults(run=_simulate)
@@ -108,6 +108,11 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("-o", "--output", metavar="VOLTAGE.csv", required=True)
     command.add_argument("--voltage-min", metavar="V", type=float, default=-np.inf, help="default: what was identified")
     command.add_argument("--voltage-max", metavar="V", type=float, default=np.inf)
+
+    command = commands.add_parser("experiments", help="compute the two papers' tables and figures anew")
+    command.set_defaults(run=_experiments)
+    command.add_argument("-o", "--output", metavar="DIR", required=True, help="folder of index.html")
+    command.add_argument("--data", metavar="DIR", help="folder of measured records, to be compared too")
 
     command = commands.add_parser("show", help="say what a model holds")
     command.set_defaults(run=_show)
@@ -130,19 +135,17 @@ def _import(options: argparse.Namespace) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
-    if len(options.bags) > 1:
-        raise UsageError(f"{len(options.bags)} bags given; this version fits one bag at a time")
     target = Path(options.output)
     if target.is_dir() or not target.parent.is_dir():
         raise ModelError(f"{target}: cannot be written: no file can be there; choose another place")
-    record = bags.read_bag(options.bags[0], options.topic, axes=options.axis)
-    model = identify(record, options.kind, start=options.start, stop=options.stop, loops_at_rest=options.loops_at_rest)
+    records = [bags.read_bag(path, options.topic, axes=options.axis) for path in options.bags]
+    model = identify(records, options.kind, start=options.start, stop=options.stop, loops_at_rest=options.loops_at_rest)
     save_model(model, options.output)
     if options.report:
         # Plotting is slow to load, and most commands do without.
         from slpi_ros.reports.identification import write_report
 
-        write_report(Path(options.report), record, model)
+        write_report(Path(options.report), records[0], model)
     print("\n".join(describe_model(model)))
 
 
@@ -176,6 +179,15 @@ def _known(columns: dict[str, FloatArray], model: StageModel, table: str) -> dic
                 f"{table}: column of axis '{axis}', but the model holds {', '.join(model.axes)}; rename the column"
             )
     return columns
+
+
+def _experiments(options: argparse.Namespace) -> None:
+    from slpi_ros.experiments.page import write_experiments
+
+    data = Path(options.data) if options.data else None
+    if data and not data.is_dir():
+        raise UsageError(f"{data}: no such folder; give the folder of the measured records, or leave --data out")
+    print(f"{write_experiments(Path(options.output), data)}: open it in a browser")
 
 
 def _show(options: argparse.Namespace) -> None:

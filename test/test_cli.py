@@ -166,7 +166,8 @@ def unwritable_model(folder, tmp_path):
 
 
 def two_bags(folder, tmp_path):
-    return ("identify", folder / "bag", folder / "bag", "-o", tmp_path / "m.json"), 2, "2 bags"
+    arguments = ("identify", folder / "bag", folder / "bag", "-o", tmp_path / "m.json", "--kind", "smpi")
+    return arguments, 2, "fitted to one"
 
 
 def unknown_kind(folder, tmp_path):

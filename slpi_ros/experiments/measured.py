@@ -113,12 +113,17 @@ def _exhibit(folder: Path, case: Case) -> Exhibit:
         if found.refusal:
             refusals.append(f"{found.kind} refused: {found.refusal}.")
     usable = [(found.errors[0], k) for k, found in enumerate(scores) if found.errors]
-    best, worst = min(usable), max(usable)
+    ours, best = "No kind of model could be fitted.", None
+    if usable:
+        (least, best), (most, worst) = min(usable), max(usable)
+        ours = (
+            f"Best on {next(iter(case.predicted))}: {KINDS[best]}, {least * 1e6:.4f} µm rms; worst: {KINDS[worst]}, "
+            f"{most * 1e6:.4f} µm."
+        )
     return Exhibit(
         title=f"Measured: {case.name}",
         paper="Not one of the papers' records.",
-        ours=f"Best on {next(iter(case.predicted))}: {KINDS[best[1]]}, {best[0] * 1e6:.4f} µm rms; worst: "
-        f"{KINDS[worst[1]]}, {worst[0] * 1e6:.4f} µm.",
+        ours=ours,
         remark=" ".join(["rms errors, held out, free-run from the record's first sample.", *refusals]),
-        tables=(Table(("error (µm)", *case.predicted), tuple(rows), best=best[1]),),
+        tables=(Table(("error (µm)", *case.predicted), tuple(rows), best),),
     )

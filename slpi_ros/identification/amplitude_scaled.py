@@ -1,5 +1,7 @@
 """The SMPI model: the multi-slope model of the largest cycles of a record, and the line of all cycles' peaks."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,20 +11,23 @@ from slpi_ros.hysteresis.smpi import BACK, AmplitudeScaled, cycles
 from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.multi_slope import SAME_AMPLITUDE, MultiSlopeBasis, peak_line
 from slpi_ros.identification.problem import FIRST_SMOOTHNESS, Problem, held_out_rms
-from slpi_ros.identification.samples import FEWEST, Samples
+from slpi_ros.identification.samples import FEWEST, Samples, only_one
 from slpi_ros.model import Start
 
 FloatArray = NDArray[np.float64]
 
 
-def fit_amplitude_scaled(samples: Samples) -> Fitted:
-    """Fit the SMPI model.
+def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
+    """Fit the SMPI model to one record.
 
     Raises
     ------
+    UsageError
+        If there are several records.
     IdentificationError
         If too few samples belong to cycles of the largest amplitude.
     """
+    samples = only_one(records, "smpi")
     largest = in_largest_cycles(samples.v)
     count = int(np.count_nonzero(samples.fitted & largest))
     if count < FEWEST:
@@ -37,11 +42,12 @@ def fit_amplitude_scaled(samples: Samples) -> Fitted:
 
     model, offset = _fit(samples, samples.fitted, largest)
     y = model.along(float(samples.v[0]), offset).forward_array(samples.v)
-    problem = Problem.pose(samples.only(largest), MultiSlopeBasis.over(*_ends(samples)))
+    problem = Problem.pose([samples.only(largest)], MultiSlopeBasis.over(*_ends(samples)))
     return Fitted(
         hysteresis=model,
         start=Start(float(samples.v[0]), offset),
-        samples=samples,
+        y=samples.y[samples.fitted],
+        voltage_range=samples.voltage_range,
         errors=(y - samples.y)[samples.fitted],
         held_out_rms=held_out_rms(samples, samples.fitted, predict),
         covered=problem.basis.covered(problem.design.local[problem.weights > 0]),
@@ -64,11 +70,12 @@ def _ends(samples: Samples) -> tuple[float, float]:
 def _fit(samples: Samples, kept: NDArray[np.bool_], largest: NDArray[np.bool_]) -> tuple[AmplitudeScaled, float]:
     """Return the model fitted to the samples `kept`, and the displacement at the start (m)."""
     part = Samples(samples.v, samples.y, kept & largest, samples.primed)
-    problem = Problem.pose(part, MultiSlopeBasis.over(*_ends(samples)))
+    problem = Problem.pose([part], MultiSlopeBasis.over(*_ends(samples)))
     x = problem.solve(FIRST_SMOOTHNESS) * problem.scale
     base = problem.basis.shape(x, problem.gain)
     assert isinstance(base, MultiSlope)
-    model = AmplitudeScaled(base, *peak_line(samples.v, np.where(kept, samples.y, np.nan)))
+    # Of all fitted samples: a few peaks say nothing of the samples between them.
+    model = AmplitudeScaled(base, *peak_line(samples.v, np.where(samples.fitted, samples.y, np.nan)))
     # Displacement at the start: the largest cycles alone say little about it.
     relative = model.along(float(samples.v[0]), 0.0).forward_array(samples.v)
     return model, float(np.median((samples.y - relative)[kept]))

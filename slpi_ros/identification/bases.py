@@ -85,7 +85,7 @@ class SurfaceBasis:
         if falls_long.any():
             top = np.full(v.size, self.grid[-1])
             fall = falls_long.astype(np.float64)
-            part = part + self._surface_rows(top, np.full(v.size, v[0]), fall) - self._surface_rows(top, v, fall)
+            part = part + self._surface_rows(top, walk.v_rest, fall) - self._surface_rows(top, v, fall)
         if rises.any():
             rise = rises.astype(np.float64)
             part = part + self._rise_rows(v, rise) - self._rise_rows(v_origin, rise)

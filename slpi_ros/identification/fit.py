@@ -17,7 +17,7 @@ from slpi_ros.model import AxisModel, FitQuality, StageModel
 
 FloatArray = NDArray[np.float64]
 
-FITS: dict[str, Callable[[Samples], Fitted]] = {
+FITS: dict[str, Callable[[Sequence[Samples]], Fitted]] = {
     "slpi": linear.fit_family,
     "slpi-published": separated.fit_primed,
     "pi": linear.fit_plays,
@@ -30,7 +30,7 @@ SENSELESS = 0.5
 
 
 def identify(
-    record: Record,
+    record: Record | Sequence[Record],
     kind: str = "slpi",
     *,
     start: float | None = None,
@@ -38,12 +38,14 @@ def identify(
     axes: Sequence[str] | None = None,
     loops_at_rest: bool = False,
 ) -> StageModel:
-    """Identify the model of a stage from a record.
+    """Identify the model of a stage from a record, or from several in one fit.
 
     Parameters
     ----------
-    record : Record
-        Voltage before `start` still moves the memory; only the displacement there is not fitted.
+    record : Record or sequence of Record
+        Voltage before `start` still moves the memory; only the displacement there is not fitted. Several records share
+        the hysteresis, but each has its own memory at the start and its own displacement at rest; the model starts as
+        the first one does. Kinds ``slpi``, ``pi`` and ``mpi`` can be fitted to several.
     kind : str
         ``slpi`` (the loop family), ``slpi-published`` (a classical PI model for each separated loop), ``pi`` (classical
         Prandtl-Ishlinskii), ``mpi`` (multi-slope PI) or ``smpi`` (the same, scaled with the amplitude).
@@ -52,7 +54,7 @@ def identify(
     start, stop : float, seconds, optional
         Fit only samples with ``start <= t < stop``, t from the record's first stamp.
     axes : sequence of str, optional
-        All axes of the record by default.
+        All axes of the first record by default.
 
     Returns
     -------
@@ -72,26 +74,40 @@ def identify(
     if loops_at_rest and kind != "slpi-published":
         raise UsageError(f"loops at rest are a matter of kind 'slpi-published', not of '{kind}'; leave that out")
     fit = separated.fit_at_rest if loops_at_rest else FITS[kind]
+    records = [record] if isinstance(record, Record) else list(record)
+    hardware_id = _one_stage(records)
+    source = ", ".join(part.source for part in records)
     models = {}
-    for axis in axes or record.axes:
-        samples = select_samples(record, axis, start, stop)
+    for axis in axes or records[0].axes:
+        samples = [select_samples(part, axis, start, stop) for part in records]
         try:
             # The matrices are small: more threads than one only stand in each other's way.
             with threadpool_limits(1):
-                models[axis] = _axis_model(samples, kind, fit(samples), record.source)
+                models[axis] = _axis_model(kind, fit(samples), source)
         except SlpiError as error:
-            raise type(error)(f"{record.source}: axis '{axis}': {error}") from None
-    return StageModel(models, record.hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))
+            raise type(error)(f"{source}: axis '{axis}': {error}") from None
+    return StageModel(models, hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))
 
 
-def _axis_model(samples: Samples, kind: str, fitted: Fitted, source: str) -> AxisModel:
-    _require_sense(samples, fitted)
-    y = fitted.samples.y[fitted.samples.fitted]
+def _one_stage(records: Sequence[Record]) -> str:
+    """Return the hardware id of records; UsageError where there are none, or of several stages."""
+    if not records:
+        raise UsageError("no record given; give at least one")
+    named = {record.hardware_id: record.source for record in records if record.hardware_id}
+    if len(named) > 1:
+        stages = ", ".join(f"'{stage}' ({source})" for stage, source in named.items())
+        raise UsageError(f"records of several stages: {stages}; identify each stage by itself")
+    return next(iter(named), "")
+
+
+def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:
+    _require_sense(fitted)
+    y = fitted.y
     return AxisModel(
         kind=kind,
         hysteresis=fitted.hysteresis,
         start=fitted.start,
-        voltage_range=fitted.samples.voltage_range,
+        voltage_range=fitted.voltage_range,
         displacement_range=(float(y.min()), float(y.max())),
         quality=FitQuality(
             rms=float(np.sqrt(np.mean(fitted.errors**2))),
@@ -105,11 +121,11 @@ def _axis_model(samples: Samples, kind: str, fitted: Fitted, source: str) -> Axi
     )
 
 
-def _require_sense(samples: Samples, fitted: Fitted) -> None:
+def _require_sense(fitted: Fitted) -> None:
     """Refuse a model that says nothing."""
     if fitted.covered == 0.0:
         raise IdentificationError("the voltage never turns back; drive it up and down over the range to be used")
-    spread = float(np.std(samples.y[samples.fitted]))
+    spread = float(np.std(fitted.y))
     if fitted.held_out_rms > SENSELESS * spread:
         raise IdentificationError(
             f"the voltage does not explain the displacement: error {fitted.held_out_rms * 1e9:.4g} nm rms on blocks "

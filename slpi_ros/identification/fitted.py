@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.kinds import Hysteresis
-from slpi_ros.identification.samples import Samples
 from slpi_ros.model import Start
 
 FloatArray = NDArray[np.float64]
@@ -20,8 +19,10 @@ class Fitted:
     ----------
     hysteresis : Hysteresis
     start : Start
-    samples : Samples
-        Those it was fitted to.
+    y : ndarray, shape (number fitted,), metres
+        Displacements it was fitted to.
+    voltage_range : (float, float), volts
+        Covered by them.
     errors : ndarray, shape (number fitted,), metres
         Model minus measurement, free-run, on the samples fitted.
     held_out_rms : float, metres
@@ -32,7 +33,8 @@ class Fitted:
 
     hysteresis: Hysteresis
     start: Start
-    samples: Samples
+    y: FloatArray
+    voltage_range: tuple[float, float]
     errors: FloatArray
     held_out_rms: float
     covered: float

@@ -24,24 +24,37 @@ PLAY_OPERATORS = 30
 SELECTION_SAMPLES, FIT_SAMPLES = 100_000, 1_000_000
 
 
-def fit_family(samples: Samples) -> Fitted:
-    """Fit the loop family."""
-    low, high = float(samples.v.min()), float(samples.v.max())
+def fit_family(samples: Sequence[Samples]) -> Fitted:
+    """Fit the loop family to one record or several."""
+    low, high = _voltage_range(samples)
     return fit_linear(samples, [SurfaceBasis(np.linspace(low, high, n)) for n in VERTICES], SMOOTHNESS)
 
 
-def fit_plays(samples: Samples) -> Fitted:
-    """Fit the classical PI model."""
-    half_range = float(np.ptp(samples.v)) / 2
-    return fit_linear(samples, [PlayBasis(np.linspace(0.0, half_range, PLAY_OPERATORS, endpoint=False))])
+def fit_plays(samples: Sequence[Samples]) -> Fitted:
+    """Fit the classical PI model to one record or several."""
+    low, high = _voltage_range(samples)
+    return fit_linear(samples, [PlayBasis(np.linspace(0.0, (high - low) / 2, PLAY_OPERATORS, endpoint=False))])
 
 
-def fit_linear(samples: Samples, bases: Sequence[Basis], smoothness: Sequence[float] = SMOOTHNESS[:1]) -> Fitted:
+def fit_multi_slope(samples: Sequence[Samples]) -> Fitted:
+    """Fit the MPI model of the amplitude that the records cover, from rest, by plain least squares as published."""
+    problem = Problem.pose(samples, MultiSlopeBasis.over(*_voltage_range(samples)))
+    return _solved(samples, problem, FIRST_SMOOTHNESS, ())
+
+
+def _voltage_range(samples: Sequence[Samples]) -> tuple[float, float]:
+    return float(min(part.v.min() for part in samples)), float(max(part.v.max() for part in samples))
+
+
+def fit_linear(
+    samples: Sequence[Samples], bases: Sequence[Basis], smoothness: Sequence[float] = SMOOTHNESS[:1]
+) -> Fitted:
     """Fit the basis, with the roughness weight, that predicts blocks left out best.
 
     Parameters
     ----------
-    samples : Samples
+    samples : sequence of Samples
+        Of each record.
     bases : sequence of Basis
         Those that compete, the simplest one first.
     smoothness : sequence of float
@@ -52,9 +65,9 @@ def fit_linear(samples: Samples, bases: Sequence[Basis], smoothness: Sequence[fl
     IdentificationError
         If the samples do not determine the model.
     """
-    thin = samples.thinned(SELECTION_SAMPLES)
-    beginning = choose_start(thin, lambda candidate: Problem.pose(candidate, bases[0]))
-    thin = beginning.of(thin)
+    thin = [part.thinned(SELECTION_SAMPLES // len(samples)) for part in samples]
+    beginnings = [choose_start(part, lambda candidate: Problem.pose([candidate], bases[0])) for part in thin]
+    thin = [beginning.of(part) for beginning, part in zip(beginnings, thin, strict=True)]
     candidates = []
     for basis in bases:
         problem = Problem.pose(thin, basis).reweighted()
@@ -62,28 +75,30 @@ def fit_linear(samples: Samples, bases: Sequence[Basis], smoothness: Sequence[fl
         k = int(np.argmin(scores))
         candidates.append((float(scores[k]), smoothness[k], problem))
     _, chosen, problem = min(candidates, key=lambda candidate: candidate[0])
-    if samples.v.size > thin.v.size:
-        samples = beginning.of(samples.thinned(FIT_SAMPLES))
-        problem = Problem.pose(samples, problem.basis).reweighted()
-    else:
-        samples = thin
-    return _solved(samples, problem, chosen, beginning.history)
+    fitted = [
+        beginning.of(part.thinned(FIT_SAMPLES // len(samples)))
+        for beginning, part in zip(beginnings, samples, strict=True)
+    ]
+    if any(part.v.size > thinned.v.size for part, thinned in zip(fitted, thin, strict=True)):
+        problem = Problem.pose(fitted, problem.basis).reweighted()
+    return _solved(fitted, problem, chosen, beginnings[0].history)
 
 
-def fit_multi_slope(samples: Samples) -> Fitted:
-    """Fit the MPI model of the amplitude that the record covers, from rest, by plain least squares as published."""
-    problem = Problem.pose(samples, MultiSlopeBasis.over(float(samples.v.min()), float(samples.v.max())))
-    return _solved(samples, problem, FIRST_SMOOTHNESS, ())
-
-
-def _solved(samples: Samples, problem: Problem, smoothness: float, history: tuple[float, ...]) -> Fitted:
+def _solved(samples: Sequence[Samples], problem: Problem, smoothness: float, history: tuple[float, ...]) -> Fitted:
+    """Solve a problem; the model starts as the first record does, after its `history`."""
     x = problem.solve(smoothness)
     at_start = problem.design.predict(x)[len(history)] * problem.scale
     return Fitted(
-        hysteresis=problem.basis.shape(x * problem.scale, problem.gain),
-        start=Start(float(samples.v[len(history)]), float(at_start), history),
-        samples=samples,
+        hysteresis=problem.basis.shape(x[: problem.basis.size + 1] * problem.scale, problem.gain),
+        start=Start(float(samples[0].v[len(history)]), float(at_start), history),
+        y=np.concatenate([part.y[part.fitted] for part in samples]),
+        voltage_range=_fitted_range(samples),
         errors=problem.errors(x),
         held_out_rms=problem.held_out(smoothness),
-        covered=problem.basis.covered(problem.design.local[samples.fitted]),
+        covered=problem.basis.covered(problem.design.local[np.concatenate([part.fitted for part in samples])]),
     )
+
+
+def _fitted_range(samples: Sequence[Samples]) -> tuple[float, float]:
+    low, high = zip(*(part.voltage_range for part in samples), strict=True)
+    return min(low), max(high)

@@ -44,8 +44,8 @@ class MultiSlopeBasis:
         waits = rising_envelope(upper[:, None] - self.origin, self.thresholds) - self._falling(lower)
         moved = np.maximum(0.0, waits) * walk.direction[:, None]
         if walk.long_fall.any():
-            fallen = walk.v[walk.long_fall]
-            moved[walk.long_fall] = self._falling(fallen) - self._falling(walk.v[:1])
+            fallen, rest = walk.v[walk.long_fall], walk.v_rest[walk.long_fall]
+            moved[walk.long_fall] = self._falling(fallen) - self._falling(rest)
         return sp.csr_array(moved)
 
     def _falling(self, v: FloatArray) -> FloatArray:

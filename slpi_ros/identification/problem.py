@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from slpi_ros.identification.bases import Basis
@@ -25,7 +26,7 @@ RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class Problem:
-    """One basis on one record.
+    """One basis on one record or several.
 
     Displacement is in units of `scale`; weights are zero where a sample is not fitted; `rough` is the matrix of the
     basis's roughness.
@@ -40,17 +41,22 @@ class Problem:
     gain: float
 
     @classmethod
-    def pose(cls, samples: Samples, basis: Basis) -> "Problem":
-        """Pose the problem of fitting `basis` to `samples`."""
-        walk = Walk.along(samples.v, symmetric_rest=basis.symmetric_rest, primed=samples.primed)
-        volts, metres = samples.spread
-        rough = basis.roughness()
+    def pose(cls, samples: Sequence[Samples], basis: Basis) -> "Problem":
+        """Pose the problem of fitting `basis` to the samples of one record or several."""
+        walk = Walk.joined(
+            [Walk.along(part.v, symmetric_rest=basis.symmetric_rest, primed=part.primed) for part in samples]
+        )
+        design = Design.of(walk, basis.branch_part(walk))
+        volts, metres = np.max([part.spread for part in samples], axis=0).tolist()
+        rough = np.zeros((design.local.shape[1],) * 2)
+        own = basis.roughness()
+        rough[: own.shape[1], : own.shape[1]] = (own.T @ own).toarray()
         return cls(
             basis=basis,
-            design=Design.of(walk, basis.branch_part(walk)),
-            y=samples.y / metres,
-            weights=samples.fitted.astype(np.float64),
-            rough=(rough.T @ rough).toarray(),
+            design=design,
+            y=np.concatenate([part.y for part in samples]) / metres,
+            weights=np.concatenate([part.fitted for part in samples]).astype(np.float64),
+            rough=rough,
             scale=metres,
             gain=metres / volts,
         )
@@ -75,6 +81,9 @@ class Problem:
         """Fit all samples, with every branch rising."""
         matrix, vector = self.design.normal_equations(self.y, self.weights)
         constraints, bound = self.basis.monotone(self.gain / self.scale)
+        # The displacement at rest is free, that of every record.
+        shape = (bound.size, matrix.shape[0])
+        constraints = sp.csr_array((constraints.data, constraints.indices, constraints.indptr), shape)
         return solve_qp(matrix + self.penalty(smoothness, self.count), vector, constraints, bound)
 
     def residual(self) -> FloatArray:

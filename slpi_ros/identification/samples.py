@@ -1,11 +1,12 @@
 """The samples of one axis that a fit uses, after the checks that every fit needs."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.errors import RecordError
+from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.hysteresis.runs import monotone_runs
 from slpi_ros.identification.record import Record
 
@@ -126,3 +127,10 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     if np.corrcoef(v[fitted], y[fitted])[0, 1] < 0:
         raise RecordError(f"{where}: displacement falls where voltage rises; change the sign of one of them")
     return Samples(v, np.where(fitted, y, 0.0), fitted)
+
+
+def only_one(records: Sequence[Samples], kind: str) -> Samples:
+    """Return the samples of the only record; UsageError where there are several, which `kind` cannot be fitted to."""
+    if len(records) != 1:
+        raise UsageError(f"{len(records)} records given, but kind '{kind}' is fitted to one; choose one or 'slpi'")
+    return records[0]

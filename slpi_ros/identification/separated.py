@@ -1,6 +1,7 @@
 """The published SLPI model: a classical PI model for each separated loop, each by its own quadratic program."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from slpi_ros.identification.bases import LEAST_GAIN
 from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.problem import RIDGE, held_out_rms
 from slpi_ros.identification.qp import solve_qp
-from slpi_ros.identification.samples import FEWEST, Samples
+from slpi_ros.identification.samples import FEWEST, Samples, only_one
 from slpi_ros.model import Start
 
 FloatArray = NDArray[np.float64]
@@ -34,14 +35,14 @@ NOISE_PEAK_TO_PEAK = 8.0
 LARGEST_DEAD_BAND = 0.02
 
 
-def fit_primed(samples: Samples) -> Fitted:
-    """Fit loops that close: those of level 1 and more are primed; the outer one too where the record returns to it."""
-    return _fit(samples, at_rest=False)
+def fit_primed(samples: Sequence[Samples]) -> Fitted:
+    """Fit the loops of one record so that those of level 1 and more close."""
+    return _fit(only_one(samples, "slpi-published"), at_rest=False)
 
 
-def fit_at_rest(samples: Samples) -> Fitted:
-    """Fit loops whose play operators start at rest, as published."""
-    return _fit(samples, at_rest=True)
+def fit_at_rest(samples: Sequence[Samples]) -> Fitted:
+    """Fit the loops of one record with play operators that start at rest, as published."""
+    return _fit(only_one(samples, "slpi-published"), at_rest=True)
 
 
 def default_thresholds(span: float) -> FloatArray:
@@ -81,7 +82,8 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
     return Fitted(
         hysteresis=loops,
         start=Start(float(samples.v[0]), offset),
-        samples=samples,
+        y=samples.y[samples.fitted],
+        voltage_range=samples.voltage_range,
         errors=(_predict(loops, offset, samples.v) - samples.y)[samples.fitted],
         held_out_rms=held_out_rms(samples, samples.fitted & after_first_rise, predict),
         covered=len(loops.loops) / len(separate(samples.v, dead_band=loops.dead_band).loops),

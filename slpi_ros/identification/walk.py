@@ -5,6 +5,7 @@ plus what the branch adds. With ``A_local`` the branch parts, ``P`` picking each
 predictions at turning points, the whole record is ``(A_local + P T) x``; the product is never formed.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,11 +29,14 @@ class Walk:
         Sample at which its branch started, or `AT_REST` or `LONG_FALL`.
     direction : ndarray of int, shape (N,)
         +1, -1, or 0 for samples that still rest.
+    first : ndarray of int, shape (N,)
+        First sample of the record that each one belongs to: there the voltage rested.
     """
 
     v: FloatArray
     origin: NDArray[np.int64]
     direction: NDArray[np.int64]
+    first: NDArray[np.int64]
 
     @classmethod
     def along(cls, v: FloatArray, *, symmetric_rest: bool, primed: bool) -> "Walk":
@@ -42,12 +46,29 @@ class Walk:
         for piece in trace(v, symmetric_rest=symmetric_rest, primed=primed):
             origin[piece.start : piece.stop] = piece.origin
             direction[piece.start : piece.stop] = piece.direction
-        return cls(v, origin, direction)
+        return cls(v, origin, direction, np.zeros(v.size, dtype=np.int64))
+
+    @classmethod
+    def joined(cls, walks: Sequence["Walk"]) -> "Walk":
+        """Put the walks of several records one behind the other; each starts anew."""
+        shifts = np.cumsum([0, *(walk.v.size for walk in walks[:-1])])
+        moved = zip(walks, shifts.tolist(), strict=True)
+        origin, first = zip(
+            *((np.where(walk.origin >= 0, walk.origin + by, walk.origin), walk.first + by) for walk, by in moved),
+            strict=True,
+        )
+        v, direction = (np.concatenate([getattr(walk, name) for walk in walks]) for name in ("v", "direction"))
+        return cls(v, np.concatenate(origin), direction, np.concatenate(first))
+
+    @property
+    def v_rest(self) -> FloatArray:
+        """Voltage at which each sample's record started, shape (N,), volts."""
+        return self.v[self.first]
 
     @property
     def v_origin(self) -> FloatArray:
         """Voltage at which each sample's branch started, shape (N,), volts; where it rested, if it starts there."""
-        return np.where(self.origin >= 0, self.v[np.maximum(self.origin, 0)], self.v[0])
+        return np.where(self.origin >= 0, self.v[np.maximum(self.origin, 0)], self.v_rest)
 
     @property
     def first_rise(self) -> NDArray[np.bool_]:
@@ -67,7 +88,7 @@ class Walk:
 
 @dataclass(frozen=True)
 class Design:
-    """The linear prediction of a record: one column for each parameter, the last one for the displacement at rest."""
+    """The linear prediction: a column for each parameter, then one for each record's displacement at rest."""
 
     local: sp.csr_array
     turns: NDArray[np.int64]
@@ -91,8 +112,10 @@ class Design:
 
     @classmethod
     def of(cls, walk: Walk, branch_part: sp.csr_array) -> "Design":
-        """Complete the `branch_part`, shape (N, p - 1), of a basis by the column of the displacement at rest."""
-        no_turn = sp.csr_array((walk.origin < 0).astype(np.float64)[:, None])
+        """Complete the `branch_part`, shape (N, size), of a basis by the columns of the displacements at rest."""
+        rows = np.flatnonzero(walk.origin < 0)
+        starts, record = np.unique(walk.first, return_inverse=True)
+        no_turn = sp.csr_array((np.ones(rows.size), (rows, record[rows])), shape=(walk.v.size, starts.size))
         local = sp.csr_array(sp.hstack([branch_part, no_turn], format="csr"))
         return cls(local, np.unique(walk.origin[walk.origin >= 0]), walk)
 

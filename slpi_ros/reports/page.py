@@ -18,7 +18,7 @@ body { max-width: 1040px; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.7rem; margin-bottom: .2rem; }
 h2 { font-size: 1.3rem; margin-top: 2.2rem; }
 h3 { font-size: 1.1rem; margin-top: 2.2rem; border-top: 1px solid #d5dde5; padding-top: .8rem; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1rem; margin: .6rem 0; }
+dl { display: grid; grid-template-columns: fit-content(17rem) 1fr; gap: .3rem 1rem; margin: .6rem 0; }
 dt { color: #51606e; }
 dd { margin: 0; }
 table { border-collapse: collapse; margin: 1rem 0; }

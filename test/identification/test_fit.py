@@ -1,5 +1,7 @@
 """Identification: what it finds, what it stands, and what it refuses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from identification.records import calibration, record_of, rms, stage
@@ -195,3 +197,41 @@ def test_outliers_count_in_the_held_out_error(recorded):
 
 def test_every_kind_of_model_can_be_identified():
     assert tuple(DESCRIPTIONS) == KINDS
+
+
+def later_record(seed, offset):
+    """Loops that the calibration of the same stage does not hold, with another zero of the sensor."""
+    other = stage(seed)
+    t = 0.005 * np.arange(4000)
+    v = 50.0 - 50.0 * np.cos(2 * np.pi * 0.11 * t) * (0.6 + 0.4 * np.cos(2 * np.pi * 0.013 * t))
+    return record_of(t, v, other.run(t, v)[1] + offset)
+
+
+def test_several_records_share_one_model(recorded):
+    first, second = recorded[0], later_record(1, 3e-7)
+    joint = slpi_ros.identify([first, second]).axes["x"]
+    alone = slpi_ros.identify(first).axes["x"]
+    assert joint.quality.samples == len(first) + len(second)
+    assert joint.start.voltage == alone.start.voltage
+    assert joint.start.displacement == pytest.approx(alone.start.displacement, abs=2e-8)
+    # It is still the model of the first record, to the noise.
+    error = joint.simulate(first.voltage["x"]) - first.displacement["x"]
+    assert rms(error) < 1.2 * alone.quality.rms
+    assert joint.quality.held_out_rms < 2 * joint.quality.floor_rms
+
+
+def test_one_record_in_a_list_is_that_record(recorded, model):
+    again = slpi_ros.identify([recorded[0]]).axes["x"]
+    np.testing.assert_array_equal(again.hysteresis.surface, model.axes["x"].hysteresis.surface)
+
+
+def test_records_that_do_not_belong_together(recorded):
+    record = recorded[0]
+    with pytest.raises(UsageError, match="no record given"):
+        slpi_ros.identify([])
+    with pytest.raises(UsageError, match="several stages: 'a'.*'b'"):
+        slpi_ros.identify([replace(record, hardware_id="a"), replace(record, hardware_id="b")])
+    with pytest.raises(UsageError, match="axis 'x'"):
+        slpi_ros.identify([record, record_of(record.t, record.voltage["x"], record.displacement["x"], axis="z")])
+    with pytest.raises(UsageError, match="fitted to one"):
+        slpi_ros.identify([record, record], "slpi-published")

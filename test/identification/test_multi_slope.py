@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from identification.records import record_of
 
 from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.mpi import MultiSlope, thresholds_for
 from slpi_ros.hysteresis.smpi import AmplitudeScaled
+from slpi_ros.identification.fit import identify
 from slpi_ros.identification.multi_slope import (
     MultiSlopeBasis,
     PeakFrequency,
@@ -181,3 +183,12 @@ def test_peaks_are_fitted_with_the_least_squared_error_in_metres():
 def test_peaks_that_cannot_be_fitted_are_told(frequency, peak):
     with pytest.raises(IdentificationError, match=r"^X_p = a f\^b: [^\n]+$"):
         fit_peak_frequency(frequency, peak)
+
+
+def test_equal_cycles_do_not_upset_the_cross_validation():
+    """Eight cycles of one length: blocks of them may hold every peak."""
+    v = drive((150, 150, 140, 120, 100, 80, 60, 40, 20), low=0.0, samples=100)
+    y = MultiSlope(0.0, 150.0, thresholds_for(150.0), WEIGHTS[:11])
+    record = record_of(0.01 * np.arange(v.size), v, Memory(y, 0.0, 1e-6).forward_array(v))
+    axis = identify(record, "smpi", start=2.0).axes["x"]
+    assert axis.quality.held_out_rms < 0.02 * np.ptp(record.displacement["x"])

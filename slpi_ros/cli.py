@@ -19,9 +19,10 @@ from slpi_ros import bags, tables
 from slpi_ros.errors import ModelError, SlpiError, UsageError
 from slpi_ros.identification.fit import KINDS, identify
 from slpi_ros.identification.record import FloatArray
+from slpi_ros.identification.refit import refit
 from slpi_ros.model import StageModel, check_time, held_message
 from slpi_ros.model_file import load_model, save_model
-from slpi_ros.reports.text import describe_model
+from slpi_ros.reports.text import describe_change, describe_model
 from slpi_ros.stream import Limits
 
 
@@ -95,6 +96,13 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
     command.add_argument("--report", metavar="DIR", help="also write a page with plots, of the first bag")
 
+    command = commands.add_parser("refit", help="update a model with a new bag; what the bag does not visit stays")
+    command.set_defaults(run=_refit)
+    command.add_argument("model", metavar="MODEL.json")
+    command.add_argument("bag", metavar="BAG")
+    command.add_argument("-o", "--output", metavar="MODEL.json", required=True, help="may be the same file")
+    command.add_argument("--topic", default="stage_state")
+
     command = commands.add_parser("simulate", help="voltage to displacement")
     command.set_defaults(run=_simulate)
     command.add_argument("model", metavar="MODEL.json")
@@ -147,6 +155,12 @@ def _identify(options: argparse.Namespace) -> None:
 
         write_report(Path(options.report), records[0], model)
     print("\n".join(describe_model(model)))
+
+
+def _refit(options: argparse.Namespace) -> None:
+    model, changes = refit(load_model(options.model), bags.read_bag(options.bag, options.topic))
+    save_model(model, options.output)
+    print("\n".join(line for axis, change in changes.items() for line in describe_change(axis, change)))
 
 
 def _simulate(options: argparse.Namespace) -> None:

@@ -11,6 +11,7 @@ from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.identification import linear, separated
 from slpi_ros.identification.amplitude_scaled import fit_amplitude_scaled
 from slpi_ros.identification.fitted import Fitted
+from slpi_ros.identification.problem import noise_rms
 from slpi_ros.identification.record import Record
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.model import AxisModel, FitQuality, StageModel
@@ -113,7 +114,7 @@ def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:
             rms=float(np.sqrt(np.mean(fitted.errors**2))),
             maximum=float(np.max(np.abs(fitted.errors))),
             held_out_rms=fitted.held_out_rms,
-            floor_rms=_noise(fitted.errors),
+            floor_rms=noise_rms(fitted.errors),
             samples=y.size,
             covered=fitted.covered,
             source=source,
@@ -132,8 +133,3 @@ def _require_sense(fitted: Fitted) -> None:
             f"left out, of {spread * 1e9:.4g} nm rms in all; check that both signals belong to this axis, and their "
             "clocks"
         )
-
-
-def _noise(errors: FloatArray) -> float:
-    """Return the rms of what changes from sample to sample in `errors`, outliers apart."""
-    return float(1.4826 * np.median(np.abs(np.diff(errors))) / np.sqrt(2))

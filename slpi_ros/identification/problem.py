@@ -80,11 +80,15 @@ class Problem:
     def solve(self, smoothness: float) -> FloatArray:
         """Fit all samples, with every branch rising."""
         matrix, vector = self.design.normal_equations(self.y, self.weights)
+        return self.constrained(matrix + self.penalty(smoothness, self.count), vector)
+
+    def constrained(self, matrix: FloatArray, vector: FloatArray) -> FloatArray:
+        """Minimise ``x' M x / 2 - b' x`` with every branch rising."""
         constraints, bound = self.basis.monotone(self.gain / self.scale)
         # The displacement at rest is free, that of every record.
         shape = (bound.size, matrix.shape[0])
         constraints = sp.csr_array((constraints.data, constraints.indices, constraints.indptr), shape)
-        return solve_qp(matrix + self.penalty(smoothness, self.count), vector, constraints, bound)
+        return solve_qp(matrix, vector, constraints, bound)
 
     def residual(self) -> FloatArray:
         """Return the errors, shape (N,), in units of `scale`, of a rough fit whose branches may fall."""
@@ -162,3 +166,8 @@ def held_out_rms(
         kept[chosen] = False
         errors.append((predict(kept) - samples.y)[chosen])
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+
+def noise_rms(errors: FloatArray) -> float:
+    """Return the rms of what changes from sample to sample in `errors`, outliers apart."""
+    return float(1.4826 * np.median(np.abs(np.diff(errors))) / np.sqrt(2))

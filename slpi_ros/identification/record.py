@@ -27,6 +27,8 @@ class Record:
         Where it came from, for messages and for the model document.
     hardware_id : str
         The stage, as its driver names it; "" when the record does not say.
+    notes : tuple of str
+        What a reader should know about how the record was made.
 
     Raises
     ------
@@ -39,6 +41,7 @@ class Record:
     displacement: Mapping[str, FloatArray]
     source: str = "record"
     hardware_id: str = ""
+    notes: tuple[str, ...] = ()
     axes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:

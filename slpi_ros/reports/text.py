@@ -4,6 +4,7 @@ from slpi_ros.hysteresis.family import LoopFamily
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
 from slpi_ros.hysteresis.slpi import SeparatedLoops
 from slpi_ros.hysteresis.smpi import AmplitudeScaled
+from slpi_ros.identification.refit import AxisChange
 from slpi_ros.model import AxisModel, StageModel
 
 
@@ -33,6 +34,17 @@ def describe_axis(axis: AxisModel) -> list[str]:
         f"sensor noise about {quality.floor_rms * 1e9:.1f} nm rms",
         f"from {quality.samples} samples of {quality.source}",
         "effects: none",
+    ]
+
+
+def describe_change(axis: str, change: AxisChange) -> list[str]:
+    """Return lines that say what an update changed in one axis, in nm."""
+    verdict = "the stage has changed" if change.drifted else "no change beyond repeatability"
+    return [
+        f"axis {axis}: {verdict}: the old model's error on the new record is {change.error_before * 1e9:.1f} nm rms, "
+        f"it was known to {change.repeatability * 1e9:.1f} nm",
+        f"axis {axis}: gain {change.gain:+.2%}, branches moved by up to {change.largest * 1e9:.1f} nm; "
+        f"error on the new record now {change.error_after * 1e9:.1f} nm rms",
     ]
 
 

@@ -1,0 +1,210 @@
+"""A model kept up to date: a new record corrects the old model where it visits, and leaves the rest as it was.
+
+The old parameters ``x_old`` are the prior of a convex fit. What a stage does in the course of time is mostly a change
+of gain, and little else: ``x = (1 + s) x_old + e``, where ``s`` is free within some per cent and ``e`` is small and
+smooth. A gain is looked for only where the old model is wrong beyond what it was known to be: a record of small loops
+that agrees with it must not touch the large ones.
+"""
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from slpi_ros.errors import IdentificationError, SlpiError, UsageError
+from slpi_ros.hysteresis.family import LoopFamily
+from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
+from slpi_ros.identification.linear import FIT_SAMPLES
+from slpi_ros.identification.problem import FIRST_SMOOTHNESS, Problem, noise_rms
+from slpi_ros.identification.qp import solve_free
+from slpi_ros.identification.record import Record
+from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.start import choose_start
+from slpi_ros.model import AxisModel, StageModel, Start
+
+FloatArray = NDArray[np.float64]
+
+# Standard deviations of the prior: of the gain (relative) and of each parameter, which follows its neighbours (relative
+# to the displacement range), where the stage has changed; and where the old model is as good as it ever was.
+CHANGED = (0.1, 1e-3)
+UNCHANGED = (0.0, 1e-4)
+# How much the deviation from the old shape may bend, against how large it may be.
+SMOOTH = 30.0
+# The stage has changed when the old model's error on the new record is this many times the one it was identified with.
+BEYOND_REPEATABILITY = 2.0
+
+
+@dataclass(frozen=True)
+class AxisChange:
+    """What a new record changed.
+
+    Parameters
+    ----------
+    error_before, error_after : float, metres
+        rms error on the new record, free-run, of the old and of the new model.
+    repeatability : float, metres
+        What the old model's error was on blocks left out, or the noise of the sensor if that is more.
+    drifted : bool
+        Whether the old model is wrong beyond what it was known to be.
+    gain : float
+        Relative change of the outermost loop's height.
+    largest : float, metres
+        Largest change of a branch.
+    """
+
+    error_before: float
+    error_after: float
+    repeatability: float
+    drifted: bool
+    gain: float
+    largest: float
+
+
+def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, AxisChange]]:
+    """Update a model with a new record, without forgetting what the record does not visit.
+
+    Parameters
+    ----------
+    model : StageModel
+        Axes of kind ``slpi`` or ``pi``.
+    record : Record
+        Within the voltages of the model. Axes that it does not hold stay as they are.
+
+    Returns
+    -------
+    StageModel
+        It starts as the record does.
+    dict of axis name to AxisChange
+
+    Raises
+    ------
+    UsageError
+        If the record is of another stage, or the model's kind cannot be updated.
+    RecordError, IdentificationError
+        If the record does not allow it.
+    """
+    if model.hardware_id and record.hardware_id and model.hardware_id != record.hardware_id:
+        raise UsageError(
+            f"the model is of stage '{model.hardware_id}', {record.source} of '{record.hardware_id}'; "
+            "identify each stage by itself"
+        )
+    shared = [axis for axis in model.axes if axis in record.axes]
+    if not shared:
+        raise UsageError(f"{record.source} holds none of the model's axes {', '.join(model.axes)}")
+    axes, changes = dict(model.axes), {}
+    for name in shared:
+        try:
+            with threadpool_limits(1):
+                axes[name], changes[name] = _refit_axis(
+                    model.axes[name], select_samples(record, name, None, None), record.source
+                )
+        except SlpiError as error:
+            raise type(error)(f"{record.source}: axis '{name}': {error}") from None
+    return replace(model, axes=axes, created=datetime.now(UTC).isoformat(timespec="seconds")), changes
+
+
+def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisModel, AxisChange]:
+    basis, x_old = _basis_of(old)
+    low, high = samples.voltage_range
+    if isinstance(basis, SurfaceBasis) and not basis.grid[0] <= samples.v.min() <= samples.v.max() <= basis.grid[-1]:
+        raise IdentificationError(
+            f"the record goes from {low:g} to {high:g} V, the model from {basis.grid[0]:g} to {basis.grid[-1]:g} V; "
+            "identify the stage anew"
+        )
+    samples = samples.thinned(FIT_SAMPLES)
+    beginning = choose_start(samples, lambda candidate: Problem.pose([candidate], basis))
+    samples = beginning.of(samples)
+    problem = Problem.pose([samples], basis).reweighted()
+    old_errors = problem.errors(_solved(problem, x_old / problem.scale))
+    repeatability = max(old.quality.held_out_rms, noise_rms(old_errors))
+    drifted = _rms(old_errors) > BEYOND_REPEATABILITY * repeatability
+    x = _solved(problem, x_old / problem.scale, *(CHANGED if drifted else UNCHANGED))
+    errors = problem.errors(x)
+    x_new = x[: basis.size + 1] * problem.scale
+    largest = int(np.argmax(np.abs(x_old)))
+    change = AxisChange(
+        error_before=_rms(old_errors),
+        error_after=_rms(errors),
+        repeatability=repeatability,
+        drifted=drifted,
+        gain=float(x_new[largest] / x_old[largest] - 1.0),
+        largest=float(np.max(np.abs(x_new[:-1] - x_old))),
+    )
+    history = beginning.history
+    at_start = float(problem.design.predict(x)[len(history)] * problem.scale)
+    start = Start(float(samples.v[len(history)]), at_start, history)
+    if _same_start(start, old.start, repeatability):
+        # One record more does not know the zero better than those before.
+        start = old.start
+    y = samples.y[samples.fitted]
+    new = replace(
+        old,
+        hysteresis=basis.shape(x_new, problem.gain),
+        start=start,
+        displacement_range=(
+            min(old.displacement_range[0], float(y.min())),
+            max(old.displacement_range[1], float(y.max())),
+        ),
+        quality=replace(
+            old.quality,
+            rms=_rms(errors),
+            maximum=float(np.max(np.abs(errors))),
+            floor_rms=noise_rms(errors),
+            samples=old.quality.samples + y.size,
+            source=f"{old.quality.source}, {source}",
+        ),
+    )
+    return new, change
+
+
+def _same_start(new: Start, old: Start, repeatability: float) -> bool:
+    close = abs(new.displacement - old.displacement) <= repeatability
+    return close and (new.voltage, new.history) == (old.voltage, old.history)
+
+
+def _basis_of(axis: AxisModel) -> tuple[Basis, FloatArray]:
+    """Return the basis of a model, and its parameters without the displacement at rest, metres."""
+    shape = axis.hysteresis
+    if isinstance(shape, PrandtlIshlinskii):
+        return PlayBasis(shape.thresholds), shape.weights
+    if isinstance(shape, LoopFamily):
+        if not np.allclose(np.diff(shape.grid), np.diff(shape.grid).mean(), rtol=1e-6):
+            raise UsageError("the model's vertices are not evenly spaced; identify the stage anew")
+        return SurfaceBasis(shape.grid), np.concatenate(
+            [shape.surface[np.tril_indices(shape.grid.size, -1)], shape.rise]
+        )
+    raise UsageError(f"kind '{axis.kind}' cannot be updated; identify the stage anew")
+
+
+def _solved(problem: Problem, x_old: FloatArray, gain_spread: float = 0.0, shape_spread: float = 0.0) -> FloatArray:
+    """Return the parameters after a fit with the old ones as prior, and the displacement at rest, in units of scale.
+
+    Without any spread the old ones stay, and only the displacement at rest is found.
+    """
+    matrix, vector = problem.design.normal_equations(problem.y, problem.weights)
+    size = x_old.size
+    if not shape_spread:
+        at_rest = (vector[size:] - matrix[size:, :size] @ x_old) / np.diag(matrix)[size:]
+        return np.concatenate([x_old, at_rest])
+    free = solve_free(matrix + problem.penalty(FIRST_SMOOTHNESS, problem.count), vector)
+    noise = noise_rms(problem.design.predict(free)[problem.weights > 0] - problem.y[problem.weights > 0])
+    prior = np.zeros_like(matrix)
+    prior[:size, :size] = _precision(problem.rough[:size, :size], x_old, gain_spread, shape_spread)
+    old = np.append(x_old, np.zeros(matrix.shape[0] - size))
+    return problem.constrained(matrix + noise**2 * prior, vector + noise**2 * (prior @ old))
+
+
+def _precision(rough: FloatArray, x_old: FloatArray, gain_spread: float, shape_spread: float) -> FloatArray:
+    """Return the inverse covariance of the parameters: a smooth deviation, and a common factor (Woodbury)."""
+    shape = (np.eye(x_old.size) + SMOOTH * rough) / shape_spread**2
+    if not gain_spread:
+        return shape
+    along = shape @ x_old
+    return shape - np.outer(along, along) / (1.0 / gain_spread**2 + x_old @ along)
+
+
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))

@@ -1,0 +1,102 @@
+"""Updating a model: drift is followed, and what the new record does not visit is not spoilt."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from identification.records import calibration, record_of, rms, stage
+
+import slpi_ros
+from slpi_ros.errors import IdentificationError, UsageError
+from slpi_ros.identification.refit import refit
+from slpi_ros.model_file import format_model, parse_model
+from slpi_ros.stage.drive import calibration_drive, scan_path
+from slpi_ros.stage.preisach import PreisachStage
+
+SEED = 1
+
+
+@pytest.fixture(scope="module")
+def model():
+    return slpi_ros.identify(calibration(seed=SEED, duration=40.0)[0])
+
+
+def drifted_stage(gain):
+    parameters = stage(SEED).parameters
+    return PreisachStage(replace(parameters, stroke=gain * parameters.stroke), SEED)
+
+
+def small_loops():
+    t = np.arange(3000) / 200.0
+    return t, np.where(t < 2, 20 * t, 40 - 8 * np.sin(4.4 * (t - 2)))
+
+
+def unseen_error(model, gain):
+    """Mean error on a path over the whole range, metres."""
+    t, desired = scan_path(3e-6, 0.93 * model.axes["x"].displacement_range[1], duration=20.0, rate=200.0, seed=9)
+    return float(np.mean(np.abs(drifted_stage(gain).run(t, model.compensate(t, desired))[0] - desired)))
+
+
+def test_small_loops_do_not_spoil_the_large_ones(model):
+    t, v = small_loops()
+    new, changes = refit(model, record_of(t, v, stage(SEED).run(t, v)[1]))
+    assert not changes["x"].drifted
+    assert unseen_error(new, 1.0) < 1.05 * unseen_error(model, 1.0)
+    assert changes["x"].largest < 5e-9
+
+
+@pytest.mark.parametrize("gain", [0.97, 1.03])
+def test_a_gain_that_drifts_is_followed(model, gain):
+    t, v = calibration_drive(0.0, 100.0, duration=15.0, rate=200.0, seed=3)
+    new, changes = refit(model, record_of(t, v, drifted_stage(gain).run(t, v)[1]))
+    change = changes["x"]
+    assert change.drifted and change.gain == pytest.approx(gain - 1.0, abs=2e-3)
+    assert change.error_after < 0.2 * change.error_before
+    assert unseen_error(new, gain) < 0.05 * unseen_error(model, gain)
+
+
+def test_drift_seen_in_small_loops_corrects_the_large_ones(model):
+    t, v = small_loops()
+    new, changes = refit(model, record_of(t, v, drifted_stage(1.03).run(t, v)[1]))
+    assert changes["x"].gain == pytest.approx(0.03, abs=4e-3)
+    assert unseen_error(new, 1.03) < 0.1 * unseen_error(model, 1.03)
+
+
+def test_the_new_model_is_a_whole_document(model):
+    t, v = small_loops()
+    new, _ = refit(model, record_of(t, v, stage(SEED).run(t, v)[1]))
+    again = parse_model(format_model(new), "test")
+    np.testing.assert_array_equal(again.axes["x"].simulate(v), new.axes["x"].simulate(v))
+    assert again.axes["x"].quality.samples == model.axes["x"].quality.samples + v.size
+    assert again.axes["x"].voltage_range == model.axes["x"].voltage_range
+
+
+def test_axes_that_the_record_does_not_hold_stay(model):
+    both = replace(model, axes={"x": model.axes["x"], "z": model.axes["x"]})
+    t, v = small_loops()
+    new, changes = refit(both, record_of(t, v, stage(SEED).run(t, v)[1]))
+    assert new.axes["z"] is both.axes["z"] and set(changes) == {"x"}
+
+
+def test_classical_model_too():
+    record = calibration(seed=SEED)[0]
+    old = slpi_ros.identify(record, "pi")
+    t, v = calibration_drive(0.0, 100.0, duration=15.0, rate=200.0, seed=3)
+    y = drifted_stage(1.1).run(t, v)[1]
+    new, _ = refit(old, record_of(t, v, y))
+    assert rms(new.axes["x"].simulate(v) - y) < 0.7 * rms(old.axes["x"].simulate(v) - y)
+
+
+def test_what_cannot_be_updated_is_refused(model):
+    t, v = small_loops()
+    y = stage(SEED).run(t, v)[1]
+    record = record_of(t, v, y)
+    with pytest.raises(UsageError, match="'a'.*'b'"):
+        refit(replace(model, hardware_id="a"), replace(record, hardware_id="b"))
+    with pytest.raises(UsageError, match="none of the model's axes x"):
+        refit(model, record_of(t, v, y, axis="z"))
+    with pytest.raises(IdentificationError, match="identify the stage anew"):
+        refit(model, record_of(t, 3 * v, y))
+    published = slpi_ros.identify(calibration(seed=SEED)[0], "smpi")
+    with pytest.raises(UsageError, match="kind 'smpi' cannot be updated"):
+        refit(published, record)

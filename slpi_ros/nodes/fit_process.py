@@ -18,8 +18,8 @@ class FitRequest:
 
     Parameters
     ----------
-    bag : str
-        Path.
+    bags : tuple of str
+        Paths; all in one fit.
     topic : str
     kind : str
         Kind of hysteresis model.
@@ -29,12 +29,17 @@ class FitRequest:
         File that gets the model too; "": none.
     """
 
-    bag: str
+    bags: tuple[str, ...]
     topic: str
     kind: str
     start: float | None
     stop: float | None
     output: str
+
+    @property
+    def source(self) -> str:
+        """The bags, in words."""
+        return ", ".join(self.bags)
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,7 @@ class FitProcess:
         except EOFError:
             self._process.join()
             outcome = FitOutcome(
-                error=f"{self.request.bag}: the identification ended with exit code {self._process.exitcode} "
+                error=f"{self.request.source}: the identification ended with exit code {self._process.exitcode} "
                 "and no result; look for a lack of memory, or try a shorter part of the record"
             )
         self.end()
@@ -93,8 +98,8 @@ def fit(request: FitRequest) -> FitOutcome:
     """Read the bag, identify the model and write it to the file, if one is named."""
     document = ""
     try:
-        record = read_bag(request.bag, request.topic)
-        model = identify(record, request.kind, start=request.start, stop=request.stop)
+        records = [read_bag(bag, request.topic) for bag in request.bags]
+        model = identify(records, request.kind, start=request.start, stop=request.stop)
         document = format_model(model)
         if request.output:
             save_model(model, request.output)

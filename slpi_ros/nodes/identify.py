@@ -1,15 +1,18 @@
-"""Node ``identify``: a bag in, a latched model out."""
+"""Node ``identify``: bags in, a latched model out."""
 
 import math
 import sys
 import time
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, replace
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
-from slpi_ros.errors import UsageError
+from slpi_ros.bag_watch import BagWatch
+from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.fit import KINDS
 from slpi_ros.model import StageModel
 from slpi_ros.model_file import parse_model
@@ -20,12 +23,19 @@ from slpi_ros.nodes.qos import LATCHED
 from slpi_ros.nodes.runner import run
 
 POLL_PERIOD = 0.1
+WATCH_PERIOD = 0.5
+NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
 REPORT_PERIOD = (0.05, 3600.0)
 
 DECLARATIONS = (
     Declaration(
         "bags", [""],
-        "The bag to identify: a rosbag2 folder, or a lone mcap or db3 file. Setting a parameter later identifies anew.",
+        "Bags to identify in one fit: rosbag2 folders, or lone mcap or db3 files. Setting a parameter later identifies "
+        "anew.",
+    ),
+    Declaration(
+        "watch_directory", "",
+        "Folder: every bag completed there is identified too, the newest one there at once; empty: none.",
     ),
     Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
     Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}."),
@@ -51,12 +61,15 @@ class IdentifySettings:
 
     Parameters
     ----------
-    request : FitRequest or None
-        What to identify; None without a bag.
+    request : FitRequest
+        What to identify; without bags, what to identify those of the watched folder like.
+    watch_directory : str
+        "": none.
     diagnostic_period : float, seconds
     """
 
-    request: FitRequest | None
+    request: FitRequest
+    watch_directory: str
     diagnostic_period: float
 
     @classmethod
@@ -68,17 +81,18 @@ class IdentifySettings:
         UsageError
             If a value makes no sense.
         """
-        bags = [bag for bag in values["bags"] if bag]
-        if len(bags) > 1:
-            raise UsageError(f"parameter bags names {len(bags)} bags; this version identifies one bag at a time")
+        bags = tuple(bag for bag in values["bags"] if bag)
         if not values["topic"]:
             raise UsageError("parameter topic is empty; name the topic of the bag, as in stage_state")
         kind = choice(values, "kind", KINDS)
         start, stop = bound(values, "start"), bound(values, "stop")
         if start is not None and stop is not None and not start < stop:
             raise UsageError(f"parameter start is {start:g} s and stop {stop:g} s; start before you stop")
-        request = FitRequest(bags[0], values["topic"], kind, start, stop, values["output"]) if bags else None
-        return cls(request, number(values, "diagnostic_period", *REPORT_PERIOD))
+        request = FitRequest(bags, values["topic"], kind, start, stop, values["output"])
+        folder = values["watch_directory"]
+        if folder:
+            BagWatch(folder)
+        return cls(request, folder, number(values, "diagnostic_period", *REPORT_PERIOD))
 
 
 def bound(values: Values, name: str) -> float | None:
@@ -91,10 +105,11 @@ def bound(values: Values, name: str) -> float | None:
 
 
 class Identify(Node):
-    """A node that identifies the stage of a bag and keeps the model latched on ``stage_model``.
+    """A node that identifies the stage of bags and keeps the model latched on ``stage_model``.
 
-    Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`. A bag that cannot be identified is
-    reported, and the last good model stays published.
+    Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`; the service ``~/identify``
+    (``std_srvs/Trigger``) starts anew. A bag that cannot be identified is reported and skipped, and the last good model
+    stays published.
 
     Raises
     ------
@@ -108,12 +123,17 @@ class Identify(Node):
         self._publisher = self.create_publisher(String, "stage_model", LATCHED)
         self._diagnostics = Diagnostics(self, "identify")
         self._job: FitProcess | None = None
+        self._queue: deque[FitRequest] = deque()
+        self._watch: BagWatch | None = None
+        self._failed = 0
         self._model: StageModel | None = None
         self._error = ""
         # A simulated clock may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._poll = self.create_timer(POLL_PERIOD, self._look, clock=steady, autostart=False)
         self.create_timer(self._parameter_set.settings.diagnostic_period, self._report, clock=steady)
+        self._watching = self.create_timer(WATCH_PERIOD, self._look_for_bags, clock=steady)
+        self.create_service(Trigger, "~/identify", self._on_trigger)
         self._parameter_set.follow(self._begin)
         self._begin(self._parameter_set.settings)
 
@@ -126,12 +146,39 @@ class Identify(Node):
         """Start to identify what the parameters name, in place of what is under way."""
         self._end_job()
         self._error = ""
-        if settings.request is None:
-            self.get_logger().warning("no bag to identify; set the parameter bags")
-        else:
-            self._job, self._job_start = FitProcess(settings.request), time.monotonic()
-            self._poll.reset()
+        self._queue.clear()
+        self._watch = BagWatch(settings.watch_directory) if settings.watch_directory else None
+        if settings.request.bags:
+            self._queue.append(settings.request)
+        elif not self._watch:
+            self.get_logger().warning(NOTHING_TO_DO)
+        self._look_for_bags()
+        self._start_next()
         self._report()
+
+    def _look_for_bags(self) -> None:
+        """Queue the bags that have been completed in the watched folder."""
+        for bag in self._watch.look() if self._watch else ():
+            self.get_logger().info(f"{bag} is complete")
+            self._queue.append(replace(self._parameter_set.settings.request, bags=(str(bag),)))
+        self._start_next()
+
+    def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Identify the parameter's bags again, or the newest one of the watched folder."""
+        try:
+            self._begin(self._parameter_set.settings)
+        except SlpiError as error:
+            response.success, response.message = False, str(error)
+            return response
+        response.success = self._job is not None
+        response.message = f"identifying {self._job.request.source}" if self._job else NOTHING_TO_DO
+        return response
+
+    def _start_next(self) -> None:
+        """Start the next identification in the queue, unless one is under way."""
+        if self._queue and not self._job:
+            self._job, self._job_start = FitProcess(self._queue.popleft()), time.monotonic()
+            self._poll.reset()
 
     def _end_job(self) -> None:
         self._poll.cancel()
@@ -146,6 +193,7 @@ class Identify(Node):
             self._job = None
             self._poll.cancel()
             self._take(outcome)
+            self._start_next()
 
     def _take(self, outcome: FitOutcome) -> None:
         if outcome.document:
@@ -154,6 +202,7 @@ class Identify(Node):
             self.get_logger().info(described(self._model))
         self._error = outcome.error
         if self._error:
+            self._failed += 1
             self.get_logger().error(self._error)
         self._report()
 
@@ -163,6 +212,8 @@ class Identify(Node):
             "state": "identifying" if self._job else "waiting",
             "model.created": model.created if model else "",
             "model.hardware_id": model.hardware_id if model else "",
+            "waiting_bags": len(self._queue),
+            "failed": self._failed,
             "last_error": self._error,
         }
         for name, axis in model.axes.items() if model else ():
@@ -178,14 +229,14 @@ class Identify(Node):
                 f"{name}.source": quality.source,
             }
         problems = ((ERROR, self._error),) if self._error else ()
-        if not problems and not model and not self._job:
-            problems = ((WARN, "no bag to identify; set the parameter bags"),)
+        if not problems and not model and not self._job and not self._watch:
+            problems = ((WARN, NOTHING_TO_DO),)
         hardware_id = model.hardware_id if model else ""
         self._diagnostics.report(Health(problems, self._doing(), values, hardware_id))
 
     def _doing(self) -> str:
         if self._job:
-            return f"identifying {self._job.request.bag} for {time.monotonic() - self._job_start:.0f} s"
+            return f"identifying {self._job.request.source} for {time.monotonic() - self._job_start:.0f} s"
         return described(self._model) if self._model else ""
 
 

@@ -27,6 +27,7 @@ from nodes.ros_helpers import (  # noqa: E402
     voltage_path,
 )  # fmt: skip
 from std_msgs.msg import String  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
 
 from slpi_ros.bags import read_bag, write_bag  # noqa: E402
 from slpi_ros.identification.fit import identify  # noqa: E402
@@ -154,7 +155,7 @@ def test_wrong_parameters_change_nothing(bag):
         client.status(lambda status: True, "a report")
         for refused, why in (
             ({"kind": "magic"}, "kind"),
-            ({"bags": ["a", "b"]}, "one bag at a time"),
+            ({"watch_directory": "/nowhere/at/all"}, "no such folder"),
             ({"start": 5, "stop": 2.0}, "start before you stop"),
             ({"topic": ""}, "topic"),
             ({"diagnostic_period": 3.0}, "read-only"),
@@ -165,9 +166,56 @@ def test_wrong_parameters_change_nothing(bag):
         client.identified()
 
 
+def source_of(document: str) -> str:
+    return str(json.loads(document)["axes"]["x"]["quality"]["source"])
+
+
+def test_several_bags_in_one_fit(bag, tmp_path):
+    other = write_calibration(tmp_path / "other", seed=2)
+    with identifying(bags=[bag, other]) as client:
+        document = client.identified()
+        assert source_of(document) == f"{bag}, {other}"
+        assert json.loads(document)["axes"]["x"]["quality"]["samples"] == 1200
+
+
+def test_bags_completed_in_the_watched_folder_are_identified(tmp_path):
+    old, new = tmp_path / "watched" / "old", tmp_path / "watched" / "new"
+    write_calibration(old, seed=1)
+    output = tmp_path / "model.json"
+    with identifying(watch_directory=str(old.parent), output=str(output)) as client:
+        # The newest bag that is there already.
+        assert source_of(client.identified()) == str(old)
+        # One still being written: everything but what its writer adds last.
+        write_calibration(tmp_path / "elsewhere", seed=3)
+        new.mkdir()
+        (recorded,) = (tmp_path / "elsewhere").glob("*.mcap")
+        (new / recorded.name).write_bytes(recorded.read_bytes())
+        later = time.monotonic() + 1.5
+        client.graph.spin_until(lambda: time.monotonic() > later, "a moment")
+        assert len(client.models) == 1
+        # A broken one is reported and skipped.
+        broken = old.parent / "broken"
+        broken.mkdir()
+        (broken / "metadata.yaml").write_text("nonsense")
+        client.failed("broken")
+        (new / "metadata.yaml").write_bytes((tmp_path / "elsewhere" / "metadata.yaml").read_bytes())
+        document = client.identified(2)
+        assert source_of(document) == str(new)
+        assert without_time(output.read_text()) == without_time(document)
+        answer = client.graph.call(Trigger, "/identify/identify", Trigger.Request())
+        assert answer.success and str(new) in answer.message
+        client.identified(3)
+
+
+def test_trigger_without_anything_to_do():
+    with identifying() as client:
+        answer = client.graph.call(Trigger, "/identify/identify", Trigger.Request())
+        assert not answer.success and "no bag" in answer.message
+
+
 @pytest.mark.parametrize(
     ("parameters", "named"),
-    [({"kind": "magic"}, "kind"), ({"bags": ["a", "b"]}, "one bag at a time"), ({"start": "x"}, "start")],
+    [({"kind": "magic"}, "kind"), ({"watch_directory": "/nowhere"}, "no such folder"), ({"start": "x"}, "start")],
 )
 def test_wrong_parameters_end_it_in_one_line(parameters, named):
     with started("identify", parameters) as node:
@@ -203,7 +251,7 @@ def test_an_endless_identification_blocks_nothing_and_leaves_nothing(bag, number
 
 
 def test_a_worker_that_dies_is_an_error_not_a_hang(bag):
-    job = FitProcess(FitRequest(bag, "stage_state", "pi", None, None, ""))
+    job = FitProcess(FitRequest((bag,), "stage_state", "pi", None, None, ""))
     job._process.kill()
     deadline = time.monotonic() + PATIENCE_S
     while (outcome := job.outcome()) is None:

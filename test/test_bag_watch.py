@@ -1,0 +1,58 @@
+"""Which bags of a folder are complete."""
+
+import os
+
+import numpy as np
+import pytest
+
+from slpi_ros.bag_watch import BagWatch
+from slpi_ros.bags import write_bag
+from slpi_ros.errors import UsageError
+from slpi_ros.identification.record import Record
+
+
+def write(path, finished):
+    stamps = np.arange(60, dtype=np.int64) * 5_000_000 + 1
+    write_bag(path, Record(stamps, {"x": np.linspace(0, 1, 60)}, {"x": np.linspace(0, 1, 60)}))
+    os.utime(path / "metadata.yaml", ns=(finished, finished))
+
+
+def test_only_the_newest_one_that_is_there_counts_as_new(tmp_path):
+    for k, name in enumerate(("b", "a", "c")):
+        write(tmp_path / name, 10**18 + k * 10**9)
+    watch = BagWatch(tmp_path)
+    assert watch.look() == [tmp_path / "c"]
+    assert watch.look() == []
+    write(tmp_path / "d", 2 * 10**18)
+    write(tmp_path / "e", 10**18)
+    assert watch.look() == [tmp_path / "e", tmp_path / "d"]
+
+
+def test_what_is_being_written_is_no_bag_yet(tmp_path):
+    watch = BagWatch(tmp_path)
+    write(tmp_path / "whole", 10**18)
+    (lone,) = (tmp_path / "whole").glob("*.mcap")
+    data = lone.read_bytes()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "folder_0.mcap").write_bytes(data)
+    (tmp_path / "lone.mcap").write_bytes(data[:-5])
+    (tmp_path / ".hidden.partial").mkdir()
+    (tmp_path / ".hidden.partial" / "metadata.yaml").write_text("x")
+    (tmp_path / "notes.txt").write_text("x")
+    (tmp_path / "empty.mcap").touch()
+    assert watch.look() == [tmp_path / "whole"]
+    (tmp_path / "lone.mcap").write_bytes(data)
+    (tmp_path / "folder" / "metadata.yaml").touch()
+    assert watch.look() == [tmp_path / "lone.mcap"]
+    (tmp_path / "folder" / "metadata.yaml").write_text("x")
+    assert watch.look() == [tmp_path / "folder"]
+
+
+def test_a_folder_that_goes_holds_none(tmp_path):
+    folder = tmp_path / "bags"
+    folder.mkdir()
+    watch = BagWatch(folder)
+    folder.rmdir()
+    assert watch.look() == []
+    with pytest.raises(UsageError, match="no such folder"):
+        BagWatch(folder)

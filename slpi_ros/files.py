@@ -43,3 +43,20 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
     finally:
         with suppress(OSError, ValueError):
             draft.unlink(missing_ok=True)
+
+
+def make_folder(path: str | os.PathLike[str]) -> None:
+    """Make a folder, and those above it, unless it is there; before long work, so that its end is not in vain.
+
+    Raises
+    ------
+    SlpiError
+        If it cannot be made or written to.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+        reason = "" if os.access(path, os.W_OK) else "it is write-protected"
+    except (OSError, ValueError) as error:
+        reason = str(error.strerror if isinstance(error, OSError) else error)
+    if reason:
+        raise SlpiError(f"{path}: no folder to write into: {reason}; choose another place") from None

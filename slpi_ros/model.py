@@ -156,7 +156,10 @@ class AxisModel:
         held = (v <= lower) | (v >= upper)
         if held.any():
             # At a limit a wish may just be met.
-            missed = (self._known_path() or self.stream(limits).memory).forward_array(v) - y
+            with warnings.catch_warnings():
+                # What stands in for loops that were never identified has been said.
+                warnings.simplefilter("ignore", slpi.UnidentifiedLoopWarning)
+                missed = (self._known_path() or self.stream(limits).memory).forward_array(v) - y
             held &= np.abs(missed) > ROUNDING * (high - low)
         return v, held
 

@@ -5,10 +5,9 @@ from pathlib import Path
 
 from slpi_ros.experiments import compound, measured, mpi_paper, slpi_exhibits
 from slpi_ros.experiments.exhibit import Exhibit
-from slpi_ros.experiments.paths import ramps
-from slpi_ros.experiments.slpi_paper import RANDOM_PATH, STEP_V, measure
-from slpi_ros.files import all_or_nothing
-from slpi_ros.hysteresis.loops import separate
+from slpi_ros.experiments.slpi_paper import RANDOM_PATH, study
+from slpi_ros.files import all_or_nothing, make_folder
+from slpi_ros.hysteresis.loops import Separation
 from slpi_ros.reports.page import Page
 
 FIRST = "Paper 1: Separated Level-loop Prandtl-Ishlinskii (SLPI) model"
@@ -30,8 +29,10 @@ def write_experiments(folder: Path, data: Path | None) -> Path:
     SlpiError
         If something cannot be written or read.
     """
+    make_folder(folder)
+    random = study(RANDOM_PATH)
     parts = {
-        FIRST: slpi_exhibits.exhibits(),
+        FIRST: slpi_exhibits.exhibits(random),
         SECOND: [*mpi_paper.exhibits(), *compound.exhibits()],
         "Measured records": measured.exhibits(data),
     }
@@ -47,7 +48,7 @@ def write_experiments(folder: Path, data: Path | None) -> Path:
         _show(page, part)
     path = folder / "index.html"
     page.write(path)
-    _write_separation(folder / "separation.csv")
+    _write_separation(folder / "separation.csv", random.separation)
     return path
 
 
@@ -61,11 +62,9 @@ def _show(page: Page, exhibits: Sequence[Exhibit]) -> None:
             page.figure(picture.figure, picture.caption)
 
 
-def _write_separation(path: Path) -> None:
-    """Write ``NewData`` (Eq. 4) of the random path."""
-    v = ramps(RANDOM_PATH, STEP_V)
-    table = separate(v, measure(v, 0)).table()
+def _write_separation(path: Path, separation: Separation) -> None:
+    """Write ``NewData`` (Eq. 4)."""
     with all_or_nothing(path) as file:
         file.write("k,voltage_V,displacement_m,tr,lv,sp\n")
-        for k, voltage, displacement, tr, lv, sp in table.tolist():
+        for k, voltage, displacement, tr, lv, sp in separation.table().tolist():
             file.write(f"{k:.0f},{voltage!r},{displacement!r},{tr:.0f},{lv:.0f},{sp:.0f}\n")

@@ -13,6 +13,7 @@ from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi import KnownPath, SeparatedLoops, UnidentifiedLoopWarning
 from slpi_ros.identification.fit import identify
+from slpi_ros.identification.linear import PLAY_OPERATORS
 from slpi_ros.identification.record import Record
 from slpi_ros.identification.separated import default_thresholds, fit_plays, least_iterations
 from slpi_ros.stage.presets import flexure_stage
@@ -25,11 +26,12 @@ RANDOM_PATH = (0.0, 80.0, 12.0, 68.0, 20.0, 80.0, 100.0, 0.0)
 DOUBLE_INNER_LOOP = (0.0, 64.0, 24.0, 100.0, 40.0, 76.0, 0.0)
 OVERLAPPED = (0.0, 60.0, 0.0, 100.0, 0.0)
 STEP_V, STEP_S = 4.0, 0.8
+VOLTAGE_RANGE = (0.0, 100.0)
 # As many passes are averaged (2.2, step 4).
 PASSES = 2
 UNSEEN = 6
 
-CLASSICAL, MORE_PLAYS = "classical PI", "classical PI, 30 operators"
+CLASSICAL, MORE_PLAYS = "classical PI", f"classical PI, {PLAY_OPERATORS} operators"
 AT_REST, CLOSING, FAMILY = "SLPI, at rest", "SLPI, closing", "loop family"
 MODELS = (CLASSICAL, MORE_PLAYS, AT_REST, CLOSING, FAMILY)
 
@@ -231,9 +233,7 @@ def measure(v: FloatArray, seed: int) -> FloatArray:
 
 def reached(v: FloatArray) -> FloatArray:
     """Drive a fresh stage through `v`, shape (N,), volts; return where it is, shape (N,), metres."""
-    stage = flexure_stage()
-    low, high = stage.parameters.threshold_min, stage.parameters.threshold_max
-    return stage.run(_times(v), np.clip(v, low, high))[0]
+    return flexure_stage().run(_times(v), v)[0]
 
 
 def forward(drive: Drive, v: FloatArray) -> FloatArray:
@@ -244,10 +244,10 @@ def forward(drive: Drive, v: FloatArray) -> FloatArray:
 
 
 def voltage_for(drive: Drive, y: FloatArray) -> FloatArray:
-    """Return the model's voltage, shape (N,), volts, for displacements, shape (N,), metres."""
+    """Return the model's voltage within what was identified, shape (N,), volts, for displacements (m)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnidentifiedLoopWarning)
-        return drive.inverse_array(y)
+        return drive.inverse_array(y, *VOLTAGE_RANGE)
 
 
 def gain(before: float, after: float) -> float:

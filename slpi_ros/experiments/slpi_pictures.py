@@ -47,6 +47,33 @@ def separated(separation: Separation) -> Figure:
     return figure
 
 
+def inclinations(separation: Separation) -> Figure:
+    """Draw all single loops from their vertices, one over the other."""
+    figure, (panel,) = panels(1, 1, (7, 4.2))
+    for colour, loop in zip(COLOURS, separation.loops, strict=False):
+        drive, y = _own(separation, loop)
+        panel.plot(drive, y * 1e6, ".-", color=colour, markersize=4, linewidth=0.9, label=f"level {ROMAN[loop.level]}")
+    label(panel, "from the vertex (V)", "from the vertex (µm)")
+    panel.legend(frameon=False)
+    return figure
+
+
+def single_inverses(study: Study) -> Figure:
+    """Draw the inverse of each single loop: voltage over displacement, from the vertex."""
+    loops = study.separation.loops
+    figure, drawn = panels(1, len(loops), (11, 4.0))
+    for number, (panel, loop) in enumerate(zip(drawn, reversed(loops), strict=True)):
+        drive, y = _own(study.separation, loop)
+        panel.plot(y * 1e6, drive, ".", color=MEASURED, markersize=5, label="measured")
+        for name, model in ((AT_REST, study.at_rest), (CLOSING, study.closing)):
+            single = model.loops[len(loops) - 1 - number]
+            panel.plot(y * 1e6, single.memory().inverse_array(y), color=COLOUR[name], linewidth=1.1, label=name)
+        panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
+        label(panel, "from the vertex (µm)", "from the vertex (V)" if panel is drawn[0] else "")
+    drawn[0].legend(frameon=False)
+    return figure
+
+
 def single_models(separation: Separation, models: Mapping[str, SeparatedLoops]) -> Figure:
     """Draw each single loop in its own coordinates, with the PI models of it."""
     loops = separation.loops
@@ -112,8 +139,11 @@ def compensation(study: Study, errors: Mapping[str, LoopErrors], desired: FloatA
         label(upper, "desired (µm)", "achieved (µm)" if not column else "")
         for loop in study.separation.loops:
             lower.plot(
-                loop.samples, errors[name].error[loop.samples] * 1e6, ".", markersize=3, label=ROMAN[loop.level]
+                loop.samples, errors[name].error[loop.samples] * 1e6, ".", markersize=4, label=ROMAN[loop.level]
             )
         label(lower, "sample", "error (µm)" if not column else "")
-    drawn[len(names)].legend(frameon=False, title="level", ncols=3)
+    handles, levels = drawn[-1].get_legend_handles_labels()
+    figure.legend(
+        handles, levels, loc="outside lower center", title="level", ncols=len(handles), markerscale=3, frameon=False
+    )
     return figure

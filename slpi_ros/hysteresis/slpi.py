@@ -15,12 +15,15 @@ from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.loops import Loop, separate
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.hysteresis.runs import require_finite
 
 FloatArray = NDArray[np.float64]
 
 # A loop of a path counts as identified when level and direction are the same, and vertex and span within this share
 # of the outer loop's span: a path of displacements turns at slightly other places than the path of voltages did.
 SAME_LOOP = 0.2
+# A path starts where the axis rests if it starts as near as this (share of the outer loop's span).
+NEAR_START = 0.01
 # How far away a loop of another level, or of the other direction, is (share of the outer loop's span). More for two
 # levels than for one would be wrong: how levels count depends on how a record is cut.
 OTHER = 0.5
@@ -186,12 +189,16 @@ class KnownPath:
         """Drive one coordinate (0 voltage, 1 displacement) through `x`: the outer loop first, then those on it."""
         if not x.size:
             return np.empty_like(x)
-        # The path begins where the axis rests.
+        require_finite(x)
+        # The path begins where the axis rests; a step from there that is next to nothing is no loop.
         path = np.concatenate([[self._start[coordinate]], x])
         answer = np.full_like(path, self._start[1 - coordinate])
+        if abs(path[1] - path[0]) < NEAR_START * self._model.outer_span[coordinate]:
+            path[0] = path[1]
         replaced = []
         separation = separate(path, dead_band=0.0 if coordinate else self._model.dead_band)
         path = separation.voltage
+        path[0] = self._start[coordinate]
         for loop in separation.loops:
             drive = loop.direction * (path[loop.samples] - path[loop.vertex])
             place = loop.level, loop.direction, float(path[loop.vertex]), float(np.max(np.abs(drive), initial=0.0))

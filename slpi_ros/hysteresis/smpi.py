@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from slpi_ros.errors import ModelError
+from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.mpi import MultiSlope
 from slpi_ros.hysteresis.runs import require_finite
+from slpi_ros.hysteresis.shape import FAR
 
 FloatArray = NDArray[np.float64]
 Volts = TypeVar("Volts", float, FloatArray)
@@ -75,6 +76,8 @@ class AmplitudeScaled:
         for name, knots in (("voltages", v), ("displacements", x)):
             if not (np.isfinite(knots).all() and (np.diff(knots, prepend=0.0) > 0).all()):
                 raise ModelError(f"SMPI: the peaks' {name} must be finite, positive and rise strictly")
+        if not self.base.stroke(self.base.origin + self.base.amplitude, self.base.origin) > 0.0:
+            raise ModelError("SMPI: no operator of the base model moves within its amplitude; lower the thresholds")
 
     def peak(self, amplitude: float) -> float:
         """Return ``X_p`` (m) at an amplitude (V): linear from (0, 0) through the knots, and on beyond the last one."""
@@ -112,10 +115,12 @@ class KnownPath:
         Raises
         ------
         UsageError
-            If a voltage is not finite.
+            If a voltage is not finite, or none of a stage.
         """
         v = np.asarray(v, dtype=np.float64)
         require_finite(v)
+        if v.size and np.max(np.abs(v)) > FAR:
+            raise UsageError(f"voltage {v[np.argmax(np.abs(v))]} V is none that a stage can be given")
         origin, y = self.model.base.origin, np.empty_like(v)
         present = (self.start_voltage, self.start_displacement)
         for start, stop in cycles(np.append(self.start_voltage, v), origin + self._least_amplitude):
@@ -131,7 +136,7 @@ class KnownPath:
         Raises
         ------
         UsageError
-            If a displacement is not finite.
+            If a displacement is not finite, or none that the model can take.
         """
         y = np.asarray(y, dtype=np.float64)
         require_finite(y)
@@ -169,6 +174,8 @@ class KnownPath:
         most = 2.0 * least
         while missing(most) > 0.0:
             most *= 2.0
+            if most > FAR:
+                raise UsageError(f"displacement {peak} m is none that this model can take; leave such samples out")
         return float(brentq(missing, least, most, xtol=1e-14 * self.model.base.amplitude, rtol=1e-15))
 
 

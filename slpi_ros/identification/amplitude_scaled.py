@@ -76,6 +76,8 @@ def _fit(samples: Samples, kept: NDArray[np.bool_], largest: NDArray[np.bool_]) 
     assert isinstance(base, MultiSlope)
     # Of all fitted samples: a few peaks say nothing of the samples between them.
     model = AmplitudeScaled(base, *peak_line(samples.v, np.where(samples.fitted, samples.y, np.nan)))
-    # Displacement at the start: the largest cycles alone say little about it.
+    # Displacement at the start: at the low end, where all cycles begin, the model must be right.
     relative = model.along(float(samples.v[0]), 0.0).forward_array(samples.v)
-    return model, float(np.median((samples.y - relative)[kept]))
+    low, high = _ends(samples)
+    at_low_end = kept & (samples.v <= low + BACK * (high - low))
+    return model, float(np.median((samples.y - relative)[at_low_end if at_low_end.any() else kept]))

@@ -13,7 +13,7 @@ from slpi_ros.identification.amplitude_scaled import fit_amplitude_scaled
 from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.problem import noise_rms
 from slpi_ros.identification.record import Record
-from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples
 from slpi_ros.model import AxisModel, FitQuality, StageModel
 
 FloatArray = NDArray[np.float64]
@@ -125,9 +125,9 @@ def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:
 def _require_sense(fitted: Fitted) -> None:
     """Refuse a model that says nothing."""
     if fitted.covered == 0.0:
-        raise IdentificationError("the voltage never turns back; drive it up and down over the range to be used")
+        raise IdentificationError(NEVER_TURNS)
     spread = float(np.std(fitted.y))
-    if fitted.held_out_rms > SENSELESS * spread:
+    if not fitted.held_out_rms <= SENSELESS * spread:
         raise IdentificationError(
             f"the voltage does not explain the displacement: error {fitted.held_out_rms * 1e9:.4g} nm rms on blocks "
             f"left out, of {spread * 1e9:.4g} nm rms in all; check that both signals belong to this axis, and their "

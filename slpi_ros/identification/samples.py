@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.runs import monotone_runs
 from slpi_ros.identification.record import Record
 
@@ -14,6 +14,7 @@ FloatArray = NDArray[np.float64]
 
 # Fewer samples than this say nothing about a loop.
 FEWEST = 50
+NEVER_TURNS = "the voltage never turns back; drive it up and down over the range to be used"
 # The memory counts as wiped once the voltage has come this near to both ends of its range (share of the range).
 NEAR_END = 0.02
 
@@ -97,6 +98,8 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
         If the record has no such axis.
     RecordError
         If the samples are too few, out of order, or one signal does not vary.
+    IdentificationError
+        If the voltage never turns back.
     """
     record.require_axis(axis)
     where = f"{record.source}: axis '{axis}'"
@@ -124,6 +127,8 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
             raise RecordError(
                 f"{where}: {name} stays at {signal[0]:g} {unit}; record a drive over the range to be used"
             )
+    if len(monotone_runs(v)) < 3:
+        raise IdentificationError(f"{where}: {NEVER_TURNS}")
     if np.corrcoef(v[fitted], y[fitted])[0, 1] < 0:
         raise RecordError(f"{where}: displacement falls where voltage rises; change the sign of one of them")
     return Samples(v, np.where(fitted, y, 0.0), fitted)

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from slpi_ros.errors import IdentificationError
+from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.hysteresis.loops import Loop, separate
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii, play
 from slpi_ros.hysteresis.slpi import SeparatedLoops, SingleLoop, UnidentifiedLoopWarning, at_vertex
@@ -17,7 +17,7 @@ from slpi_ros.identification.bases import LEAST_GAIN
 from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.problem import RIDGE, held_out_rms
 from slpi_ros.identification.qp import solve_qp
-from slpi_ros.identification.samples import FEWEST, Samples, only_one
+from slpi_ros.identification.samples import FEWEST, NEVER_TURNS, Samples, only_one
 from slpi_ros.model import Start
 
 FloatArray = NDArray[np.float64]
@@ -79,6 +79,8 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
     loops, offset = fit_loops(samples, samples.fitted, at_rest=at_rest)
     # The first rise is never left out: a record shows it once.
     after_first_rise = np.arange(samples.v.size) > int(np.argmax(samples.v))
+    if not np.any(samples.fitted & after_first_rise):
+        raise IdentificationError(NEVER_TURNS)
     return Fitted(
         hysteresis=loops,
         start=Start(float(samples.v[0]), offset),
@@ -142,7 +144,13 @@ def fit_loops(
         single = _SingleLoopFit(loop, samples, fitted, thresholds)
         fits = [single.solve(run_in) for run_in in _run_ins(loop.level, thresholds, at_rest)]
         best = min(fits, key=lambda fit: fit.rms)
-        identified[number] = single.loop(best, identified.get(below[loop.vertex]) if loop.level else None)
+        try:
+            identified[number] = single.loop(best, identified.get(below[loop.vertex]) if loop.level else None)
+        except UsageError:
+            raise IdentificationError(
+                f"the loop from {samples.v[loop.vertex]:g} V (sample {loop.vertex}) does not fit onto the one below it; "
+                "check that voltage and displacement belong together"
+            ) from None
     return SeparatedLoops(tuple(identified.values()), dead_band), identified[0].vertex[1]
 
 

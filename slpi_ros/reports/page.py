@@ -9,8 +9,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from slpi_ros.errors import SlpiError
-from slpi_ros.files import all_or_nothing
+from slpi_ros.files import all_or_nothing, make_folder
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1b2733; background: #fff; }
@@ -96,10 +95,7 @@ class Page:
             f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>'
             f"<body><h1>{title}</h1>{''.join(self._parts)}</body></html>"
         )
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise SlpiError(f"{path.parent}: cannot make the folder: {error.strerror}; choose another place") from None
+        make_folder(path.parent)
         with all_or_nothing(path) as file:
             file.write(document)
 

@@ -183,3 +183,14 @@ def test_refuses_what_is_no_model() -> None:
             SeparatedLoops((outer, broken))
     with pytest.raises(UsageError, match="nan"):
         SeparatedLoops((outer,)).along(0.0, 0.0).forward_array(np.array([0.0, np.nan]))
+
+
+def test_a_start_that_is_nearly_there_makes_no_loop() -> None:
+    loops = nested([np.full(10, 2e-8)] * 3, 0.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # The sensor's noise at rest; the path starts a little below.
+        y = loops.along(0.0, 1e-9).forward_array(PATH)
+        v = loops.along(0.0, 1e-9).inverse_array(np.concatenate([[0.0], y[1:81]]))
+    assert abs(v[0]) < 0.1
+    np.testing.assert_allclose(v[2:], PATH[2:81], atol=1e-6)

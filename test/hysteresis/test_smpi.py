@@ -196,3 +196,9 @@ def test_what_is_not_finite_is_told(method, value):
 def test_peaks_that_make_no_model(voltages, displacements):
     with pytest.raises(ModelError, match=r"^SMPI: [^\n]+$"):
         AmplitudeScaled(BASE, np.array(voltages), np.array(displacements))
+
+
+def test_a_base_that_never_moves_is_no_model():
+    base = MultiSlope(0.0, 120.0, np.array([1000.0]), np.array([1e-7]))
+    with pytest.raises(ModelError, match="no operator of the base model moves"):
+        AmplitudeScaled(base, np.array([120.0]), np.array([1e-5]))

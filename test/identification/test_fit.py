@@ -235,3 +235,11 @@ def test_records_that_do_not_belong_together(recorded):
         slpi_ros.identify([record, record_of(record.t, record.voltage["x"], record.displacement["x"], axis="z")])
     with pytest.raises(UsageError, match="fitted to one"):
         slpi_ros.identify([record, record], "slpi-published")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_kind_is_fitted_to_a_mere_rise(kind):
+    t = 0.01 * np.arange(400)
+    for v in (25.0 * t, np.where(t < 1, 0.0, 50.0)):
+        with pytest.raises(IdentificationError, match="never turns back"):
+            slpi_ros.identify(record_of(t, v, 2e-7 * v), kind)

@@ -148,7 +148,7 @@ def fit_loops(
             identified[number] = single.loop(best, identified.get(below[loop.vertex]) if loop.level else None)
         except UsageError:
             raise IdentificationError(
-                f"the loop from {samples.v[loop.vertex]:g} V (sample {loop.vertex}) does not fit onto the one below it; "
+                f"the loop from {samples.v[loop.vertex]:g} V (sample {loop.vertex}) does not fit the one below it; "
                 "check that voltage and displacement belong together"
             ) from None
     return SeparatedLoops(tuple(identified.values()), dead_band), identified[0].vertex[1]

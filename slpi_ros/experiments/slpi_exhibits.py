@@ -7,33 +7,22 @@ from numpy.typing import NDArray
 
 from slpi_ros.experiments import slpi_pictures as pictures
 from slpi_ros.experiments.exhibit import Exhibit, Picture, Table
-from slpi_ros.experiments.published import (
-    HIGHEST_MEAN,
-    OUTER_MAXIMUM,
-    OVERALL_MEAN,
-    SPREAD,
-    TABLE_2,
-    TABLE_3,
-    TABLE_4,
-    TABLE_5,
-    THRESHOLDS,
-)
+from slpi_ros.experiments.published import TABLE_2, TABLE_3, TABLE_4, TABLE_5, THRESHOLDS
+from slpi_ros.experiments.slpi_compensation import compensation, other, straight_line, unseen
 from slpi_ros.experiments.slpi_paper import (
     AT_REST,
     CLASSICAL,
     CLOSING,
     DOUBLE_INNER_LOOP,
+    DRAWN,
     FAMILY,
-    MODELS,
     OVERLAPPED,
-    LoopErrors,
     Study,
-    UnseenPaths,
     gain,
     study,
     unseen_paths,
 )
-from slpi_ros.hysteresis.loops import Separation
+from slpi_ros.experiments.slpi_tables import errors_table, turns_of, um
 from slpi_ros.hysteresis.slpi import SeparatedLoops
 from slpi_ros.identification.linear import PLAY_OPERATORS
 from slpi_ros.identification.separated import least_iterations
@@ -41,9 +30,6 @@ from slpi_ros.identification.separated import least_iterations
 FloatArray = NDArray[np.float64]
 
 ROMAN = pictures.ROMAN
-DRAWN = (CLASSICAL, AT_REST, CLOSING, FAMILY)
-FIGURES = ("outer loop's maximum", "highest loop's mean", "spread between loops", "overall mean")
-PAPER = (OUTER_MAXIMUM, HIGHEST_MEAN, SPREAD, OVERALL_MEAN)
 PRINTED = {2: TABLE_2, 1: TABLE_3, 0: TABLE_4}
 
 
@@ -57,21 +43,12 @@ def exhibits(random: Study) -> list[Exhibit]:
         _closure(random),
         _classical(random),
         _inverse(random),
-        _compensation(random),
-        _straight_line(random),
-        _other("Fig. 16 and 17: double inner loop, one vertex on the back branch", study(DOUBLE_INNER_LOOP)),
-        _other("Fig. 18 and 19: overlapped inner and outer loop", study(OVERLAPPED)),
-        _unseen(unseen_paths(random)),
+        compensation(random),
+        straight_line(random),
+        other("Fig. 16 and 17: double inner loop, one vertex on the back branch", study(DOUBLE_INNER_LOOP)),
+        other("Fig. 18 and 19: overlapped inner and outer loop", study(OVERLAPPED)),
+        unseen(unseen_paths(random)),
     ]
-
-
-def um(metres: float) -> str:
-    """Return a length in micrometres, three digits behind the point."""
-    return f"{metres * 1e6:.3f}"
-
-
-def _turns(study: Study) -> str:
-    return " → ".join(f"{turn:.0f}" for turn in study.turns) + " V"
 
 
 def _nonlinear_curve(study: Study) -> Exhibit:
@@ -82,7 +59,7 @@ def _nonlinear_curve(study: Study) -> Exhibit:
         title="Fig. 4 and 5: random complex voltage, and the displacement",
         paper="A random voltage between 0 and 100 V with loops up to level II, a sample every 4 V and 0.8 s; the mean "
         "of two measurements. No numbers are printed.",
-        ours=f"{_turns(study)}; stroke {um(stroke)} µm, {um(remanence)} µm left at the end.",
+        ours=f"{turns_of(study)}; stroke {um(stroke)} µm, {um(remanence)} µm left at the end.",
         remark="The path is ours: the paper's is known as a picture only.",
         pictures=(Picture(pictures.path_and_curve(study.separation.voltage, y), "Voltage over time; the curve."),),
     )
@@ -185,18 +162,6 @@ def _closure(study: Study) -> Exhibit:
     )
 
 
-def _errors_table(errors: Mapping[str, LoopErrors], separation: Separation, what: str = "") -> Table:
-    v = separation.voltage
-    levels = [f"{ROMAN[loop.level]} from {v[loop.vertex]:.0f} V" for loop in separation.loops]
-    rows = [
-        (name, um(e.overall), *(um(mean) for mean in e.means), um(e.maxima[0]), um(e.spread))
-        for name, e in errors.items()
-    ]
-    name = f"error {what} (µm)" if what else "error (µm)"
-    header = (name, "mean", *(f"mean, level {level}" for level in levels), "maximum, level 0", "spread")
-    return Table(header, tuple(rows), best=int(np.argmin([e.overall for e in errors.values()])))
-
-
 def _classical(study: Study) -> Exhibit:
     rows = [
         (f"{r:.0f}", f"{w:.5f}", f"{ours * 1e6:.5f}")
@@ -213,7 +178,7 @@ def _classical(study: Study) -> Exhibit:
         f"{PLAY_OPERATORS} operators and a free start, as kind pi has them, it is better; it stands beside.",
         tables=(
             Table(("Table 5: r (V)", "ω, paper", "ω, ours (µm/V)"), tuple(rows)),
-            _errors_table(study.modelled, study.separation),
+            errors_table(study.modelled, study.separation),
         ),
         pictures=(Picture(pictures.over_data(study.separation, study.modelled, DRAWN), "Models over the data."),),
     )
@@ -230,97 +195,4 @@ def _inverse(study: Study) -> Exhibit:
             Picture(pictures.single_inverses(study), "Fig. 12: inverses of the single loops."),
             Picture(pictures.inverses(study, DRAWN), "Fig. 13: the rebuilt inverse, voltage over displacement."),
         ),
-    )
-
-
-def _percentages(errors: Mapping[str, LoopErrors]) -> Table:
-    rows = [("paper, SLPI", *(f"{value:.1f}" for value in PAPER))]
-    rows += [(f"ours, {name}", *(f"{fall:.1f}" for fall in _falls(errors, name))) for name in MODELS[1:]]
-    return Table(("less than classical PI by (%)", *FIGURES), tuple(rows))
-
-
-def _falls(errors: Mapping[str, LoopErrors], name: str) -> tuple[float, float, float, float]:
-    """Return by how much a model beats classical PI, in per cent, in the order of the paper's four figures."""
-    classical, other = errors[CLASSICAL], errors[name]
-    return (
-        gain(classical.maxima[0], other.maxima[0]),
-        gain(classical.means[-1], other.means[-1]),
-        gain(classical.spread, other.spread),
-        gain(classical.overall, other.overall),
-    )
-
-
-def _verdict(errors: Mapping[str, LoopErrors], name: str) -> str:
-    """Say how a model stands in each of the paper's four figures."""
-    parts = []
-    for what, paper, ours in zip(FIGURES, PAPER, _falls(errors, name), strict=True):
-        parts.append(f"{what} {-ours:+.1f} % ({'met' if ours >= paper else 'not met'})")
-    return ", ".join(parts)
-
-
-def _compensation(study: Study) -> Exhibit:
-    errors = study.compensated
-    return Exhibit(
-        title="Fig. 15 and the four percentages: compensation",
-        paper="Against classical PI: "
-        + ", ".join(f"{what} -{value} %" for what, value in zip(FIGURES, PAPER, strict=True))
-        + ".",
-        ours=f"Closing form: {_verdict(errors, CLOSING)}. At rest, as published: {_verdict(errors, AT_REST)}.",
-        remark="Desired: straight lines between the displacements measured at the turns, so that the loops are those "
-        "that were identified. The stage is a fresh one, errors are true ones, voltages stay within 0 to 100 V. The "
-        "spread grows where the inner loops gain more than the outer one, whose shape no PI model has.",
-        tables=(_percentages(errors), _errors_table(errors, study.separation)),
-        pictures=(
-            Picture(pictures.compensation(study, errors, study.desired, DRAWN), "Achieved over desired; errors."),
-        ),
-    )
-
-
-def _straight_line(study: Study) -> Exhibit:
-    errors = study.straight
-    return Exhibit(
-        title="Fig. 15 with the paper's straight line",
-        paper="Expected is the straight line through zero and the maximum (4.1).",
-        ours=f"Closing form: {_verdict(errors, CLOSING)}. At rest, as published: {_verdict(errors, AT_REST)}.",
-        remark="This path turns at other displacements than the record did, by up to the hysteresis itself, so that no "
-        "published loop quite fits; and it ends below what the stage can reach at 0 V after the rise. The loop family "
-        "interpolates between vertices and loses little.",
-        tables=(_percentages(errors), _errors_table(errors, study.separation)),
-    )
-
-
-def _other(title: str, study: Study) -> Exhibit:
-    errors = study.modelled
-    worst = {name: max(errors[name].means[1:]) for name in (CLASSICAL, CLOSING, FAMILY)}
-    return Exhibit(
-        title=title,
-        paper="SLPI describes the inner loops much better than classical PI; there was no error calculation.",
-        ours=f"{_turns(study)}. Worst inner loop, mean error of the model: {um(worst[CLASSICAL])} µm (classical PI), "
-        f"{um(worst[CLOSING])} µm (SLPI closing), {um(worst[FAMILY])} µm (loop family).",
-        remark="As in the paper, and with numbers.",
-        tables=(
-            _errors_table(errors, study.separation, "of the model"),
-            _errors_table(study.compensated, study.separation, "compensated"),
-        ),
-        pictures=(
-            Picture(pictures.separated(study.separation), "The loops."),
-            Picture(pictures.over_data(study.separation, errors, DRAWN), "Models over data."),
-        ),
-    )
-
-
-def _unseen(unseen: UnseenPaths) -> Exhibit:
-    rows = [
-        (name, *(um(mean) for mean in means), um(float(np.mean(means)))) for name, means in unseen.mean_errors.items()
-    ]
-    header = ("mean error (µm)", *(f"path {k + 1}" for k in range(len(unseen.turns))), "all")
-    paths = "; ".join(" → ".join(f"{turn:.0f}" for turn in turns) for turns in unseen.turns)
-    return Exhibit(
-        title="Paths whose loops were never identified",
-        paper="Not tried.",
-        ours=f"Models of the random path on {len(unseen.turns)} other paths (V): {paths}. "
-        f"{unseen.replaced} of their {unseen.loops} inner loops were never identified; the nearest stand in.",
-        remark="Published SLPI has nothing to say about loops it has not seen, and is no better than classical PI with "
-        "more operators there; the loop family interpolates.",
-        tables=(Table(header, tuple(rows), best=int(np.argmin([np.mean(e) for e in unseen.mean_errors.values()]))),),
     )

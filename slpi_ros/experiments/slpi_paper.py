@@ -34,6 +34,7 @@ UNSEEN = 6
 CLASSICAL, MORE_PLAYS = "classical PI", f"classical PI, {PLAY_OPERATORS} operators"
 AT_REST, CLOSING, FAMILY = "SLPI, at rest", "SLPI, closing", "loop family"
 MODELS = (CLASSICAL, MORE_PLAYS, AT_REST, CLOSING, FAMILY)
+DRAWN = (CLASSICAL, AT_REST, CLOSING, FAMILY)
 
 Drive = Memory | KnownPath
 

@@ -1,7 +1,7 @@
 """Compensation sample by sample: what the compensator node runs for each axis."""
 
-from dataclasses import dataclass
-from math import inf, isfinite
+from dataclasses import dataclass, replace
+from math import inf, isfinite, sqrt
 
 from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis.memory import Memory
@@ -11,22 +11,39 @@ from slpi_ros.hysteresis.memory import Memory
 TOLERATED_SHARE = 0.2
 # A displacement missed by less than this share of the range is met: it is rounding.
 ROUNDING = 1e-9
+# A longer pause between two samples frees no longer way than this one, seconds.
+LONGEST_STEP = 0.1
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Voltages that an axis may be given: `lower` to `upper` (V), changing by at most `slew` (V/s; inf: no limit)."""
+    """Voltages that an axis may be given, and how fast.
+
+    Parameters
+    ----------
+    lower, upper : float, volts
+    slew : float, V/s
+        Fastest change; inf: no limit.
+    acceleration : float, V/s^2
+        Fastest change of that change; inf: no limit.
+
+    Raises
+    ------
+    UsageError
+        If they leave no voltage or no motion.
+    """
 
     lower: float
     upper: float
     slew: float = inf
+    acceleration: float = inf
 
     def __post_init__(self) -> None:
         """Refuse limits that leave no voltage."""
-        if not self.lower <= self.upper or not self.slew > 0:
+        if not self.lower <= self.upper or not self.slew > 0 or not self.acceleration > 0:
             raise UsageError(
-                f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s leave nothing to do; "
-                "give lower <= upper and a positive slew"
+                f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s and acceleration "
+                f"{self.acceleration:g} V/s^2 leave nothing to do; give lower <= upper, and the others positive"
             )
 
     def within(self, voltage_range: tuple[float, float]) -> "Limits":
@@ -37,7 +54,103 @@ class Limits:
                 f"the model was identified from {voltage_range[0]:g} to {voltage_range[1]:g} V, outside the voltage "
                 f"limits {self.lower:g}..{self.upper:g} V; identify it again within them, or correct the limits"
             )
-        return Limits(lower, upper, self.slew)
+        return replace(self, lower=lower, upper=upper)
+
+    def clip(self, voltage: float) -> float:
+        """Return the allowed voltage (V) nearest to `voltage` (V)."""
+        return min(max(voltage, self.lower), self.upper)
+
+
+class Pace:
+    """How far a voltage may go from one sample to the next.
+
+    With a limit of acceleration every step leaves room to brake: before the voltage limits always, and before the goal
+    unless the goal itself turns too sharply.
+
+    Parameters
+    ----------
+    limits : Limits
+        They may be replaced at any time; a voltage outside new ones goes inside as fast as slew and acceleration allow.
+
+    Attributes
+    ----------
+    rate : float, V/s
+        Of the last step.
+    """
+
+    __slots__ = ("limits", "rate")
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        self.rate = 0.0
+
+    def reach(self, present: float, dt: float) -> tuple[float, float]:
+        """Return the lowest and the highest voltage (V) that may follow `present` (V) after `dt` (s)."""
+        limits = self.limits
+        lower, upper = limits.lower, limits.upper
+        if limits.acceleration < inf:
+            down, up = self._ways(present, dt)
+        elif limits.slew < inf:
+            up = limits.slew * dt
+            down = -up
+        else:
+            return lower, upper
+        # A voltage outside its limits goes inside at full pace.
+        lowest, highest = present + down, present + up
+        lowest = max(lowest, min(lower, highest))
+        return lowest, min(highest, max(upper, lowest))
+
+    def toward(self, present: float, goal: float, goal_before: float, dt: float) -> tuple[float, float]:
+        """Return what `reach` does, narrowed so that the voltage can stop at a goal that moves on as it just did.
+
+        Parameters
+        ----------
+        present, goal, goal_before : float, volts
+            The goal now, and at the sample before.
+        dt : float, seconds
+        """
+        lowest, highest = self.reach(present, dt)
+        if self.limits.acceleration == inf:
+            return lowest, highest
+        behind, along = goal_before - present, present + (goal - goal_before)
+        low, high = along - self._braking_way(-behind, dt), along + self._braking_way(behind, dt)
+        return min(max(low, lowest), highest), min(max(high, lowest), highest)
+
+    def step(self, present: float, goal: float, dt: float, goal_before: float | None = None) -> float:
+        """Return the voltage (V) that follows `present` (V) on the way to a `goal` (V) after `dt` (s)."""
+        lowest, highest = self.toward(present, goal, goal if goal_before is None else goal_before, dt)
+        v = min(max(goal, lowest), highest)
+        self.moved(v - present, dt)
+        return v
+
+    def moved(self, way: float, dt: float) -> None:
+        """Remember how fast the last step went: `way` (V) in `dt` (s)."""
+        if dt > 0.0:
+            self.rate = way / dt
+
+    def rest(self) -> None:
+        """Start anew from a voltage at rest."""
+        self.rate = 0.0
+
+    def _ways(self, present: float, dt: float) -> tuple[float, float]:
+        """Return how far (V) down and up slew, acceleration and room to brake allow."""
+        limits = self.limits
+        change, fastest = limits.acceleration * dt, limits.slew
+        down = max(self.rate - change, -fastest) * dt
+        up = min(self.rate + change, fastest) * dt
+        to_lower, to_upper = present - limits.lower, limits.upper - present
+        if to_upper >= 0.0:
+            up = min(up, self._braking_way(to_upper, dt))
+        if to_lower >= 0.0:
+            down = max(down, -self._braking_way(to_lower, dt))
+        return min(down, up), max(down, up)
+
+    def _braking_way(self, distance: float, dt: float) -> float:
+        """Return the longest step (V) in `dt` after which the voltage can still stop within `distance` (V)."""
+        if distance <= 0.0:
+            return 0.0
+        acceleration = self.limits.acceleration
+        return min(acceleration * dt * (sqrt(dt * dt + 2.0 * distance / acceleration) - dt), distance)
 
 
 class AxisStream:
@@ -51,17 +164,33 @@ class AxisStream:
         Smallest and largest displacement the model was identified on.
     limits : Limits
         The memory follows the voltage that is really given, so that limits do it no harm.
+
+    Attributes
+    ----------
+    accepted : (float, float), metres
+        Smallest and largest displacement that may be wished for.
+    pace : Pace
     """
 
     def __init__(self, memory: Memory, displacement_range: tuple[float, float], limits: Limits) -> None:
         self.memory = memory
-        self.limits = limits
-        self._accepted = accepted_range(displacement_range)
+        self.accepted = accepted_range(displacement_range)
+        self.pace = Pace(limits)
         self._t = -inf
         # The axis may rest outside its limits; the first voltage it is given is inside.
-        memory.forward(min(max(memory.voltage, limits.lower), limits.upper))
+        memory.forward(limits.clip(memory.voltage))
         self._wish = memory.displacement
+        self._goal = memory.voltage
         self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
+
+    @property
+    def limits(self) -> Limits:
+        """Voltage limits; new ones count from the next sample on."""
+        return self.pace.limits
+
+    @limits.setter
+    def limits(self, limits: Limits) -> None:
+        self.pace.limits = limits
 
     @property
     def voltage(self) -> float:
@@ -82,8 +211,8 @@ class AxisStream:
             raise UsageError(f"sample t = {t} s, displacement = {y} m is not finite; leave it out")
         if t < self._t:
             raise UsageError(f"time runs backwards: {t:.9g} s after {self._t:.9g} s; send samples in order")
-        if not self._accepted[0] <= y <= self._accepted[1]:
-            raise UnreachableError(refusal(y, self._accepted))
+        if not self.accepted[0] <= y <= self.accepted[1]:
+            raise UnreachableError(refusal(y, self.accepted))
 
     def step(self, t: float, y: float) -> float:
         """Return the voltage (V) for the desired displacement `y` (m) at time `t` (s).
@@ -94,25 +223,60 @@ class AxisStream:
             As in `check`; nothing has moved then.
         """
         self.check(t, y)
-        limits = self.limits
-        if limits.slew == inf:
-            lower, upper = limits.lower, limits.upper
-        else:
-            # At the first sample no time has passed yet: the voltage stays and catches up from there.
-            reach = limits.slew * (t - self._t) if self._t > -inf else 0.0
-            present = self.memory.voltage
-            lower, upper = max(limits.lower, present - reach), min(limits.upper, present + reach)
-        v = self.memory.inverse(y, lower, upper)
-        self._t, self._wish = t, y
+        # At the first sample no time has passed yet: the voltage stays and catches up from there.
+        v = self.move(t - self._t if self._t > -inf else 0.0, y)
+        self._t = t
         return v
 
     __call__ = step
 
+    def move(self, dt: float, y: float) -> float:
+        """Return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last one; neither is checked.
+
+        Raises
+        ------
+        UsageError
+            If the model has no voltage for it; nothing has moved then.
+        """
+        memory, pace = self.memory, self.pace
+        if pace.limits.acceleration < inf:
+            v = self._move_gently(dt, y)
+        else:
+            lower, upper = pace.reach(memory.voltage, dt)
+            v = memory.inverse(y, lower, upper)
+        self._wish = y
+        return v
+
+    def drive(self, voltage: float) -> float:
+        """Move to a voltage (V) whatever is wished for; return the displacement (m) that the model gives it."""
+        self._wish = self.memory.forward(voltage)
+        self._goal = voltage
+        return self._wish
+
+    def _move_gently(self, dt: float, y: float) -> float:
+        """Move within the limit of acceleration: slow down before the voltage that the wish asks for."""
+        memory, pace = self.memory, self.pace
+        present, state = memory.voltage, memory.snapshot()
+        goal = memory.inverse(y, pace.limits.lower, pace.limits.upper)
+        lowest, highest = pace.toward(present, goal, self._goal, dt)
+        if lowest <= goal <= highest:
+            v = goal
+        else:
+            memory.restore(state)
+            v = memory.inverse(y, lowest, highest)
+        pace.moved(v - present, dt)
+        self._goal = goal
+        return v
+
     @property
     def held(self) -> bool:
         """Whether the last wish could not be met: the voltage waits at one of its limits."""
-        at_limit = self.memory.voltage in (self.limits.lower, self.limits.upper)
-        return at_limit and abs(self.memory.displacement - self._wish) > self._rounding
+        return self.missed and self.memory.voltage in (self.limits.lower, self.limits.upper)
+
+    @property
+    def missed(self) -> bool:
+        """Whether the last wish is not met, for whatever limit."""
+        return abs(self.memory.displacement - self._wish) > self._rounding
 
 
 def accepted_range(displacement_range: tuple[float, float]) -> tuple[float, float]:

@@ -1,3 +1,6 @@
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +10,7 @@ from strategies import FAMILY_CASE, Case, cases, fractions, paths
 from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii
-from slpi_ros.stream import TOLERATED_SHARE, AxisStream, Limits
+from slpi_ros.stream import TOLERATED_SHARE, AxisStream, Limits, Pace
 
 RANGE = (2e-6, 14e-6)
 
@@ -182,3 +185,86 @@ def test_a_single_voltage_is_a_limit_too():
     stream = stream_of(limits=Limits(40.0, 40.0))
     assert [stream.step(float(i), y) for i, y in enumerate((2e-6, 14e-6, 6e-6))] == [40.0] * 3
     assert isinstance(stream.memory, Memory)
+
+
+@pytest.mark.parametrize("acceleration", [0.0, -1.0, np.nan])
+def test_an_acceleration_that_leaves_nothing(acceleration):
+    with pytest.raises(UsageError, match="^[^\n]+$"):
+        Limits(0.0, 1.0, acceleration=acceleration)
+
+
+GENTLE = Limits(0.0, 100.0, 300.0, 5000.0)
+STEPS = st.lists(fractions(2e-3, 0.1), min_size=1, max_size=7)
+
+
+def gently(pace: Pace, v: float, goals: list[float], steps: list[float]) -> Iterator[tuple[float, float]]:
+    """Yield time and voltage; check what a pace promises of every step."""
+    t, rate, limits = 0.0, 0.0, pace.limits
+    for i, goal in enumerate(goals):
+        dt = steps[i % len(steps)]
+        before, v, t = v, pace.step(v, goal, dt), t + dt
+        assert limits.lower <= v <= limits.upper
+        assert abs(v - before) <= limits.slew * dt * (1 + 1e-9) + 1e-12
+        assert abs((v - before) / dt - rate) <= limits.acceleration * dt * (1 + 1e-9) + 1e-9
+        rate = (v - before) / dt
+        yield t, v
+
+
+@given(st.lists(fractions(-50, 150), min_size=1, max_size=30), STEPS)
+def test_a_gentle_pace_keeps_all_limits_wherever_it_is_told_to_go(goals, steps):
+    """Goals jump and turn, far outside the limits too; every one stays for a few samples."""
+    list(gently(Pace(GENTLE), 40.0, [goal for goal in goals for _ in range(5)], steps))
+
+
+@given(fractions(0, 100), STEPS)
+def test_a_gentle_pace_comes_to_rest_at_its_goal_without_overshoot(goal, steps):
+    way = [v for _, v in gently(Pace(GENTLE), 40.0, [goal] * 400, steps)]
+    assert way[-1] == pytest.approx(goal, abs=1e-9)
+    towards = np.diff(way) * np.sign(goal - 40.0)
+    assert towards.min(initial=0.0) >= -1e-12
+
+
+@given(fractions(0.5, 20), fractions(1e-3, 5e-3))
+def test_a_gentle_stream_follows_a_path_within_its_limits_exactly(omega, dt):
+    """A sine of voltages, begun at rest at its lowest point, whose slew and acceleration are allowed."""
+    t = np.arange(0.0, 0.7, dt)
+    v = 50.0 - min(49.0, 0.9 * 300.0 / omega, 0.9 * 5000.0 / omega**2) * np.cos(omega * t)
+    twin = FAMILY_CASE.memory()
+    y = [twin.forward(x) for x in v.tolist()]
+    stream = stream_of(limits=GENTLE)
+    stream.drive(v[0])
+    answers = [stream.step(*sample) for sample in zip(t.tolist(), y, strict=True)]
+    np.testing.assert_allclose(answers, v, rtol=0, atol=1e-9)
+
+
+@given(streams(st.sampled_from([np.inf, 300.0])), fractions(100, 1e5))
+def test_a_gentle_stream_keeps_to_its_limits_and_the_memory_to_the_voltage(drawn, acceleration):
+    case, limits, samples = drawn
+    limits = replace(limits, acceleration=acceleration)
+    stream, twin = stream_of(case, limits, everywhere(case)), case.memory()
+    v, rate, before = stream.voltage, 0.0, samples[0][0]
+    twin.forward(v)
+    for t, y in samples:
+        last, v, dt = v, stream.step(t, y), t - before
+        assert limits.lower <= v <= limits.upper
+        assert abs(v - last) <= limits.slew * dt + 1e-9 if dt else v == last
+        if dt:
+            assert abs(v - last - rate * dt) <= acceleration * dt**2 + 1e-9
+            rate = (v - last) / dt
+        assert abs(twin.forward(v) - stream.memory.displacement) < 1e-9 * case.height
+        before = t
+
+
+def test_a_gentle_stream_reaches_a_far_wish_and_stays_there():
+    stream, quick = stream_of(limits=GENTLE), stream_of()
+    goal = quick.step(0.0, 10e-6)
+    way = [stream.step(i * 1e-3, 10e-6) for i in range(600)]
+    assert max(way) <= goal + 1e-9
+    assert way[-1] == pytest.approx(goal, abs=1e-9)
+    assert stream.memory.depth == quick.memory.depth
+
+
+@pytest.mark.parametrize(("present", "expected"), [(60.0, 55.0), (52.0, 50.0), (10.0, 15.0), (38.0, 40.0)])
+def test_a_voltage_outside_new_limits_goes_inside_at_full_pace(present, expected):
+    pace = Pace(Limits(40.0, 50.0, 500.0))
+    assert pace.step(present, present, 0.01) == expected

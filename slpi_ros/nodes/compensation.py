@@ -1,64 +1,24 @@
 """The compensator without ROS: a desired message in, the voltages of all axes out, or nothing moved."""
 
 from array import array
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from math import inf, isfinite
+from collections.abc import Callable, Mapping, Sequence
+from time import monotonic
 
-from slpi_ros.errors import ModelError, SlpiError, UnreachableError, UsageError
-from slpi_ros.model import AxisModel, StageModel
-from slpi_ros.stream import TOLERATED_SHARE, AxisStream, Limits
+from slpi_ros.control import PidGains
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.model import StageModel
+from slpi_ros.runtime import rejection
+from slpi_ros.runtime.axis import ASSUMED, RESTORED, Axis
+from slpi_ros.runtime.clock import SECOND_NS, TimeRules
+from slpi_ros.runtime.counts import Counts
+from slpi_ros.runtime.driving import Driving
+from slpi_ros.runtime.following import Following
+from slpi_ros.runtime.loop import LoopSettings
+from slpi_ros.runtime.rejection import RejectedError
+from slpi_ros.runtime.saved_memory import SavedAxis
+from slpi_ros.stream import Limits
 
-NO_MODEL = "no_model"
-INACTIVE = "inactive"
-EMPTY = "empty"
-LENGTH = "length"
-DUPLICATE_AXIS = "duplicate_axis"
-UNKNOWN_AXIS = "unknown_axis"
-NOT_FINITE = "not_finite"
-TIME_BACKWARDS = "time_backwards"
-OUT_OF_RANGE = "out_of_range"
-CAUSES = (
-    NO_MODEL, INACTIVE, EMPTY, LENGTH, DUPLICATE_AXIS, UNKNOWN_AXIS, NOT_FINITE, TIME_BACKWARDS, OUT_OF_RANGE,
-)  # fmt: skip
-
-NEVER_NS = -(2**63)
-
-
-class RejectedError(SlpiError):
-    """A desired message was rejected as a whole; `cause` is one of `CAUSES`."""
-
-    def __init__(self, cause: str, message: str) -> None:
-        super().__init__(message)
-        self.cause = cause
-
-
-@dataclass
-class Counts:
-    """What became of the desired messages.
-
-    Parameters
-    ----------
-    received, accepted : int
-    held_at_limit : int
-        Accepted ones of which an axis could not reach its displacement within the voltage limits.
-    by_cause : dict of str to int
-        Rejected ones.
-    """
-
-    received: int = 0
-    accepted: int = 0
-    held_at_limit: int = 0
-    by_cause: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CAUSES, 0))
-
-    @property
-    def rejected(self) -> int:
-        """All rejected messages."""
-        return self.received - self.accepted
-
-    def copy(self) -> "Counts":
-        """Return the present counts, which do not count on."""
-        return replace(self, by_cause=dict(self.by_cause))
+OPEN_LOOP = LoopSettings(False, PidGains(0.0), 0.1)
 
 
 class Compensation:
@@ -70,69 +30,104 @@ class Compensation:
         Names, in the order of the voltages.
     limits : sequence of Limits
         One for each axis. No model widens them.
+    hardware_id : str
+        The stage; models of another one are refused. "": any will do.
+    time : TimeRules
+    loops : sequence of LoopSettings, optional
+        One for each axis; without them there is no feedback.
+    now : callable
+        A clock that never jumps, seconds.
 
     Attributes
     ----------
+    axes : list of Axis
     voltages : array of float, shape (axes,), volts
         The present ones, always the same array. An axis that a message does not name keeps its voltage.
     active : bool
         Whether messages are answered.
     counts : Counts
     model : StageModel or None
+    driving : Driving
+        What moves the axes on their own.
+    following : Following
+        What moves them along trajectories.
     """
 
-    def __init__(self, axes: Sequence[str], limits: Sequence[Limits]) -> None:
-        self.axes = list(axes)
+    def __init__(
+        self,
+        axes: Sequence[str],
+        limits: Sequence[Limits],
+        hardware_id: str = "",
+        time: TimeRules | None = None,
+        loops: Sequence[LoopSettings] = (),
+        now: Callable[[], float] = monotonic,
+    ) -> None:
+        self.names = list(axes)
+        loops = loops or [OPEN_LOOP] * len(self.names)
+        self.axes = [Axis(name, place, limits[place], loops[place], now) for place, name in enumerate(self.names)]
         self.voltages = array("d", [0.0] * len(self.axes))
         self.active = False
+        self.driving = Driving(self.axes)
+        self.following = Following({axis.name: axis for axis in self.axes})
         self.counts = Counts()
         self.model: StageModel | None = None
-        self._limits = tuple(limits)
-        self._index = {axis: i for i, axis in enumerate(self.axes)}
-        self._streams: tuple[AxisStream, ...] = ()
-        # Before the first model nobody knows what voltages the axes have.
-        self._driven = False
-        self._first_ns: int | None = None
-        self._last_ns = [NEVER_NS] * len(self.axes)
+        self._hardware_id = hardware_id
+        self._by_name = {axis.name: axis for axis in self.axes}
         self._last_names: list[str] | None = None
-        self._last_indices: list[int] = []
+        self._last_axes: list[Axis] = []
+        self.use_time(time or TimeRules())
 
-    def use_model(self, model: StageModel) -> None:
+    # Models
+
+    def use_model(self, model: StageModel, saved: Mapping[str, SavedAxis] | None = None) -> None:
         """Take a model over; the voltages stay as they are.
+
+        Parameters
+        ----------
+        model : StageModel
+        saved : mapping of axis name to SavedAxis, optional
+            Where the axes were when the node last ended; for the first model only.
 
         Raises
         ------
         SlpiError
             If the model lacks an axis or cannot serve within the limits; the one before works on.
         """
-        present = self.voltages if self._driven else [None] * len(self.axes)
-        streams = []
-        for name, limits, voltage in zip(self.axes, self._limits, present, strict=True):
-            axis = model.axis(name)
+        if self._hardware_id and model.hardware_id and model.hardware_id != self._hardware_id:
+            raise UsageError(
+                f"the model is of the stage '{model.hardware_id}', this is '{self._hardware_id}'; "
+                "give a model of this stage, or correct hardware_id"
+            )
+        prepared = []
+        for axis in self.axes:
+            one = model.axis(axis.name)
             try:
-                streams.append(start_stream(axis, limits, voltage))
+                turns = saved[axis.name].went_through if saved else None
+                prepared.append((axis, one, axis.prepare(one, turns)))
             except SlpiError as error:
-                raise type(error)(f"axis '{name}': {error}") from None
-        self._streams, self.model, self._driven = tuple(streams), model, True
-        for i, stream in enumerate(streams):
-            self.voltages[i] = stream.voltage
+                raise type(error)(f"axis '{axis.name}': {error}") from None
+        for axis, one, stream in prepared:
+            axis.use(one, stream)
+            if saved:
+                axis.memory_state = RESTORED if saved[axis.name].certain else ASSUMED
+        self.model = model
+        self._show()
 
     def forget_model(self) -> None:
         """Reject everything until the next model; the voltages stay."""
-        self._streams, self.model = (), None
+        self.model = None
+
+    @property
+    def driven(self) -> bool:
+        """Whether there has been a model: before, nobody knows what voltages the axes have."""
+        return self.axes[0].driven
+
+    # Settings
 
     def check_limits(self, limits: Sequence[Limits]) -> None:
         """Raise what `use_limits` would raise."""
-        if not self._driven:
-            return
-        for name, new, present in zip(self.axes, limits, self.voltages, strict=True):
-            if not new.lower <= present <= new.upper:
-                raise UsageError(
-                    f"axis '{name}' has {present:g} V, outside the new limits {new.lower:g}..{new.upper:g} V; "
-                    "move it inside first"
-                )
-            if self.model:
-                new.within(self.model.axis(name).voltage_range)
+        for axis, new in zip(self.axes, limits, strict=True):
+            axis.check_limits(new)
 
     def use_limits(self, limits: Sequence[Limits]) -> None:
         """Take new limits over; memory and voltages stay.
@@ -143,20 +138,45 @@ class Compensation:
             If an axis is outside of them, or the model has no voltage inside.
         """
         self.check_limits(limits)
-        self._limits = tuple(limits)
-        if self.model:
-            for name, new, stream in zip(self.axes, limits, self._streams, strict=True):
-                stream.limits = stretched(new.within(self.model.axis(name).voltage_range), stream.voltage)
+        for axis, new in zip(self.axes, limits, strict=True):
+            axis.use_limits(new)
 
-    def move(self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float]) -> bool:
+    def use_loops(self, loops: Sequence[LoopSettings]) -> None:
+        """Go on with other settings of the feedback, without a jump."""
+        for axis, settings in zip(self.axes, loops, strict=True):
+            axis.retune(settings)
+
+    def use_time(self, rules: TimeRules) -> None:
+        """Judge stamps by these rules from now on."""
+        self._jump, self._max_age_ns = rules.jump, int(rules.max_age * SECOND_NS)
+        for axis in self.axes:
+            axis.stamps.jump_ns = int(rules.jump * SECOND_NS)
+
+    def activate(self, active: bool) -> None:
+        """Answer messages from now on, starting at the present voltages, or no longer."""
+        self.active = active
+        for axis in self.axes:
+            axis.restart()
+
+    # Messages
+
+    @property
+    def needs_arrival(self) -> bool:
+        """Whether `move` has to know when a message arrived though it has a stamp."""
+        return self._max_age_ns > 0
+
+    def move(self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float], now_ns: int = 0) -> bool:
         """Move the named axes to their desired displacements; `voltages` holds the answer.
 
         Parameters
         ----------
         stamp_ns : int, nanoseconds
+            0: the message has none and counts from its arrival.
         names : sequence of str
         displacements : sequence of float, metres
             One for each name.
+        now_ns : int, nanoseconds
+            The arrival, on the clock of the stamps; needed for messages without stamp and where `max_age` counts.
 
         Returns
         -------
@@ -168,107 +188,109 @@ class Compensation:
         RejectedError
             If the message cannot be answered as a whole; it is counted, and no axis has moved.
         """
-        self.counts.received += 1
+        counts = self.counts
+        counts.received += 1
         try:
-            indices = self._indices(names, len(displacements))
-            t = (stamp_ns - self._first_ns) * 1e-9 if self._first_ns is not None else 0.0
-            for i, y in zip(indices, displacements, strict=True):
-                self._check(i, stamp_ns, t, y)
+            axes = self._axes_of(names, len(displacements))
+            self._check(axes, stamp_ns, displacements, now_ns)
         except RejectedError as error:
-            self.counts.by_cause[error.cause] += 1
+            counts.by_cause[error.cause] += 1
             raise
-        if self._first_ns is None:
-            self._first_ns = stamp_ns
-        missed = False
-        for i, y in zip(indices, displacements, strict=True):
-            stream = self._streams[i]
-            self.voltages[i] = stream.step(t, y)
-            self._last_ns[i] = stamp_ns
-            missed = missed or stream.held
-        self.counts.accepted += 1
-        self.counts.held_at_limit += missed
-        return missed
+        held = slewing = gap = jump = began = False
+        if self.driving.on:
+            self.driving.stop()
+        for axis, y in zip(axes, displacements, strict=True):
+            ahead = axis.stamps.accept(stamp_ns) if stamp_ns else axis.stamps.arrive(now_ns)
+            was_held = axis.held
+            self.voltages[axis.place] = axis.move(ahead, y)
+            if axis.held:
+                held, began = True, began or not was_held
+            elif axis.slewing:
+                slewing = True
+            if ahead > self._jump:
+                gap = True
+            elif ahead < 0.0:
+                jump = True
+        counts.accepted += 1
+        if held or slewing or gap or jump:
+            counts.held_at_limit += held
+            counts.slew_limited += slewing
+            counts.excursions += began
+            counts.gaps += gap
+            counts.time_jumps += jump
+        return held
 
-    def _indices(self, names: Sequence[str], count: int) -> list[int]:
-        """Return the places of the named axes."""
+    def measure(self, names: Sequence[str], displacements: Sequence[float]) -> None:
+        """Note measured displacements (m) of the axes among the names; what is not finite is left out."""
+        for name, y in zip(names, displacements, strict=False):
+            axis = self._by_name.get(name)
+            if axis:
+                axis.measure(y)
+
+    def drive(self, dt: float) -> bool:
+        """Move all axes on where they are driven, `dt` (s) later; return whether all have arrived."""
+        arrived = self.driving.step(dt)
+        self._show()
+        return arrived
+
+    def follow(self, now_ns: int) -> None:
+        """Move on to the points of trajectories that are due, nanoseconds on their clock."""
+        self.following.step(now_ns)
+        self._show()
+
+    def _show(self) -> None:
+        for axis in self.axes:
+            self.voltages[axis.place] = axis.voltage
+
+    # Checks
+
+    def _axes_of(self, names: Sequence[str], count: int) -> list[Axis]:
+        """Return the named axes."""
         if not self.active:
-            raise RejectedError(INACTIVE, "the compensator is not active; activate it")
-        if not self._streams:
-            raise RejectedError(NO_MODEL, "there is no model yet; give model_file, or publish stage_model")
+            raise RejectedError(rejection.INACTIVE, "the compensator is not active; activate it")
+        if self.model is None:
+            raise RejectedError(rejection.NO_MODEL, "there is no model yet; give model_file, or publish stage_model")
+        if self.driving.resetting:
+            raise RejectedError(rejection.RESETTING, "the memory is being reset; wait until reset_memory answers")
+        if self.following.on:
+            raise RejectedError(
+                rejection.FOLLOWING, "a trajectory is being followed; wait, or stop it with an empty one"
+            )
         if count != len(names):
-            raise RejectedError(LENGTH, f"{len(names)} axes but {count} displacements; send one for each axis")
+            raise RejectedError(
+                rejection.LENGTH, f"{len(names)} axes but {count} displacements; send one for each axis"
+            )
         # Most senders name the same axes every time.
         if names != self._last_names:
-            self._last_indices = self._match(names)
+            self._last_axes = self._match(names)
             self._last_names = list(names)
-        return self._last_indices
+        return self._last_axes
 
-    def _match(self, names: Sequence[str]) -> list[int]:
+    def _match(self, names: Sequence[str]) -> list[Axis]:
         if not names:
-            raise RejectedError(EMPTY, "no axis is named; name the axes to move")
+            raise RejectedError(rejection.EMPTY, "no axis is named; name the axes to move")
         if len(set(names)) != len(names):
-            raise RejectedError(DUPLICATE_AXIS, f"{', '.join(names)}: an axis is named twice; name each once")
-        unknown = [name for name in names if name not in self._index]
+            raise RejectedError(rejection.DUPLICATE_AXIS, f"{', '.join(names)}: an axis is named twice; name each once")
+        unknown = [name for name in names if name not in self._by_name]
         if unknown:
-            raise RejectedError(UNKNOWN_AXIS, f"no axis '{unknown[0]}'; this node moves {', '.join(self.axes)}")
-        return [self._index[name] for name in names]
+            raise RejectedError(
+                rejection.UNKNOWN_AXIS, f"no axis '{unknown[0]}'; this node moves {', '.join(self.names)}"
+            )
+        return [self._by_name[name] for name in names]
 
-    def _check(self, i: int, stamp_ns: int, t: float, y: float) -> None:
-        """Reject what the stream of axis `i` would refuse."""
-        last = self._last_ns[i]
-        # A new stream does not know the stamps before it.
-        if stamp_ns < last:
-            back = f"{(last - stamp_ns) * 1e-9:.9g} s"
-            raise RejectedError(TIME_BACKWARDS, f"axis '{self.axes[i]}': time runs {back} backwards; send in order")
-        if not isfinite(y):
-            raise RejectedError(NOT_FINITE, f"axis '{self.axes[i]}': displacement is {y} m; send finite ones only")
+    def _check(self, axes: Sequence[Axis], stamp_ns: int, displacements: Sequence[float], now_ns: int) -> None:
+        """Reject what an axis would refuse: first for what is asked, then for when."""
+        axis = axes[0]
         try:
-            self._streams[i].check(t, y)
-        except UnreachableError as error:
-            raise RejectedError(OUT_OF_RANGE, f"axis '{self.axes[i]}': {error}") from None
-
-
-def start_stream(axis: AxisModel, limits: Limits, present: float | None) -> AxisStream:
-    """Return a stream of a new model that stands at the voltage `present` (V), or at the model's start if that is None.
-
-    Only the voltage is taken over so far: the new memory reaches it in one move from its own start, and knows no other
-    turning point of the old one.
-
-    Raises
-    ------
-    SlpiError
-        If the model has no voltage within the limits, or its displacements contradict its curves.
-    """
-    allowed = limits.within(axis.voltage_range)
-    low, high = axis.displacement_range
-    margin = TOLERATED_SHARE * (high - low) * (1.0 - 1e-9)
-    try_out(
-        AxisStream(axis.memory(), axis.displacement_range, replace(allowed, slew=inf)), (low - margin, high + margin)
-    )
-    if present is not None:
-        allowed = stretched(allowed, present)
-    stream = AxisStream(axis.memory(), axis.displacement_range, allowed)
-    if present is not None:
-        stream.memory.forward(present)
-    return stream
-
-
-def try_out(stream: AxisStream, ends: tuple[float, float]) -> None:
-    """Ask for both ends (m) of what commands may ask for, at both voltage limits: none may find a surprise later.
-
-    Raises
-    ------
-    SlpiError
-        If a displacement has no voltage within the limits.
-    """
-    lower, upper = stream.limits.lower, stream.limits.upper
-    for v in (upper, lower):
-        for y in ends * 2:
-            stream.memory.forward(v)
-            if not lower <= stream.step(0.0, y) <= upper:
-                raise ModelError(f"the model gives {stream.voltage} V for {y} m; identify the stage again")
-
-
-def stretched(limits: Limits, present: float) -> Limits:
-    """Return the limits, wide enough for the voltage `present` (V): taking them over must not move the axis."""
-    return Limits(min(limits.lower, present), max(limits.upper, present), limits.slew)
+            for axis, y in zip(axes, displacements, strict=True):
+                axis.check(y)
+            if stamp_ns:
+                for axis in axes:
+                    axis.stamps.check(stamp_ns)
+        except RejectedError as error:
+            raise RejectedError(error.cause, f"axis '{axis.name}': {error}") from None
+        if stamp_ns and 0 < self._max_age_ns < now_ns - stamp_ns:
+            age = (now_ns - stamp_ns) * 1e-9
+            raise RejectedError(
+                rejection.STALE, f"stamped {age:.6g} s ago, longer than max_age; check delays and clocks"
+            )

@@ -1,37 +1,50 @@
 """Node ``compensator``: desired displacements in, voltages out."""
 
 import sys
-import time
 from collections.abc import Sequence
+from time import monotonic_ns
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
+from trajectory_msgs.msg import JointTrajectory
 
-from slpi_ros.errors import ModelError, SlpiError
-from slpi_ros.model import StageModel
-from slpi_ros.model_file import format_model, load_model, parse_model
-from slpi_ros.nodes.compensation import Compensation, RejectedError
-from slpi_ros.nodes.compensator_settings import DECLARATIONS, CompensatorSettings
-from slpi_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Health
+from slpi_ros.errors import SlpiError
+from slpi_ros.nodes.compensation import Compensation
+from slpi_ros.nodes.compensator_driver import Driver
+from slpi_ros.nodes.compensator_memory import MemoryKeeper
+from slpi_ros.nodes.compensator_models import Models
+from slpi_ros.nodes.compensator_parameters import DECLARATIONS
+from slpi_ros.nodes.compensator_priority import ask_for_priority
+from slpi_ros.nodes.compensator_report import Reporter
+from slpi_ros.nodes.compensator_reset import MemoryReset
+from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.compensator_trajectory import TrajectoryFollower
+from slpi_ros.nodes.diagnostics import WARN
 from slpi_ros.nodes.lifecycle import refuse_impossible_transitions
 from slpi_ros.nodes.parameters import Parameters
-from slpi_ros.nodes.qos import COMMANDS, LATCHED
+from slpi_ros.nodes.qos import COMMANDS, LATCHED, MEASUREMENTS
 from slpi_ros.nodes.runner import run
+from slpi_ros.runtime.clock import SECOND_NS
+from slpi_ros.runtime.rejection import RejectedError
 
-SECOND_NS = 1_000_000_000
 LOG_PERIOD = 5.0
-# Nothing has driven the stage to a known state: its memory is taken to be where the model starts.
-MEMORY_STATE = "assumed"
+# How often the node looks whether commands have stopped, seconds.
+WATCH_PERIOD = 0.05
+# History, depth and reliability, by parameters qos_overrides./TOPIC.{publisher,subscription}.POLICY.
+OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 
 
 class Compensator(LifecycleNode):
     """A lifecycle node that answers every desired message with the voltages of all its axes.
 
-    Subscribes ``desired_displacement`` and ``stage_model``, publishes ``voltage_command`` and ``/diagnostics``;
-    types, units and quality of service are in ``msg_schemas/README.md``, parameters in `compensator_settings`.
+    Subscribes ``desired_displacement``, ``desired_trajectory``, ``measured_displacement`` and ``stage_model``,
+    publishes ``voltage_command`` and ``/diagnostics``, serves ``~/reset_memory``; types, units and quality of service
+    are in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
 
     Raises
     ------
@@ -45,18 +58,30 @@ class Compensator(LifecycleNode):
         super().__init__("compensator")
         refuse_impossible_transitions(self)
         self._parameter_set = Parameters(self, DECLARATIONS, CompensatorSettings.of)
-        settings = self._settings
-        self._compensation = Compensation(settings.axes, settings.limits)
-        self._parameter_set.follow(
-            lambda new: self._compensation.use_limits(new.limits),
-            check=lambda new: self._compensation.check_limits(new.limits),
-        )
-        self._state = "unconfigured"
-        self._failure: SlpiError | None = None
-        self._starting = settings.autostart
+        told = self._settings
+        self._compensation = Compensation(told.axes, told.limits, told.hardware_id, told.time, told.loops)
+        self._parameter_set.follow(self._use_settings, check=lambda new: self._compensation.check_limits(new.limits))
         self._command = Float64MultiArray()
-        self._start_reporting(settings.diagnostic_period)
-        if settings.autostart:
+        self._failure: SlpiError | None = None
+        self._excursions = self._accepted_before = 0
+        self._fell_silent = False
+        self._keeper = MemoryKeeper(self, self._compensation, told.memory_file)
+        self._driver = Driver(self, self._compensation, self._publish)
+        self._reporter = Reporter(self, self._compensation, lambda: self._settings)
+        self._follower = TrajectoryFollower(
+            self, self._compensation, self._publish_point, lambda: self._reporter.silent_since_ns
+        )
+        self._reporter.lateness = self._follower.lateness
+        self._reset = MemoryReset(self, self._compensation, self._driver, self._reporter, lambda: self._settings)
+        self._models = Models(self, self._compensation, self._keeper, self._reporter, lambda: self._settings)
+        # A simulated clock may stand still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(told.diagnostic_period, self._on_period, clock=steady)
+        self.create_timer(WATCH_PERIOD, self._watch, clock=steady)
+        if told.realtime_priority:
+            ask_for_priority(self, told.realtime_priority)
+        self._starting = told.autostart
+        if told.autostart:
             self.trigger_configure()
             if self._failure:
                 raise self._failure
@@ -72,6 +97,11 @@ class Compensator(LifecycleNode):
     def _settings(self) -> CompensatorSettings:
         return self._parameter_set.settings
 
+    def _use_settings(self, new: CompensatorSettings) -> None:
+        self._compensation.use_limits(new.limits)
+        self._compensation.use_loops(new.loops)
+        self._compensation.use_time(new.time)
+
     # Lifecycle
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -79,34 +109,47 @@ class Compensator(LifecycleNode):
         settings = self._settings
         try:
             if settings.model_file:
-                self._use_model(load_model(settings.model_file), settings.model_file)
+                self._models.load(settings.model_file)
         except SlpiError as error:
             self._failure = error
-            self._refuse(error)
+            # Where the refusal ends the process, its message is printed anyway.
+            if not self._starting:
+                self.get_logger().error(f"model refused: {error}")
+            self._reporter.model_refused(str(error))
             return TransitionCallbackReturn.FAILURE
-        self._publisher = self.create_lifecycle_publisher(Float64MultiArray, "voltage_command", COMMANDS)
+        self._publisher = self.create_lifecycle_publisher(
+            Float64MultiArray, "voltage_command", COMMANDS, qos_overriding_options=OVERRIDABLE
+        )
         on_desired: dict[str, tuple[Any, Any]] = {
             "JointState": (JointState, self._on_joint_state),
             "Float64": (Float64, self._on_value),
             "Float64MultiArray": (Float64MultiArray, self._on_values),
         }
         kind, callback = on_desired[settings.desired_type]
-        self._desired = self.create_subscription(kind, "desired_displacement", callback, COMMANDS)
-        self._models = self.create_subscription(String, "stage_model", self._on_model, LATCHED)
-        self._enter("inactive")
+        self._subscriptions_of_state = [
+            self._subscribe(kind, "desired_displacement", callback, COMMANDS),
+            self._subscribe(JointTrajectory, "desired_trajectory", self._on_trajectory, COMMANDS, raw=True),
+            self._subscribe(JointState, "measured_displacement", self._on_measured, MEASUREMENTS),
+            self._subscribe(String, "stage_model", self._models.on_message, LATCHED),
+        ]
+        self._reporter.enter("inactive")
         return super().on_configure(state)
+
+    def _subscribe(self, kind: Any, topic: str, callback: Any, qos: QoSProfile, raw: bool = False) -> Any:
+        return self.create_subscription(kind, topic, callback, qos, qos_overriding_options=OVERRIDABLE, raw=raw)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Answer from now on, starting at the present voltages."""
-        self._compensation.active = True
-        self._last_accepted = time.monotonic()
-        self._enter("active")
+        self._keeper.save(complete=False)
+        self._accepted_before = self._compensation.counts.accepted
+        self._compensation.activate(True)
+        self._reporter.enter("active")
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Hold the present voltages."""
-        self._compensation.active = False
-        self._enter("inactive")
+        """Hold the present voltages, or go to the safe ones first."""
+        self._end_activity()
+        self._reporter.enter("inactive")
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -114,145 +157,130 @@ class Compensator(LifecycleNode):
         result = super().on_cleanup(state)
         self._compensation.forget_model()
         self._leave_topics()
-        self._enter("unconfigured")
+        self._reporter.enter("unconfigured")
         return result
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Hold the present voltages for good."""
+        """Hold the present voltages for good, or go to the safe ones first."""
+        self._end_activity()
         result = super().on_shutdown(state)
-        self._compensation.active = False
-        if self._state != "unconfigured":
+        if self._reporter.state != "unconfigured":
             self._leave_topics()
-        self._enter("finalized")
+        self._reporter.enter("finalized")
         return result
 
+    def destroy_node(self) -> None:
+        """End the activity in order, and the node."""
+        self._end_activity()
+        super().destroy_node()
+
+    def _end_activity(self) -> None:
+        if not self._compensation.active:
+            return
+        self._driver.stop()
+        self._follower.stop()
+        safety = self._settings.safety
+        if safety.ramps_on_deactivate and self._compensation.model:
+            self._driver.ramp_now(safety.voltages, safety.rate)
+        self._compensation.activate(False)
+        self._keeper.save(complete=True)
+
     def _leave_topics(self) -> None:
-        self.destroy_subscription(self._desired)
-        self.destroy_subscription(self._models)
+        for subscription in self._subscriptions_of_state:
+            self.destroy_subscription(subscription)
         self.destroy_lifecycle_publisher(self._publisher)
 
-    def _enter(self, state: str) -> None:
-        self._state = state
-        self._report()
-
-    # Desired displacements
+    # Desired and measured displacements
 
     def _on_joint_state(self, message: JointState) -> None:
         stamp = message.header.stamp
         self._answer(stamp.sec * SECOND_NS + stamp.nanosec, message.name, message.position)
 
     def _on_values(self, message: Float64MultiArray) -> None:
-        self._answer(0, self._compensation.axes, message.data)
+        self._answer(0, self._compensation.names, message.data)
 
     def _on_value(self, message: Float64) -> None:
-        self._answer(0, self._compensation.axes, (message.data,))
+        self._answer(0, self._compensation.names, (message.data,))
+
+    def _on_measured(self, message: JointState) -> None:
+        self._compensation.measure(message.name, message.position)
 
     def _answer(self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float]) -> None:
-        """Publish the voltages for one message, or count why not; a message without a stamp counts from its arrival."""
+        """Publish the voltages for one message, or count why not."""
+        arrived = monotonic_ns()
+        # Asking for the time takes as long as compensating an axis.
+        now_ns = 0 if stamp_ns and not self._compensation.needs_arrival else self.get_clock().now().nanoseconds
         try:
-            missed = self._compensation.move(stamp_ns or self.get_clock().now().nanoseconds, names, displacements)
+            held = self._compensation.move(stamp_ns, names, displacements, now_ns)
         except RejectedError as error:
-            self._last_rejection = str(error)
+            self._reporter.last_rejection = str(error)
             self.get_logger().warning(f"rejected: {error}", throttle_duration_sec=LOG_PERIOD)
-            self._report_at_least(WARN)
+            self._reporter.report_at_least(WARN)
             return
+        self._publish()
+        answered = monotonic_ns()
+        self._reporter.timing.note(arrived, answered)
+        self._reporter.silent_since_ns = answered
+        if held:
+            self._on_held()
+
+    def _on_trajectory(self, data: bytes) -> None:
+        counts, following = self._compensation.counts, self._compensation.following
+        counts.trajectories += 1
+        try:
+            self._follower.take(data)
+        except SlpiError as error:
+            counts.trajectories_rejected += 1
+            self._reporter.last_rejection = str(error)
+            self.get_logger().warning(f"trajectory rejected: {error}", throttle_duration_sec=LOG_PERIOD)
+        else:
+            self.get_logger().info(
+                f"trajectory: {following.remaining} points to come; of the new ones {following.points_held} wait at a "
+                f"voltage limit, {following.points_slewing} are slowed down by the slew limit"
+            )
+        self._reporter.report()
+
+    def _publish_point(self) -> None:
+        self._publish()
+        self._reporter.silent_since_ns = monotonic_ns()
+        if not self._compensation.following.on:
+            self._reporter.report()
+
+    def _publish(self) -> None:
         # Of an array, not of a list: the message copies it ten times faster.
         self._command.data = self._compensation.voltages
         self._publisher.publish(self._command)
-        self._last_accepted = time.monotonic()
-        if missed:
-            self._report_at_least(WARN)
 
-    # Models
+    def _on_held(self) -> None:
+        """Warn, once for each excursion."""
+        self._reporter.report_at_least(WARN)
+        if self._compensation.counts.excursions > self._excursions:
+            self._excursions = self._compensation.counts.excursions
+            out = [axis.name for axis in self._compensation.axes if axis.held]
+            self.get_logger().warning(
+                f"desired displacement out of reach, held at a voltage limit: axis {', '.join(out)}; "
+                "send displacements within the identified range"
+            )
 
-    def _on_model(self, message: String) -> None:
-        try:
-            self._use_model(parse_model(message.data, self._models.topic_name), self._models.topic_name)
-        except SlpiError as error:
-            self._refuse(error)
-
-    def _refuse(self, error: SlpiError) -> None:
-        """Say that a model was refused; the one before works on."""
-        self._models_refused += 1
-        self._model_error = str(error)
-        # Where the refusal ends the process, its message is printed anyway.
-        if not self._starting:
-            self.get_logger().error(f"model refused: {error}")
-        self._report()
-
-    def _use_model(self, model: StageModel, source: str) -> None:
-        """Take a model over, unless it is the one in use: a latched document may come more than once."""
-        former = self._compensation.model
-        if former is None or format_model(model) != format_model(former):
-            try:
-                self._compensation.use_model(model)
-            except SlpiError as error:
-                raise ModelError(f"{source}: {error}") from None
-            self.get_logger().info(f"using the model of {source}, identified {model.created or 'at an unknown time'}")
-        self._model_error = ""
-        self._report()
-
-    # Health
-
-    def _start_reporting(self, period: float) -> None:
-        self._models_refused = 0
-        self._model_error = ""
-        self._last_rejection = ""
-        self._last_accepted = time.monotonic()
-        self._start_window()
-        self._diagnostics = Diagnostics(self, "compensator")
-        # A simulated clock may stand still.
-        self.create_timer(period, self._on_period, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def _start_window(self) -> None:
-        self._window, self._window_start = self._compensation.counts.copy(), time.monotonic()
+    # What happens without messages
 
     def _on_period(self) -> None:
-        self._report()
-        self._start_window()
+        self._reporter.on_period()
+        if self._compensation.active:
+            self._keeper.save(complete=False)
 
-    def _report_at_least(self, level: bytes) -> None:
-        """Report now if the last report was better than this."""
-        if self._diagnostics.level < level:
-            self._report()
-
-    def _report(self) -> None:
-        counts, model = self._compensation.counts, self._compensation.model
-        elapsed = max(time.monotonic() - self._window_start, 1e-3)
-        values = {
-            "state": self._state,
-            "received": counts.received,
-            "accepted": counts.accepted,
-            "rejected": counts.rejected,
-            **{f"rejected.{cause}": count for cause, count in counts.by_cause.items()},
-            "last_rejection": self._last_rejection,
-            "held_at_limit": counts.held_at_limit,
-            "rate_hz": f"{(counts.received - self._window.received) / elapsed:.1f}",
-            "memory": MEMORY_STATE,
-            "model.created": model.created if model else "",
-            "model.hardware_id": model.hardware_id if model else "",
-            "model.kind": ", ".join(model.axis(axis).kind for axis in self._settings.axes) if model else "",
-            "models_refused": self._models_refused,
-            "last_model_error": self._model_error,
-        }
-        hardware_id = self._settings.hardware_id or (model.hardware_id if model else "")
-        summary = "compensating" if self._state == "active" else self._state
-        self._diagnostics.report(Health(tuple(self._problems()), summary, values, hardware_id))
-
-    def _problems(self) -> list[tuple[bytes, str]]:
-        """Say what is wrong, or was since the last periodic report."""
-        counts, window = self._compensation.counts, self._window
-        ready, active = self._compensation.model is not None, self._state == "active"
-        rejected, held = counts.rejected - window.rejected, counts.held_at_limit - window.held_at_limit
-        silent, timeout = time.monotonic() - self._last_accepted, self._settings.command_timeout
-        found = [
-            (self._model_error != "", WARN if ready else ERROR, f"model refused: {self._model_error}"),
-            (active and not ready, WARN, "waiting for a model"),
-            (rejected > 0, WARN, f"{rejected} messages rejected, the last: {self._last_rejection}"),
-            (held > 0, WARN, f"{held} times held at a voltage limit"),
-            (active and 0 < timeout < silent, WARN, f"no command for {silent:.3g} s; voltages are held"),
-        ]
-        return [(level, text) for wrong, level, text in found if wrong]
+    def _watch(self) -> None:
+        """Go to the safe voltages once commands have stopped."""
+        safety = self._settings.safety
+        silent = 0.0 < safety.command_timeout < self._reporter.silence and not self._compensation.following.on
+        if silent and not self._fell_silent:
+            self._reporter.report_at_least(WARN)
+            # Nothing moves before it has been told to.
+            commanded = self._compensation.counts.accepted > self._accepted_before
+            if safety.ramps_on_timeout and commanded and not self._compensation.driving.on:
+                self._compensation.driving.ramp(safety.voltages, safety.rate)
+                self._driver.start()
+        self._fell_silent = silent
 
 
 def main() -> int:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -31,7 +31,7 @@ class Declaration:
     between : (float, float), optional
         Smallest and largest value of a number; without it any.
     number : bool
-        Whether integers, and one value for each axis, may stand for the default's one double.
+        Whether integers, and one value for each axis, may stand for the default's one double. Not for whole numbers.
     """
 
     name: str
@@ -48,7 +48,10 @@ class Declaration:
         )
         if self.between:
             low, high = self.between
-            described.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+            if self.number:
+                described.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+            else:
+                described.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
         return described
 
 
@@ -135,6 +138,14 @@ def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: fl
         if not (math.isfinite(value) and low <= value <= high):
             raise UsageError(f"parameter {name} is {value:g}; give a value from {low:g} to {high:g}")
     return [float(value) for value in several]
+
+
+def whole(values: Values, name: str, low: int, high: int) -> int:
+    """Return the parameter `name`; UsageError unless it is a whole number from `low` to `high`."""
+    given = values[name]
+    if isinstance(given, bool) or not isinstance(given, int) or not low <= given <= high:
+        raise UsageError(f"parameter {name} is {given!r}; give a whole number from {low} to {high}")
+    return given
 
 
 def choice(values: Values, name: str, known: Sequence[str]) -> str:

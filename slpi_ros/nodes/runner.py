@@ -131,10 +131,11 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
     """Create, spin and destroy the node; raise what made it fail."""
     node = _start(make_node)
     try:
+        # From here on a signal is only noted: one that interrupts the making of an executor leaves a traceback.
+        _stop.spinning = True
         executor = make_executor(getattr(node, "executor_kind", kind))
         executor.add_node(node)
         try:
-            _stop.spinning = True
             while ok() and not _stop.requested:
                 executor.spin_once(timeout_sec=SPIN_TIMEOUT)
         finally:

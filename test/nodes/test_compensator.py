@@ -16,7 +16,7 @@ from std_msgs.msg import Float64, Float64MultiArray, String  # noqa: E402
 
 from slpi_ros.model import HeldAtLimitWarning  # noqa: E402
 from slpi_ros.model_file import format_model, save_model  # noqa: E402
-from slpi_ros.nodes.compensation import CAUSES  # noqa: E402
+from slpi_ros.runtime.rejection import CAUSES  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings(f"ignore::{HeldAtLimitWarning.__module__}.{HeldAtLimitWarning.__name__}")
 

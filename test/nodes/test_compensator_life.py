@@ -1,7 +1,9 @@
 """The life of a compensator: how it starts, is told what to do, and ends."""
 
 import json
+import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -85,11 +87,11 @@ def test_a_wrong_model_file_keeps_it_unconfigured_until_it_is_right(x_file, tmp_
         assert client.ask(["x"], [0.0]) == [0.0]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-@pytest.mark.parametrize("executor", ["events", "default"])
+@pytest.mark.parametrize(("executor", "number"), [("events", signal.SIGTERM), ("default", signal.SIGINT)])
 def test_a_signal_ends_it_in_order(number, executor):
     with compensator(executor=executor) as client:
         client.connect()
+        assert state(client) == State.PRIMARY_STATE_ACTIVE, "who answers is spinning"
         assert client.node.stop(number) == 0
         assert client.node.stderr == ""
 
@@ -171,18 +173,26 @@ def test_silence_is_reported_and_the_voltage_held(x_file):
         client.graph.wait_for_status(f"{client.name}: compensator", lambda s: s.level == b"\0", "health again")
 
 
+def test_real_time_where_the_system_allows_it(x_file):
+    with compensator(model_file=x_file, realtime_priority=1) as client:
+        client.connect()
+        assert client.ask(["x"], [0.0]) == [0.0]
+        in_real_time = os.sched_getscheduler(client.node.process.pid) == os.SCHED_FIFO
+        assert in_real_time != ("no realtime_priority 1" in client.node.stderr)
+
+
 CONFIGS = {"one_axis": ["x"], "xy": ["x", "y"], "ros2_control": ["x", "y"]}
 
 
-@pytest.mark.parametrize("config", CONFIGS)
-@pytest.mark.parametrize("namespace", ["", "/left"])
+@pytest.mark.parametrize(("config", "namespace"), list(zip(CONFIGS, ("", "/left", ""), strict=True)))
 def test_config_files_start_a_compensator(config, namespace):
     axes = CONFIGS[config]
     arguments = ["--params-file", str(CHECKOUT / "config" / f"{config}.yaml"), "-r", f"__ns:={namespace or '/'}"]
     with compensator(*arguments, namespace=namespace) as client:
         client.connect()
         models = client.graph.publisher(String, f"{namespace}/stage_model", LATCHED)
-        models.publish(String(data=format_model(stage_model(axes))))
+        # The stage that xy.yaml names is another one than stage_model's.
+        models.publish(String(data=format_model(replace(stage_model(axes), hardware_id=""))))
         client.report("the model", **{"model.kind": ", ".join(["slpi"] * len(axes))})
         assert client.ask(axes, [0.0] * len(axes)) == [0.0] * len(axes)
 

@@ -1,0 +1,68 @@
+"""The compensator's memory over a restart."""
+
+from collections.abc import Mapping, Sequence
+
+from rclpy.node import Node
+
+from slpi_ros.errors import SlpiError
+from slpi_ros.model import StageModel
+from slpi_ros.nodes.compensation import Compensation
+from slpi_ros.runtime.axis import KNOWN, RESTORED
+from slpi_ros.runtime.saved_memory import SavedAxis, SavedMemory, load_memory, model_id, save_memory
+from slpi_ros.stream import Limits
+
+LOG_PERIOD = 60.0
+
+
+class MemoryKeeper:
+    """Keeps the memory in a file, if there is one; a file that cannot be read or written does not stop the node.
+
+    Parameters
+    ----------
+    node : Node
+    compensation : Compensation
+    path : str
+        "": none.
+    """
+
+    def __init__(self, node: Node, compensation: Compensation, path: str) -> None:
+        self._log = node.get_logger()
+        self._compensation, self._path = compensation, path
+        self._last: SavedMemory | None = None
+
+    def find(self, model: StageModel, limits: Sequence[Limits]) -> Mapping[str, SavedAxis] | None:
+        """Return where the axes were when the node last ended; None when nobody knows.
+
+        After a crash they may have moved on since: what is best known then counts as assumed.
+        """
+        if not self._path:
+            return None
+        try:
+            saved = load_memory(self._path)
+            if saved is None:
+                return None
+            saved.require_fit(model, self._compensation.names, limits)
+        except SlpiError as error:
+            self._log.warning(str(error))
+            return None
+        return {
+            name: SavedAxis(axis.went_through, axis.certain and saved.complete) for name, axis in saved.axes.items()
+        }
+
+    def save(self, complete: bool) -> None:
+        """Write the memory, if it has changed; `complete`: nothing will move until the node has ended."""
+        model = self._compensation.model
+        if not self._path or model is None:
+            return
+        axes = {
+            axis.name: SavedAxis(axis.went_through, axis.memory_state in (KNOWN, RESTORED))
+            for axis in self._compensation.axes
+        }
+        memory = SavedMemory(model_id(model), complete, axes)
+        if memory == self._last:
+            return
+        try:
+            save_memory(memory, self._path)
+            self._last = memory
+        except SlpiError as error:
+            self._log.error(str(error), throttle_duration_sec=LOG_PERIOD)

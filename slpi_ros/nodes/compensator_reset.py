@@ -1,0 +1,95 @@
+"""The compensator's service ``~/reset_memory``."""
+
+from collections.abc import Callable
+from time import monotonic_ns
+from typing import Any
+
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from slpi_ros.nodes.compensation import Compensation
+from slpi_ros.nodes.compensator_driver import Driver
+from slpi_ros.nodes.compensator_report import Reporter
+from slpi_ros.nodes.compensator_settings import CompensatorSettings
+
+
+class MemoryReset:
+    """Starts a reset of the memory when asked to, and answers when it is done.
+
+    Parameters
+    ----------
+    node : Node
+    compensation : Compensation
+    driver : Driver
+    reporter : Reporter
+    settings : callable
+        Returns the present ones.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        compensation: Compensation,
+        driver: Driver,
+        reporter: Reporter,
+        settings: Callable[[], CompensatorSettings],
+    ) -> None:
+        self._compensation, self._driver, self._reporter, self._settings = compensation, driver, reporter, settings
+        self._service = LateService(node, "~/reset_memory", self._start)
+
+    def _start(self) -> str:
+        """Start a reset, unless one is under way; return why that cannot be, or ""."""
+        compensation, settings = self._compensation, self._settings()
+        if not compensation.active or compensation.model is None:
+            return "not reset: there must be a model, and the node must be active"
+        if compensation.following.on:
+            return "not reset: a trajectory is being followed; wait, or stop it with an empty one"
+        if not compensation.driving.resetting:
+            finals = settings.safety.voltages if settings.reset.to_safe else compensation.voltages
+            compensation.driving.reset(settings.reset.cycles, settings.reset.rate, finals)
+            self._driver.start(self._on_end)
+            self._reporter.report()
+        return ""
+
+    def _on_end(self, arrived: bool) -> None:
+        self._reporter.silent_since_ns = monotonic_ns()
+        voltages = ", ".join(f"{v:.6g}" for v in self._compensation.voltages)
+        said = f"memory known; voltages {voltages} V" if arrived else "interrupted; the memory is assumed"
+        self._service.answer(arrived, said)
+        self._reporter.report()
+
+
+class LateService:
+    """A service that answers later, without a thread that waits: neither of the executors may be blocked.
+
+    Parameters
+    ----------
+    node : Node
+    name : str
+    start : callable
+        Starts what is asked for; returns why it cannot, or "".
+    """
+
+    def __init__(self, node: Node, name: str, start: Callable[[], str]) -> None:
+        self._start = start
+        self._waiting: list[Any] = []
+        self._service = node.create_service(Trigger, name, self._on_request)
+        # The executors send what the callback returns; only here is known whom an answer is for.
+        self._send = self._service.send_response
+        self._service.send_response = self._send_or_keep
+
+    def answer(self, success: bool, message: str) -> None:
+        """Answer everyone who waits."""
+        waiting, self._waiting = self._waiting, []
+        for header in waiting:
+            self._send(Trigger.Response(success=success, message=message), header)
+
+    def _on_request(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = self._start()
+        return response
+
+    def _send_or_keep(self, response: Trigger.Response, header: Any) -> None:
+        if response.message:
+            self._send(response, header)
+        else:
+            self._waiting.append(header)

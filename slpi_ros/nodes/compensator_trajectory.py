@@ -1,0 +1,137 @@
+"""The compensator's trajectories: bytes in, voltages at their own times out."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from trajectory_msgs.msg import JointTrajectory
+
+from slpi_ros.nodes.compensation import Compensation
+from slpi_ros.runtime.clock import SECOND_NS
+from slpi_ros.runtime.rejection import INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
+from slpi_ros.runtime.timing import Timing
+from slpi_ros.runtime.trajectory import Trajectory
+from slpi_ros.runtime.trajectory_bytes import TrajectoryArrays, decode_trajectory
+
+# How often a simulated clock is looked at, seconds.
+SIMULATED_PERIOD = 0.001
+SHORTEST_WAIT_NS = 1_000
+
+
+class TrajectoryFollower:
+    """Takes trajectories, and publishes the voltages of each point when it is due.
+
+    Deadlines are absolute, on a clock that never jumps; with `use_sim_time` on the simulated one.
+
+    Parameters
+    ----------
+    node : Node
+    compensation : Compensation
+    publish : callable
+        Publishes the present voltages.
+    resting_since_ns : callable
+        Returns when voltages were last given to all axes, nanoseconds on ``time.monotonic_ns``.
+
+    Attributes
+    ----------
+    lateness : Timing
+        Of the points since the last report.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        compensation: Compensation,
+        publish: Callable[[], None],
+        resting_since_ns: Callable[[], int],
+    ) -> None:
+        self._node, self._compensation = node, compensation
+        self._publish, self._resting_since_ns = publish, resting_since_ns
+        self.lateness = Timing()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(SIMULATED_PERIOD, self._on_timer, clock=steady)
+        self._timer.cancel()
+
+    def take(self, data: bytes) -> None:
+        """Follow a serialized JointTrajectory from its time on; one without points stops what is being followed.
+
+        Raises
+        ------
+        SlpiError
+            If it cannot be followed; what was being followed goes on.
+        """
+        arrays = decode_trajectory(data) or _read(deserialize_message(data, JointTrajectory))
+        if not arrays.time_from_start_ns.size:
+            self.stop()
+            return
+        compensation = self._compensation
+        if not compensation.active:
+            raise RejectedError(INACTIVE, "the compensator is not active; activate it")
+        if compensation.model is None:
+            raise RejectedError(NO_MODEL, "there is no model yet; give model_file, or publish stage_model")
+        if compensation.driving.resetting:
+            raise RejectedError(RESETTING, "the memory is being reset; wait until reset_memory answers")
+        now_ns = self._now_ns()
+        start_ns = arrays.start_ns + now_ns - self._node.get_clock().now().nanoseconds if arrays.start_ns else 0
+        trajectory = Trajectory.of(
+            arrays.names, arrays.time_from_start_ns, arrays.positions, start_ns, axes=compensation.names
+        )
+        compensation.driving.stop()
+        since_ns = self._resting_since_ns() + now_ns - time.monotonic_ns()
+        compensation.following.start(trajectory, self._now_ns, since_ns)
+        self._wait()
+
+    def stop(self) -> None:
+        """Leave the axes where they are."""
+        self._timer.cancel()
+        self._compensation.following.stop()
+
+    def _on_timer(self) -> None:
+        following = self._compensation.following
+        while (deadline_ns := following.next_deadline_ns) is not None and deadline_ns <= (now_ns := self._now_ns()):
+            self._compensation.follow(now_ns)
+            self._publish()
+            self.lateness.note(deadline_ns, now_ns)
+        self._wait()
+
+    def _wait(self) -> None:
+        """Set the timer to the next deadline."""
+        deadline_ns = self._compensation.following.next_deadline_ns
+        if deadline_ns is None:
+            self._timer.cancel()
+            return
+        wait_ns = max(deadline_ns - self._now_ns(), SHORTEST_WAIT_NS)
+        self._timer.timer_period_ns = int(SIMULATED_PERIOD * SECOND_NS) if self._simulated else wait_ns
+        self._timer.reset()
+
+    @property
+    def _simulated(self) -> bool:
+        return bool(self._node.get_clock().ros_time_is_active)
+
+    def _now_ns(self) -> int:
+        return int(self._node.get_clock().now().nanoseconds) if self._simulated else time.monotonic_ns()
+
+
+def _read(message: JointTrajectory) -> TrajectoryArrays:
+    """Return what a JointTrajectory says whose points are not alike.
+
+    Raises
+    ------
+    RejectedError
+        If a point has not one position for each joint.
+    """
+    stamp, names = message.header.stamp, tuple(message.joint_names)
+    for i, point in enumerate(message.points):
+        if len(point.positions) != len(names):
+            said = f"point {i} has {len(point.positions)} positions for {len(names)} axes"
+            raise RejectedError(LENGTH, f"{said}; send one for each")
+    times = [point.time_from_start.sec * SECOND_NS + point.time_from_start.nanosec for point in message.points]
+    return TrajectoryArrays(
+        stamp.sec * SECOND_NS + stamp.nanosec,
+        names,
+        np.array(times, dtype=np.int64),
+        np.array([point.positions for point in message.points], dtype=np.float64).reshape(len(times), len(names)),
+    )

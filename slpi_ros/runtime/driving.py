@@ -1,0 +1,70 @@
+"""All axes driven on their own: to a safe voltage, or to a known memory."""
+
+from collections.abc import Sequence
+
+from slpi_ros.runtime.axis import ASSUMED, KNOWN, RESETTING, Axis
+from slpi_ros.runtime.ramp import Ramp
+from slpi_ros.runtime.reset import decaying_turns
+
+
+class Driving:
+    """What moves axes on their own.
+
+    Parameters
+    ----------
+    axes : sequence of Axis
+        Each with a model before anything starts.
+
+    Attributes
+    ----------
+    on : bool
+        Whether something has been started and not been stopped.
+    resetting : bool
+        Whether that is a reset of the memory.
+    """
+
+    def __init__(self, axes: Sequence[Axis]) -> None:
+        self._axes = axes
+        self.on = self.resetting = False
+
+    def reset(self, cycles: int, rate: float, finals: Sequence[float]) -> None:
+        """Start the decaying oscillation that wipes the memory.
+
+        Parameters
+        ----------
+        cycles : int
+        rate : float, V/s
+        finals : sequence of float, volts
+            Where the axes end, or as near as their limits allow.
+        """
+        self.stop()
+        for axis, final in zip(self._axes, finals, strict=True):
+            limits = axis.stream.limits
+            axis.start_drive(Ramp(decaying_turns(limits, limits.clip(final), cycles), rate))
+            axis.memory_state = RESETTING
+        self.on = self.resetting = True
+
+    def ramp(self, goals: Sequence[float], rate: float) -> None:
+        """Start to go to the voltages `goals` (V), or as near as limits allow, at `rate` (V/s)."""
+        self.stop()
+        for axis, goal in zip(self._axes, goals, strict=True):
+            axis.start_drive(Ramp([goal], rate))
+        self.on = True
+
+    def step(self, dt: float) -> bool:
+        """Move all axes on, `dt` (s) later; return whether all have arrived."""
+        arrived = [axis.drive(dt) for axis in self._axes]
+        return all(arrived)
+
+    def stop(self) -> None:
+        """Take up desired displacements again, from where the axes are; without effect when off.
+
+        A reset that has not come to its end leaves the memory assumed.
+        """
+        if not self.on:
+            return
+        for axis in self._axes:
+            axis.stop_drive()
+            if self.resetting:
+                axis.memory_state = KNOWN if axis.arrived else ASSUMED
+        self.on = self.resetting = False

@@ -1,0 +1,130 @@
+"""All axes along trajectories: which voltages are due, and what becomes of a plan when things change."""
+
+from collections.abc import Callable, Mapping
+from math import inf
+
+from slpi_ros.runtime.axis import Axis
+from slpi_ros.runtime.deadlines import Due, Streamer
+from slpi_ros.runtime.trajectory import Plan, Standing, Trajectory, prepare
+from slpi_ros.stream import ROUNDING, AxisStream
+
+
+class Following:
+    """Moves axes along trajectories. All times are nanoseconds on one clock.
+
+    While nothing comes in between, the voltages are those that were planned. Once something has - another model, new
+    limits, points that were too late - the rest of the path is compensated sample by sample, from where the axes
+    really are.
+
+    Parameters
+    ----------
+    axes : mapping of name to Axis
+
+    Attributes
+    ----------
+    points_held, points_slewing : int
+        Of the last plan: at a voltage limit, or still on their way.
+    """
+
+    def __init__(self, axes: Mapping[str, Axis]) -> None:
+        self._axes = axes
+        self._streamer: Streamer[Plan] = Streamer()
+        self._plan: Plan | None = None
+        self._streams: dict[str, AxisStream] = {}
+        self._as_planned = False
+        self._last_ns = dict.fromkeys(axes, 0)
+        self.points_held = self.points_slewing = 0
+
+    @property
+    def on(self) -> bool:
+        """Whether points are still to come."""
+        return self._streamer.next_deadline_ns is not None
+
+    @property
+    def remaining(self) -> int:
+        """Points still to come."""
+        return self._streamer.remaining
+
+    @property
+    def skipped(self) -> int:
+        """Points that came too late so far."""
+        return self._streamer.skipped
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """When the next point is due, nanoseconds; None: there is none."""
+        return self._streamer.next_deadline_ns
+
+    def start(self, trajectory: Trajectory, now: Callable[[], int], resting_since_ns: int) -> None:
+        """Let a trajectory take over from what is being followed: at once, or when its first point is due.
+
+        Parameters
+        ----------
+        trajectory : Trajectory
+        now : callable
+            Returns the time, nanoseconds. A long trajectory takes a while to compensate; one that starts at once starts
+            after that.
+        resting_since_ns : int, nanoseconds
+            When axes that no trajectory has moved were given their voltage.
+
+        Raises
+        ------
+        SlpiError
+            If it cannot be followed; what was being followed goes on.
+        """
+        if not self.on:
+            self._last_ns = dict.fromkeys(self._axes, resting_since_ns)
+        standing = {
+            name: Standing(axis.model, axis.stream, self._last_ns[name])
+            for name, axis in self._axes.items()
+            if axis.model
+        }
+        plan = prepare(trajectory, standing, now(), self._streamer)
+        self.points_held, self.points_slewing = (int(mask.any(axis=1).sum()) for mask in (plan.held, plan.slewed))
+        self._streamer.start(plan, now())
+
+    def stop(self) -> None:
+        """Leave the axes where they are, and take up desired displacements from there."""
+        if not self.on and self._plan is None:
+            return
+        self._streamer.cancel()
+        self._plan = None
+        for axis in self._axes.values():
+            axis.restart()
+
+    def step(self, now_ns: int) -> int | None:
+        """Move on to the latest point that is due; return its deadline (ns), None when none is due."""
+        due = self._streamer.due(now_ns)
+        if due is None:
+            return None
+        self._enter(due)
+        plan, point = due.points, due.point
+        for column, name in enumerate(plan.trajectory.names):
+            ahead = (due.deadline_ns - self._last_ns[name]) * 1e-9
+            self._last_ns[name] = due.deadline_ns
+            self._move(self._axes[name], plan, point, column, ahead)
+        if not self.on:
+            self.stop()
+        return due.deadline_ns
+
+    def _enter(self, due: Due[Plan]) -> None:
+        """Notice what makes the plan no longer hold."""
+        streams = {name: self._axes[name].stream for name in due.points.trajectory.names}
+        if due.points is not self._plan:
+            self._plan, self._as_planned = due.points, due.point == 0
+        elif due.skipped or any(streams[name] is not self._streams[name] for name in streams):
+            self._as_planned = False
+        self._streams = streams
+
+    def _move(self, axis: Axis, plan: Plan, point: int, column: int, ahead: float) -> None:
+        wish = float(plan.trajectory.positions[point, column])
+        if not self._as_planned:
+            axis.move(ahead, wish)
+            return
+        planned = float(plan.voltages[point, column])
+        before = float(plan.voltages[point - 1, column]) if point else axis.stream.voltage
+        axis.follow(ahead, wish, planned, before)
+        limits = axis.stream.limits
+        width = limits.upper - limits.lower if limits.upper - limits.lower < inf else 1.0
+        if abs(axis.stream.voltage - planned) > ROUNDING * width:
+            self._as_planned = False

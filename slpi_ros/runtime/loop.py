@@ -1,0 +1,146 @@
+"""The closed loop of one axis: its measurements correct the voltage, and say how healthy the model is."""
+
+from dataclasses import dataclass
+from math import inf, isfinite
+
+from slpi_ros.control import Feedback, PidGains
+from slpi_ros.errors import SlpiError
+from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.runtime.health import ResidualWindow
+from slpi_ros.stream import Limits, Pace
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """What the closed loop of one axis is told.
+
+    Parameters
+    ----------
+    enabled : bool
+        Whether measurements act on the voltage; if not, they only serve the health.
+    gains : PidGains
+    timeout : float, seconds
+        An older measurement does not act.
+    """
+
+    enabled: bool
+    gains: PidGains
+    timeout: float
+
+
+class ClosedLoop:
+    """Feedback of one axis, and the memory that follows the voltage it is really given.
+
+    The inverse model's own memory follows the desired path, as if there were no correction: noise of the sensor must
+    not turn it.
+
+    Parameters
+    ----------
+    settings : LoopSettings
+    limits : Limits
+        Of the voltage in total.
+    memory : Memory
+        In its present state; owned by the loop from here on.
+    """
+
+    def __init__(self, settings: LoopSettings, limits: Limits, memory: Memory) -> None:
+        self.memory = memory
+        self.residuals = ResidualWindow(memory.displacement)
+        self._settings = settings
+        self._pace = Pace(limits)
+        self._t, self._wanted = 0.0, memory.voltage
+        self._start()
+
+    @property
+    def voltage(self) -> float:
+        """Present voltage in total, volts."""
+        return self.memory.voltage
+
+    @property
+    def correction(self) -> float:
+        """Part of the present voltage that comes from the feedback, volts."""
+        return self._feedback.correction
+
+    @property
+    def acting(self) -> bool:
+        """Whether the last sample had a measurement to act on."""
+        return self._acting
+
+    def swap(self, limits: Limits, memory: Memory) -> None:
+        """Go on with another model's memory; the correction stays."""
+        self.limit(limits)
+        self.memory = memory
+        self.residuals.forget(memory.displacement)
+
+    def settle(self) -> None:
+        """Start anew where the axis is, without a correction."""
+        self._start()
+        self.residuals.forget(self.memory.displacement)
+
+    def retune(self, settings: LoopSettings) -> None:
+        """Go on with other settings, without a jump."""
+        self._settings = settings
+        self._feedback.retune(settings.gains)
+        if settings.enabled:
+            self._feedback.enable()
+        else:
+            self._feedback.disable()
+
+    def limit(self, limits: Limits) -> None:
+        """Go on within other limits."""
+        self._feedback.limits = self._pace.limits = limits
+
+    def measure(self, displacement: float, now: float) -> None:
+        """Note a measurement (m) that came at `now` (s)."""
+        if isfinite(displacement):
+            self._measured, self._measured_at = displacement, now
+            self.residuals.measure(displacement)
+
+    def correct(self, dt: float, desired: float, feedforward: float, now: float) -> float:
+        """Return the voltage in total (V).
+
+        A measurement acts once, and only while it is fresh; without one the correction stays.
+
+        Parameters
+        ----------
+        dt : float, seconds
+            Since the last sample.
+        desired : float, metres
+        feedforward : float, volts
+        now : float, seconds
+            On the clock of `measure`.
+        """
+        self._t += dt
+        before = self.memory.voltage
+        self._acting = now - self._measured_at <= self._settings.timeout
+        v = wanted = self._give(desired, feedforward)
+        if self._pace.limits.acceleration < inf:
+            v = self._pace.step(before, wanted, dt, self._wanted)
+        self._wanted = wanted
+        self._measured_at = -inf
+        self.residuals.expect(self.memory.forward(v))
+        return v
+
+    def drive(self, voltage: float) -> None:
+        """Go to a voltage (V) whatever is desired or measured."""
+        self.residuals.expect(self.memory.forward(voltage))
+
+    def _start(self) -> None:
+        """Forget corrections and measurements."""
+        voltage = self.memory.voltage
+        self._pace.rest()
+        self._t, self._wanted = 0.0, voltage
+        self._measured, self._measured_at, self._acting = 0.0, -inf, False
+        self._feedback = Feedback(self._settings.gains, self._pace.limits, voltage)
+        self._feedback.hold(0.0, voltage)
+        if self._settings.enabled:
+            self._feedback.enable()
+
+    def _give(self, desired: float, feedforward: float) -> float:
+        if self._acting:
+            try:
+                return self._feedback.correct(self._t, desired, self._measured, feedforward)
+            except SlpiError:
+                # A measurement beyond reason is none.
+                self._acting = False
+        return self._feedback.hold(self._t, feedforward)

@@ -1,0 +1,81 @@
+"""Measured displacements over DDS: they correct the voltage when told to, and tell when the model no longer holds."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from nodes.compensator_client import PERIOD_NS, START_NS, Client, compensator  # noqa: E402
+from nodes.ros_helpers import stage_model  # noqa: E402
+from rclpy.qos import qos_profile_sensor_data  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+
+from slpi_ros.model_file import save_model  # noqa: E402
+
+GAINS = {"kp": 2e6, "ki": 1e9}
+
+
+@pytest.fixture
+def x_file(tmp_path: Path) -> str:
+    path = tmp_path / "x.json"
+    save_model(stage_model(), path)
+    return str(path)
+
+
+class DriftedStage:
+    """A stage that is the model, but for an offset of its voltage."""
+
+    def __init__(self, client: Client, offset: float) -> None:
+        self._client, self._offset = client, offset
+        self._memory = stage_model().axis("x").memory()
+        self._measured = client.graph.publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
+        self._sent = 0
+
+    def follow(self, wishes: list[float]) -> np.ndarray:
+        """Return the errors (m) of a path, each sample measured before the next is sent."""
+        errors = []
+        for y in wishes:
+            (voltage,) = self._client.ask(["x"], [y], START_NS + self._sent * PERIOD_NS)
+            self._sent += 1
+            place = self._memory.forward(voltage + self._offset)
+            self._measured.publish(JointState(name=["other", "x"], position=[1.0, place]))
+            errors.append(place - y)
+        return np.array(errors)
+
+
+PATH = (5e-6 + 2e-6 * np.sin(np.linspace(0.0, 6.0, 400))).tolist()
+
+
+def test_feedback_corrects_what_the_model_does_not_know_and_the_drift_is_told(x_file):
+    with compensator(model_file=x_file, measurement_timeout=10, **GAINS) as client:
+        client.connect()
+        stage = DriftedStage(client, 4.0)
+        without = stage.follow(PATH)
+        status = client.graph.wait_for_status(
+            f"{client.name}: compensator", lambda status: "is off its model" in status.message, "the drift"
+        )
+        assert status.level == b"\1" and "nm rms" in status.message
+        assert client.graph.set_parameters(client.name, feedback=True) == ""
+        stage.follow(PATH[-1:] * 100)
+        with_feedback = stage.follow(PATH[::-1])
+        _, values = client.report(**{"x.feedback": "on"})
+        assert np.abs(without).mean() > 3e-7
+        assert np.abs(with_feedback).mean() < 0.1 * np.abs(without).mean()
+        assert float(values["x.correction_V"]) == pytest.approx(-4.0, abs=1.0)
+        assert float(values["x.residual_rms_nm"]) > 100.0
+        # Gains and switch change while it runs, together or not at all.
+        assert "kp" in client.graph.set_parameters(client.name, kp=-1.0, feedback=False)
+        assert client.graph.set_parameters(client.name, feedback=False, drift_alarm=0.0) == ""
+        client.report(**{"x.feedback": "off"})
+
+
+def test_without_measurements_the_feedback_holds_and_says_so(x_file):
+    with compensator(model_file=x_file, feedback=True, **GAINS) as client:
+        client.connect()
+        expected = stage_model().compensate(np.arange(50), np.array(PATH[:50]))
+        assert client.follow(["x"], np.array(PATH[:50])[:, None])[:, 0] == pytest.approx(expected, abs=1e-9)
+        client.graph.wait_for_status(
+            f"{client.name}: compensator", lambda status: "feedback holds" in status.message, "the lack"
+        )

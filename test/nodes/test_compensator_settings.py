@@ -1,0 +1,80 @@
+"""The compensator's parameters without a node: what they mean, together, and what makes no sense."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+rclpy = pytest.importorskip("rclpy")
+
+from slpi_ros.errors import UsageError  # noqa: E402
+from slpi_ros.nodes.compensator_parameters import DECLARATIONS  # noqa: E402
+from slpi_ros.nodes.compensator_settings import CompensatorSettings  # noqa: E402
+from slpi_ros.stream import Limits  # noqa: E402
+
+CONFIG = Path(__file__).resolve().parents[2] / "config"
+DEFAULTS = {entry.name: entry.default for entry in DECLARATIONS}
+
+
+def settings(**values: Any) -> CompensatorSettings:
+    return CompensatorSettings.of(DEFAULTS | values)
+
+
+def test_defaults_limit_the_voltage_only_and_change_nothing_on_their_own():
+    told = settings()
+    assert told.limits == (Limits(0.0, 100.0),)
+    assert not (told.safety.ramps_on_timeout or told.safety.ramps_on_deactivate or told.loops[0].enabled)
+    assert told.safety.command_timeout == told.time.max_age == told.realtime_priority == 0
+
+
+def test_one_value_stands_for_all_axes_and_integers_for_doubles():
+    told = settings(
+        axes=["x", "y"], voltage_min=[0, 0], voltage_max=[100, 80.5], slew_limit=2000, acceleration_limit=[0, 5],
+        safe_voltage=1, kp=[1, 2], derivative_filter=0, command_timeout=1,
+    )  # fmt: skip
+    assert told.limits == (Limits(0.0, 100.0, 2000.0), Limits(0.0, 80.5, 2000.0, 5.0))
+    assert told.safety.voltages == (1.0, 1.0)
+    assert [loop.gains.proportional for loop in told.loops] == [1.0, 2.0]
+    assert told.safety.command_timeout == 1.0
+
+
+WRONG = [
+    {"on_timeout": "explode"}, {"on_deactivate": ""}, {"reset_to": "home"}, {"reset_cycles": 0}, {"reset_cycles": 2.5},
+    {"reset_cycles": True}, {"reset_rate": 0}, {"ramp_rate": -1.0}, {"realtime_priority": 100}, {"kp": [1.0, 2.0]},
+    {"ki": -1.0}, {"kd": math.nan}, {"derivative_filter": math.inf}, {"acceleration_limit": -1.0}, {"time_jump": 0.0},
+    {"max_age": -1.0}, {"drift_alarm": -3.0}, {"measurement_timeout": "long"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("values", WRONG, ids=str)
+def test_a_value_that_makes_no_sense_is_named(values):
+    (name,) = values
+    with pytest.raises(UsageError, match=f"^[^\n]*{name}[^\n]*$"):
+        settings(**values)
+
+
+@pytest.mark.parametrize("use", [{"on_timeout": "safe"}, {"on_deactivate": "safe"}, {"reset_to": "safe"}])
+def test_a_safe_voltage_must_be_within_the_limits_where_it_is_used(use):
+    settings(safe_voltage=200.0)
+    with pytest.raises(UsageError, match="safe_voltage 200 V is outside"):
+        settings(safe_voltage=200.0, **use)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIG.glob("*.yaml")), ids=lambda path: path.stem)
+def test_config_files_hold_known_parameters(path):
+    told = yaml.safe_load(path.read_text())["/**/compensator"]["ros__parameters"]
+    assert told.keys() <= DEFAULTS.keys()
+    settings(**told)
+    if path.stem == "one_axis":
+        assert told == DEFAULTS, "it shows every parameter at its default"
+
+
+def test_every_parameter_is_described():
+    for entry in DECLARATIONS:
+        described = entry.descriptor()
+        assert described.description.endswith((".", ")."))
+        assert described.read_only == entry.read_only
+        assert bool(described.floating_point_range) == bool(entry.between and entry.number)
+        assert bool(described.integer_range) == bool(entry.between and not entry.number)

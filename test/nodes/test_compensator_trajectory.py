@@ -1,0 +1,137 @@
+"""Trajectories over DDS: compensated as one block, given at their own times, replaced and cancelled."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from builtin_interfaces.msg import Duration  # noqa: E402
+from nodes.compensator_client import SECOND_NS, Client, compensator  # noqa: E402
+from nodes.ros_helpers import LATCHED, RELIABLE, stage_model, voltage_path  # noqa: E402
+from std_msgs.msg import Float64MultiArray, String  # noqa: E402
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
+
+from slpi_ros.model import HeldAtLimitWarning  # noqa: E402
+from slpi_ros.model_file import format_model, save_model  # noqa: E402
+
+pytestmark = pytest.mark.filterwarnings(f"ignore::{HeldAtLimitWarning.__module__}.{HeldAtLimitWarning.__name__}")
+MS = 1_000_000
+
+
+@pytest.fixture
+def xy_file(tmp_path: Path) -> str:
+    path = tmp_path / "xy.json"
+    save_model(stage_model(("x", "y")), path)
+    return str(path)
+
+
+def trajectory(names, times_ns, positions, start_ns=0) -> JointTrajectory:
+    message = JointTrajectory(joint_names=list(names))
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(start_ns, SECOND_NS)
+    for at, row in zip(times_ns, positions, strict=True):
+        sec, nanosec = divmod(int(at), SECOND_NS)
+        message.points.append(
+            JointTrajectoryPoint(positions=list(row), time_from_start=Duration(sec=sec, nanosec=nanosec))
+        )
+    return message
+
+
+def sender(client: Client):
+    return client.graph.publisher(JointTrajectory, "/desired_trajectory", RELIABLE)
+
+
+def library(path: np.ndarray, axes=("x", "y")) -> np.ndarray:
+    model = stage_model(axes)
+    answer = model.compensate(np.arange(len(path)), dict(zip(axes, path.T, strict=True)))
+    return np.column_stack([answer[axis] for axis in axes])
+
+
+def wide_path(samples: int, axes=("x", "y")) -> np.ndarray:
+    model = stage_model(axes)
+    return np.column_stack([model.axis(a).simulate(voltage_path(samples, seed)) for seed, a in enumerate(axes)])
+
+
+def test_a_trajectory_is_given_point_by_point_at_its_times(xy_file):
+    # Up, a rest, and down: a machine too busy for every deadline loses points, but no turn.
+    legs = np.concatenate([np.linspace(0.0, 9e-6, 120), np.full(60, 9e-6), np.linspace(9e-6, 4e-6, 120)])
+    path, times = np.column_stack([legs, 0.8 * legs]), np.arange(300) * 4 * MS
+    with compensator(axes=["x", "y"], model_file=xy_file) as client:
+        client.connect()
+        came = []
+        client.graph.node.create_subscription(
+            Float64MultiArray, "/voltage_command", lambda _: came.append(time.monotonic()), RELIABLE
+        )
+        sender(client).publish(trajectory(["y", "x"], times, path[:, ::-1]))
+        client.graph.spin_until(lambda: client.answered >= 1, "the first point")
+        client.wish(["x"], [1e-6])
+        _, values = client.report("the end", points_remaining=0, trajectories=1)
+        assert client.answered + int(values["points_skipped"]) == 300
+        expected = library(path)
+        places = [int(np.abs(expected - answer).sum(axis=1).argmin()) for answer in client.answers]
+        assert np.array(client.answers) == pytest.approx(expected[places], abs=1e-8)
+        assert places == sorted(places) and client.answers[-1] == pytest.approx(expected[-1].tolist(), abs=1e-8)
+        assert values["rejected.following"] == "1" and float(values["deadline_error_p50_us"]) >= 0.0
+        # Not before its time: the last point comes 299 intervals after the first, at most one late start earlier.
+        assert came[-1] - came[0] > 0.5 * 299 * 4e-3
+        # Afterwards wishes count again, from where it ended.
+        assert client.ask(["x"], [path[-1, 0]])[0] == pytest.approx(expected[-1, 0], abs=1e-8)
+        client.report(accepted=1)
+
+
+def test_cancel_replace_append_and_refuse(xy_file):
+    long = np.full((2000, 1), 3e-6)
+    with compensator(axes=["x", "y"], model_file=xy_file) as client:
+        client.connect()
+        publisher = sender(client)
+        publisher.publish(trajectory(["x"], np.arange(2000) * 5 * MS, long))
+        client.graph.spin_until(lambda: client.answered >= 3, "the first points")
+        # Refused ones change nothing.
+        for names, times, rows in (
+            (["z"], [0], [[1e-6]]), (["x"], [0, 0], [[1e-6]] * 2), (["x"], [0], [[1.0]]), (["x"], [0], [[1e-6, 2e-6]]),
+            (["x"], [0], [[np.nan]]), (["x", "x"], [0], [[1e-6] * 2]),
+        ):  # fmt: skip
+            publisher.publish(trajectory(names, times, rows))
+        past = client.graph.node.get_clock().now().nanoseconds - 5 * SECOND_NS
+        publisher.publish(trajectory(["x"], [0], [[1e-6]], past))
+        _, values = client.report(trajectories_rejected=7)
+        assert int(values["points_remaining"]) > 1000
+        # Appended: what comes before its time goes on, then it takes over.
+        start = client.graph.node.get_clock().now().nanoseconds + SECOND_NS // 2
+        publisher.publish(trajectory(["y"], [0, 100 * MS], [[4e-6], [5e-6]], start))
+        _, values = client.report(trajectories=9)
+        assert 2 < int(values["points_remaining"]) < 500
+        client.graph.spin_until(lambda: client.answers[-1][1] > 0, "the appended one")
+        client.report(points_remaining=0)
+        assert client.answers[-1] == pytest.approx(library(np.array([[3e-6, 4e-6], [3e-6, 5e-6]]))[-1], abs=1e-8)
+        # Replaced at once, and cancelled by an empty one.
+        publisher.publish(trajectory(["x"], np.arange(2000) * 5 * MS, long))
+        client.report(trajectories=10)
+        publisher.publish(trajectory(["x"], np.arange(2000) * 5 * MS, long + 1e-6))
+        client.report(trajectories=11)
+        client.graph.spin_until(lambda: client.answers[-1][0] > client.answers[3][0] + 1.0, "the other path")
+        publisher.publish(JointTrajectory())
+        _, values = client.report(points_remaining=0, trajectories=12)
+        held = client.answered
+        assert client.ask(["x"], [4e-6])[0] == pytest.approx(client.answers[held - 1][0], abs=1e-8)
+        assert client.answered == held + 1
+
+
+def test_a_trajectory_keeps_to_the_slew_limit_and_survives_new_limits_and_a_new_model(xy_file):
+    path, times = wide_path(400), np.arange(400) * 2 * MS
+    with compensator(axes=["x", "y"], model_file=xy_file, slew_limit=2000.0) as client:
+        client.connect()
+        models = client.graph.publisher(String, "/stage_model", LATCHED)
+        sender(client).publish(trajectory(["x", "y"], times, path))
+        client.graph.spin_until(lambda: client.answered >= 20, "the first points")
+        assert client.graph.set_parameters(client.name, slew_limit=1500.0) == ""
+        models.publish(String(data=format_model(stage_model(("x", "y"), stroke=9.5e-6))))
+        _, values = client.report("the end", points_remaining=0, trajectories=1)
+        v = np.vstack([[0.0, 0.0], client.answers])
+    assert values["models_refused"] == "0" and values["last_rejection"] == ""
+    assert len(v) + int(values["points_skipped"]) == 401
+    assert v.min() >= 0.0 and v.max() <= 100.0
+    # A step after skipped points may be as long as theirs together.
+    assert np.abs(np.diff(v, axis=0)).max() <= 2000.0 * 2e-3 * (1 + int(values["points_skipped"])) + 1e-9

@@ -55,6 +55,7 @@ setup(
             "identify = slpi_ros.nodes.identify:main",
             "recorder = slpi_ros.nodes.recorder:main",
             "slpi = slpi_ros.cli:main",
+            "exciter = slpi_ros.nodes.exciter:main",
             "stage_simulator = slpi_ros.nodes.stage_simulator:main",
         ],
     },

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import slpi_ros
-from slpi_ros.stage.drive import calibration_drive, scan_path
+from slpi_ros.excitation.drives import calibration_drive
+from slpi_ros.stage.drive import scan_path
 from slpi_ros.stage.parameters import StageParameters
 from slpi_ros.stage.preisach import PreisachStage
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from slpi_ros import bags, tables
 from slpi_ros.errors import ModelError, SlpiError, UsageError
+from slpi_ros.excitation.drives import DRIVES, excite
 from slpi_ros.identification.fit import KINDS, identify
 from slpi_ros.identification.record import FloatArray
 from slpi_ros.identification.refit import refit
@@ -96,6 +97,21 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
     command.add_argument("--report", metavar="DIR", help="also write a page with plots, of the first bag")
 
+    command = commands.add_parser("excite", help="make the voltages to record for an identification")
+    command.set_defaults(run=_excite)
+    command.add_argument("-o", "--output", metavar="DRIVE.csv", required=True, help="columns time_s, <axis>_V")
+    command.add_argument("--axis", metavar="NAME", nargs="+", default=("x",), help="they move one after the other")
+    command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="never left")
+    command.add_argument("--voltage-max", metavar="V", type=float, required=True)
+    command.add_argument("--slew", metavar="V/S", type=float, default=0.0, help="fastest change; 0: none")
+    command.add_argument("--duration", metavar="S", type=float, default=30.0)
+    command.add_argument("--rate", metavar="HZ", type=float, default=200.0)
+    command.add_argument("--seed", metavar="N", type=int, default=0)
+    command.add_argument(
+        "--for", dest="drive", metavar="EFFECT", choices=DRIVES, default=DRIVES[0],
+        help=f"what the record is to tell from others: {', '.join(DRIVES[1:])}",
+    )  # fmt: skip
+
     command = commands.add_parser("refit", help="update a model with a new bag; what the bag does not visit stays")
     command.set_defaults(run=_refit)
     command.add_argument("model", metavar="MODEL.json")
@@ -155,6 +171,21 @@ def _identify(options: argparse.Namespace) -> None:
 
         write_report(Path(options.report), records[0], model)
     print("\n".join(describe_model(model)))
+
+
+def _excite(options: argparse.Namespace) -> None:
+    drive = excite(
+        options.axis,
+        voltage_min=options.voltage_min,
+        voltage_max=options.voltage_max,
+        slew_limit=options.slew,
+        duration=options.duration,
+        rate=options.rate,
+        seed=options.seed,
+        drive=options.drive,
+    )
+    tables.write_table(options.output, drive.t, drive.voltage, "V")
+    print(f"{options.output}: {drive.t.size} voltages in {drive.t[-1]:.6g} s; {drive.why}")
 
 
 def _refit(options: argparse.Namespace) -> None:

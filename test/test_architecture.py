@@ -17,7 +17,7 @@ LAYERS = (
     {"reports", "experiments"},
     {"diagnosis"},
     {"bag_watch", "bags", "bag_files", "csv_table", "joint_state", "tables"},
-    {"identification"},
+    {"excitation", "identification"},
     {"control", "model", "model_file", "runtime", "schemas", "stream"},
     {"effects"},
     {"hysteresis"},

@@ -70,7 +70,7 @@ class Trajectory:
         positions : array_like, shape (N, K), metres
         start_ns : int, nanoseconds
         axes : sequence of str
-            All that there are.
+            All there are.
 
         Raises
         ------
@@ -233,7 +233,8 @@ def stream_twin_of(stream: AxisStream) -> AxisStream:
 
 
 def _compensate(trajectory: Trajectory, deadlines: TimeArray, standing: Mapping[str, Standing]) -> Plan:
-    v, held, slewed = (np.empty(trajectory.positions.shape, kind, "F") for kind in (np.float64, np.bool_, np.bool_))
+    shape = trajectory.positions.shape
+    v, held, slewed = np.empty(shape, order="F"), np.empty(shape, np.bool_, "F"), np.empty(shape, np.bool_, "F")
     for column, name in enumerate(trajectory.names):
         here, y = standing[name], np.ascontiguousarray(trajectory.positions[:, column])
         _check_reachable(name, here.model, y, trajectory.cut)
@@ -254,8 +255,8 @@ def _from_memory(model: AxisModel, axis: AxisStream, y: FloatArray, elapsed: Flo
     lowest, highest = v <= axis.limits.lower, v >= axis.limits.upper
     if not (lowest.any() or highest.any() or late.any()):
         return v, lowest, late
-    low, high = model.displacement_range
-    missing, rounding = y - twin_of(axis.memory).forward_array(v), ROUNDING * (high - low)
+    missing, (low, high) = y - twin_of(axis.memory).forward_array(v), model.displacement_range
+    rounding = ROUNDING * (high - low)
     # At a limit a wish may just be met, or lie on this side of it.
     held = (lowest & (missing < -rounding)) | (highest & (missing > rounding))
     return v, held, late & ~held
@@ -293,8 +294,7 @@ def _as_array(values: ArrayLike, dtype: type | None = None) -> NDArray[Any]:
 
 def _check_reachable(name: str, model: AxisModel, y: FloatArray, cut: int) -> None:
     accepted = accepted_range(model.displacement_range)
-    far = (y < accepted[0]) | (y > accepted[1])
-    if far.any():
+    if (far := (y < accepted[0]) | (y > accepted[1])).any():
         at = int(np.argmax(far))
-        where = f"axis '{name}', point {cut + at}"
-        raise RejectedError(rejection.OUT_OF_RANGE, f"{where}: {refusal(float(y[at]), accepted)}")
+        what = f"axis '{name}', point {cut + at}: {refusal(float(y[at]), accepted)}"
+        raise RejectedError(rejection.OUT_OF_RANGE, what)

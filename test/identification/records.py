@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.record import Record
-from slpi_ros.stage.drive import calibration_drive
 from slpi_ros.stage.parameters import StageParameters
 from slpi_ros.stage.preisach import PreisachStage
 

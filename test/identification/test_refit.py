@@ -8,9 +8,10 @@ from identification.records import calibration, record_of, rms, stage
 
 import slpi_ros
 from slpi_ros.errors import IdentificationError, UsageError
+from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.refit import refit
 from slpi_ros.model_file import format_model, parse_model
-from slpi_ros.stage.drive import calibration_drive, scan_path
+from slpi_ros.stage.drive import scan_path
 from slpi_ros.stage.preisach import PreisachStage
 
 SEED = 1

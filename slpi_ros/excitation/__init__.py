@@ -1,0 +1,1 @@
+"""Voltages that drive a stage so that it can be identified."""

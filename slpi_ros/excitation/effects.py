@@ -1,0 +1,256 @@
+"""For each effect the drive that separates it from the others, where a calibration drive could not."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slpi_ros.errors import UsageError
+from slpi_ros.excitation.calibration import PACE
+from slpi_ros.excitation.legs import FEWEST_STEPS, STEEPEST, Path, Room
+
+# Share of the drive for the first hold and the full loop that wipes the memory.
+WIPED = 0.15
+# No move is faster than so many ranges per second at its steepest, even without a slew limit; steps are small instead.
+FASTEST = 5.0
+
+
+@dataclass(frozen=True)
+class EffectDrive:
+    """A drive made for one effect.
+
+    Parameters
+    ----------
+    effect : str
+        Its name in the package's vocabulary.
+    why : str
+        One sentence: what the drive does, and why that separates the effect from others.
+    draw : callable
+        Draws the drive, given an empty path and the room; see `path`.
+    least_axes : int
+        How many axes it takes.
+    """
+
+    effect: str
+    why: str
+    draw: Callable[[Path, Room], None]
+    least_axes: int = 1
+
+    def path(self, room: Room) -> Path:
+        """Return the drive, from the low end to the low end; a full loop comes first, so that the memory is known."""
+        path = Path()
+        full = max(WIPED * room.duration / 3, _brisk(1.0))
+        path.hold(WIPED * room.duration / 3)
+        path.to(1.0, full)
+        path.to(0.0, full)
+        self.draw(path, room)
+        path.to(0.0, max(path.at, 0.1) / PACE)
+        return path
+
+
+def for_effect(name: str) -> EffectDrive:
+    """Return the drive that separates an effect from the others.
+
+    Parameters
+    ----------
+    name : str
+        One of `EFFECTS`.
+
+    Raises
+    ------
+    UsageError
+        If there is no such effect.
+    """
+    if name not in EFFECTS:
+        raise UsageError(f"no drive for the effect '{name}'; choose one of {', '.join(EFFECTS)}")
+    return EFFECTS[name]
+
+
+def _brisk(span: float) -> float:
+    """Return the seconds of a move over a `span` of the range (share) that no stage should mind."""
+    return abs(span) * STEEPEST / FASTEST
+
+
+def _left(room: Room) -> float:
+    """Return the time (s) after the memory is wiped."""
+    return (1.0 - WIPED) * room.duration
+
+
+def _go(path: Path, share: float) -> None:
+    path.to(share, max(abs(share - path.at), 0.05) / PACE)
+
+
+def _loops(path: Path, low: float, high: float, seconds: float, count: int, *, straight: bool = False) -> None:
+    """Run `count` loops between two shares of the range, each with two legs of some seconds."""
+    for _ in range(count):
+        path.to(high, seconds, straight=straight)
+        path.to(low, seconds, straight=straight)
+
+
+def _tempos(slowest: float, quickest: float, count: int) -> list[float]:
+    """Return evenly graded durations of a leg (s), the slowest first."""
+    return [float(seconds) for seconds in np.geomspace(max(slowest, quickest), quickest, count)]
+
+
+def _at_tempos(path: Path, room: Room, low: float, high: float, *, straight: bool) -> None:
+    """Run one loop slowly to fast, about the same time at each tempo, at least twice at each."""
+    count = 6
+    each = _left(room) / count
+    span = high - low
+    quickest = max(room.quickest(span, straight), _brisk(span), 8 / room.rate)
+    _go(path, low)
+    for seconds in _tempos(each / 4, quickest, count):
+        _loops(path, low, high, seconds, max(2, round(each / (2 * seconds))), straight=straight)
+
+
+def _delay(path: Path, room: Room) -> None:
+    _at_tempos(path, room, 0.35, 0.65, straight=True)
+
+
+def _lag(path: Path, room: Room) -> None:
+    _at_tempos(path, room, 0.45, 0.55, straight=False)
+
+
+def _rate_dependence(path: Path, room: Room) -> None:
+    spans, doublings, loops = (0.6, 0.3, 0.15), 3, 2
+    # Loops of one span take 2 (1 + 2 + 4) quickest legs.
+    quickest = _left(room) / (len(spans) * loops * 2 * (2**doublings - 1))
+    quickest = max(quickest, room.quickest(spans[0]), _brisk(spans[0]))
+    for span in spans:
+        _go(path, 0.5 - span / 2)
+        for doubling in range(doublings):
+            _loops(path, 0.5 - span / 2, 0.5 + span / 2, quickest * 2**doubling, loops)
+
+
+def _saturation(path: Path, room: Room) -> None:
+    for near in (0.2, 0.1, 0.05, 0.0):
+        for seconds in (_left(room) / 12, _left(room) / 48):
+            for end in (1.0 - near, near):
+                path.to(end, max(seconds, _brisk(1.0)))
+                path.hold(0.01 * room.duration)
+
+
+def _creep(path: Path, room: Room) -> None:
+    levels, shares = (0.8, 0.2, 0.6, 0.9, 0.4), (1, 2, 4, 8, 8)
+    for level, share in zip(levels, shares, strict=True):
+        path.to(level, _brisk(level - path.at))
+        path.hold(_left(room) * share / sum(shares))
+
+
+def _resonance(path: Path, room: Room) -> None:
+    step, levels, repeats = 0.1, (0.2, 0.5, 0.8), 3
+    ring = 0.5 * _left(room) / (len(levels) * (1 + 2 * repeats))
+    for level in levels:
+        _go(path, level)
+        path.hold(ring)
+        for _ in range(repeats):
+            for to in (level + step, level):
+                path.to(to, 0.0, straight=True)
+                path.hold(ring)
+    # The sweep: each half-wave is by a sample shorter than the one before, two loops of each take 0.3 of the time.
+    _go(path, 0.5)
+    longest = int(math.sqrt(0.3 * _left(room) * room.rate / 2))
+    for steps in range(longest, FEWEST_STEPS - 1, -1):
+        _loops(path, 0.5 - step / 4, 0.5 + step / 4, steps / room.rate, 2)
+
+
+def _cross_coupling(path: Path, room: Room) -> None:
+    spans = ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0), (0.25, 0.75))
+    seconds = _left(room) / (len(spans) * 2 * (1 + 2))
+    for low, high in spans:
+        _go(path, low)
+        for each in (2 * seconds, seconds):
+            _loops(path, low, high, each, 1)
+            path.hold(seconds / 4)
+
+
+def _thermal_drift(path: Path, room: Room) -> None:
+    # Of a cycle 0.6 is motion.
+    shortest = 2 * max(room.quickest(1.0), _brisk(1.0)) / 0.6
+    repeats = min(max(int(_left(room) / shortest), 3), 8)
+    each = _left(room) / repeats
+    for _ in range(repeats):
+        path.to(1.0, 0.3 * each)
+        path.hold(0.2 * each)
+        path.to(0.0, 0.3 * each)
+        path.hold(0.2 * each)
+
+
+def _sensor_periodic(path: Path, room: Room) -> None:
+    for share in (1 / 6, 1 / 3):
+        _loops(path, 0.0, 1.0, share * _left(room), 1, straight=True)
+
+
+def _hum(path: Path, room: Room) -> None:
+    for level in (0.1, 0.5, 0.9):
+        _go(path, level)
+        path.hold(_left(room) / 3)
+
+
+EFFECTS = {
+    drive.effect: drive
+    for drive in (
+        EffectDrive(
+            "delay",
+            "The same triangle at six speeds: a delay shifts its sharp corners by one time at every speed and leaves "
+            "them sharp, where a lag rounds them and rate dependence changes the loop between them.",
+            _delay,
+        ),
+        EffectDrive(
+            "lag",
+            "The same small loop as a sine, slow to fast: hysteresis stays as it is, the phase of a delay grows with "
+            "frequency at full amplitude, and a lag also loses amplitude.",
+            _lag,
+        ),
+        EffectDrive(
+            "saturation",
+            "Peaks that come up to both limits in steps, slow and fast, with a hold at each: a clipped amplifier stops "
+            "at one voltage at any speed, where hysteresis and lag go on to the peak.",
+            _saturation,
+        ),
+        EffectDrive(
+            "rate_dependence",
+            "Loops of three sizes at three speeds each, some of different size at the same volts per second: a linear "
+            "filter treats these alike, loops that widen with the drive rate do not.",
+            _rate_dependence,
+        ),
+        EffectDrive(
+            "creep",
+            "Quick moves up and down, each followed by a hold, the later ones longer: at constant voltage hysteresis, "
+            "lag and delay are still, and only creep goes on, in proportion to the move and in its direction.",
+            _creep,
+        ),
+        EffectDrive(
+            "resonance",
+            "Small steps as fast as allowed with time to ring down, at three levels, then a sweep up to a sixth of the "
+            "sampling rate: only a resonance rings on, at one frequency (sample at six times that or more).",
+            _resonance,
+        ),
+        EffectDrive(
+            "cross_coupling",
+            "One axis moves while all others rest: what a resting axis shows then is coupling, and neither its own "
+            "hysteresis nor its own dynamics.",
+            _cross_coupling,
+            least_axes=2,
+        ),
+        EffectDrive(
+            "thermal_drift",
+            "The same full loop over and over, with the same holds: voltage, memory and creep repeat, so what differs "
+            "from one repeat to the next follows time alone.",
+            _thermal_drift,
+        ),
+        EffectDrive(
+            "sensor_periodic",
+            "Slow ramps of constant speed over the whole range, at two speeds: an error of the sensor has the same "
+            "period in displacement at both speeds, hum the same in time, and hysteresis is smooth.",
+            _sensor_periodic,
+        ),
+        EffectDrive(
+            "hum",
+            "Rest at three levels: nothing is commanded, so what oscillates there at one frequency comes from outside; "
+            "an error of the sensor does not, at rest (sample at more than twice the mains frequency).",
+            _hum,
+        ),
+    )
+}

@@ -1,0 +1,207 @@
+"""Node ``exciter``: drives a stage so that it can be identified."""
+
+import math
+import sys
+import time
+from array import array
+
+from builtin_interfaces.msg import Duration as DurationMsg
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from slpi_ros.errors import SlpiError
+from slpi_ros.excitation.playback import Playback
+from slpi_ros.nodes.exciter_settings import DECLARATIONS, LIVE, ExciterSettings
+from slpi_ros.nodes.parameters import Parameters
+from slpi_ros.nodes.qos import COMMANDS, LATCHED
+from slpi_ros.nodes.runner import request_stop, run
+
+SECOND_NS = 1_000_000_000
+POLL_PERIOD = 0.1
+LOG_PERIOD = 5.0
+# The last voltage must have arrived before the node goes.
+PATIENCE = Duration(seconds=1.0)
+# A drive that takes so much longer than it should is reported.
+SLUGGISH = 1.02
+
+
+class Exciter(Node):
+    """Drives a stage within its limits, and brings it back to where it was, whatever ends the drive.
+
+    Publishes ``voltage_command``, one sample a period by a clock that never jumps: after a stall the drive goes on
+    where it was, later, and never leaps. Or, with the parameter ``output`` "trajectory", all samples at once on
+    ``voltage_trajectory``: volts in ``effort``, as in ``stage_state``, and no positions. Subscribes ``stage_state`` to
+    learn where the axes are. It waits for a subscriber before it starts.
+    Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `exciter_settings`.
+
+    Raises
+    ------
+    UsageError
+        If the parameters make no drive.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("exciter")
+        self._parameter_set = Parameters(self, DECLARATIONS, ExciterSettings.of)
+        self._parameter_set.follow(lambda settings: None)
+        self._playback: Playback | None = None
+        self._timer = None
+        self._heard: list[float] | None = None
+        self._live = self._settings.output == LIVE
+        if self._live:
+            self._publisher = self.create_publisher(Float64MultiArray, "voltage_command", COMMANDS)
+        else:
+            self._publisher = self.create_publisher(JointTrajectory, "voltage_trajectory", LATCHED)
+        self.create_subscription(JointState, "stage_state", self._on_state, qos_profile_sensor_data)
+        self.create_service(Trigger, "~/start", self._on_start)
+        self.create_service(Trigger, "~/stop", self._on_stop)
+        # A simulated clock may stand still.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._polls_left = self._listeners = 0
+        self._waiting = self.create_timer(POLL_PERIOD, self._look, clock=self._steady, autostart=False)
+        if self._settings.autostart:
+            self._wait()
+
+    def destroy_node(self) -> None:
+        """Bring the axes back, then destroy the node."""
+        if self.context.ok():
+            if self._playback:
+                self._turn_back(self._playback)
+                while not self._playback.done:
+                    self._give(self._playback.next())
+                    time.sleep(1.0 / self._playback.drive.rate)
+            self._publisher.wait_for_all_acked(PATIENCE)
+        super().destroy_node()
+
+    @property
+    def _settings(self) -> ExciterSettings:
+        return self._parameter_set.settings
+
+    # Before the drive
+
+    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._playback or self._polls_left:
+            response.message = "started already; call ~/stop first"
+        else:
+            self._wait()
+            response.success = True
+            response.message = f"drive '{self._settings.drive}' of {self._settings.duration:g} s"
+        return response
+
+    def _wait(self) -> None:
+        self._listeners = 0
+        self._polls_left = 1
+        self._waiting.reset()
+
+    def _look(self) -> None:
+        """Begin when nobody has joined for a while: who connects late would miss the beginning."""
+        listeners = self._publisher.get_subscription_count()
+        if not listeners:
+            self.get_logger().info(
+                f"waiting for a subscriber of {self._publisher.topic_name}", throttle_duration_sec=LOG_PERIOD
+            )
+        elif listeners != self._listeners:
+            self._polls_left = 1 + round(self._settings.settle / POLL_PERIOD)
+        else:
+            self._polls_left -= 1
+        self._listeners = listeners
+        if not self._polls_left:
+            self._waiting.cancel()
+            self._begin()
+
+    def _on_state(self, state: JointState) -> None:
+        at = dict(zip(state.name, state.effort, strict=False))
+        heard = [at.get(axis, math.nan) for axis in self._settings.axes]
+        if all(map(math.isfinite, heard)):
+            self._heard = heard
+
+    # The drive
+
+    def _begin(self) -> None:
+        settings = self._settings
+        try:
+            drive = settings.drawn(self._heard)
+        except SlpiError as error:
+            self.get_logger().error(str(error))
+            if settings.autostart:
+                request_stop(error)
+            return
+        self._playback, self._begun = Playback(drive, repeat=settings.repeat), time.monotonic()
+        self._timer = self.create_timer(1.0 / drive.rate, self._step, clock=self._steady)
+        self._hand_over(self._playback)
+        if self.count_publishers(self._publisher.topic_name) > 1:
+            self.get_logger().warning(f"others publish {self._publisher.topic_name} too; stop them and drive again")
+        self.get_logger().info(f"driving {', '.join(drive.axes)} for {settings.duration:g} s. {drive.why}")
+
+    def _step(self) -> None:
+        if self._playback:
+            self._give(self._playback.next())
+            if self._playback.done:
+                self._end(self._playback)
+
+    def _give(self, voltages: list[float]) -> None:
+        if self._live:
+            self._publisher.publish(Float64MultiArray(data=array("d", voltages)))
+
+    def _hand_over(self, playback: Playback) -> None:
+        if not self._live:
+            self._publisher.publish(trajectory_of(playback))
+
+    def _end(self, playback: Playback) -> None:
+        self.destroy_timer(self._timer)
+        self._playback = None
+        took, planned = time.monotonic() - self._begun, playback.drive.t[-1]
+        rest = ", ".join(f"{axis} at {v[0]:g} V" for axis, v in playback.drive.voltage.items())
+        self.get_logger().info(f"{'stopped' if playback.stopping else 'done'} after {took:.1f} s; {rest}")
+        if not playback.stopping:
+            if took > SLUGGISH * planned:
+                self.get_logger().warning(
+                    f"the drive took {took:.1f} s in place of {planned:.1f} s; for this machine lower the rate"
+                )
+            if self._settings.autostart:
+                request_stop()
+
+    # Its end
+
+    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = True
+        self._waiting.cancel()
+        self._polls_left = 0
+        response.message = f"back in {self._turn_back(self._playback):.1f} s" if self._playback else "at rest"
+        return response
+
+    def _turn_back(self, playback: Playback) -> float:
+        """Return to where the axes rest; return how long that takes, seconds."""
+        if playback.stop():
+            self._hand_over(playback)
+        return playback.seconds_left
+
+
+def trajectory_of(playback: Playback) -> JointTrajectory:
+    """Return what is left of a drive: volts in ``effort``, no positions, times from now."""
+    rate = playback.drive.rate
+    points = [
+        JointTrajectoryPoint(effort=array("d", voltages), time_from_start=_duration(number / rate))
+        for number, voltages in enumerate(playback.samples_left.tolist(), 1)
+    ]
+    return JointTrajectory(joint_names=list(playback.drive.axes), points=points)
+
+
+def _duration(seconds: float) -> DurationMsg:
+    whole_seconds, nanoseconds = divmod(round(seconds * SECOND_NS), SECOND_NS)
+    return DurationMsg(sec=whole_seconds, nanosec=nanoseconds)
+
+
+def main() -> int:
+    """Run the node; return the exit code of the process: 0 when the drive is done or was stopped."""
+    return run(Exciter)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,251 @@
+"""The exciter as a process of its own, over DDS."""
+
+import math
+import signal
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from nodes.ros_helpers import LATCHED, RELIABLE, on_graph, started  # noqa: E402
+from rclpy.event_handler import SubscriptionEventCallbacks  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_msgs.msg import Float64MultiArray  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+from trajectory_msgs.msg import JointTrajectory  # noqa: E402
+
+from slpi_ros.errors import UsageError  # noqa: E402
+from slpi_ros.excitation.drives import excite  # noqa: E402
+from slpi_ros.nodes.exciter_settings import DECLARATIONS, ExciterSettings  # noqa: E402
+
+RATE = 100.0
+LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0, "rate": RATE}
+# As soon as somebody listens.
+AT_ONCE = LIMITS | {"settle": 0.0}
+
+
+class Listener:
+    """Keeps the voltages that come, and knows whether it would miss any."""
+
+    def __init__(self, graph):
+        self._graph, self.commands, self.publishers = graph, [], 0
+        callbacks = SubscriptionEventCallbacks(matched=self._on_matched)
+        graph.node.create_subscription(
+            Float64MultiArray, "voltage_command", self.commands.append, RELIABLE, event_callbacks=callbacks
+        )
+
+    def _on_matched(self, status):
+        self.publishers = status.current_count
+
+    @property
+    def v(self):
+        """Voltages so far, shape (N, axes)."""
+        return np.array([list(command.data) for command in self.commands])
+
+    def wait_for_publisher(self):
+        self._graph.spin_until(lambda: self.publishers, "the exciter to be connected")
+
+    def wait_for_motion(self):
+        self._graph.spin_until(lambda: self.commands and self.commands[-1].data[0] > 60.0, "the drive")
+
+    def wait_for(self, count):
+        self._graph.spin_until(lambda: len(self.commands) >= count, f"{count} voltages")
+
+
+@contextmanager
+def exciter(graph, **given):
+    with started("exciter", given) as node:
+        graph.tested = node
+        yield node
+        graph.tested = None
+
+
+def call(graph, name):
+    return graph.call(Trigger, f"exciter/{name}", Trigger.Request())
+
+
+def wait_for_end(graph, node):
+    """Return the exit code once the node has ended and all that it sent has come."""
+    graph.tested = None
+    graph.spin_until(lambda: node.process.poll() is not None, "the end of the exciter")
+    end = time.monotonic() + 0.3
+    graph.spin_until(lambda: time.monotonic() > end, "the last message")
+    return node.wait()
+
+
+def drawn(**given):
+    """Return the voltages of a drive, shape (N, axes)."""
+    return np.column_stack(
+        list(excite(**({"voltage_min": 0.0, "voltage_max": 100.0, "rate": RATE} | given)).voltage.values())
+    )
+
+
+def fastest(v):
+    return float(np.max(np.abs(np.diff(v, axis=0)))) * RATE
+
+
+def stall(node, seconds):
+    node.process.send_signal(signal.SIGSTOP)
+    time.sleep(seconds)
+    node.process.send_signal(signal.SIGCONT)
+
+
+def test_a_drive_reaches_the_stage_sample_by_sample():
+    drive = {"duration": 4.0, "axes": ["x", "y"], "seed": 3}
+    with on_graph() as graph, started("stage_simulator", {"axes": ["x", "y"]}):
+        listener, states = Listener(graph), graph.record(JointState, "stage_state")
+        with exciter(graph, **LIMITS, **drive, settle=1.0, autostart=False) as node:
+            listener.wait_for_publisher()
+            assert call(graph, "start").success
+            wanted = drawn(**drive)
+            listener.wait_for(len(wanted))
+            np.testing.assert_array_equal(listener.v, wanted)
+            # The simulator may have been the last to connect.
+            effort = np.array([list(state.effort) for state in states])
+            np.testing.assert_array_equal(effort, wanted[-len(effort) :])
+            stamps = np.array([state.header.stamp.sec + state.header.stamp.nanosec * 1e-9 for state in states])
+            # On a busy machine it takes longer, but never less.
+            assert stamps[-1] - stamps[0] > 0.98 * (len(stamps) - 1) / RATE
+            assert node.stop(signal.SIGINT) == 0
+            assert "done after" in node.stderr and "Traceback" not in node.stderr
+
+
+def test_a_stall_delays_the_drive_and_never_makes_it_leap():
+    with on_graph() as graph, exciter(graph, **AT_ONCE, duration=3.0) as node:
+        listener = Listener(graph)
+        listener.wait_for_motion()
+        stall(node, 0.5)
+        assert wait_for_end(graph, node) == 0
+        assert "in place of 3.0 s; for this machine lower the rate" in node.stderr
+        v = listener.v
+    np.testing.assert_array_equal(v, drawn(duration=3.0)[-len(v) :])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_brings_the_stage_back(number):
+    with on_graph() as graph, exciter(graph, **AT_ONCE, duration=20.0, slew_limit=400.0, start_voltage=10.0) as node:
+        listener = Listener(graph)
+        listener.wait_for_motion()
+        if number == signal.SIGTERM:
+            stall(node, 0.3)
+        node.process.send_signal(number)
+        assert wait_for_end(graph, node) == 0
+        assert "Traceback" not in node.stderr
+        v = listener.v
+    assert v[-1, 0] == pytest.approx(10.0) and v.max() > 60.0
+    assert v.min() >= 0.0 and v.max() <= 100.0
+    assert fastest(v) <= 400.0 * (1 + 1e-9)
+    assert len(v) < 20.0 * RATE
+
+
+def test_services_start_and_stop():
+    with on_graph() as graph, exciter(graph, **AT_ONCE, slew_limit=500.0, autostart=False) as node:
+        listener = Listener(graph)
+        listener.wait_for_publisher()
+        assert call(graph, "stop").message == "at rest" and not listener.commands
+        assert "voltage_max" in graph.set_parameters("exciter", voltage_max=1e9)
+        assert "give more time" in graph.set_parameters("exciter", slew_limit=1.0)
+        assert graph.set_parameters("exciter", drive="creep", duration=10.0) == ""
+        wanted = drawn(slew_limit=500.0, drive="creep", duration=10.0)
+        for _ in range(2):
+            listener.commands.clear()
+            answer = call(graph, "start")
+            assert answer.success and answer.message == "drive 'creep' of 10 s"
+            assert not call(graph, "start").success
+            listener.wait_for_motion()
+            seen = len(listener.commands)
+            answer = call(graph, "stop")
+            assert answer.success and answer.message.startswith("back in ")
+            graph.spin_until(lambda: listener.commands[-1].data[0] == 0.0, "the way back")
+            np.testing.assert_array_equal(listener.v[:seen], wanted[:seen])
+            assert fastest(listener.v) <= 500.0 * (1 + 1e-9)
+        assert node.process.poll() is None
+
+
+def publish_state(graph, **effort):
+    """Say again and again where the axes are; return once somebody listens."""
+    publisher = graph.node.create_publisher(JointState, "stage_state", RELIABLE)
+    state = JointState(name=list(effort), position=[0.0] * len(effort), effort=list(effort.values()))
+    graph.node.create_timer(0.02, lambda: publisher.publish(state))
+    graph.spin_until(publisher.get_subscription_count, "the exciter to listen")
+    end = time.monotonic() + 0.2
+    graph.spin_until(lambda: time.monotonic() > end, "some states")
+
+
+def test_the_drive_begins_and_ends_where_the_stage_is():
+    with on_graph() as graph, exciter(graph, **AT_ONCE, duration=3.0, autostart=False):
+        listener = Listener(graph)
+        listener.wait_for_publisher()
+        publish_state(graph, other=5.0, x=40.0)
+        call(graph, "start")
+        wanted = drawn(duration=3.0, start=40.0)
+        listener.wait_for(len(wanted))
+        np.testing.assert_array_equal(listener.v, wanted)
+
+
+def test_a_stage_outside_the_limits_is_left_alone():
+    with on_graph() as graph, exciter(graph, **AT_ONCE) as node:
+        publish_state(graph, x=120.0)
+        listener = Listener(graph)
+        assert wait_for_end(graph, node) == 1
+        said = node.stderr.splitlines()[-1]
+    assert said == "exciter: axis 'x' is at 120 V, outside 0 to 100 V; bring it there first"
+    assert not listener.commands
+
+
+def test_a_drive_as_one_trajectory():
+    drive = {"duration": 20.0, "axes": ["x", "y"], "drive": "cross_coupling"}
+    with on_graph() as graph, exciter(graph, **AT_ONCE, **drive, output="trajectory") as node:
+        listener, trajectories = Listener(graph), graph.record(JointTrajectory, "voltage_trajectory", LATCHED)
+        graph.spin_until(lambda: trajectories, "the trajectory")
+        until = time.monotonic() + 1.0
+        graph.spin_until(lambda: time.monotonic() > until, "the first full loop")
+        node.process.send_signal(signal.SIGINT)
+        assert wait_for_end(graph, node) == 0
+    whole, back = trajectories
+    for trajectory in trajectories:
+        assert list(trajectory.joint_names) == ["x", "y"]
+        assert not any(len(point.positions) or len(point.velocities) for point in trajectory.points)
+        times = [point.time_from_start.sec + point.time_from_start.nanosec * 1e-9 for point in trajectory.points]
+        np.testing.assert_allclose(np.diff([0.0, *times]), 1.0 / RATE, atol=1e-9)
+    np.testing.assert_array_equal([list(point.effort) for point in whole.points], drawn(**drive))
+    assert back.points[0].effort[0] > 1.0 and back.points[-1].effort[0] == pytest.approx(0.0, abs=1e-9)
+    assert not listener.commands
+
+
+def test_limits_must_be_given():
+    with started("exciter") as node:
+        assert node.wait() == 2
+        assert node.stderr == "parameter voltage_min is nan; give a value from -10000 to 10000\n"
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"voltage_max": math.nan}, "parameter voltage_max is nan"),
+        ({"voltage_max": -5.0}, "the first must be the lower one"),
+        ({"slew_limit": 5.0}, "give more time"),
+        ({"drive": "friction"}, "parameter drive is 'friction'; choose one of calibration, delay, "),
+        ({"voltage_max": [100.0, 50.0]}, r"parameter voltage_max is \[100.0, 50.0\]; give a number"),
+        ({"start_voltage": 120.0}, "it starts at 120 V"),
+        ({"output": "trajectory", "repeat": True}, "do not go together"),
+        ({"axes": ["x", "x"]}, "each by a name of its own"),
+        ({"axes": []}, "name at least one"),
+    ],
+)
+def test_parameters_of_which_no_drive_can_be_made(given, says):
+    values = {entry.name: entry.default for entry in DECLARATIONS} | LIMITS
+    ExciterSettings.of(values)
+    with pytest.raises(UsageError, match=says):
+        ExciterSettings.of(values | given)
+
+
+@pytest.mark.parametrize(("heard", "start"), [([50.0], 50.0), ([-0.5], 0.0), ([100.9], 100.0), (None, 0.0)])
+def test_a_voltage_read_back_is_taken_to_be_within_limits(heard, start):
+    values = {entry.name: entry.default for entry in DECLARATIONS} | LIMITS
+    assert ExciterSettings.of(values).drawn(heard).voltage["x"][0] == start
+    given = ExciterSettings.of(values | {"start_voltage": 25.0})
+    assert given.drawn(heard).voltage["x"][0] == 25.0

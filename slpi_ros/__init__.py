@@ -4,12 +4,20 @@ SLPI is the Separated Level-loop Prandtl-Ishlinskii model. Nothing here needs a 
 """
 
 import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from slpi_ros.errors import SlpiError
+from slpi_ros.identification.findings import findings
 from slpi_ros.identification.fit import identify
+from slpi_ros.identification.quality import assess
 from slpi_ros.identification.record import Record
+from slpi_ros.identification.refit import refit
 from slpi_ros.model import AxisModel, HeldAtLimitWarning, StageModel
 from slpi_ros.model_file import load_model, save_model
+
+if TYPE_CHECKING:
+    from slpi_ros.bags import SeparateTopics
 
 __all__ = [
     "AxisModel",
@@ -17,22 +25,29 @@ __all__ = [
     "Record",
     "SlpiError",
     "StageModel",
+    "assess",
+    "findings",
     "identify",
     "load_model",
     "read_bag",
+    "refit",
     "save_model",
 ]
 
 
-def read_bag(path: str | os.PathLike[str], topic: str = "stage_state") -> Record:
+def read_bag(
+    path: str | os.PathLike[str], topic: "str | SeparateTopics" = "stage_state", *, axes: Sequence[str] | None = None
+) -> Record:
     """Read voltage and displacement of a stage from a bag.
 
     Parameters
     ----------
     path : path-like
         A rosbag2 folder, or a lone mcap or sqlite3 file.
-    topic : str
-        A topic of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts.
+    topic : str or slpi_ros.bags.SeparateTopics
+        A topic of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts; or one topic of each.
+    axes : sequence of str, optional
+        The axes to read; all by default.
 
     Returns
     -------
@@ -47,4 +62,4 @@ def read_bag(path: str | os.PathLike[str], topic: str = "stage_state") -> Record
     # Bags need rosbags, models do not: whoever only compensates does without it.
     from slpi_ros.bags import read_bag as read
 
-    return read(path, topic)
+    return read(path, topic, axes=axes)

@@ -1,55 +1,54 @@
-"""Bags in and out: the stage's recordings as rosbag2 folders or lone files, mcap or sqlite3.
+"""Bags in and out: the stage's recordings as rosbag2 folders or lone files, mcap or sqlite3, compressed or not.
 
-This is the only module that imports rosbags, and no rosbags exception leaves it.
+Only this module and ``bag_writer`` import rosbags, and no rosbags exception leaves them. Of reading, rosbags does what
+takes little time: it finds the files and the topics of a bag. It handles messages one by one, which takes long.
 """
 
 import os
-import shutil
-import sqlite3
-from collections.abc import Sequence
-from contextlib import suppress
-from functools import cache
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
-from rosbags.typesys import Stores, TypesysError, get_typestore
+from rosbags.rosbag2 import Reader
 
-from slpi_ros.bag_files import absolute_name, locate, match_topic, one_line, partial_path, translated
+from slpi_ros.alignment import SeparateTopics, combine
+from slpi_ros.bag_files import locate, match_topic, translated, unpacked
+from slpi_ros.bag_writer import STORAGES, BagWriter, typestore
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.identification.record import Record
-from slpi_ros.joint_state import JointStateBlock, choose_joints, decode_joint_states, joint_state_layout
+from slpi_ros.joint_state import JointStateBlock, encode_joint_states
+from slpi_ros.mcap_file import read_mcap
+from slpi_ros.message_blocks import MessageBlock
+from slpi_ros.message_types import JOINT_STATE, MESSAGE_TYPES
+from slpi_ros.signals import Signals, decode_signals
+from slpi_ros.sqlite_file import read_sqlite
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
-STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+__all__ = ["JOINT_STATE", "STORAGES", "BagWriter", "SeparateTopics", "read_bag", "read_bags", "write_bag"]
 
-_BAG_VERSION: Literal[9] = 9  # what ROS 2 Jazzy writes
-_WRITE_ERRORS = (OSError, sqlite3.Error, WriterError)
+_Path = str | os.PathLike[str]
 
 
-def read_bag(
-    path: str | os.PathLike[str], topic: str = "stage_state", *, axes: Sequence[str] | None = None
-) -> Record:
+def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: Sequence[str] | None = None) -> Record:
     """Read voltage and displacement of a stage from a bag.
 
     Parameters
     ----------
     path : path
-        A rosbag2 folder, or a lone ``.mcap`` or ``.db3`` file.
-    topic : str
+        A rosbag2 folder, or a lone ``.mcap`` or ``.db3`` file; compressed or not.
+    topic : str or SeparateTopics
         Name with or without the leading slash; it also finds ``/ns/stage_state`` when that is the only one.
-        Of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts.
+        Of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts. Or two topics.
     axes : sequence of str, optional
         The axes to read, in this order; all that the messages name when not given or empty.
 
     Returns
     -------
     Record
-        Time is the header stamp, or the time of recording where no header is stamped. NaN where a message
-        does not hold an axis.
+        Time is the header stamp, or the time of recording where no header is stamped, which `notes` tell. NaN where a
+        message does not hold an axis.
 
     Raises
     ------
@@ -57,23 +56,65 @@ def read_bag(
         If there is no such bag, topic or axis, or the bag cannot be read; the message says what to do.
     """
     path = Path(path)
-    source = locate(path)
-    with translated(source):
-        logged, messages = _collect(source, topic)
-        samples = decode_joint_states(messages, _deserialise)
-    chosen = choose_joints(samples, axes, f"{path}, topic '{topic}'")
+    sources = locate(path)
+    with _Bag(sources, path) as bag:
+        if isinstance(topic, SeparateTopics):
+            voltage = bag.read(topic.voltage, MESSAGE_TYPES)
+            displacement = bag.read(topic.displacement, MESSAGE_TYPES)
+            return combine(voltage, displacement, topic, axes or (), path)
+        state = bag.read(topic, (JOINT_STATE,))
+    chosen = _choose_axes(state, axes, f"{path}, topic '{topic}'")
     return Record(
-        time_ns=samples.stamp_ns if samples.stamp_ns.any() else logged,
-        voltage={axis: samples.effort[axis] for axis in chosen},
-        displacement={axis: samples.position[axis] for axis in chosen},
+        time_ns=state.logged if state.stamp is None else state.stamp,
+        voltage={axis: state.fields["effort"][axis] for axis in chosen},
+        displacement={axis: state.fields["position"][axis] for axis in chosen},
         source=str(path),
-        hardware_id=samples.frame_id,
+        hardware_id=state.frame_id,
+        notes=() if state.stamp is not None else ("time is that of recording: the messages are not stamped",),
     )
 
 
-def write_bag(
-    path: str | os.PathLike[str], record: Record, *, storage: str = "mcap", topic: str = "/stage_state"
-) -> None:
+def read_bags(
+    paths: Iterable[_Path], topic: str | SeparateTopics = "stage_state", *, axes: Sequence[str] | None = None
+) -> list[Record]:
+    """Read several bags of one stage.
+
+    Parameters
+    ----------
+    paths : iterable of path
+        At least one, none of them twice.
+    topic, axes
+        As for `read_bag`.
+
+    Returns
+    -------
+    list of Record
+        In the order of the paths.
+
+    Raises
+    ------
+    UsageError
+        If there is no path, or one of them comes twice.
+    RecordError
+        As from `read_bag`; also if the bags are of different stages.
+    """
+    places = [Path(path) for path in paths]
+    if not places:
+        raise UsageError("no bag given; name at least one")
+    for number, place in enumerate(places):
+        if place.resolve() in {earlier.resolve() for earlier in places[:number]}:
+            raise UsageError(f"{place}: given twice; name every bag once")
+    records = [read_bag(place, topic, axes=axes) for place in places]
+    for record in records[1:]:
+        if record.hardware_id != records[0].hardware_id:
+            raise RecordError(
+                f"{record.source}: of stage '{record.hardware_id}', but {records[0].source} of "
+                f"'{records[0].hardware_id}'; give bags of one stage"
+            )
+    return records
+
+
+def write_bag(path: _Path, record: Record, *, storage: str = "mcap", topic: str = "/stage_state") -> None:
     """Write a record as a new rosbag2 folder that ``read_bag`` reads back without loss.
 
     Parameters
@@ -94,9 +135,8 @@ def write_bag(
     """
     displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
     voltage = np.column_stack([record.voltage[axis] for axis in record.axes])
-    messages = joint_state_layout(record.axes, record.hardware_id).encode(
-        JointStateBlock(record.time_ns, displacement, voltage)
-    )
+    block = JointStateBlock(record.time_ns, displacement, voltage)
+    messages = encode_joint_states(block, record.axes, record.hardware_id)
     # readers sort by log time: where stamps run backwards, the order of the record must survive
     logged = np.maximum.accumulate(record.time_ns)
     with BagWriter(path, storage=storage, topic=topic) as bag:
@@ -104,209 +144,80 @@ def write_bag(
             bag.write_raw(stamp, message)
 
 
-class BagWriter:
-    """A bag being written; a context manager.
+class _Bag:
+    """A bag that is open for reading; its files stay unpacked until the end of ``with``."""
 
-    Until it is complete the bag is in ``.NAME.partial`` beside its place, so a folder of that name is always
-    a whole bag. An exception inside ``with`` discards it; without ``with``, call ``close`` or ``discard``.
-
-    Parameters
-    ----------
-    path : path
-        The rosbag2 folder to make; parent folders are made too.
-    storage : {"mcap", "sqlite3"}
-        File format.
-    topic : str, optional
-        Topic of type ``sensor_msgs/JointState`` that ``write`` and ``write_raw`` go to; None to announce
-        all topics by ``add_topic``.
-    hardware_id : str
-        The stage, for messages made by ``write``.
-
-    Attributes
-    ----------
-    path : Path
-        Where the bag will be.
-    partial : Path
-        Where it is until then.
-    message_count : int
-        Messages written so far.
-
-    Raises
-    ------
-    RecordError
-        If the path or an unfinished bag of that name exists, or cannot be written.
-    UsageError
-        If there is no such storage.
-    """
-
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        storage: str = "mcap",
-        topic: str | None = "/stage_state",
-        hardware_id: str = "",
-    ) -> None:
-        if storage not in STORAGES:
-            raise UsageError(f"no bag storage '{storage}'; choose {' or '.join(STORAGES)}")
-        self.path = Path(path).absolute()
-        self.partial = partial_path(self.path)
-        self.message_count = 0
-        self._hardware_id = hardware_id
-        self._topic = topic
-        self._connections: dict[str, Any] = {}
-        if os.path.lexists(self.path):
-            raise RecordError(f"{path}: exists already; choose another name, or remove it first")
-        if self.partial.exists():
-            raise RecordError(
-                f"{self.partial}: an unfinished bag of the same name; wait for its recorder, or, if that was "
-                "killed, move the folder away (mcap files can be saved with `mcap recover`)"
-            )
-        try:
-            self._writer = Writer(
-                self.partial / self.path.name, version=_BAG_VERSION, storage_plugin=STORAGES[storage]
-            )
-            self._writer.open()
-        except _WRITE_ERRORS as error:
-            shutil.rmtree(self.partial, ignore_errors=True)
-            raise RecordError(f"{path}: cannot be made ({one_line(error)}); choose another place") from error
-        if topic is not None:
-            self.add_topic(topic)
-
-    def add_topic(self, topic: str, msgtype: str = JOINT_STATE) -> None:
-        """Announce a topic.
-
-        Parameters
-        ----------
-        topic : str
-            Name; a missing leading slash is added.
-        msgtype : str
-            As in ``sensor_msgs/msg/JointState``; any type of ROS 2 Jazzy's own packages.
-
-        Raises
-        ------
-        RecordError
-            If the definition of the type is not known here.
-        """
-        name = absolute_name(topic)
-        try:
-            self._connections[name] = self._writer.add_connection(name, msgtype, typestore=_typestore())
-        except (KeyError, TypesysError) as error:
-            raise RecordError(
-                f"{name}: no definition of type {msgtype}, only of ROS 2 Jazzy's own; leave this topic out"
-            ) from error
-        except _WRITE_ERRORS as error:
-            raise self._failure(error) from error
-
-    def write(
-        self, stamp_ns: int, names: Sequence[str], displacement: ArrayLike, voltage: ArrayLike
-    ) -> None:
-        """Write one sample of all axes.
-
-        Parameters
-        ----------
-        stamp_ns : int, nanoseconds
-            Stamp of the header and time of the log.
-        names : sequence of str, length K
-            Axes.
-        displacement : array_like, shape (K,), metres
-            Measured displacement.
-        voltage : array_like, shape (K,), volts
-            Applied voltage.
-        """
-        row = (1, len(names))
-        block = JointStateBlock(
-            np.array([stamp_ns], np.int64),
-            np.asarray(displacement, float).reshape(row),
-            np.asarray(voltage, float).reshape(row),
-        )
-        self.write_raw(stamp_ns, joint_state_layout(tuple(names), self._hardware_id).encode(block)[0])
-
-    def write_raw(self, stamp_ns: int, message: bytes, topic: str | None = None) -> None:
-        """Write a message that is serialised already.
-
-        Parameters
-        ----------
-        stamp_ns : int, nanoseconds
-            Time of the log.
-        message : bytes
-            CDR with its encapsulation header.
-        topic : str, optional
-            One that was announced; by default the writer's own.
-        """
-        name = absolute_name(topic or self._topic or "")
-        if name not in self._connections:
-            raise UsageError(f"{self.path}: topic '{name}' was not announced; call add_topic first")
-        try:
-            self._writer.write(self._connections[name], stamp_ns, message)
-        except _WRITE_ERRORS as error:
-            raise self._failure(error) from error
-        self.message_count += 1
-
-    def close(self) -> None:
-        """Complete the bag and put it in its place.
-
-        Raises
-        ------
-        RecordError
-            If the disk does not take it; what is there stays in the partial folder.
-        """
-        try:
-            self._writer.close()
-            (self.partial / self.path.name).rename(self.path)
-            self.partial.rmdir()
-        except _WRITE_ERRORS as error:
-            raise self._failure(error) from error
-
-    def discard(self) -> None:
-        """Give up: remove everything written so far."""
-        # a full disk lets even this fail; there is nothing left to lose
-        with suppress(*_WRITE_ERRORS):
-            self._writer.abort()
-        shutil.rmtree(self.partial, ignore_errors=True)
+    def __init__(self, sources: Sequence[Path], path: Path) -> None:
+        self._sources = sources
+        self._path = path
+        self._topics: dict[str, str] = {}
+        self._counts: Counter[str] = Counter()
+        self._files: list[tuple[Path, Path]] = []
+        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        """Return the open writer."""
+        """Find the files and the topics."""
+        with ExitStack() as stack:
+            for source in self._sources:
+                with translated(source):
+                    self._open(source, stack)
+            self._stack = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Complete the bag, or discard it after an exception."""
-        if error is not None:
-            self.discard()
-            return
-        try:
-            self.close()
-        except RecordError:
-            self.discard()
-            raise
+    def __exit__(self, *_: object) -> None:
+        """Remove what was unpacked."""
+        self._stack.close()
 
-    def _failure(self, error: Exception) -> RecordError:
-        return RecordError(
-            f"{self.path}: cannot be written ({one_line(error)}); free some space or choose another place"
-        )
+    def _open(self, source: Path, stack: ExitStack) -> None:
+        reader = stack.enter_context(Reader(stack.enter_context(unpacked(source))))
+        for connection in reader.connections:
+            self._topics[connection.topic] = connection.msgtype
+            self._counts[connection.topic] += connection.msgcount
+        # A folder has a storage for each of its files, unpacked where it was compressed; a lone file is one.
+        storages = getattr(reader.storage, "storages", [reader.storage])
+        self._files += [(storage.path, source) for storage in storages]
+
+    def read(self, topic: str, msgtypes: Iterable[str]) -> Signals:
+        """Return what the messages of a topic hold, which is of one of the types."""
+        name = match_topic(self._topics, topic, tuple(msgtypes), self._path)
+        with translated(self._path):
+            msgtype = self._topics[name]
+            signals = decode_signals(self._blocks(name), msgtype, _deserialiser(msgtype), self._counts[name])
+        if signals is None:
+            raise RecordError(f"{self._path}: no message on topic '{topic}'; was the stage's driver running?")
+        return signals
+
+    def _blocks(self, topic: str) -> Iterator[MessageBlock]:
+        for file, source in self._files:
+            with translated(source):
+                yield from (read_mcap if file.suffix == ".mcap" else read_sqlite)(file, topic)
 
 
-def _collect(source: Path, topic: str) -> tuple[NDArray[np.int64], list[bytes]]:
-    """Return log times and serialised messages of the topic, in the order of the log."""
-    with Reader(source) as reader:
-        name = match_topic({c.topic: c.msgtype for c in reader.connections}, topic, JOINT_STATE, source)
-        connections = [c for c in reader.connections if c.topic == name]
-        rows = [(stamp, message) for _, stamp, message in reader.messages(connections)]
-    if not rows:
-        raise RecordError(f"{source}: no message on topic '{topic}'; was the stage's driver running?")
-    return np.array([stamp for stamp, _ in rows], np.int64), [message for _, message in rows]
-
-
-def _deserialise(message: bytes) -> Any:
-    """Return the message as an object; a short one raises."""
+def _deserialiser(msgtype: str) -> Callable[[bytes], Any]:
+    """Return a function from a message to an object; a short message makes it raise."""
     # not Typestore.deserialize_cdr: it refuses the garbage that rclpy's serialize_message leaves at the end
-    definition = _typestore().get_msgdef(JOINT_STATE)
-    decode = definition.deserialize_cdr_le if message[1] & 1 else definition.deserialize_cdr_be
-    return decode(message[4:], 0, definition.cls, _typestore())[0]
+    definition = typestore().get_msgdef(msgtype)
+
+    def deserialise(message: bytes) -> Any:
+        decode = definition.deserialize_cdr_le if message[1] & 1 else definition.deserialize_cdr_be
+        return decode(message[4:], 0, definition.cls, typestore())[0]
+
+    return deserialise
 
 
-@cache
-def _typestore() -> Any:
-    return get_typestore(Stores.ROS2_JAZZY)
+def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tuple[str, ...]:
+    """Return the wanted axes, by default all, once it is sure that each has both signals."""
+    names = ", ".join(state.names)
+    if not names:
+        raise RecordError(f"{where}: the messages name no axis; name[] must hold the axes")
+    chosen = tuple(axes or state.names)
+    for axis in chosen:
+        if axis not in state.names:
+            raise RecordError(f"{where}: no axis '{axis}'; there is {names}")
+        for field in ("position", "effort"):
+            if np.isnan(state.fields[field][axis]).all():
+                raise RecordError(
+                    f"{where}: axis '{axis}' has no value in {field}[] of any message; position[] must hold "
+                    f"the measured metres, effort[] the applied volts; else read other axes, of {names}"
+                )
+    return chosen

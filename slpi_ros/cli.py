@@ -18,8 +18,10 @@ import numpy as np
 from slpi_ros import bags, tables
 from slpi_ros.errors import ModelError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, excite
+from slpi_ros.identification.findings import findings, require_usable
 from slpi_ros.identification.fit import KINDS, identify
-from slpi_ros.identification.record import FloatArray
+from slpi_ros.identification.quality import assess
+from slpi_ros.identification.record import FloatArray, Record
 from slpi_ros.identification.refit import refit
 from slpi_ros.model import StageModel, check_time, held_message
 from slpi_ros.model_file import load_model, save_model
@@ -67,9 +69,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="slpi", description="Hysteresis models of piezo stages: identify, simulate, compensate.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
-    command = commands.add_parser("import", help="turn a CSV table of measured data into a bag")
+    command = commands.add_parser("import", help="turn a table of measured data into a bag")
     command.set_defaults(run=_import)
-    command.add_argument("table", metavar="DATA.csv")
+    command.add_argument("table", metavar="DATA.csv|DATA.mat")
     command.add_argument("-o", "--output", metavar="BAG", required=True, help="folder of the new bag")
     command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
     command.add_argument("--voltage", metavar="COLUMN", nargs="+", default=(), help="one for all axes or one for each")
@@ -92,6 +94,11 @@ def _parser() -> argparse.ArgumentParser:
         help="slpi-published: operators start at rest, as published",
     )
     command.add_argument("--topic", default="stage_state")
+    command.add_argument("--voltage-topic", metavar="TOPIC", help="where voltage and displacement are apart")
+    command.add_argument("--displacement-topic", metavar="TOPIC")
+    clocks = ("displacement", "voltage")
+    command.add_argument("--clock", choices=clocks, default=clocks[0], help="whose stamps count")
+    command.add_argument("--voltage-measured", action="store_true", help="voltage is a reading, no command that holds")
     command.add_argument("--axis", metavar="NAME", nargs="+", help="default: every axis of the bag")
     command.add_argument("--start", metavar="S", type=float, help="fit only from here on, seconds from the first stamp")
     command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
@@ -145,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _import(options: argparse.Namespace) -> None:
-    record = tables.import_csv(
+    record = tables.import_table(
         options.table,
         time=options.time,
         voltage=options.voltage,
@@ -162,7 +169,9 @@ def _identify(options: argparse.Namespace) -> None:
     target = Path(options.output)
     if target.is_dir() or not target.parent.is_dir():
         raise ModelError(f"{target}: cannot be written: no file can be there; choose another place")
-    records = [bags.read_bag(path, options.topic, axes=options.axis) for path in options.bags]
+    records = bags.read_bags(options.bags, _topics(options), axes=options.axis)
+    for record in records:
+        _judge(record, options)
     model = identify(records, options.kind, start=options.start, stop=options.stop, loops_at_rest=options.loops_at_rest)
     save_model(model, options.output)
     if options.report:
@@ -171,6 +180,24 @@ def _identify(options: argparse.Namespace) -> None:
 
         write_report(Path(options.report), records[0], model)
     print("\n".join(describe_model(model)))
+
+
+def _topics(options: argparse.Namespace) -> str | bags.SeparateTopics:
+    """Return where the bag holds voltage and displacement."""
+    voltage, displacement = options.voltage_topic, options.displacement_topic
+    if bool(voltage) != bool(displacement):
+        raise UsageError("--voltage-topic and --displacement-topic go together; give both, or --topic")
+    if not voltage:
+        return str(options.topic)
+    return bags.SeparateTopics(voltage, displacement, clock=options.clock, held=not options.voltage_measured)
+
+
+def _judge(record: Record, options: argparse.Namespace) -> None:
+    """Print what the record is good for; stop where it is good for nothing."""
+    for axis in record.axes:
+        found = findings(assess(record, axis, start=options.start, stop=options.stop))
+        print("\n".join(f"axis {axis}: {finding.level:4} {finding.text}" for finding in found))
+        require_usable(found, f"{record.source}: axis '{axis}'")
 
 
 def _excite(options: argparse.Namespace) -> None:

@@ -34,8 +34,7 @@ class CsvTable:
 
     def listing(self) -> str:
         """Return the names of the columns for a message."""
-        text = ", ".join(self.columns)
-        return "".join(c if c.isprintable() else "?" for c in text[:200]) + ("..." if len(text) > 200 else "")
+        return listed(self.columns)
 
     def read(self, wanted: Sequence[str]) -> dict[str, FloatArray]:
         """Return the wanted columns as numbers, each of shape (N,), N >= 2; an empty cell is NaN.
@@ -147,6 +146,12 @@ def load_csv(path: Path) -> CsvTable:
     if all(_is_number(name) for name in columns):
         raise RecordError(f"{path}: numbers in the first line; put the names of the columns above them")
     return CsvTable(path, columns, body)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names for a message, not too many and without what would spoil a terminal."""
+    text = ", ".join(names)
+    return "".join(c if c.isprintable() else "?" for c in text[:200]) + ("..." if len(text) > 200 else "")
 
 
 def _is_number(text: str) -> bool:

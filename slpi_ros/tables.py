@@ -1,4 +1,4 @@
-"""CSV tables in and out: measured data to import, and the command tables of the command line."""
+"""Tables in and out: measured data to import, and the command tables of the command line."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,6 +12,7 @@ from slpi_ros.csv_table import CsvTable, load_csv
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.files import all_or_nothing
 from slpi_ros.identification.record import FloatArray, Record
+from slpi_ros.mat_table import MatTable, load_mat
 
 _METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
 _VOLTS = {"kV": 1e3, "V": 1.0, "mV": 1e-3}
@@ -21,7 +22,7 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _TIME_END = 2.0**31
 
 
-def import_csv(
+def import_table(
     path: str | os.PathLike[str],
     *,
     time: str | None = None,
@@ -37,7 +38,8 @@ def import_csv(
     Parameters
     ----------
     path : path
-        Comma-separated, with the names of the columns in the first line.
+        Comma-separated, with the names of the columns in the first line; or a MATLAB file of numeric arrays, up to
+        version 7, whose name ends in ``.mat``: its vectors are the columns.
     time : str, optional
         Column of time; by default ``time_s``, else the first that begins with "time".
     voltage : sequence of str
@@ -66,7 +68,7 @@ def import_csv(
     """
     if displacement_unit not in _METRES:
         raise UsageError(f"no displacement unit '{displacement_unit}'; choose {', '.join(_METRES)}")
-    table = load_csv(Path(path))
+    table = _load(Path(path))
     clock = time or _time_column(table)
     moved = tuple(displacement) or _displacement_columns(table)
     driven = _one_for_each(moved, tuple(voltage) or _voltage_columns(table, moved), table.path)
@@ -75,11 +77,13 @@ def import_csv(
     return Record(
         time_ns=_nanoseconds(values[clock] * _scale(clock, _SECONDS, "s"), clock, table),
         voltage={n: values[c] * _scale(c, _VOLTS, "V") for n, c in zip(names, driven, strict=True)},
-        displacement={
-            n: values[c] * _scale(c, _METRES, displacement_unit) for n, c in zip(names, moved, strict=True)
-        },
+        displacement={n: values[c] * _scale(c, _METRES, displacement_unit) for n, c in zip(names, moved, strict=True)},
         source=str(path),
     )
+
+
+# The name it had before it read anything else.
+import_csv = import_table
 
 
 def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -116,9 +120,7 @@ def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, d
     return values["time_s"], {axis: values[column] for axis, column in columns.items()}
 
 
-def write_table(
-    path: str | os.PathLike[str], t: FloatArray, columns: Mapping[str, FloatArray], suffix: str
-) -> None:
+def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[str, FloatArray], suffix: str) -> None:
     """Write a table that ``read_table`` reads back: time to the nanosecond, values to the last bit.
 
     The file appears complete or not at all; one of the same name is replaced.
@@ -151,7 +153,11 @@ def write_table(
         file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
 
 
-def _displacement_columns(table: CsvTable) -> tuple[str, ...]:
+def _load(path: Path) -> CsvTable | MatTable:
+    return load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
+
+
+def _displacement_columns(table: CsvTable | MatTable) -> tuple[str, ...]:
     """Return the columns that hold displacement, by their names."""
     if found := tuple(n for n in table.columns if n.startswith("displacement")):
         return found
@@ -161,7 +167,7 @@ def _displacement_columns(table: CsvTable) -> tuple[str, ...]:
     return found or _missing(table, "displacement column", "displacement")
 
 
-def _voltage_columns(table: CsvTable, moved: Sequence[str]) -> tuple[str, ...]:
+def _voltage_columns(table: CsvTable | MatTable, moved: Sequence[str]) -> tuple[str, ...]:
     """Return the columns that hold voltage, sorted as the displacements where they name the same axes."""
     found = tuple(n for n in table.columns if n.startswith("voltage") or n.endswith("_V"))
     by_axis = {_split(n, _VOLTS)[0]: n for n in found}
@@ -171,13 +177,13 @@ def _voltage_columns(table: CsvTable, moved: Sequence[str]) -> tuple[str, ...]:
     return found or _missing(table, "voltage column", "voltage")
 
 
-def _time_column(table: CsvTable) -> str:
+def _time_column(table: CsvTable | MatTable) -> str:
     """Return the column that holds time."""
     found = [n for n in table.columns if n.startswith("time")] or _missing(table, "time column", "time")
     return "time_s" if "time_s" in found else found[0]
 
 
-def _missing(table: CsvTable, what: str, option: str) -> NoReturn:
+def _missing(table: CsvTable | MatTable, what: str, option: str) -> NoReturn:
     raise RecordError(
         f"{table.path}: no {what}; there is {table.listing()}; name one of them (--{option} or {option}=)"
     )
@@ -226,7 +232,7 @@ def _axis_names(moved: Sequence[str], axes: Sequence[str], path: Path) -> tuple[
     return names
 
 
-def _nanoseconds(seconds: FloatArray, column: str, table: CsvTable) -> NDArray[np.int64]:
+def _nanoseconds(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> NDArray[np.int64]:
     """Return stamps; times before zero move all stamps up, as messages cannot hold them."""
     table.require(np.isfinite(seconds), column, seconds, "every row needs a time")
     table.require(np.abs(seconds) < _TIME_END, column, seconds, "more than 2^31 s; is the unit right?")
@@ -235,6 +241,6 @@ def _nanoseconds(seconds: FloatArray, column: str, table: CsvTable) -> NDArray[n
     return stamps
 
 
-def _require_order(seconds: FloatArray, column: str, table: CsvTable) -> None:
+def _require_order(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> None:
     forward = np.concatenate([[True], np.diff(seconds) >= 0])
     table.require(forward, column, seconds, "time runs backwards here; sort or cut the table")

@@ -1,15 +1,17 @@
 """Tables: measured data of any source, and command tables whose round trip is exact."""
 
 import os
+from contextlib import suppress
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.io import savemat
 
 from slpi_ros.bags import read_bag, write_bag
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.tables import import_csv, read_table, write_table
+from slpi_ros.tables import import_table, read_table, write_table
 
 MEASURED = {
     "afm_double_sine_x": (3531, ("x",), 1.2, 150.0, 20.0e-6),
@@ -43,7 +45,7 @@ def refusal(call, *args, **kwargs) -> str:
 @pytest.mark.parametrize("name", MEASURED)
 def test_measured_record(measured_data, name, tmp_path):
     samples, axes, period, top, stroke = MEASURED[name]
-    record = import_csv(measured_data / f"{name}.csv")
+    record = import_table(measured_data / f"{name}.csv")
     assert (len(record), record.axes) == (samples, axes)
     assert np.median(np.diff(record.time_ns)) == pytest.approx(period * 1e9, rel=0.01)
     for axis in axes:
@@ -60,7 +62,7 @@ def test_measured_record(measured_data, name, tmp_path):
 
 
 def test_drop_outs_of_a_measured_record(measured_data):
-    record = import_csv(measured_data / "afm_triangle_sine.csv")
+    record = import_table(measured_data / "afm_triangle_sine.csv")
     assert [int(np.isnan(record.displacement[axis]).sum()) for axis in "xyz"] == [0, 37, 71]
     assert all(np.isfinite(voltage).all() for voltage in record.voltage.values())
 
@@ -79,7 +81,7 @@ def test_drop_outs_of_a_measured_record(measured_data):
 )
 def test_columns_speak_for_themselves(table, header, displacement):
     width = header.count(",") + 1
-    record = import_csv(table(header, *[f"{row}," + ",".join("234"[: width - 1]) for row in range(3)]))
+    record = import_table(table(header, *[f"{row}," + ",".join("234"[: width - 1]) for row in range(3)]))
     assert record.time_ns.tolist() == [0, 1_000_000_000, 2_000_000_000]
     assert {axis: values[0] for axis, values in record.displacement.items()} == pytest.approx(displacement)
     assert {axis: values[0] for axis, values in record.voltage.items()} == dict.fromkeys(displacement, 2.0)
@@ -87,41 +89,41 @@ def test_columns_speak_for_themselves(table, header, displacement):
 
 @pytest.mark.parametrize(("column", "scale"), [("time_ms", 1e6), ("timestamp", 1e9), ("time_us", 1e3)])
 def test_unit_of_time(table, column, scale):
-    record = import_csv(table(f"other,{column},voltage_mV,displacement_um", "0,1,2000,3", "0,2,2000,3"))
+    record = import_table(table(f"other,{column},voltage_mV,displacement_um", "0,1,2000,3", "0,2,2000,3"))
     assert record.time_ns.tolist() == [scale, 2 * scale]
     assert record.voltage["x"].tolist() == [2.0, 2.0]
 
 
 def test_voltages_go_to_the_axis_they_name(table):
     path = table("time_s,y_V,x_V,displacement_x_um,displacement_y_um", "0,20,10,1,2", "1,20,10,1,2")
-    record = import_csv(path)
+    record = import_table(path)
     assert (record.voltage["x"][0], record.voltage["y"][0]) == (10, 20)
     columns = ["displacement_x_um", "displacement_y_um"]
-    record = import_csv(path, voltage=["y_V", "x_V"], displacement=columns, axes=["a", "b"])
+    record = import_table(path, voltage=["y_V", "x_V"], displacement=columns, axes=["a", "b"])
     assert (record.voltage["a"][0], record.voltage["b"][0]) == (20, 10)
 
 
 def test_columns_and_unit_by_option(table):
     path = table("when,drive,sensor,spare", "0.5,1,7,", "0.75,2,8,text")
-    record = import_csv(path, time="when", voltage=["drive"], displacement=["sensor"], displacement_unit="nm")
+    record = import_table(path, time="when", voltage=["drive"], displacement=["sensor"], displacement_unit="nm")
     assert record.axes == ("sensor",)
     assert record.time_ns.tolist() == [500_000_000, 750_000_000]
     assert record.displacement["sensor"].tolist() == pytest.approx([7e-9, 8e-9])
     with pytest.raises(UsageError, match="no displacement unit 'inch'"):
-        import_csv(path, displacement_unit="inch")
+        import_table(path, displacement_unit="inch")
     with pytest.raises(UsageError, match="2 axes for the displacement columns sensor"):
-        import_csv(path, time="when", voltage=["drive"], displacement=["sensor"], axes=["x", "y"])
+        import_table(path, time="when", voltage=["drive"], displacement=["sensor"], axes=["x", "y"])
 
 
 def test_empty_cells_are_nan(table):
-    record = import_csv(table("time_s,voltage_V,displacement_um", "0,1,", "1,,2", "2,3,nan", "", "3,4, 5 "))
+    record = import_table(table("time_s,voltage_V,displacement_um", "0,1,", "1,,2", "2,3,nan", "", "3,4, 5 "))
     np.testing.assert_allclose(record.displacement["x"], [np.nan, 2e-6, np.nan, 5e-6])
     np.testing.assert_array_equal(record.voltage["x"], [1, np.nan, 3, 4])
 
 
 def test_time_before_zero_is_shifted(table):
     path = table("time_s,voltage_V,displacement_um", "-0.25,0,0", "0,0,0", "0.5,0,0")
-    assert import_csv(path).time_ns.tolist() == [0, 250_000_000, 750_000_000]
+    assert import_table(path).time_ns.tolist() == [0, 250_000_000, 750_000_000]
 
 
 @pytest.mark.parametrize("mark", ["\ufeff", ""])
@@ -130,7 +132,7 @@ def test_as_spreadsheets_write_it(tmp_path, mark, end):
     path = tmp_path / "table.csv"
     lines = ['"time_s", voltage_V,"displacement_um"', '"0","1",2', "1,1,2", ""]
     path.write_bytes((mark + end.join(lines)).encode())
-    assert import_csv(path).displacement["x"].tolist() == pytest.approx([2e-6, 2e-6])
+    assert import_table(path).displacement["x"].tolist() == pytest.approx([2e-6, 2e-6])
 
 
 @pytest.mark.parametrize(
@@ -162,7 +164,7 @@ def test_as_spreadsheets_write_it(tmp_path, mark, end):
     ],
 )
 def test_bad_table(table, lines, says):
-    message = refusal(import_csv, table(*lines))
+    message = refusal(import_table, table(*lines))
     assert says in message
     assert len(message) < 500
 
@@ -170,15 +172,90 @@ def test_bad_table(table, lines, says):
 def test_column_that_is_not_there(table):
     path = table("time_s,voltage_V,displacement_um", "0,1,2", "1,1,2")
     for option in ({"time": "when"}, {"voltage": ["when"]}, {"displacement": ["when"]}):
-        assert "no column 'when'; there is time_s, voltage_V" in refusal(import_csv, path, **option)
+        assert "no column 'when'; there is time_s, voltage_V" in refusal(import_table, path, **option)
 
 
 def test_no_text_file(tmp_path):
-    assert "no such file" in refusal(import_csv, tmp_path / "nothing.csv")
-    assert "cannot be read" in refusal(import_csv, tmp_path)
+    assert "no such file" in refusal(import_table, tmp_path / "nothing.csv")
+    assert "cannot be read" in refusal(import_table, tmp_path)
     for junk in (bytes(range(256)) * 10, b"\0" * 100, b"time_s,displacement_\xb5m\n"):
         (tmp_path / "junk.csv").write_bytes(junk)
-        assert "not a text file" in refusal(import_csv, tmp_path / "junk.csv")
+        assert "not a text file" in refusal(import_table, tmp_path / "junk.csv")
+
+
+@pytest.fixture
+def mat(tmp_path):
+    """Return a function that writes variables to a MATLAB file and returns its path."""
+
+    def write(version="5", **variables):
+        path = tmp_path / "data.mat"
+        savemat(path, variables, format=version, do_compression=version == "5", oned_as="column")
+        return path
+
+    return write
+
+
+T = np.arange(60) * 0.01
+MOVED = np.column_stack([T, 2 * T, 3 * T])
+
+
+@pytest.mark.parametrize("version", ["4", "5"])
+def test_matlab_file_as_a_table(mat, version):
+    record = import_table(mat(version, time_ms=1e3 * T, voltage=100 * T[None], displacement_nm=T, other=np.eye(3)))
+    np.testing.assert_array_equal(record.time_ns, 10_000_000 * np.arange(60))
+    np.testing.assert_allclose(record.voltage["x"], 100 * T)
+    np.testing.assert_allclose(record.displacement["x"], 1e-9 * T)
+
+
+@pytest.mark.parametrize(("y", "column"), [(MOVED, "y(:,{})"), (MOVED.T, "y({},:)")])
+def test_matrix_of_a_matlab_file(mat, y, column):
+    path = mat(t=T.astype(np.float32), u=(100 * T).astype(np.int16), y=y)
+    columns = [column.format(number) for number in (1, 3)]
+    record = import_table(path, time="t", voltage=["u"], displacement=columns, axes=["a", "b"], displacement_unit="mm")
+    np.testing.assert_allclose(record.displacement["a"], 1e-3 * T)
+    np.testing.assert_allclose(record.displacement["b"], 3e-3 * T)
+    np.testing.assert_array_equal(record.voltage["a"], np.trunc(100 * T))
+    message = refusal(import_table, path, time="t", voltage=["u"], displacement=["y"])
+    assert f"no numeric array 'y'; there is t, u, {columns[0]}, " in message
+
+
+@pytest.mark.parametrize(
+    ("variables", "says"),
+    [
+        ({"time": T, "voltage": T, "displacement": T[1:]}, "'displacement' has 59 values, 'time' 60"),
+        ({"time": T, "voltage": T + 1j, "displacement": T}, "'voltage' is complex"),
+        ({"time": T[::-1], "voltage": T, "displacement": T}, "value 2 of 'time': 0.58; time runs backwards"),
+        ({"time": np.where(T > 0.3, np.nan, T), "voltage": T, "displacement": T}, "value 32 of 'time': nan; every row"),
+        ({"t": T, "voltage": T, "displacement": T}, "no time column; there is t, voltage, displacement"),
+        ({"time": [[1.0]], "voltage": [[1.0]], "displacement": [[1.0]]}, "at least two"),
+        (
+            {"log": {"time": T}, "name": "stage", "parts": np.array(["a", 1], object)},
+            "there is log (struct, 1x1), name",
+        ),
+        ({"cube": np.zeros((2, 2, 2)), "none": np.zeros((0, 3))}, "there is cube (double, 2x2x2), none (double, 0x3)"),
+        ({}, "there is nothing"),
+    ],
+)
+def test_bad_matlab_file(mat, variables, says):
+    assert says in refusal(import_table, mat(**variables))
+
+
+def test_no_matlab_file(tmp_path, mat):
+    assert "no such file" in refusal(import_table, tmp_path / "nothing.mat")
+    hdf5 = tmp_path / "new.mat"
+    hdf5.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM" + bytes(400))
+    assert "version 7.3; save it anew with `save(..., '-v7')`" in refusal(import_table, hdf5)
+    for junk in (b"", b"time_s,x_V\n", bytes(range(256)) * 10):
+        hdf5.write_bytes(junk)
+        assert "cannot be read as a MATLAB file" in refusal(import_table, hdf5)
+    whole = mat(time=T, voltage=T, displacement=T).read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        damaged = np.frombuffer(whole, np.uint8).copy()
+        damaged[rng.integers(len(whole), size=4)] = rng.integers(256, size=4)
+        hdf5.write_bytes(damaged.tobytes()[: rng.integers(1, len(whole) + 1)])
+        with suppress(SlpiError):
+            import_table(hdf5)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

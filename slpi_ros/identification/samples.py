@@ -56,8 +56,8 @@ class Samples:
 
     def thinned(self, most: int) -> "Samples":
         """Return every so manieth sample, about `most` of them, and all at which the voltage turns: the same memory."""
-        every = -(-self.v.size // most)
-        if every == 1:
+        every = round(self.v.size / most)
+        if every <= 1:
             return self
         kept = np.zeros(self.v.size, dtype=bool)
         kept[::every] = True
@@ -103,35 +103,52 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     """
     record.require_axis(axis)
     where = f"{record.source}: axis '{axis}'"
-    back = np.flatnonzero(np.diff(record.time_ns) < 0)
+    back = np.flatnonzero(record.time_ns[1:] < record.time_ns[:-1])
     if back.size:
         at = int(back[0]) + 1
         raise RecordError(
             f"{record.source}: time runs backwards at sample {at} (t = {record.t[at]:.6g} s); sort the record"
         )
-    t, v, y = record.t, record.voltage[axis], record.displacement[axis]
-    used = np.isfinite(v) & (t < (np.inf if stop is None else stop))
-    t, v, y = t[used], v[used], y[used]
-    fitted = np.isfinite(y) & (t >= (-np.inf if start is None else start))
+    # In order, so that the part to be used is a slice: a long record leaves no room for copies.
+    t = record.t
+    first = np.searchsorted(t, -np.inf if start is None else start)
+    until = np.searchsorted(t, np.inf if stop is None else stop)
+    del t
+    v, y = record.voltage[axis][:until], record.displacement[axis][:until]
+    fitted = np.isfinite(y)
+    fitted[:first] = False
+    driven = np.isfinite(v)
+    if not driven.all():
+        v, y, fitted = v[driven], y[driven], fitted[driven]
     count = int(np.count_nonzero(fitted))
     if count < FEWEST:
         raise RecordError(
             f"{where}: {count} usable samples of {len(record)} between start and stop; at least {FEWEST} are needed"
         )
-    for name, unit, most, signal in (("voltage", "V", 1e4, v), ("displacement", "m", 1.0, y[fitted])):
-        largest = np.max(np.abs(signal))
+    if count < fitted.size:
+        y = np.where(fitted, y, 0.0)
+    _require_motion(v, y, fitted, where)
+    return Samples(v, y, fitted)
+
+
+def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> None:
+    """Raise RecordError unless both signals vary, in their units, and together; IdentificationError without a turn."""
+    turns = bool((v[1:] > v[:-1]).any() and (v[1:] < v[:-1]).any())
+    if not fitted.all():
+        v, y = v[fitted], y[fitted]
+    for name, unit, least, most, signal in (("voltage", "V", 1e-6, 1e4, v), ("displacement", "m", 1e-12, 1.0, y)):
+        low, high = float(signal.min()), float(signal.max())
+        largest = max(-low, high)
         if largest > most:
             raise RecordError(f"{where}: {name} of {largest:g} {unit} is none of a stage; check the unit")
-    for name, unit, least, signal in (("voltage", "V", 1e-6, v[fitted]), ("displacement", "m", 1e-12, y[fitted])):
-        if np.ptp(signal) < least or np.ptp(signal) <= 1e-9 * np.max(np.abs(signal)):
+        if high - low < least or high - low <= 1e-9 * largest:
             raise RecordError(
                 f"{where}: {name} stays at {signal[0]:g} {unit}; record a drive over the range to be used"
             )
-    if len(monotone_runs(v)) < 3:
+    if not turns:
         raise IdentificationError(f"{where}: {NEVER_TURNS}")
-    if np.corrcoef(v[fitted], y[fitted])[0, 1] < 0:
+    if (v - v.mean()) @ (y - y.mean()) < 0:
         raise RecordError(f"{where}: displacement falls where voltage rises; change the sign of one of them")
-    return Samples(v, np.where(fitted, y, 0.0), fitted)
 
 
 def only_one(records: Sequence[Samples], kind: str) -> Samples:

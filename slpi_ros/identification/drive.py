@@ -1,0 +1,130 @@
+"""What the voltage of a record does: where it turns, how fast it goes, where it rests."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Cells on each side of the map of turning points and voltages.
+_CELLS = 10
+# Runs of nearly one swing are compared, and speeds that differ by less than this factor are one.
+_SWING_FACTOR = 1.6
+_SPEED_FACTOR = 1.5
+# Anything shorter is a turn; creep shows from here on.
+_SHORTEST_HOLD = 0.5
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The stretches between turning points.
+
+    Parameters
+    ----------
+    ends : ndarray of int, shape (M + 1,)
+        Samples at which they begin and end: the turning points, and the first and the last sample if they are none.
+    swing : ndarray, shape (M,), volts
+        How far each goes, with its sign.
+    duration : ndarray, shape (M,), seconds
+    """
+
+    ends: IntArray
+    swing: FloatArray
+    duration: FloatArray
+
+    @classmethod
+    def of(cls, t: FloatArray, v: FloatArray, dead_band: float) -> "Runs":
+        """Cut a voltage, shape (N,), at its turns; smaller ones than the dead band (V) do not count."""
+        ends = turning_points(v, dead_band)
+        return cls(ends, np.diff(v[ends]), np.diff(t[ends]))
+
+    @property
+    def turns(self) -> int:
+        """Number of turning points."""
+        return max(self.ends.size - 2, 0)
+
+    @property
+    def speeds(self) -> tuple[float, ...]:
+        """Speeds (V/s) at which swings of one size are run through, from slow to fast; the most varied size counts."""
+        timed = (self.duration > 0.0) & (self.swing != 0.0)
+        swing, speed = np.abs(self.swing[timed]), np.abs(self.swing[timed]) / self.duration[timed]
+        best: tuple[float, ...] = ()
+        for size in np.unique(np.round(np.log(swing) / np.log(_SWING_FACTOR))).tolist():
+            alike = np.abs(np.log(swing) / np.log(_SWING_FACTOR) - size) < 0.5
+            found = _distinct(np.sort(speed[alike]))
+            if len(found) > len(best):
+                best = found
+        return best
+
+
+def _distinct(speeds: FloatArray) -> tuple[float, ...]:
+    """Return one of each group of sorted speeds, of those that come at least twice."""
+    result: list[float] = []
+    for group in np.split(speeds, np.flatnonzero(speeds[1:] > speeds[:-1] * np.sqrt(_SPEED_FACTOR)) + 1):
+        middle = float(np.median(group))
+        if group.size > 1 and (not result or middle > _SPEED_FACTOR * result[-1]):
+            result.append(middle)
+    return tuple(result)
+
+
+def turning_points(v: FloatArray, dead_band: float) -> IntArray:
+    """Return the samples between which `v`, shape (N,), goes one way, but for reversals within `dead_band` (V).
+
+    The smallest swings are taken out, with both their ends, until only larger ones are left. At the ends of a record
+    there may be such a small one; it is left out.
+    """
+    kept = _extremes(v)
+    while True:
+        swing = np.abs(np.diff(v[kept]))
+        small = swing <= dead_band
+        if not small.any():
+            return kept
+        if small.all():
+            return np.array([0, v.size - 1])
+        smallest = small & (swing < np.append(np.inf, swing[:-1])) & (swing <= np.append(swing[1:], np.inf))
+        smallest[[0, -1]] = False
+        if smallest.any():
+            gone = np.append(smallest, False) | np.append(False, smallest)
+            kept = kept[~gone]
+        else:
+            kept = kept[int(small[0]) : kept.size - int(small[-1])]
+        kept = kept[_extremes(v[kept])]
+
+
+def _extremes(v: FloatArray) -> IntArray:
+    """Return the first, the last and all samples at which the direction changes; of level stretches the last."""
+    # Small integers: of a long record there may be no room for more.
+    way = (v[1:] > v[:-1]).astype(np.int8) - (v[1:] < v[:-1]).astype(np.int8)
+    moves = np.flatnonzero(way)
+    if not moves.size:
+        return np.array([0, v.size - 1])
+    way = way[moves]
+    return np.concatenate([[0], moves[1:][way[1:] != way[:-1]], [v.size - 1]])
+
+
+def covered(v: FloatArray, runs: Runs) -> float:
+    """Return the share of all pairs of turning point and voltage that the record visits, of a map of cells."""
+    low, high = float(v.min()), float(v.max())
+    cell = np.minimum((v - low) * (_CELLS / (high - low)), _CELLS - 1).astype(np.int8)
+    origin = np.repeat(cell[runs.ends[:-1]], np.diff(runs.ends))
+    visited = np.bincount(_CELLS * origin + cell[runs.ends[0] : runs.ends[-1]], minlength=_CELLS**2) > 0
+    # The diagonal is where every turn begins.
+    aside = ~np.eye(_CELLS, dtype=bool).ravel()
+    return float(np.mean(visited[aside]))
+
+
+def holds(t: FloatArray, v: FloatArray, band: float) -> FloatArray:
+    """Return how long the voltage rests, within `band` (V), each time it does so, shape (H,), seconds."""
+    period = float(np.median(np.diff(t)))
+    width = max(5, round(_SHORTEST_HOLD / period)) if period > 0.0 else 5
+    if width >= v.size:
+        return np.empty(0)
+    # A window that begins at each sample.
+    low, high = (filtered(v, width, origin=-(width // 2)) for filtered in (minimum_filter1d, maximum_filter1d))
+    high -= low
+    resting = (high <= band)[: v.size - width + 1]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], resting, [False]]).astype(np.int8)))
+    return np.asarray(t[edges[1::2] + width - 2] - t[edges[::2]])

@@ -1,0 +1,65 @@
+"""What a voltage does: turns, speeds, holds and the pairs of voltages it visits."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slpi_ros.hysteresis.runs import without_small_reversals
+from slpi_ros.identification.drive import Runs, covered, holds, turning_points
+
+T = np.arange(8000) * 1e-3
+HOLDS = np.interp(T, [0, 1, 2, 3, 5, 6, 8], [0, 100, 100, 20, 20, 80, 80])
+
+
+@given(st.lists(st.integers(0, 12), min_size=2, max_size=60), st.sampled_from([0.0, 0.5, 1.0, 2.0, 5.0]))
+def test_turning_points(values, dead_band):
+    v = np.array(values, float)
+    ends = turning_points(v, dead_band)
+    assert np.all(np.diff(ends) > 0)
+    swing = np.diff(v[ends])
+    assert np.all(swing[1:] * swing[:-1] < 0)
+    assert np.all(np.abs(swing) > dead_band) or (swing.size == 1 and np.ptp(v) <= dead_band)
+    for outside in (v[: ends[0] + 1], v[ends[-1] :]):
+        assert np.ptp(outside) <= dead_band
+    for (start, stop), move in zip(itertools.pairwise(ends), swing, strict=True):
+        # Nothing within a run turns back by more than the dead band.
+        along = v[start : stop + 1] * (1 if move >= 0 else -1)
+        if swing.size > 1:
+            assert np.max(np.maximum.accumulate(along) - along) <= dead_band
+    # The other way in which the package passes over small reversals knows the same turns.
+    flat = without_small_reversals(v, dead_band)
+    way = np.sign(np.diff(flat))
+    way = way[way != 0]
+    assert np.count_nonzero(np.diff(way)) == max(swing.size - 1, 0)
+
+
+def test_speeds_and_holds():
+    turns = np.array([0.0, 80.0] * 6 + [0.0])
+    for rates, expected in (((20.0,), 1), ((20.0, 60.0, 180.0), 3)):
+        seconds = np.cumsum(np.concatenate([[0.0], 80.0 / np.repeat(rates, 12 // len(rates))]))
+        t = np.arange(0, seconds[-1], 0.002)
+        v = np.interp(t, seconds, turns)
+        found = Runs.of(t, v, 0.5).speeds
+        assert found == pytest.approx(rates, rel=0.05)
+        assert len(found) == expected
+        assert holds(t, v, 0.01).size == 0
+    assert holds(T, HOLDS, 0.01) == pytest.approx([1.0, 2.0, 2.0], abs=0.02)
+    noisy = HOLDS + 0.05 * np.random.default_rng(0).standard_normal(T.size)
+    assert holds(T, noisy, 0.45) == pytest.approx([1.0, 2.0, 2.0], abs=0.05)
+
+
+def test_covered_pairs():
+    sine = 50 - 50 * np.cos(2 * np.pi * T)
+    # Turns at the lowest and the highest of ten cells, and from each all others.
+    assert covered(sine, Runs.of(T, sine, 0.5)) == pytest.approx(0.2)
+    levels = np.arange(5.0, 100.0, 10.0)
+    turns = np.concatenate(
+        [[0.0, 100.0], *([[level, 100.0] for level in levels]), *([[level, 0.0] for level in levels])]
+    )
+    seconds = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(turns)))])
+    t = np.arange(0.0, seconds[-1], 0.5)
+    v = np.interp(t, seconds, turns)
+    assert covered(v, Runs.of(t, v, 0.5)) == 1.0

@@ -22,7 +22,7 @@ def main() -> None:
     """Print the table."""
     print("   samples   rosbags, by message   read_bag   identify slpi        pi   (seconds)")
     with tempfile.TemporaryDirectory() as folder:
-        for duration, rate in ((60.0, 200.0), (120.0, 1000.0)):
+        for duration, rate in ((60.0, 200.0), (120.0, 1000.0), (100.0, 10_000.0)):
             record, _, _ = calibrated(0, duration, rate)
             path = Path(folder) / f"bag_{len(record)}"
             write_bag(path, record)

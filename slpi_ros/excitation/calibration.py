@@ -15,7 +15,7 @@ FAST, SLOW = 1.8, 0.6
 # Smaller moves take as long as one over this share of the range: several samples each.
 SHORTEST = 0.05
 # Each of the holds lasts this share of the drive.
-HOLD = 0.015
+HOLD = 0.025
 # Reversal curves from each end, and as many loops in each nest. Where there is no time for the usual number, moves are
 # hurried, and where that is not enough, there are fewer; where there is time for more than the most, moves are slow.
 FEWEST_LEVELS, USUAL_LEVELS, MOST_LEVELS = 2, 4, 100
@@ -70,9 +70,10 @@ class _Plan:
         for maximum in self._spread(levels):
             self._through(maximum, 0.0)
         for centre in NESTS:
-            self._nest(centre, levels)
-            self._rest()
             self._through(0.0)
+            self._nest(centre, levels)
+        self._rest()
+        self._through(0.0)
         self._rest()
         return self._path
 

@@ -8,7 +8,7 @@ import numpy as np
 from slpi_ros.excitation.legs import FloatArray, Path, Room
 
 # Ranges of travel per second, and how many times as fast moves are, in turn: a 100 V stage moves at 70 V/s on average
-# and at most at 250 V/s. What depends on time then differs between moves; hysteresis does not.
+# and at most at about 250 V/s. What depends on time then differs between moves; hysteresis does not.
 PACE = 0.8
 SPEEDS = (0.6, 1.0, 1.8)
 FAST, SLOW = 1.8, 0.6
@@ -70,10 +70,10 @@ class _Plan:
         for maximum in self._spread(levels):
             self._through(maximum, 0.0)
         for centre in NESTS:
-            self._through(0.0)
             self._nest(centre, levels)
-        self._rest()
-        self._through(0.0)
+            if centre == NESTS[-1]:
+                self._rest()
+            self._through(0.0)
         self._rest()
         return self._path
 

@@ -84,6 +84,13 @@ class Pace:
         self.limits = limits
         self.rate = 0.0
 
+    def counted(self, elapsed: float) -> float:
+        """Return how much of the time since the last step (s) counts; after a pause the voltage starts from rest."""
+        if elapsed > LONGEST_STEP:
+            self.rest()
+            return LONGEST_STEP
+        return max(elapsed, 0.0)
+
     def reach(self, present: float, dt: float) -> tuple[float, float]:
         """Return the lowest and the highest voltage (V) that may follow `present` (V) after `dt` (s)."""
         limits = self.limits

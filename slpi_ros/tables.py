@@ -82,10 +82,6 @@ def import_table(
     )
 
 
-# The name it had before it read anything else.
-import_csv = import_table
-
-
 def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Read a command table, in which every value counts.
 

@@ -14,7 +14,7 @@ from slpi_ros.hysteresis.slpi import UnidentifiedLoopWarning
 from slpi_ros.identification.fit import KINDS, identify
 from slpi_ros.identification.record import Record
 from slpi_ros.model import AxisModel
-from slpi_ros.tables import import_csv
+from slpi_ros.tables import import_table
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def score(folder: Path, case: Case, kind: str) -> Scores:
     SlpiError
         If the record cannot be read.
     """
-    record = import_csv(folder / f"{case.name}.csv")
+    record = import_table(folder / f"{case.name}.csv")
     end = float(record.t[-1]) + 1e-9
 
     def seconds(bound: float) -> float:

@@ -38,6 +38,8 @@ class Loop:
         Those samples at which inner loops were taken out: their vertices.
     closed : bool
         Whether the voltage came back to the vertex. The outer loop counts as open: nothing forgets it.
+    below : int
+        Number of the loop that its vertex lies on; 0 for the outer loop too, which lies on none.
     """
 
     level: int
@@ -46,6 +48,7 @@ class Loop:
     samples: IntArray
     sewn: IntArray
     closed: bool
+    below: int
 
     @property
     def path(self) -> IntArray:
@@ -172,13 +175,14 @@ def _loops(closed: list[tuple[int, int]], suspects: list[int], falls_first: bool
     opened = [(vertex, phase.size) for vertex in suspects[2 if falls_first else 1 :: 2]]
     spans = sorted(closed + opened)
     owner = np.zeros(phase.size, dtype=np.int64)
-    levels, inner = [0], [list[int]() for _ in range(len(spans) + 1)]
+    levels, below, inner = [0], [0], [list[int]() for _ in range(len(spans) + 1)]
     for number, (vertex, end) in enumerate(spans, 1):
-        levels.append(levels[owner[vertex]] + 1)
-        inner[owner[vertex]].append(vertex)
+        below.append(int(owner[vertex]))
+        levels.append(levels[below[number]] + 1)
+        inner[below[number]].append(vertex)
         owner[vertex + 1 : end] = number
     samples = np.split(np.argsort(owner, kind="stable"), np.cumsum(np.bincount(owner, minlength=len(levels)))[:-1])
-    outer = Loop(0, 0, -1 if falls_first else 1, samples[0], np.array(inner[0], dtype=np.int64), False)
+    outer = Loop(0, 0, -1 if falls_first else 1, samples[0], np.array(inner[0], dtype=np.int64), False, 0)
     return outer, *(
         Loop(
             level=levels[number],
@@ -187,6 +191,7 @@ def _loops(closed: list[tuple[int, int]], suspects: list[int], falls_first: bool
             samples=samples[number],
             sewn=np.array(inner[number], dtype=np.int64),
             closed=end < phase.size,
+            below=below[number],
         )
         for number, (vertex, end) in enumerate(spans, 1)
     )

@@ -188,17 +188,37 @@ class SurfaceBasis:
         return float(np.count_nonzero(touched < pairs) / pairs)
 
 
+class OperatorWeights:
+    """What models with one weight for each operator have in common."""
+
+    thresholds: FloatArray
+
+    @property
+    def size(self) -> int:
+        """Number of operators."""
+        return self.thresholds.size
+
+    def roughness(self) -> sp.csr_array:
+        """Return no rows: the weights are few and not negative, that is smooth enough."""
+        return sp.csr_array((1, self.size + 1))
+
+    def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
+        """No weight may be negative, and that of the lowest threshold must be positive."""
+        bound = np.zeros(self.size)
+        bound[0] = LEAST_GAIN * gain
+        return sp.csr_array(sp.eye_array(self.size, self.size + 1)), bound
+
+    def covered(self, branch_part: sp.csr_array) -> float:
+        """Return the share of operators that the samples of a `branch_part` move, 0..1."""
+        return float(np.count_nonzero(np.unique(branch_part.indices) < self.size) / self.size)
+
+
 @dataclass(frozen=True)
-class PlayBasis:
+class PlayBasis(OperatorWeights):
     """The classical PI model: one weight for each threshold."""
 
     thresholds: FloatArray
     symmetric_rest: bool = True
-
-    @property
-    def size(self) -> int:
-        """Number of play operators."""
-        return self.thresholds.size
 
     def branch_part(self, walk: Walk) -> sp.csr_array:
         """Return how far each play operator has moved along the branch."""
@@ -208,20 +228,6 @@ class PlayBasis:
         moved = np.maximum(way - play, 0.0) * walk.direction[:, None]
         return sp.csr_array(moved)
 
-    def roughness(self) -> sp.csr_array:
-        """Return no rows: the weights are few and not negative, that is smooth enough."""
-        return sp.csr_array((1, self.size + 1))
-
-    def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
-        """No weight may be negative, and the linear one must be positive."""
-        bound = np.zeros(self.size)
-        bound[0] = LEAST_GAIN * gain
-        return sp.csr_array(sp.eye_array(self.size, self.size + 1)), bound
-
     def shape(self, x: FloatArray, gain: float) -> PrandtlIshlinskii:
         """Return the PI model."""
         return PrandtlIshlinskii(self.thresholds, np.maximum(x[:-1], 0.0))
-
-    def covered(self, branch_part: sp.csr_array) -> float:
-        """Return the share of operators that the samples of a `branch_part` move, 0..1."""
-        return float(np.count_nonzero(np.unique(branch_part.indices) < self.size) / self.size)

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.mpi import MultiSlope, falling_envelope, rising_envelope, thresholds_for
 from slpi_ros.hysteresis.smpi import BACK, cycles
-from slpi_ros.identification.bases import LEAST_GAIN
+from slpi_ros.identification.bases import OperatorWeights
 from slpi_ros.identification.walk import Walk
 
 FloatArray = NDArray[np.float64]
@@ -20,7 +20,7 @@ SAME_AMPLITUDE = 0.02
 
 
 @dataclass(frozen=True)
-class MultiSlopeBasis:
+class MultiSlopeBasis(OperatorWeights):
     """The MPI model: one weight for each operator; parameters as those of `slpi_ros.hysteresis.mpi.MultiSlope`."""
 
     origin: float
@@ -32,11 +32,6 @@ class MultiSlopeBasis:
     def over(cls, low: float, high: float) -> "MultiSlopeBasis":
         """Return the basis with the paper's thresholds for the voltages from `low` to `high` (V)."""
         return cls(low, high - low, thresholds_for(high - low))
-
-    @property
-    def size(self) -> int:
-        """Number of operators."""
-        return self.thresholds.size
 
     def branch_part(self, walk: Walk) -> sp.csr_array:
         """Return how far each operator has moved along the branch."""
@@ -52,23 +47,9 @@ class MultiSlopeBasis:
         """Return the falling envelopes, shape (N, size)."""
         return falling_envelope(v[:, None] - self.origin, self.thresholds, self.amplitude)
 
-    def roughness(self) -> sp.csr_array:
-        """Return no rows: the weights are few and not negative, that is smooth enough."""
-        return sp.csr_array((1, self.size + 1))
-
-    def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
-        """No weight may be negative, and that of the lowest threshold must be positive."""
-        bound = np.zeros(self.size)
-        bound[0] = LEAST_GAIN * gain
-        return sp.csr_array(sp.eye_array(self.size, self.size + 1)), bound
-
     def shape(self, x: FloatArray, gain: float) -> MultiSlope:
         """Return the MPI model."""
         return MultiSlope(self.origin, self.amplitude, self.thresholds, np.maximum(x[:-1], 0.0))
-
-    def covered(self, branch_part: sp.csr_array) -> float:
-        """Return the share of operators that the samples of a `branch_part` move, 0..1."""
-        return float(np.count_nonzero(np.unique(branch_part.indices) < self.size) / self.size)
 
 
 def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -131,7 +131,6 @@ def fit_loops(
     if thresholds is None:
         thresholds = default_thresholds(float(np.ptp(samples.v[separation.loops[0].samples])))
     identified: dict[int, SingleLoop] = {}
-    below = _owners(separation.loops, samples.v.size)
     for number, loop in enumerate(separation.loops):
         count = int(np.count_nonzero(fitted[loop.samples]))
         seen = LEAST_SHARE * loop.samples.size if loop.level else 0
@@ -145,21 +144,13 @@ def fit_loops(
         fits = [single.solve(run_in) for run_in in _run_ins(loop.level, thresholds, at_rest)]
         best = min(fits, key=lambda fit: fit.rms)
         try:
-            identified[number] = single.loop(best, identified.get(below[loop.vertex]) if loop.level else None)
+            identified[number] = single.loop(best, identified.get(loop.below) if loop.level else None)
         except UsageError:
             raise IdentificationError(
                 f"the loop from {samples.v[loop.vertex]:g} V (sample {loop.vertex}) does not fit the one below it; "
                 "check that voltage and displacement belong together"
             ) from None
     return SeparatedLoops(tuple(identified.values()), dead_band), identified[0].vertex[1]
-
-
-def _owners(loops: tuple[Loop, ...], count: int) -> NDArray[np.int64]:
-    """Return the number of the loop that each sample belongs to, shape (count,)."""
-    owners = np.zeros(count, dtype=np.int64)
-    for number, loop in enumerate(loops):
-        owners[loop.samples] = number
-    return owners
 
 
 def _run_ins(level: int, thresholds: FloatArray, at_rest: bool) -> list[float | None]:

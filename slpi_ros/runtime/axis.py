@@ -13,7 +13,7 @@ from slpi_ros.runtime.ramp import Ramp
 from slpi_ros.runtime.rejection import NOT_FINITE, OUT_OF_RANGE, RejectedError
 from slpi_ros.runtime.swap import including, replay, take_over, turning_voltages
 from slpi_ros.runtime.trajectory import twin_of
-from slpi_ros.stream import LONGEST_STEP, AxisStream, Limits, refusal
+from slpi_ros.stream import AxisStream, Limits, refusal
 
 # What the memory is worth: nobody knows where the stage has been; being wiped; wiped since; kept over a restart.
 ASSUMED, RESETTING, KNOWN, RESTORED = "assumed", "resetting", "known", "restored"
@@ -186,7 +186,7 @@ class Axis:
         y : float, metres
         """
         stream = self.stream
-        dt = self._step_of(ahead)
+        dt = stream.pace.counted(ahead)
         v = stream.move(dt, y)
         if self._loop is not None:
             v = self._loop.correct(dt, y, v, self._now())
@@ -209,7 +209,7 @@ class Axis:
             For this sample and the one before. The voltage comes as near as slew and acceleration allow.
         """
         stream = self.stream
-        dt = self._step_of(ahead)
+        dt = stream.pace.counted(ahead)
         v = stream.pace.step(stream.voltage, planned, dt, planned_before)
         stream.drive(v)
         return self._loop.correct(dt, y, v, self._now()) if self._loop else v
@@ -252,13 +252,6 @@ class Axis:
         self.stamps.restart()
         if self.driven:
             self.stream.pace.rest()
-
-    def _step_of(self, ahead: float) -> float:
-        """Return the time (s) that counts for slew and acceleration."""
-        if ahead > LONGEST_STEP:
-            self.stream.pace.rest()
-            return LONGEST_STEP
-        return max(ahead, 0.0)
 
     def _close_loop(self) -> None:
         stream = self.stream

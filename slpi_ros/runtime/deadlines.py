@@ -177,9 +177,7 @@ def keep_pace(limits: Limits, present: float, wanted: FloatArray, elapsed: Float
         return wanted
     pace, before, v = Pace(limits), present, []
     for goal, dt in zip(wanted.tolist(), elapsed.tolist(), strict=True):
-        if dt > LONGEST_STEP:
-            pace.rest()
-        present = pace.step(present, goal, min(dt, LONGEST_STEP), before)
+        present = pace.step(present, goal, pace.counted(dt), before)
         before = goal
         v.append(present)
     return np.array(v)
@@ -277,8 +275,6 @@ def _one_by_one(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple
     """Move through `y`; return the voltages, and where a displacement was missed."""
     v, late = [], []
     for wish, dt in zip(y.tolist(), elapsed.tolist(), strict=True):
-        if dt > LONGEST_STEP:
-            stream.pace.rest()
-        v.append(stream.move(min(dt, LONGEST_STEP), wish))
+        v.append(stream.move(stream.pace.counted(dt), wish))
         late.append(stream.missed)
     return v, late

@@ -6,12 +6,12 @@ from identification.records import rms
 
 import slpi_ros
 from slpi_ros.bags import write_bag
-from slpi_ros.tables import import_csv
+from slpi_ros.tables import import_table
 
 
 def through_a_bag(table, folder):
     """Import a table as a user does: into a bag, and read that."""
-    write_bag(folder / table.stem, import_csv(table))
+    write_bag(folder / table.stem, import_table(table))
     return slpi_ros.read_bag(folder / table.stem)
 
 

@@ -12,14 +12,14 @@ rclpy = pytest.importorskip("rclpy")
 from nodes.compensator_client import PERIOD_NS, START_NS, compensator  # noqa: E402
 
 import slpi_ros  # noqa: E402
-from slpi_ros.tables import import_csv, read_table, write_table  # noqa: E402
+from slpi_ros.tables import import_table, read_table, write_table  # noqa: E402
 
 
 @pytest.fixture
 def shifted(measured_data, tmp_path):
     """Identify the PICMA record; write its desired path, moved into the identified displacements, as a table."""
     table = measured_data / "picma_1hz_decay_grow.csv"
-    model = slpi_ros.identify(import_csv(table), start=2.0, stop=25.0)
+    model = slpi_ros.identify(import_table(table), start=2.0, stop=25.0)
     slpi_ros.save_model(model, tmp_path / "model.json")
     desired = np.genfromtxt(table, delimiter=",", names=True)["desired_um"] * 1e-6
     low, high = model.axes["x"].displacement_range

@@ -16,7 +16,7 @@ setup(
     maintainer_email="maintainers@slpi-ros.org",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     # slpi_ros/msg_schemas is a link to the top-level folder, so that every install carries the schemas
-    package_data={NAME: ["py.typed", "msg_schemas/*.json"]},
+    package_data={NAME: ["py.typed", "msg_schemas/*.json", "reports/assets/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),

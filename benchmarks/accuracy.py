@@ -56,7 +56,7 @@ def below_remanence(model: slpi_ros.StageModel, seed: int, low: float, high: flo
     excursion[middle] = low - 0.1 * (high - low) * np.sin(np.linspace(0.0, np.pi, excursion[middle].size))
     means = []
     for path in (excursion, desired):
-        v, _ = model.axes["x"].compensate(path)
+        v, _ = model.axes["x"].compensate(t, path)
         achieved, _ = fresh(seed).run(t, v)
         half = desired.size // 2 + int(rate)
         means.append(float(np.mean(np.abs(achieved - path)[half:]) / (high - low)))

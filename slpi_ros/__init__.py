@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import SlpiError
 from slpi_ros.identification.findings import findings
 from slpi_ros.identification.fit import identify
@@ -26,6 +27,7 @@ __all__ = [
     "SlpiError",
     "StageModel",
     "assess",
+    "diagnose",
     "findings",
     "identify",
     "load_model",

@@ -20,9 +20,12 @@ from slpi_ros.errors import ModelError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, excite
 from slpi_ros.identification.findings import findings, require_usable
 from slpi_ros.identification.fit import KINDS, identify
+from slpi_ros.identification.progress import shown_on
 from slpi_ros.identification.quality import assess
 from slpi_ros.identification.record import FloatArray, Record
 from slpi_ros.identification.refit import refit
+from slpi_ros.identification.truth import held_out_truth
+from slpi_ros.identification.uncertainty import curve_uncertainty, require_known_uncertainty
 from slpi_ros.model import StageModel, check_time, held_message
 from slpi_ros.model_file import load_model, save_model
 from slpi_ros.reports.text import describe_change, describe_model
@@ -45,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             output.reconfigure(errors="backslashreplace")
     warnings.showwarning = partial(_show_warning, options.command)
     try:
-        options.run(options)
+        with shown_on(sys.stderr):
+            options.run(options)
     except SlpiError as error:
         print(f"slpi {options.command}: {_one_line(error)}", file=sys.stderr)
         return error.exit_code
@@ -103,6 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--start", metavar="S", type=float, help="fit only from here on, seconds from the first stamp")
     command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
     command.add_argument("--report", metavar="DIR", help="also write a page with plots, of the first bag")
+    command.add_argument("--uncertainty", action="store_true", help="also say how surely the curves are known")
 
     command = commands.add_parser("excite", help="make the voltages to record for an identification")
     command.set_defaults(run=_excite)
@@ -169,17 +174,29 @@ def _identify(options: argparse.Namespace) -> None:
     target = Path(options.output)
     if target.is_dir() or not target.parent.is_dir():
         raise ModelError(f"{target}: cannot be written: no file can be there; choose another place")
+    if options.uncertainty:
+        require_known_uncertainty(options.kind)
     records = bags.read_bags(options.bags, _topics(options), axes=options.axis)
     for record in records:
         _judge(record, options)
     model = identify(records, options.kind, start=options.start, stop=options.stop, loops_at_rest=options.loops_at_rest)
     save_model(model, options.output)
+    told = []
+    part = {"start": options.start, "stop": options.stop}
     if options.report:
         # Plotting is slow to load, and most commands do without.
         from slpi_ros.reports.identification import write_report
 
-        write_report(Path(options.report), records[0], model)
-    print("\n".join(describe_model(model)))
+        truth = {
+            axis: held_out_truth(records, axis, options.kind, loops_at_rest=options.loops_at_rest, **part)
+            for axis in model.axes
+        }
+        write_report(Path(options.report), records[0], model, truth=truth)
+        told += [f"axis {axis}: {line}" for axis, held_out in truth.items() for line in held_out.lines()]
+    if options.uncertainty:
+        for axis in model.axes:
+            told.append(f"axis {axis}: {curve_uncertainty(records, axis, options.kind, **part).line()}")
+    print("\n".join([*told, *describe_model(model)]))
 
 
 def _topics(options: argparse.Namespace) -> str | bags.SeparateTopics:
@@ -232,15 +249,14 @@ def _compensate(options: argparse.Namespace) -> None:
     t, desired = tables.read_table(options.table, "m")
     check_time(t)
     limits = Limits(options.voltage_min, options.voltage_max)
-    voltage = {}
-    for axis, y in _known(desired, model, options.table).items():
-        try:
-            voltage[axis], held = model.axis(axis).compensate(y, limits)
-        except SlpiError as error:
-            raise type(error)(f"{options.table}, axis '{axis}': {error}") from None
+    try:
+        answers = model.command(t, _known(desired, model, options.table), limits)
+    except SlpiError as error:
+        raise type(error)(f"{options.table}, {error}") from None
+    for axis, (_, held) in answers.items():
         if held.any():
             print(f"slpi compensate: axis '{axis}': {held_message(held)}", file=sys.stderr)
-    tables.write_table(options.output, t, voltage, "V")
+    tables.write_table(options.output, t, {axis: v for axis, (v, _) in answers.items()}, "V")
 
 
 def _known(columns: dict[str, FloatArray], model: StageModel, table: str) -> dict[str, FloatArray]:

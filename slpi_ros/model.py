@@ -1,20 +1,22 @@
-"""The model of a stage: for each axis a hysteresis model, where its memory starts, and what it was identified on."""
+"""The model of a stage: one for each axis, and how the axes move along with each other."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from math import inf
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slpi_ros.errors import RecordError, SlpiError, UnreachableError, UsageError
-from slpi_ros.hysteresis import slpi, smpi
-from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
-from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.runs import require_finite
-from slpi_ros.stream import ROUNDING, AxisStream, Limits, accepted_range, refusal
+from slpi_ros.axis_model import AxisModel, FitQuality, Mask, Start
+from slpi_ros.coupling import Coupling
+from slpi_ros.errors import RecordError, SlpiError, UsageError
+from slpi_ros.stage_stream import StageStream
+from slpi_ros.stream import AxisStream, Limits
+
+__all__ = ["AxisModel", "FitQuality", "HeldAtLimitWarning", "StageModel", "Start", "check_time", "held_message"]
 
 FloatArray = NDArray[np.float64]
 Signal = ArrayLike | Mapping[str, ArrayLike]
@@ -22,146 +24,6 @@ Signal = ArrayLike | Mapping[str, ArrayLike]
 
 class HeldAtLimitWarning(UserWarning):
     """Some desired displacements are out of reach and were held at a voltage limit."""
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where the memory starts: at `voltage` (V) and `displacement` (m).
-
-    `history` holds the voltages (V) at which the drive is taken to have turned before, oldest first: a long fall to
-    the first of them wiped the memory. Empty: the stage has never been moved.
-    """
-
-    voltage: float
-    displacement: float
-    history: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True)
-class FitQuality:
-    """How well the model describes the record it comes from, free-run, metres.
-
-    Parameters
-    ----------
-    rms, maximum : float, metres
-        Error over the samples fitted.
-    held_out_rms : float, metres
-        Error over blocks left out of the fit, from cross-validation.
-    floor_rms : float, metres
-        Noise of the sensor, estimated from the record.
-    samples : int
-        Samples fitted.
-    covered : float
-        Share of the surface's cells that the record visited, 0..1.
-    source : str
-        The record.
-    """
-
-    rms: float
-    maximum: float
-    held_out_rms: float
-    floor_rms: float
-    samples: int
-    covered: float
-    source: str
-
-
-@dataclass(frozen=True)
-class AxisModel:
-    """One axis.
-
-    Parameters
-    ----------
-    kind : str
-        Name of the hysteresis model.
-    hysteresis : Hysteresis
-    start : Start
-    voltage_range : (float, float), volts
-    displacement_range : (float, float), metres
-        What the record covered. `compensate` keeps to these voltages.
-    quality : FitQuality
-    """
-
-    kind: str
-    hysteresis: Hysteresis
-    start: Start
-    voltage_range: tuple[float, float]
-    displacement_range: tuple[float, float]
-    quality: FitQuality
-
-    @property
-    def causal(self) -> bool:
-        """Whether the model can follow a path that is not known in advance."""
-        return not isinstance(self.hysteresis, PathModel)
-
-    def memory(self) -> Memory:
-        """Return a fresh memory at the start.
-
-        Raises
-        ------
-        UsageError
-            If the model is not causal.
-        """
-        start = self.start
-        if isinstance(self.hysteresis, PathModel):
-            raise UsageError(
-                f"kind '{self.kind}' needs the whole path in advance and cannot follow it sample by sample; "
-                "give it a whole path, or identify kind 'slpi'"
-            )
-        if not start.history:
-            return Memory(self.hysteresis, start.voltage, start.displacement)
-        first, *turns = (*start.history, start.voltage)
-        # Displacement is known at the end of the history: walk it once to learn how far it leads.
-        way = Memory(self.hysteresis, first, 0.0, primed=True).forward_array(np.array([first, *turns]))[-1]
-        memory = Memory(self.hysteresis, first, start.displacement - float(way), primed=True)
-        for v in turns:
-            memory.forward(v)
-        return memory
-
-    def stream(self, limits: Limits | None = None) -> AxisStream:
-        """Return a fresh stream within `limits` and the identified voltages."""
-        allowed = (limits or Limits(-inf, inf)).within(self.voltage_range)
-        return AxisStream(self.memory(), self.displacement_range, allowed)
-
-    def simulate(self, v: FloatArray) -> FloatArray:
-        """Return the displacement, shape (N,), metres, for the voltage `v`, shape (N,), volts."""
-        return (self._known_path() or self.memory()).forward_array(v)
-
-    def _known_path(self) -> slpi.KnownPath | smpi.KnownPath | None:
-        """Return what moves a model that is not causal along whole paths."""
-        if isinstance(self.hysteresis, PathModel):
-            return self.hysteresis.along(self.start.voltage, self.start.displacement)
-        return None
-
-    def compensate(self, y: FloatArray, limits: Limits | None = None) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Return the voltage for a desired displacement `y`, shape (N,), metres, and where it waits at a limit.
-
-        Raises
-        ------
-        UnreachableError
-            If a displacement lies far outside the identified ones.
-        UsageError
-            If a displacement is not finite.
-        """
-        require_finite(y)
-        low, high = self.displacement_range
-        accepted = accepted_range(self.displacement_range)
-        far = (y < accepted[0]) | (y > accepted[1])
-        if far.any():
-            at = int(np.argmax(far))
-            raise UnreachableError(f"sample {at}: {refusal(float(y[at]), accepted)}")
-        allowed = (limits or Limits(-inf, inf)).within(self.voltage_range)
-        lower, upper = allowed.lower, allowed.upper
-        v = (self._known_path() or self.stream(limits).memory).inverse_array(y, lower, upper)
-        held = (v <= lower) | (v >= upper)
-        if held.any():
-            # At a limit a wish may just be met.
-            with warnings.catch_warnings():
-                # What stands in for loops that were never identified has been said.
-                warnings.simplefilter("ignore", slpi.UnidentifiedLoopWarning)
-                missed = (self._known_path() or self.stream(limits).memory).forward_array(v) - y
-            held &= np.abs(missed) > ROUNDING * (high - low)
-        return v, held
 
 
 @dataclass(frozen=True)
@@ -207,7 +69,14 @@ class StageModel:
         SlpiError
             If axes, lengths or values do not fit.
         """
-        return self._each_axis(t, v, "voltage", lambda axis, signal: axis.simulate(signal))
+        time, voltage = self._signals(t, v, "voltage")
+        own: dict[str, FloatArray] = {}
+        for name, signal in voltage.items():
+            with _naming(name, "voltage"):
+                own[name] = self.axis(name).own(time, signal)
+        motions = {name: y - self.axes[name].start.displacement for name, y in own.items()}
+        seen = {name: self.axes[name].seen(time, y, motions) for name, y in own.items()}
+        return seen if isinstance(v, Mapping) else next(iter(seen.values()))
 
     def compensate(self, t: ArrayLike, y: Signal) -> Any:
         """Return the voltage that gives a desired displacement; the inverse of `simulate`.
@@ -231,52 +100,102 @@ class StageModel:
         SlpiError
             If axes, lengths or values do not fit.
         """
-
-        def invert(axis: AxisModel, signal: FloatArray) -> FloatArray:
-            v, held = axis.compensate(signal)
+        answers = self.command(t, y)
+        for _, held in answers.values():
             if held.any():
-                warnings.warn(held_message(held), HeldAtLimitWarning, stacklevel=5)
-            return v
+                warnings.warn(held_message(held), HeldAtLimitWarning, stacklevel=2)
+        voltage = {name: v for name, (v, _) in answers.items()}
+        return voltage if isinstance(y, Mapping) else next(iter(voltage.values()))
 
-        return self._each_axis(t, y, "displacement", invert)
+    def command(self, t: ArrayLike, y: Signal, limits: Limits | None = None) -> dict[str, tuple[FloatArray, Mask]]:
+        """Return the voltage that gives a desired displacement, and where it waits at a limit.
+
+        Parameters
+        ----------
+        t, y
+            As in `compensate`.
+        limits : Limits, optional
+            Of every axis; the identified voltages are never left.
+
+        Returns
+        -------
+        dict of axis name to (ndarray, shape (N,), volts, and ndarray of bool, shape (N,))
+
+        Raises
+        ------
+        SlpiError
+            As `compensate`.
+        """
+        time, desired = self._signals(t, y, "displacement")
+        own: dict[str, FloatArray] = {}
+        for name, signal in desired.items():
+            with _naming(name, "displacement"):
+                own[name] = self.axis(name).unseen(time, signal)
+        if self.coupling.on:
+            starts = {name: self.axes[name].start.displacement for name in own}
+            apart = self.coupling.apart({name: z - starts[name] for name, z in own.items()}, {})
+            own = {name: starts[name] + motion for name, motion in apart.items()}
+        answers: dict[str, tuple[FloatArray, Mask]] = {}
+        for name, z in own.items():
+            with _naming(name, "displacement"):
+                answers[name] = self.axes[name].command(time, z, limits)
+        return answers
 
     def stream(self, axis: str) -> AxisStream:
-        """Return a causal compensator of one axis: ``step(t, y) -> v``, seconds and metres to volts."""
+        """Return a causal compensator of one axis: ``step(t, y) -> v``, seconds and metres to volts.
+
+        Other axes are taken to rest.
+        """
         return self.axis(axis).stream()
 
-    def _each_axis(
-        self, t: ArrayLike, signal: Signal, what: str, convert: Callable[[AxisModel, FloatArray], FloatArray]
-    ) -> Any:
-        time = check_time(t)
-        if isinstance(signal, Mapping):
-            converted = {}
-            for name, values in signal.items():
-                converted[name] = self._one(name, time, values, what, convert)
-            return converted
-        if len(self.axes) != 1:
-            raise UsageError(
-                f"the model holds axes {', '.join(self.axes)}; give {what} as a mapping of axis name to array"
-            )
-        return self._one(next(iter(self.axes)), time, signal, what, convert)
+    def streams(self) -> StageStream:
+        """Return a causal compensator of all axes, ``step(t, {axis: y}) -> {axis: v}``, seconds and metres to volts.
 
-    def _one(
-        self,
-        name: str,
-        t: FloatArray,
-        values: ArrayLike,
-        what: str,
-        convert: Callable[[AxisModel, FloatArray], FloatArray],
-    ) -> FloatArray:
-        axis = self.axis(name)
-        signal = _as_array(values, f"axis '{name}': {what}")
-        if signal.shape != t.shape:
-            raise UsageError(
-                f"axis '{name}': {what} has shape {signal.shape}, time has {t.shape}; give one value for each time"
-            )
-        try:
-            return convert(axis, signal)
-        except SlpiError as error:
-            raise type(error)(f"axis '{name}', {what}: {error}") from None
+        Raises
+        ------
+        UsageError
+            If a model is not causal.
+        """
+        return StageStream({name: axis.stream() for name, axis in self.axes.items()}, self.coupling, self.origins)
+
+    @cached_property
+    def coupling(self) -> Coupling:
+        """How the axes move along with each other."""
+        return Coupling({name: axis.chain.gains for name, axis in self.axes.items()})
+
+    @property
+    def origins(self) -> dict[str, float]:
+        """Where each axis starts, metres: from there its motion counts for the others."""
+        return {name: axis.start.displacement for name, axis in self.axes.items()}
+
+    def _signals(self, t: ArrayLike, signal: Signal, what: str) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Return time and the signal of each axis, shape (N,) each, once they fit each other."""
+        time = check_time(t)
+        if not isinstance(signal, Mapping):
+            if len(self.axes) != 1:
+                raise UsageError(
+                    f"the model holds axes {', '.join(self.axes)}; give {what} as a mapping of axis name to array"
+                )
+            signal = {next(iter(self.axes)): signal}
+        signals = {}
+        for name, values in signal.items():
+            self.axis(name)
+            signals[name] = _as_array(values, f"axis '{name}': {what}")
+            if signals[name].shape != time.shape:
+                raise UsageError(
+                    f"axis '{name}': {what} has shape {signals[name].shape}, time has {time.shape}; "
+                    "give one value for each time"
+                )
+        return time, signals
+
+
+@contextmanager
+def _naming(axis: str, what: str) -> Iterator[None]:
+    """Let errors name the axis and the signal."""
+    try:
+        yield
+    except SlpiError as error:
+        raise type(error)(f"axis '{axis}', {what}: {error}") from None
 
 
 def check_time(t: ArrayLike) -> FloatArray:

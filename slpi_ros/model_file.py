@@ -7,6 +7,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from slpi_ros.effects import registry
 from slpi_ros.errors import ModelError
 from slpi_ros.files import all_or_nothing
 from slpi_ros.hysteresis import kinds
@@ -126,6 +127,7 @@ def _axis_from(axis: dict[str, Any]) -> AxisModel:
             quality["rms_m"], quality["maximum_m"], quality["held_out_rms_m"], quality["floor_rms_m"],
             quality["samples"], quality["covered"], quality["source"],
         ),
+        effects=tuple(map(registry.from_document, axis.get("effects", []))),
     )  # fmt: skip
 
 
@@ -141,7 +143,7 @@ def _axis_document(axis: AxisModel) -> dict[str, Any]:
             "history_V": list(start.history),
         },
         "hysteresis": kinds.to_document(axis.hysteresis),
-        "effects": [],
+        "effects": [registry.to_document(effect) for effect in axis.effects],
         "quality": {
             "rms_m": quality.rms,
             "maximum_m": quality.maximum,

@@ -1,163 +1,46 @@
 """Compensation sample by sample: what the compensator node runs for each axis."""
 
-from dataclasses import dataclass, replace
-from math import inf, isfinite, sqrt
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, field
+from math import inf, isfinite
+from typing import Any, ClassVar
 
 from slpi_ros.errors import UnreachableError, UsageError
-from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.memory import Memory, MemoryState
+from slpi_ros.pace import LONGEST_STEP, Limits, Pace
+
+__all__ = ["LONGEST_STEP", "ROUNDING", "AxisStream", "Limits", "Pace", "StreamState", "accepted_range", "refusal"]
 
 # A wish farther outside the identified displacements than this share of their span is taken for a mistake (a wrong
 # unit, another stage) and refused; nearer ones are held at the voltage limit.
 TOLERATED_SHARE = 0.2
 # A displacement missed by less than this share of the range is met: it is rounding.
 ROUNDING = 1e-9
-# A longer pause between two samples frees no longer way than this one, seconds.
-LONGEST_STEP = 0.1
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Voltages that an axis may be given, and how fast.
+class StreamState:
+    """The whole state of an axis that is followed sample by sample.
 
     Parameters
     ----------
-    lower, upper : float, volts
-    slew : float, V/s
-        Fastest change; inf: no limit.
-    acceleration : float, V/s^2
-        Fastest change of that change; inf: no limit.
-
-    Raises
-    ------
-    UsageError
-        If they leave no voltage or no motion.
-    """
-
-    lower: float
-    upper: float
-    slew: float = inf
-    acceleration: float = inf
-
-    def __post_init__(self) -> None:
-        """Refuse limits that leave no voltage."""
-        if not self.lower <= self.upper or not self.slew > 0 or not self.acceleration > 0:
-            raise UsageError(
-                f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s and acceleration "
-                f"{self.acceleration:g} V/s^2 leave nothing to do; give lower <= upper, and the others positive"
-            )
-
-    def within(self, voltage_range: tuple[float, float]) -> "Limits":
-        """Return these limits, narrowed to a model's identified voltages."""
-        lower, upper = max(self.lower, voltage_range[0]), min(self.upper, voltage_range[1])
-        if lower > upper:
-            raise UsageError(
-                f"the model was identified from {voltage_range[0]:g} to {voltage_range[1]:g} V, outside the voltage "
-                f"limits {self.lower:g}..{self.upper:g} V; identify it again within them, or correct the limits"
-            )
-        return replace(self, lower=lower, upper=upper)
-
-    def clip(self, voltage: float) -> float:
-        """Return the allowed voltage (V) nearest to `voltage` (V)."""
-        return min(max(voltage, self.lower), self.upper)
-
-
-class Pace:
-    """How far a voltage may go from one sample to the next.
-
-    With a limit of acceleration every step leaves room to brake: before the voltage limits always, and before the goal
-    unless the goal itself turns too sharply.
-
-    Parameters
-    ----------
-    limits : Limits
-        They may be replaced at any time; a voltage outside new ones goes inside as fast as slew and acceleration allow.
-
-    Attributes
-    ----------
+    memory : MemoryState
+    voltage, goal : float, volts
+        Present voltage, and what the last wish asked for.
     rate : float, V/s
-        Of the last step.
+    wish, own : float, metres
+        What the hysteresis was asked for, and the place that came of it.
+    effects : mapping of effect name to its state
     """
 
-    __slots__ = ("limits", "rate")
-
-    def __init__(self, limits: Limits) -> None:
-        self.limits = limits
-        self.rate = 0.0
-
-    def counted(self, elapsed: float) -> float:
-        """Return how much of the time since the last step (s) counts; after a pause the voltage starts from rest."""
-        if elapsed > LONGEST_STEP:
-            self.rest()
-            return LONGEST_STEP
-        return max(elapsed, 0.0)
-
-    def reach(self, present: float, dt: float) -> tuple[float, float]:
-        """Return the lowest and the highest voltage (V) that may follow `present` (V) after `dt` (s)."""
-        limits = self.limits
-        lower, upper = limits.lower, limits.upper
-        if limits.acceleration < inf:
-            down, up = self._ways(present, dt)
-        elif limits.slew < inf:
-            up = limits.slew * dt
-            down = -up
-        else:
-            return lower, upper
-        # A voltage outside its limits goes inside at full pace.
-        lowest, highest = present + down, present + up
-        lowest = max(lowest, min(lower, highest))
-        return lowest, min(highest, max(upper, lowest))
-
-    def toward(self, present: float, goal: float, goal_before: float, dt: float) -> tuple[float, float]:
-        """Return what `reach` does, narrowed so that the voltage can stop at a goal that moves on as it just did.
-
-        Parameters
-        ----------
-        present, goal, goal_before : float, volts
-            The goal now, and at the sample before.
-        dt : float, seconds
-        """
-        lowest, highest = self.reach(present, dt)
-        if self.limits.acceleration == inf:
-            return lowest, highest
-        behind, along = goal_before - present, present + (goal - goal_before)
-        low, high = along - self._braking_way(-behind, dt), along + self._braking_way(behind, dt)
-        return min(max(low, lowest), highest), min(max(high, lowest), highest)
-
-    def step(self, present: float, goal: float, dt: float, goal_before: float | None = None) -> float:
-        """Return the voltage (V) that follows `present` (V) on the way to a `goal` (V) after `dt` (s)."""
-        lowest, highest = self.toward(present, goal, goal if goal_before is None else goal_before, dt)
-        v = min(max(goal, lowest), highest)
-        self.moved(v - present, dt)
-        return v
-
-    def moved(self, way: float, dt: float) -> None:
-        """Remember how fast the last step went: `way` (V) in `dt` (s)."""
-        if dt > 0.0:
-            self.rate = way / dt
-
-    def rest(self) -> None:
-        """Start anew from a voltage at rest."""
-        self.rate = 0.0
-
-    def _ways(self, present: float, dt: float) -> tuple[float, float]:
-        """Return how far (V) down and up slew, acceleration and room to brake allow."""
-        limits = self.limits
-        change, fastest = limits.acceleration * dt, limits.slew
-        down = max(self.rate - change, -fastest) * dt
-        up = min(self.rate + change, fastest) * dt
-        to_lower, to_upper = present - limits.lower, limits.upper - present
-        if to_upper >= 0.0:
-            up = min(up, self._braking_way(to_upper, dt))
-        if to_lower >= 0.0:
-            down = max(down, -self._braking_way(to_lower, dt))
-        return min(down, up), max(down, up)
-
-    def _braking_way(self, distance: float, dt: float) -> float:
-        """Return the longest step (V) in `dt` after which the voltage can still stop within `distance` (V)."""
-        if distance <= 0.0:
-            return 0.0
-        acceleration = self.limits.acceleration
-        return min(acceleration * dt * (sqrt(dt * dt + 2.0 * distance / acceleration) - dt), distance)
+    memory: MemoryState
+    voltage: float
+    goal: float
+    rate: float
+    wish: float
+    own: float
+    effects: Mapping[str, Any] = field(default_factory=dict)
 
 
 class AxisStream:
@@ -177,7 +60,14 @@ class AxisStream:
     accepted : (float, float), metres
         Smallest and largest displacement that may be wished for.
     pace : Pace
+    wish : float, metres
+        What the hysteresis was asked for last.
+    coupled : float, metres
+        What other axes add to the displacement; set it before a wish that is to reckon with it.
     """
+
+    # Whether it does not matter how long a voltage stays.
+    timeless: ClassVar[bool] = True
 
     def __init__(self, memory: Memory, displacement_range: tuple[float, float], limits: Limits) -> None:
         self.memory = memory
@@ -186,7 +76,8 @@ class AxisStream:
         self._t = -inf
         # The axis may rest outside its limits; the first voltage it is given is inside.
         memory.forward(limits.clip(memory.voltage))
-        self._wish = memory.displacement
+        self.wish = memory.displacement
+        self.coupled = 0.0
         self._goal = memory.voltage
         self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
 
@@ -203,6 +94,15 @@ class AxisStream:
     def voltage(self) -> float:
         """Present voltage, volts."""
         return self.memory.voltage
+
+    @property
+    def own(self) -> float:
+        """Displacement (m) that the model gives the present voltage, before other axes come in."""
+        return self.memory.displacement
+
+    def unseen(self, y: float) -> float:
+        """Return the place (m) at which a sensor sees the displacement `y` (m)."""
+        return y
 
     def check(self, t: float, y: float) -> None:
         """Raise what `step` would raise, without moving.
@@ -251,14 +151,39 @@ class AxisStream:
         else:
             lower, upper = pace.reach(memory.voltage, dt)
             v = memory.inverse(y, lower, upper)
-        self._wish = y
+        self.wish = y
         return v
 
-    def drive(self, voltage: float) -> float:
-        """Move to a voltage (V) whatever is wished for; return the displacement (m) that the model gives it."""
-        self._wish = self.memory.forward(voltage)
+    def drive(self, voltage: float, dt: float = 0.0) -> float:
+        """Move to a voltage (V), `dt` (s) after the last one, whatever is wished for; return the displacement (m)."""
+        self.wish = self.memory.forward(voltage)
         self._goal = voltage
-        return self._wish
+        return self.wish
+
+    def wait(self, duration: float) -> None:
+        """Let time (s) pass without a wish."""
+
+    def snapshot(self) -> StreamState:
+        """Return the whole state, to be given back to `restore`."""
+        return StreamState(self.memory.snapshot(), self.voltage, self._goal, self.pace.rate, self.wish, self.own)
+
+    def restore(self, state: StreamState) -> None:
+        """Take over a state from `snapshot`."""
+        self.memory.restore(state.memory)
+        self._goal, self.pace.rate, self.wish = state.goal, state.rate, state.wish
+
+    def resume(self, before: "AxisStream") -> None:
+        """Go on where another model's stream has been; its voltage stays, and what its effects have begun."""
+        self.pace.rate = before.pace.rate
+        if self.voltage != before.voltage:
+            self.drive(before.voltage)
+
+    def twin(self) -> "AxisStream":
+        """Return a stream in the same state, which moves on its own."""
+        twin = copy(self)
+        twin.memory, twin.pace = copy(self.memory), copy(self.pace)
+        twin.memory.restore(self.memory.snapshot())
+        return twin
 
     def _move_gently(self, dt: float, y: float) -> float:
         """Move within the limit of acceleration: slow down before the voltage that the wish asks for."""
@@ -283,7 +208,7 @@ class AxisStream:
     @property
     def missed(self) -> bool:
         """Whether the last wish is not met, for whatever limit."""
-        return abs(self.memory.displacement - self._wish) > self._rounding
+        return abs(self.memory.displacement - self.wish) > self._rounding
 
 
 def accepted_range(displacement_range: tuple[float, float]) -> tuple[float, float]:

@@ -21,9 +21,11 @@ LAYERS = (
         *("mat_table", "mcap_file", "message_blocks", "message_types", "signals", "sqlite_file", "tables"),
     },
     {"excitation", "identification"},
-    {"control", "model", "model_file", "runtime", "schemas", "stream"},
-    {"effects"},
-    {"hysteresis"},
+    {
+        *("axis_model", "chain", "control", "coupling", "effect_stream", "model", "model_file", "pace", "runtime"),
+        *("schemas", "stage_stream", "stream"),
+    },
+    {"effects", "hysteresis"},
     {"errors", "files", "metrics"},
 )
 

@@ -59,7 +59,7 @@ def test_the_history_decides_where_loops_close():
     plain, before = Start(20.0, 5e-6), Start(20.0, 5e-6, (0.0, 60.0))
     axes = [replace(X, start=start) for start in (plain, before)]
     rise = np.array([30.0, 60.0, 80.0])
-    first_rise, inner = (axis.simulate(rise) for axis in axes)
+    first_rise, inner = (axis.simulate(np.arange(3.0), rise) for axis in axes)
     walked = Memory(X.hysteresis, 0.0, 0.0, primed=True).forward_array(np.array([60.0, 20.0, *rise]))
     np.testing.assert_allclose(inner, walked[2:] - walked[1] + 5e-6, rtol=0, atol=1e-15)
     assert abs(first_rise - inner).max() > 1e-7
@@ -70,7 +70,7 @@ def test_forms_of_arguments():
     y = ONE.simulate(T, VOLTS)
     assert isinstance(y, np.ndarray)
     assert y.dtype == np.float64
-    assert (y == X.simulate(VOLTS)).all()
+    assert (y == X.simulate(T, VOLTS)).all()
     assert (ONE.simulate(T.tolist(), VOLTS.tolist()) == y).all()
     assert (ONE.simulate(T, VOLTS.astype(np.float32)) == y).all()
     assert (ONE.simulate(T.astype(int), VOLTS.astype(int)) == y).all()
@@ -80,7 +80,7 @@ def test_forms_of_arguments():
     both = TWO.simulate(T, {"y": VOLTS, "x": VOLTS.tolist()})
     assert list(both) == ["y", "x"]
     assert (both["x"] == y).all()
-    assert (both["y"] == Y.simulate(VOLTS)).all()
+    assert (both["y"] == Y.simulate(T, VOLTS)).all()
     assert list(TWO.simulate(T, {"y": VOLTS})) == ["y"]
     back = TWO.compensate(T, {"x": METRES})
     assert (back["x"] == ONE.compensate(T, METRES)).all()
@@ -109,7 +109,7 @@ def test_no_samples_and_equal_times():
 def test_stream_gives_what_compensate_gives(drawn):
     axis, v = drawn
     model = StageModel({"x": axis})
-    y = np.clip(axis.simulate(v), *axis.displacement_range)
+    y = np.clip(axis.simulate(np.arange(v.size), v), *axis.displacement_range)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HeldAtLimitWarning)
         batch = model.compensate(np.arange(v.size), y)
@@ -125,9 +125,9 @@ def test_what_the_model_gives_within_its_range_is_never_held(drawn):
     """Not even by rounding, where the path touches the limits."""
     axis, v = drawn
     v = np.concatenate([[np.clip(axis.start.voltage, *axis.voltage_range)], v, axis.voltage_range, v[::-1]])
-    y = axis.simulate(v)
+    y = axis.simulate(np.arange(v.size), v)
     axis = replace(axis, displacement_range=(y.min(), y.max()))
-    assert not axis.compensate(y)[1].any()
+    assert not axis.compensate(np.arange(y.size), y)[1].any()
     stream = axis.stream()
     for t, wish in enumerate(y.tolist()):
         stream.step(t, wish)
@@ -137,7 +137,7 @@ def test_what_the_model_gives_within_its_range_is_never_held(drawn):
 def test_limits_narrow_the_identified_voltages():
     assert X.stream().limits == Limits(0.0, 100.0)
     assert X.stream(Limits(-50.0, 60.0, 5.0)).limits == Limits(0.0, 60.0, 5.0)
-    v, held = X.compensate(METRES, Limits(20.0, 50.0))
+    v, held = X.compensate(T, METRES, Limits(20.0, 50.0))
     assert v.min() == 20.0
     assert v.max() == 50.0
     assert held.tolist() == ((v == 20.0) | (v == 50.0)).tolist()

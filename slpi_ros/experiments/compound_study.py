@@ -121,7 +121,9 @@ def run_study(axis: PreisachStage, name: str, path_cycles: int = 3) -> AxisStudy
     gains = tune(axis.parameters, smpi.peak(max(RECORD)) / max(RECORD))
     single = path([(smpi.peak(FEEDFORWARD_VOLTAGE), 1.0)], path_cycles)
     segments = path([(peak * 1e-6, frequency) for peak, frequency in TABLE_6], path_cycles)
-    voltages = {label: model.compensate(segments)[0] for label, model in models.items()}
+    voltages = {
+        label: model.compensate(np.arange(segments.size) / RATE, segments)[0] for label, model in models.items()
+    }
     voltages[""] = np.zeros(segments.size)
 
     def compound(label: str, fed_back: bool, rest: float = 0.0) -> Outcome:
@@ -130,7 +132,9 @@ def run_study(axis: PreisachStage, name: str, path_cycles: int = 3) -> AxisStudy
     return AxisStudy(
         gains,
         feedforward={
-            label: follow(axis, single, model.compensate(single)[0], None, FEEDFORWARD_VOLTAGE)
+            label: follow(
+                axis, single, model.compensate(np.arange(single.size) / RATE, single)[0], None, FEEDFORWARD_VOLTAGE
+            )
             for label, model in models.items()
         },
         compound={way: compound(*way) for way in (("", True), *product(models, (False, True)))},

@@ -90,7 +90,7 @@ def _rms(model: AxisModel, record: Record, start: float, stop: float) -> float:
     driven = np.isfinite(record.voltage["x"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnidentifiedLoopWarning)
-        y = model.simulate(record.voltage["x"][driven])
+        y = model.simulate(record.t[driven], record.voltage["x"][driven])
     error = y - record.displacement["x"][driven]
     t = record.t[driven]
     return float(np.sqrt(np.nanmean(error[(t >= start) & (t < stop)] ** 2)))

@@ -227,7 +227,7 @@ def _fit(drive: Drive, kind: str) -> CycleFit:
     fitted, following = drive.cycle(SETTLED), drive.cycle(NEXT)
     start, stop = drive.t[fitted.start] - 1e-9, drive.t[fitted.stop] - 1e-9
     model = identify(_record(drive.t, drive.v, drive.y), kind, start=start, stop=stop).axis("x")
-    y = model.simulate(drive.v)
+    y = model.simulate(drive.t, drive.v)
     errors = (error_metrics(drive.y[part], y[part]) for part in (fitted, following))
     return CycleFit(model, y[fitted], *errors)
 
@@ -278,10 +278,10 @@ def _variable_path(
     record = triangle_record(axis, "x", FALLING, VARIABLE[0][1], samples)
     family = identify(record, "slpi", start=1.0 / VARIABLE[0][1]).axis("x")
     models = {
-        ONE_MPI: fits[highest].model.simulate(v),
+        ONE_MPI: fits[highest].model.simulate(t, v),
         OWN_MPI: own(0.0),
         SCALED_MPI: own(peaks[highest].b),
-        FAMILY: family.simulate(v),
+        FAMILY: family.simulate(t, v),
     }
     bounds = np.cumsum([0, *(cycles * samples for _, _, cycles in path)]).tolist()
     shown, first = slice(bounds[1], None), slice(bounds[1], bounds[2])

@@ -102,9 +102,7 @@ def _separation(study: Study) -> Exhibit:
 
 
 def _weights(models: Mapping[str, SeparatedLoops], level: int, printed: tuple[float, ...]) -> Table:
-    found = [
-        next(loop.model for loop in model.loops if loop.level == level).weights * 1e6 for model in models.values()
-    ]
+    found = [next(loop.model for loop in model.loops if loop.level == level).weights * 1e6 for model in models.values()]
     rows = [
         (f"{r:.0f}", f"{w:.5f}", *(f"{weights[i]:.5f}" for weights in found))
         for i, (r, w) in enumerate(zip(THRESHOLDS, printed, strict=True))
@@ -127,9 +125,7 @@ def _single_models(study: Study) -> Exhibit:
         remark="The weights are those of another stage. The inner loops are fitted closely; the outer one, which is "
         "not symmetric, is not.",
         tables=tuple(_weights(models, level, printed) for level, printed in PRINTED.items()),
-        pictures=(
-            Picture(pictures.single_models(study.separation, models), "Single loops in their own coordinates."),
-        ),
+        pictures=(Picture(pictures.single_models(study.separation, models), "Single loops in their own coordinates."),),
     )
 
 

@@ -138,9 +138,7 @@ def compensation(study: Study, errors: Mapping[str, LoopErrors], desired: FloatA
         upper.set_title(name, fontsize=11)
         label(upper, "desired (µm)", "achieved (µm)" if not column else "")
         for loop in study.separation.loops:
-            lower.plot(
-                loop.samples, errors[name].error[loop.samples] * 1e6, ".", markersize=4, label=ROMAN[loop.level]
-            )
+            lower.plot(loop.samples, errors[name].error[loop.samples] * 1e6, ".", markersize=4, label=ROMAN[loop.level])
         label(lower, "sample", "error (µm)" if not column else "")
     handles, levels = drawn[-1].get_legend_handles_labels()
     figure.legend(

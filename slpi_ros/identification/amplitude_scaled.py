@@ -1,6 +1,7 @@
 """The SMPI model: the multi-slope model of the largest cycles of a record, and the line of all cycles' peaks."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from slpi_ros.hysteresis.mpi import MultiSlope
 from slpi_ros.hysteresis.smpi import BACK, AmplitudeScaled, cycles
 from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.multi_slope import SAME_AMPLITUDE, MultiSlopeBasis, peak_line
-from slpi_ros.identification.problem import FIRST_SMOOTHNESS, Problem, held_out_rms
+from slpi_ros.identification.problem import FIRST_SMOOTHNESS, Problem, held_out_errors
 from slpi_ros.identification.samples import FEWEST, Samples, only_one
 from slpi_ros.model import Start
 
@@ -49,7 +50,7 @@ def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
         y=samples.y[samples.fitted],
         voltage_range=samples.voltage_range,
         errors=(y - samples.y)[samples.fitted],
-        held_out_rms=held_out_rms(samples, samples.fitted, predict),
+        held_out=held_out_errors(samples, samples.fitted, predict),
         covered=problem.basis.covered(problem.design.local[problem.weights > 0]),
     )
 
@@ -69,7 +70,7 @@ def _ends(samples: Samples) -> tuple[float, float]:
 
 def _fit(samples: Samples, kept: NDArray[np.bool_], largest: NDArray[np.bool_]) -> tuple[AmplitudeScaled, float]:
     """Return the model fitted to the samples `kept`, and the displacement at the start (m)."""
-    part = Samples(samples.v, samples.y, kept & largest, samples.primed)
+    part = replace(samples, fitted=kept & largest)
     problem = Problem.pose([part], MultiSlopeBasis.over(*_ends(samples)))
     x = problem.solve(FIRST_SMOOTHNESS) * problem.scale
     base = problem.basis.shape(x, problem.gain)

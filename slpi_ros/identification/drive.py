@@ -16,6 +16,8 @@ _SWING_FACTOR = 1.6
 _SPEED_FACTOR = 1.5
 # Anything shorter is a turn; creep shows from here on.
 _SHORTEST_HOLD = 0.5
+# Turns smaller than this share of the range say nothing about loops; larger ones than that are never noise.
+_SMALLEST_TURN, _LARGEST_DEAD_BAND = 0.005, 0.1
 
 
 @dataclass(frozen=True)
@@ -82,13 +84,13 @@ def turning_points(v: FloatArray, dead_band: float) -> IntArray:
         small = swing <= dead_band
         if not small.any():
             return kept
-        if small.all():
-            return np.array([0, v.size - 1])
         smallest = small & (swing < np.append(np.inf, swing[:-1])) & (swing <= np.append(swing[1:], np.inf))
         smallest[[0, -1]] = False
         if smallest.any():
             gone = np.append(smallest, False) | np.append(False, smallest)
             kept = kept[~gone]
+        elif small.all():
+            return np.array([0, v.size - 1])
         else:
             kept = kept[int(small[0]) : kept.size - int(small[-1])]
         kept = kept[_extremes(v[kept])]
@@ -116,15 +118,38 @@ def covered(v: FloatArray, runs: Runs) -> float:
     return float(np.mean(visited[aside]))
 
 
-def holds(t: FloatArray, v: FloatArray, band: float) -> FloatArray:
-    """Return how long the voltage rests, within `band` (V), each time it does so, shape (H,), seconds."""
+def smallest_turn(v: FloatArray, noise: float) -> float:
+    """Return the swing (V) up to which a reversal of `v`, shape (N,), volts, with `noise` (V rms) says nothing."""
+    span = float(np.ptp(v))
+    return float(np.clip(8.0 * noise, _SMALLEST_TURN * span, _LARGEST_DEAD_BAND * span))
+
+
+def hold_band(v: FloatArray, noise: float, digit: float) -> float:
+    """Return within how many volts a voltage rests, for its noise (V rms) and the step between its readings (V)."""
+    return max(1e-4 * float(np.ptp(v)), 6.0 * noise, 1.5 * digit)
+
+
+def resting(t: FloatArray, v: FloatArray, band: float) -> tuple[IntArray, IntArray]:
+    """Find where the voltage rests within `band` (V).
+
+    Returns
+    -------
+    starts, stops : ndarray of int, shape (H,)
+        Samples ``start:stop`` of each hold.
+    """
     period = float(np.median(np.diff(t)))
     width = max(5, round(_SHORTEST_HOLD / period)) if period > 0.0 else 5
     if width >= v.size:
-        return np.empty(0)
+        return np.empty(0, np.int64), np.empty(0, np.int64)
     # A window that begins at each sample.
     low, high = (filtered(v, width, origin=-(width // 2)) for filtered in (minimum_filter1d, maximum_filter1d))
     high -= low
-    resting = (high <= band)[: v.size - width + 1]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], resting, [False]]).astype(np.int8)))
-    return np.asarray(t[edges[1::2] + width - 2] - t[edges[::2]])
+    still = (high <= band)[: v.size - width + 1]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    return edges[::2], edges[1::2] + width - 1
+
+
+def holds(t: FloatArray, v: FloatArray, band: float) -> FloatArray:
+    """Return how long the voltage rests, within `band` (V), each time it does so, shape (H,), seconds."""
+    starts, stops = resting(t, v, band)
+    return np.asarray(t[stops - 1] - t[starts])

@@ -12,6 +12,7 @@ from slpi_ros.identification import linear, separated
 from slpi_ros.identification.amplitude_scaled import fit_amplitude_scaled
 from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.problem import noise_rms
+from slpi_ros.identification.progress import tell
 from slpi_ros.identification.record import Record
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples
 from slpi_ros.model import AxisModel, FitQuality, StageModel
@@ -68,18 +69,15 @@ def identify(
     RecordError, IdentificationError
         If the record does not allow a fit; the message says what is missing.
     """
-    if kind not in KINDS:
-        raise UsageError(f"unknown kind '{kind}'; this version identifies {', '.join(KINDS)}")
+    fit = fit_of(kind, loops_at_rest=loops_at_rest)
     if not (-np.inf if start is None else start) < (np.inf if stop is None else stop):
         raise UsageError(f"start {start} s is not before stop {stop} s; give seconds from the first stamp, in order")
-    if loops_at_rest and kind != "slpi-published":
-        raise UsageError(f"loops at rest are a matter of kind 'slpi-published', not of '{kind}'; leave that out")
-    fit = separated.fit_at_rest if loops_at_rest else FITS[kind]
     records = [record] if isinstance(record, Record) else list(record)
     hardware_id = _one_stage(records)
     source = ", ".join(part.source for part in records)
     models = {}
     for axis in axes or records[0].axes:
+        tell(f"axis {axis}: identification")
         samples = [select_samples(part, axis, start, stop) for part in records]
         try:
             # The matrices are small: more threads than one only stand in each other's way.
@@ -88,6 +86,15 @@ def identify(
         except SlpiError as error:
             raise type(error)(f"{source}: axis '{axis}': {error}") from None
     return StageModel(models, hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))
+
+
+def fit_of(kind: str, *, loops_at_rest: bool) -> Callable[[Sequence[Samples]], Fitted]:
+    """Return the fit of a kind; UsageError if there is none."""
+    if kind not in KINDS:
+        raise UsageError(f"unknown kind '{kind}'; this version identifies {', '.join(KINDS)}")
+    if loops_at_rest and kind != "slpi-published":
+        raise UsageError(f"loops at rest are a matter of kind 'slpi-published', not of '{kind}'; leave that out")
+    return separated.fit_at_rest if loops_at_rest else FITS[kind]
 
 
 def _one_stage(records: Sequence[Record]) -> str:

@@ -25,8 +25,9 @@ class Fitted:
         Covered by them.
     errors : ndarray, shape (number fitted,), metres
         Model minus measurement, free-run, on the samples fitted.
-    held_out_rms : float, metres
-        Error on blocks left out of the fit.
+    held_out : ndarray, shape (N,), metres
+        Error of every sample given, on blocks left out of the fit: model minus measurement, free-run; NaN where a
+        sample never was left out.
     covered : float
         Share of the model that the samples determine, 0..1.
     """
@@ -36,5 +37,10 @@ class Fitted:
     y: FloatArray
     voltage_range: tuple[float, float]
     errors: FloatArray
-    held_out_rms: float
+    held_out: FloatArray
     covered: float
+
+    @property
+    def held_out_rms(self) -> float:
+        """Error on blocks left out of the fit, metres; every sample counts alike."""
+        return float(np.sqrt(np.nanmean(self.held_out**2)))

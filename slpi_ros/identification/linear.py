@@ -1,6 +1,7 @@
 """The kinds that are linear in their parameters: one convex fit, as smooth and fine as held-out blocks say."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +10,9 @@ from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
 from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.multi_slope import MultiSlopeBasis
 from slpi_ros.identification.problem import FIRST_SMOOTHNESS, Problem
+from slpi_ros.identification.progress import tell
 from slpi_ros.identification.samples import Samples
-from slpi_ros.identification.start import choose_start
+from slpi_ros.identification.start import Beginning, choose_start
 from slpi_ros.model import Start
 
 FloatArray = NDArray[np.float64]
@@ -22,24 +24,37 @@ PLAY_OPERATORS = 30
 # A long record is thinned to about so many samples to choose start, grid and smoothness by, and to be fitted at last:
 # more of them cost time and memory, and tell nothing new.
 SELECTION_SAMPLES, FIT_SAMPLES = 100_000, 1_000_000
+# Every sample moves every play operator, which takes time: this share of them does, for few parameters.
+PLAYS_SHARE = 0.2
 
 
 def fit_family(samples: Sequence[Samples]) -> Fitted:
     """Fit the loop family to one record or several."""
-    low, high = _voltage_range(samples)
-    return fit_linear(samples, [SurfaceBasis(np.linspace(low, high, n)) for n in VERTICES], SMOOTHNESS)
+    return fit_linear(samples, surfaces(samples), SMOOTHNESS)
 
 
 def fit_plays(samples: Sequence[Samples]) -> Fitted:
     """Fit the classical PI model to one record or several."""
+    return fit_linear(samples, plays(samples), share=PLAYS_SHARE)
+
+
+def surfaces(samples: Sequence[Samples]) -> list[Basis]:
+    """Return the loop families that compete."""
     low, high = _voltage_range(samples)
-    return fit_linear(samples, [PlayBasis(np.linspace(0.0, (high - low) / 2, PLAY_OPERATORS, endpoint=False))])
+    return [SurfaceBasis(np.linspace(low, high, n)) for n in VERTICES]
+
+
+def plays(samples: Sequence[Samples]) -> list[Basis]:
+    """Return the only classical PI model that competes."""
+    low, high = _voltage_range(samples)
+    return [PlayBasis(np.linspace(0.0, (high - low) / 2, PLAY_OPERATORS, endpoint=False))]
 
 
 def fit_multi_slope(samples: Sequence[Samples]) -> Fitted:
     """Fit the MPI model of the amplitude that the records cover, from rest, by plain least squares as published."""
+    samples = [part.thinned(round(PLAYS_SHARE * FIT_SAMPLES / len(samples))) for part in samples]
     problem = Problem.pose(samples, MultiSlopeBasis.over(*_voltage_range(samples)))
-    return _solved(samples, problem, FIRST_SMOOTHNESS, ())
+    return _solved(samples, problem, FIRST_SMOOTHNESS, [Beginning((), only_wiped=False)] * len(samples))
 
 
 def _voltage_range(samples: Sequence[Samples]) -> tuple[float, float]:
@@ -47,7 +62,11 @@ def _voltage_range(samples: Sequence[Samples]) -> tuple[float, float]:
 
 
 def fit_linear(
-    samples: Sequence[Samples], bases: Sequence[Basis], smoothness: Sequence[float] = SMOOTHNESS[:1]
+    samples: Sequence[Samples],
+    bases: Sequence[Basis],
+    smoothness: Sequence[float] = SMOOTHNESS[:1],
+    *,
+    share: float = 1.0,
 ) -> Fitted:
     """Fit the basis, with the roughness weight, that predicts blocks left out best.
 
@@ -59,34 +78,61 @@ def fit_linear(
         Those that compete, the simplest one first.
     smoothness : sequence of float
         Roughness weights that compete.
+    share : float
+        Of the samples to which a long record is thinned otherwise.
 
     Raises
     ------
     IdentificationError
         If the samples do not determine the model.
     """
-    thin = [part.thinned(SELECTION_SAMPLES // len(samples)) for part in samples]
+    chosen = choose(samples, bases, smoothness, share=share)
+    fitted = [
+        beginning.of(part.thinned(round(share * FIT_SAMPLES / len(samples))))
+        for beginning, part in zip(chosen.beginnings, samples, strict=True)
+    ]
+    problem = chosen.problem
+    if sum(part.v.size for part in fitted) > problem.y.size:
+        problem = Problem.pose(fitted, problem.basis).reweighted()
+    return _solved(fitted, problem, chosen.smoothness, chosen.beginnings)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The problem, of a thinned record, that predicts blocks left out best."""
+
+    problem: Problem
+    smoothness: float
+    beginnings: Sequence[Beginning]
+
+
+def choose(
+    samples: Sequence[Samples], bases: Sequence[Basis], smoothness: Sequence[float], *, share: float = 1.0
+) -> Choice:
+    """Choose start, basis and roughness weight; parameters and errors as in `fit_linear`."""
+    thin = [part.thinned(round(share * SELECTION_SAMPLES / len(samples))) for part in samples]
+    tell("choosing what went before the record")
     beginnings = [choose_start(part, lambda candidate: Problem.pose([candidate], bases[0])) for part in thin]
     thin = [beginning.of(part) for beginning, part in zip(beginnings, thin, strict=True)]
     candidates = []
-    for basis in bases:
+    for number, basis in enumerate(bases, 1):
+        tell(f"choosing how fine and how smooth, {number} of {len(bases)}")
         problem = Problem.pose(thin, basis).reweighted()
         scores = problem.scores(smoothness)
         k = int(np.argmin(scores))
         candidates.append((float(scores[k]), smoothness[k], problem))
-    _, chosen, problem = min(candidates, key=lambda candidate: candidate[0])
-    fitted = [
-        beginning.of(part.thinned(FIT_SAMPLES // len(samples)))
-        for beginning, part in zip(beginnings, samples, strict=True)
-    ]
-    if any(part.v.size > thinned.v.size for part, thinned in zip(fitted, thin, strict=True)):
-        problem = Problem.pose(fitted, problem.basis).reweighted()
-    return _solved(fitted, problem, chosen, beginnings[0].history)
+    _, best, problem = min(candidates, key=lambda candidate: candidate[0])
+    return Choice(problem, best, beginnings)
 
 
-def _solved(samples: Sequence[Samples], problem: Problem, smoothness: float, history: tuple[float, ...]) -> Fitted:
-    """Solve a problem; the model starts as the first record does, after its `history`."""
+def _solved(samples: Sequence[Samples], problem: Problem, smoothness: float, beginnings: Sequence[Beginning]) -> Fitted:
+    """Solve a problem of samples that have a history before them; the model starts as the first record does."""
+    tell(f"fit to {problem.count} samples")
     x = problem.solve(smoothness)
+    history = beginnings[0].history
+    recorded = [
+        np.arange(part.v.size) >= len(beginning.history) for part, beginning in zip(samples, beginnings, strict=True)
+    ]
     at_start = problem.design.predict(x)[len(history)] * problem.scale
     return Fitted(
         hysteresis=problem.basis.shape(x[: problem.basis.size + 1] * problem.scale, problem.gain),
@@ -94,7 +140,7 @@ def _solved(samples: Sequence[Samples], problem: Problem, smoothness: float, his
         y=np.concatenate([part.y[part.fitted] for part in samples]),
         voltage_range=_fitted_range(samples),
         errors=problem.errors(x),
-        held_out_rms=problem.held_out(smoothness),
+        held_out=problem.held_out_errors(smoothness)[np.concatenate(recorded)],
         covered=problem.basis.covered(problem.design.local[np.concatenate([part.fitted for part in samples])]),
     )
 

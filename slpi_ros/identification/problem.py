@@ -8,6 +8,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from slpi_ros.identification.bases import Basis
+from slpi_ros.identification.progress import tell
 from slpi_ros.identification.qp import solve_free, solve_qp
 from slpi_ros.identification.samples import Samples
 from slpi_ros.identification.walk import Design, Walk
@@ -28,14 +29,15 @@ RIDGE = 1e-9
 class Problem:
     """One basis on one record or several.
 
-    Displacement is in units of `scale`; weights are zero where a sample is not fitted; `rough` is the matrix of the
-    basis's roughness.
+    Displacement is in units of `scale`; weights are zero where a sample is not fitted; `judged` are those that others
+    can predict; `rough` is the matrix of the basis's roughness.
     """
 
     basis: Basis
     design: Design
     y: FloatArray
     weights: FloatArray
+    judged: NDArray[np.bool_]
     rough: FloatArray
     scale: float
     gain: float
@@ -56,6 +58,7 @@ class Problem:
             design=design,
             y=np.concatenate([part.y for part in samples]) / metres,
             weights=np.concatenate([part.fitted for part in samples]).astype(np.float64),
+            judged=np.concatenate([part.judged for part in samples]),
             rough=rough,
             scale=metres,
             gain=metres / volts,
@@ -112,17 +115,18 @@ class Problem:
 
         The first rise is never left out: a record shows it once, and no other part can predict it.
         """
-        return blocked_folds((self.weights > 0) & ~self.design.walk.first_rise)
+        return blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise)
 
-    def held_out(self, smoothness: float) -> float:
-        """Return the rms error (m) on blocks left out of the fit: every sample counts alike, and every branch rises."""
-        errors = []
-        for chosen in self.folds():
+    def held_out_errors(self, smoothness: float) -> FloatArray:
+        """Return the error (m) of each sample, shape (N,), when it is left out of the fit; NaN where it never is."""
+        errors = np.full(self.y.size, np.nan)
+        for fold, chosen in enumerate(self.folds(), 1):
+            tell(f"fits with blocks left out, {fold} of {FOLDS}")
             weights = self.weights.copy()
             weights[chosen] = 0.0
             part = replace(self, weights=weights)
-            errors.append((self.design.predict(part.solve(smoothness)) - self.y)[chosen])
-        return float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) * self.scale
+            errors[chosen] = (self.design.predict(part.solve(smoothness)) - self.y)[chosen] * self.scale
+        return errors
 
     def scores(self, smoothness: Sequence[float]) -> FloatArray:
         """Return the robust rms error (m) on blocks left out, one for each smoothness; quick, so branches may fall."""
@@ -147,10 +151,10 @@ def blocked_folds(allowed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     return [np.concatenate(blocks[fold::FOLDS]) for fold in range(FOLDS)]
 
 
-def held_out_rms(
+def held_out_errors(
     samples: Samples, allowed: NDArray[np.bool_], predict: Callable[[NDArray[np.bool_]], FloatArray]
-) -> float:
-    """Return the rms error (m) on blocks left out of a fit.
+) -> FloatArray:
+    """Return the error (m) of each sample, shape (N,), when it is left out of a fit; NaN where it never is.
 
     Parameters
     ----------
@@ -160,12 +164,13 @@ def held_out_rms(
     predict : callable
         Given the samples to be fitted, bool of shape (N,), returns the displacement of all, shape (N,), metres.
     """
-    errors = []
-    for chosen in blocked_folds(allowed):
+    errors = np.full(samples.v.size, np.nan)
+    for fold, chosen in enumerate(blocked_folds(allowed), 1):
+        tell(f"fits with blocks left out, {fold} of {FOLDS}")
         kept = samples.fitted.copy()
         kept[chosen] = False
-        errors.append((predict(kept) - samples.y)[chosen])
-    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+        errors[chosen] = (predict(kept) - samples.y)[chosen]
+    return errors
 
 
 def noise_rms(errors: FloatArray) -> float:

@@ -13,8 +13,6 @@ FloatArray = NDArray[np.float64]
 
 # Steps in time that are longer than this many periods: samples are missing; a whole gap.
 _LOST, _GAP = 1.5, 5.0
-# Turns smaller than this share of the range say nothing about loops; larger ones than that are never noise.
-_SMALLEST_TURN, _LARGEST_DEAD_BAND = 0.005, 0.1
 # A voltage is smooth only up to this share of its range: what computed it may be made of pieces.
 _LEAST_SPIKE = 0.001
 
@@ -259,15 +257,14 @@ def _signal(
 
 
 def _drive(t: FloatArray, v: FloatArray, voltage: SignalQuality, wiped: float | None) -> DriveQuality:
-    dead_band = float(np.clip(8.0 * voltage.noise, _SMALLEST_TURN * np.ptp(v), _LARGEST_DEAD_BAND * np.ptp(v)))
-    runs = drive.Runs.of(t, v, dead_band)
+    runs = drive.Runs.of(t, v, drive.smallest_turn(v, voltage.noise))
     near = NEAR_END * np.ptp(v)
     return DriveQuality(
         turns=runs.turns,
         covered=drive.covered(v, runs),
         samples_per_run=float(np.median(np.diff(runs.ends))),
         speeds=runs.speeds,
-        holds=tuple(drive.holds(t, v, max(1e-4 * np.ptp(v), 6.0 * voltage.noise, 1.5 * voltage.digit)).tolist()),
+        holds=tuple(drive.holds(t, v, drive.hold_band(v, voltage.noise, voltage.digit)).tolist()),
         begins_at_end=bool(min(v[0] - v.min(), v.max() - v[0]) <= near),
         wiped=wiped,
     )

@@ -107,7 +107,7 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
 
 
 def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisModel, AxisChange]:
-    basis, x_old = _basis_of(old)
+    basis, x_old = basis_of(old)
     low, high = samples.voltage_range
     if isinstance(basis, SurfaceBasis) and not basis.grid[0] <= samples.v.min() <= samples.v.max() <= basis.grid[-1]:
         raise IdentificationError(
@@ -165,7 +165,7 @@ def _same_start(new: Start, old: Start, repeatability: float) -> bool:
     return close and (new.voltage, new.history) == (old.voltage, old.history)
 
 
-def _basis_of(axis: AxisModel) -> tuple[Basis, FloatArray]:
+def basis_of(axis: AxisModel) -> tuple[Basis, FloatArray]:
     """Return the basis of a model, and its parameters without the displacement at rest, metres."""
     shape = axis.hysteresis
     if isinstance(shape, PrandtlIshlinskii):

@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.runs import monotone_runs
 from slpi_ros.identification.record import Record
+from slpi_ros.identification.voltage import without_noise
 
 FloatArray = NDArray[np.float64]
 
 # Fewer samples than this say nothing about a loop.
 FEWEST = 50
+# More than this need time and memory, and tell nothing new.
+ENOUGH = 1_000_000
 NEVER_TURNS = "the voltage never turns back; drive it up and down over the range to be used"
 # The memory counts as wiped once the voltage has come this near to both ends of its range (share of the range).
 NEAR_END = 0.02
@@ -26,19 +29,25 @@ class Samples:
     Parameters
     ----------
     v : ndarray, shape (N,), volts
-        All that moves the memory.
+        All that moves the memory; without the noise of its measurement.
     y : ndarray, shape (N,), metres
         Finite where `fitted`.
     fitted : ndarray of bool, shape (N,)
         Samples whose displacement is to be fitted.
-    primed : bool
-        Whether a long fall to the first voltage wiped the memory; else the axis had never been moved.
+    history : int
+        How many of the first samples are those of an earlier drive. A long fall to the first one wiped the memory;
+        without any the axis had never been moved.
     """
 
     v: FloatArray
     y: FloatArray
     fitted: NDArray[np.bool_]
-    primed: bool = False
+    history: int = 0
+
+    @property
+    def primed(self) -> bool:
+        """Whether a long fall to the first voltage wiped the memory."""
+        return self.history > 0
 
     def after(self, history: tuple[float, ...]) -> "Samples":
         """Return the samples with the voltages of an earlier drive before them."""
@@ -47,7 +56,7 @@ class Samples:
             np.concatenate([before, self.v]),
             np.concatenate([np.zeros(before.size), self.y]),
             np.concatenate([np.zeros(before.size, dtype=bool), self.fitted]),
-            primed=before.size > 0,
+            history=before.size + self.history,
         )
 
     def only(self, chosen: NDArray[np.bool_]) -> "Samples":
@@ -56,15 +65,23 @@ class Samples:
 
     def thinned(self, most: int) -> "Samples":
         """Return every so manieth sample, about `most` of them, and all at which the voltage turns: the same memory."""
-        every = round(self.v.size / most)
-        if every <= 1:
-            return self
+        kept = self.thinning(most)
+        return self if kept.all() else self.at(kept)
+
+    def thinning(self, most: int) -> NDArray[np.bool_]:
+        """Return which samples are kept where about `most` are, shape (N,)."""
+        every = max(1, round(self.v.size / most))
         kept = np.zeros(self.v.size, dtype=bool)
         kept[::every] = True
-        # Of equal samples in a row both ends: the memory does not tell which one is the turn.
-        ends = np.array(monotone_runs(self.v)).ravel()
-        kept[ends[ends < self.v.size]] = kept[np.maximum(ends - 1, 0)] = True
-        return Samples(self.v[kept], self.y[kept], self.fitted[kept], self.primed)
+        if every > 1:
+            # Of equal samples in a row both ends: the memory does not tell which one is the turn.
+            ends = np.array(monotone_runs(self.v)).ravel()
+            kept[ends[ends < self.v.size]] = kept[np.maximum(ends - 1, 0)] = True
+        return kept
+
+    def at(self, kept: NDArray[np.bool_]) -> "Samples":
+        """Return the samples that are `kept`, shape (N,)."""
+        return Samples(self.v[kept], self.y[kept], self.fitted[kept], int(np.count_nonzero(kept[: self.history])))
 
     @property
     def voltage_range(self) -> tuple[float, float]:
@@ -83,10 +100,25 @@ class Samples:
         """Which samples come after both ends of the voltage range have been visited, shape (N,)."""
         low, high = self.v.min(), self.v.max()
         margin = NEAR_END * (high - low)
-        seen_low = np.maximum.accumulate(self.v <= low + margin)
-        seen_high = np.maximum.accumulate(self.v >= high - margin)
-        both: NDArray[np.bool_] = seen_low & seen_high
-        return both
+        own = self.v[self.history :]
+        seen_low = np.maximum.accumulate(own <= low + margin)
+        seen_high = np.maximum.accumulate(own >= high - margin)
+        return np.concatenate([np.zeros(self.history, dtype=bool), seen_low & seen_high])
+
+    @property
+    def mostly_wiped(self) -> bool:
+        """Whether the larger part of the way that is fitted comes after the memory was wiped."""
+        own = self.v[self.history :]
+        way = np.abs(np.diff(own, prepend=own[0])) * self.fitted[self.history :]
+        return bool(way @ self.wiped[self.history :] >= 0.5 * way.sum())
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """Which samples can be predicted from others, shape (N,).
+
+        What comes before the memory was wiped depends on what moved the axis before, and is seen only once.
+        """
+        return self.fitted & self.wiped if self.mostly_wiped else self.fitted
 
 
 def select_samples(record: Record, axis: str, start: float | None, stop: float | None) -> Samples:
@@ -113,7 +145,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     t = record.t
     first = np.searchsorted(t, -np.inf if start is None else start)
     until = np.searchsorted(t, np.inf if stop is None else stop)
-    del t
+    t = t[:until]
     v, y = record.voltage[axis][:until], record.displacement[axis][:until]
     fitted = np.isfinite(y)
     fitted[:first] = False
@@ -128,7 +160,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     if count < fitted.size:
         y = np.where(fitted, y, 0.0)
     _require_motion(v, y, fitted, where)
-    return Samples(v, y, fitted)
+    return Samples(without_noise(t if driven.all() else t[driven], v), y, fitted)
 
 
 def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> None:
@@ -152,7 +184,7 @@ def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], whe
 
 
 def only_one(records: Sequence[Samples], kind: str) -> Samples:
-    """Return the samples of the only record; UsageError where there are several, which `kind` cannot be fitted to."""
+    """Return the samples of the only record, thinned; UsageError for several, which `kind` cannot be fitted to."""
     if len(records) != 1:
         raise UsageError(f"{len(records)} records given, but kind '{kind}' is fitted to one; choose one or 'slpi'")
-    return records[0]
+    return records[0].thinned(ENOUGH)

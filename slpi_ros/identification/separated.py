@@ -15,7 +15,7 @@ from slpi_ros.hysteresis.pi import PrandtlIshlinskii, play
 from slpi_ros.hysteresis.slpi import SeparatedLoops, SingleLoop, UnidentifiedLoopWarning, at_vertex
 from slpi_ros.identification.bases import LEAST_GAIN
 from slpi_ros.identification.fitted import Fitted
-from slpi_ros.identification.problem import RIDGE, held_out_rms
+from slpi_ros.identification.problem import RIDGE, held_out_errors
 from slpi_ros.identification.qp import solve_qp
 from slpi_ros.identification.samples import FEWEST, NEVER_TURNS, Samples, only_one
 from slpi_ros.model import Start
@@ -87,7 +87,7 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
         y=samples.y[samples.fitted],
         voltage_range=samples.voltage_range,
         errors=(_predict(loops, offset, samples.v) - samples.y)[samples.fitted],
-        held_out_rms=held_out_rms(samples, samples.fitted & after_first_rise, predict),
+        held_out=held_out_errors(samples, samples.fitted & after_first_rise, predict),
         covered=len(loops.loops) / len(separate(samples.v, dead_band=loops.dead_band).loops),
     )
 

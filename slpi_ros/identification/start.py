@@ -76,7 +76,7 @@ def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> Beginning:
     Beginning
     """
     wiped = samples.fitted & samples.wiped
-    enough = np.count_nonzero(wiped) >= max(FEWEST, 0.5 * np.count_nonzero(samples.fitted))
+    enough = np.count_nonzero(wiped) >= FEWEST and samples.mostly_wiped
     candidates = histories(samples)
     residuals = [_residual(pose(samples.after(history)), samples) for history in candidates]
     rms = [np.sqrt(np.mean(residual[samples.fitted] ** 2)) for residual in residuals]

@@ -95,14 +95,15 @@ class Design:
     walk: Walk
 
     @cached_property
-    def _pick(self) -> sp.csr_array:
+    def pick(self) -> sp.csr_array:
+        """What picks each sample's turning point, shape (N, turns)."""
         own = np.flatnonzero(self.walk.origin >= 0)
         column = np.searchsorted(self.turns, self.walk.origin[own])
         return sp.csr_array((np.ones(own.size), (own, column)), shape=(self.walk.v.size, self.turns.size))
 
     @cached_property
-    def _at_turns(self) -> FloatArray:
-        """Predictions at turning points, each from the one before it."""
+    def at_turns(self) -> FloatArray:
+        """Predictions at turning points, each from the one before it, shape (turns, p)."""
         rows: FloatArray = self.local[self.turns].toarray()
         before = self.walk.origin[self.turns]
         for row, origin in enumerate(before.tolist()):
@@ -121,12 +122,12 @@ class Design:
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Return the displacement of every sample, shape (N,), in the unit of `x`."""
-        result: FloatArray = self.local @ x + self._pick @ (self._at_turns @ x)
+        result: FloatArray = self.local @ x + self.pick @ (self.at_turns @ x)
         return result
 
     def normal_equations(self, y: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``A' W A``, shape (p, p), and ``A' W y``, shape (p,), for weights of shape (N,)."""
-        local, pick, at_turns = self.local, self._pick, self._at_turns
+        local, pick, at_turns = self.local, self.pick, self.at_turns
         weigh = sp.diags_array(weights)
         local_w, pick_w = (local.T @ weigh).tocsr(), (pick.T @ weigh).tocsr()
         mixed = (local_w @ pick) @ at_turns

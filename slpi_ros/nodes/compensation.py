@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
 
 from slpi_ros.control import PidGains
+from slpi_ros.coupling import Coupling
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.model import StageModel
 from slpi_ros.runtime import rejection
@@ -16,6 +17,7 @@ from slpi_ros.runtime.following import Following
 from slpi_ros.runtime.loop import LoopSettings
 from slpi_ros.runtime.rejection import RejectedError
 from slpi_ros.runtime.saved_memory import SavedAxis
+from slpi_ros.stage_stream import StageStream
 from slpi_ros.stream import Limits
 
 OPEN_LOOP = LoopSettings(False, PidGains(0.0), 0.1)
@@ -68,12 +70,13 @@ class Compensation:
         self.voltages = array("d", [0.0] * len(self.axes))
         self.active = False
         self.driving = Driving(self.axes)
-        self.following = Following({axis.name: axis for axis in self.axes})
+        self.following = Following({axis.name: axis for axis in self.axes}, self._decouple)
+        self._stage: StageStream | None = None
         self.counts = Counts()
         self.model: StageModel | None = None
         self._hardware_id = hardware_id
         self._by_name = {axis.name: axis for axis in self.axes}
-        self._last_names: list[str] | None = None
+        self._last_names: Sequence[str] | None = None
         self._last_axes: list[Axis] = []
         self.use_time(time or TimeRules())
 
@@ -111,6 +114,9 @@ class Compensation:
             if saved:
                 axis.memory_state = RESTORED if saved[axis.name].certain else ASSUMED
         self.model = model
+        coupling = Coupling({axis.name: model.axis(axis.name).chain.gains for axis in self.axes})
+        streams = {axis.name: axis.stream for axis in self.axes}
+        self._stage = StageStream(streams, coupling, model.origins) if coupling.on else None
         self._show()
 
     def forget_model(self) -> None:
@@ -196,6 +202,8 @@ class Compensation:
         except RejectedError as error:
             counts.by_cause[error.cause] += 1
             raise
+        if self._stage:
+            self._decouple(dict(zip(names, displacements, strict=True)))
         held = slewing = gap = jump = began = False
         if self.driving.on:
             self.driving.stop()
@@ -238,6 +246,11 @@ class Compensation:
         self.following.step(now_ns)
         self._show()
 
+    def _decouple(self, desired: Mapping[str, float]) -> None:
+        """Let each axis know what the others will add once the named ones are at their displacements (m)."""
+        if self._stage:
+            self._stage.decouple(desired)
+
     def _show(self) -> None:
         for axis in self.axes:
             self.voltages[axis.place] = axis.voltage
@@ -263,7 +276,8 @@ class Compensation:
         # Most senders name the same axes every time.
         if names != self._last_names:
             self._last_axes = self._match(names)
-            self._last_names = list(names)
+            # What may change is copied.
+            self._last_names = names[:]
         return self._last_axes
 
     def _match(self, names: Sequence[str]) -> list[Axis]:

@@ -1,34 +1,42 @@
-"""One self-contained HTML page: text, tables and pictures, nothing to fetch."""
+"""One self-contained HTML page: text, tables, pictures and interactive charts, nothing to fetch."""
 
 import base64
 import html
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Literal
+from urllib.parse import quote
 
 from slpi_ros.files import all_or_nothing, make_folder
+from slpi_ros.identification.findings import Finding
+from slpi_ros.reports.chart import Chart
 
-_STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #1b2733; background: #fff; }
-body { max-width: 1040px; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.7rem; margin-bottom: .2rem; }
-h2 { font-size: 1.3rem; margin-top: 2.2rem; }
-h3 { font-size: 1.1rem; margin-top: 2.2rem; border-top: 1px solid #d5dde5; padding-top: .8rem; }
-dl { display: grid; grid-template-columns: fit-content(17rem) 1fr; gap: .3rem 1rem; margin: .6rem 0; }
-dt { color: #51606e; }
-dd { margin: 0; }
-table { border-collapse: collapse; margin: 1rem 0; }
-th, td { padding: .35rem .9rem; text-align: right; border-bottom: 1px solid #d5dde5; }
-th { background: #f2f5f8; }
-th:first-child, td:first-child { text-align: left; }
-tr.best td { font-weight: 600; background: #eef7f0; }
-img { max-width: 100%; height: auto; }
-figure { margin: 1rem 0; }
-figcaption { color: #51606e; font-size: .92rem; }
-"""
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Mood = Literal["good", "warn", "bad"]
+
+# Whatever a page holds, a browser that shows it must fetch nothing.
+_NOTHING_FROM_OUTSIDE = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; "
+    "base-uri 'none'; form-action 'none'"
+)
+_HINT = (
+    "Drag over a chart to zoom, double-click to see all again; click a name in a legend to hide or show it, "
+    "double-click to see it alone; point at a curve for its values."
+)
+
+
+@dataclass(frozen=True)
+class Share:
+    """A part of a whole, 0..1, and how it is shown."""
+
+    name: str
+    share: float
+    colour: str
 
 
 @dataclass
@@ -41,15 +49,65 @@ class Page:
     """
 
     title: str
-    _parts: list[str] = field(default_factory=list)
+    _parts: list[str] = field(default_factory=list, init=False)
+    _has_charts: bool = field(default=False, init=False)
 
-    def heading(self, text: str) -> None:
-        """Add a heading."""
-        self._parts.append(f"<h2>{html.escape(text)}</h2>")
+    def contents(self, axes: Sequence[str]) -> None:
+        """Add links to the headings of several axes."""
+        if len(axes) > 1:
+            links = (f'<a href="#{html.escape(quote(f"axis-{axis}"))}">Axis {html.escape(axis)}</a>' for axis in axes)
+            self._parts.append(f"<nav>{''.join(links)}</nav>")
+
+    def heading(self, text: str, axis: str | None = None) -> None:
+        """Add a heading, to which `contents` leads if it is that of an axis."""
+        target = "" if axis is None else f' id="{html.escape(f"axis-{axis}")}"'
+        self._parts.append(f"<h2{target}>{html.escape(text)}</h2>")
+
+    def verdict(self, axis: str, text: str, mood: Mood, word: str = "") -> None:
+        """Add the sentence that sums up an axis, after a word; its element has the id ``verdict-<axis>``."""
+        name, before = html.escape(f"verdict-{axis}"), f"<b>{html.escape(word.replace('_', ' '))}</b> " if word else ""
+        said = f' data-verdict="{html.escape(word)}"' if word else ""
+        self._parts.append(f'<p class="verdict {mood}" id="{name}"{said}>{before}{html.escape(text)}</p>')
+
+    def tiles(self, figures: Mapping[str, str]) -> None:
+        """Add figures that are seen at a glance, each with what it is."""
+        tiles = (
+            f"<div><b>{html.escape(text)}</b><span>{html.escape(name)}</span></div>" for name, text in figures.items()
+        )
+        self._parts.append(f'<div class="tiles">{"".join(tiles)}</div>')
+
+    def findings(self, found: Iterable[Finding]) -> None:
+        """Add what was found about a record."""
+        items = (f'<li><b class="{one.level}">{one.level}</b>{html.escape(one.text)}</li>' for one in found)
+        self._parts.append(f'<ul class="findings">{"".join(items)}</ul>')
+
+    def shares(self, parts: Sequence[Share]) -> None:
+        """Add a bar of parts of a whole, and what they are."""
+        bar = (f'<div style="flex:{part.share:.4f} 0 0;background:{part.colour}"></div>' for part in parts)
+        keys = (
+            f'<li><i style="background:{part.colour}"></i>{html.escape(part.name)} <b>{part.share:.0%}</b></li>'
+            for part in parts
+        )
+        self._parts.append(f'<div class="shares">{"".join(bar)}</div><ul class="keys">{"".join(keys)}</ul>')
+
+    def chart(self, name: str, chart: Chart, caption: str) -> None:
+        """Add an interactive chart, whose element has `name` as its id, with its caption."""
+        if not self._has_charts:
+            self._parts.append(f'<p class="hint">{_HINT}</p><noscript><p>The charts need JavaScript.</p></noscript>')
+        self._has_charts = True
+        self._parts.append(
+            f'<figure class="chart"><div id="{html.escape(name)}" style="min-height:{chart.height}px"></div>'
+            f'<script type="application/json">{chart.to_json()}</script>'
+            f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        )
 
     def section(self, text: str) -> None:
         """Add a heading below a heading."""
         self._parts.append(f"<h3>{html.escape(text)}</h3>")
+
+    def subsection(self, text: str) -> None:
+        """Add a heading below that."""
+        self._parts.append(f"<h4>{html.escape(text)}</h4>")
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
@@ -64,16 +122,23 @@ class Page:
         """Add a list of short lines."""
         self._parts.append(f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>")
 
-    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]], best: int | None = None) -> None:
-        """Add a table; row `best` stands out."""
+    def table(
+        self, header: Sequence[str], rows: Sequence[Sequence[str] | str], best: int | None = None, caption: str = ""
+    ) -> None:
+        """Add a table; row `best` stands out, and a row that is a text is the heading of those below it."""
+        below = f"<caption>{html.escape(caption)}</caption>" if caption else ""
         head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
         body = []
         for k, row in enumerate(rows):
+            if isinstance(row, str):
+                body.append(f'<tr class="group"><td colspan="{len(header)}">{html.escape(row)}</td></tr>')
+                continue
             cells = "".join(f"<td>{html.escape(cell)}</td>" for cell in row)
             body.append(f'<tr class="best">{cells}</tr>' if k == best else f"<tr>{cells}</tr>")
-        self._parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>")
+        rows_below = f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody>"
+        self._parts.append(f'<div class="scroll"><table>{below}{rows_below}</table></div>')
 
-    def figure(self, figure: Figure, caption: str) -> None:
+    def figure(self, figure: "Figure", caption: str) -> None:
         """Add a picture with its caption."""
         picture = base64.b64encode(png(figure)).decode()
         self._parts.append(
@@ -90,17 +155,24 @@ class Page:
             If it cannot be written.
         """
         title = html.escape(self.title)
+        scripts = ("plotly-cartesian.min.js", "page.js") if self._has_charts else ()
         document = (
             f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-            f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>'
-            f"<body><h1>{title}</h1>{''.join(self._parts)}</body></html>"
+            f'<meta http-equiv="Content-Security-Policy" content="{_NOTHING_FROM_OUTSIDE}">'
+            f'<meta name="viewport" content="width=device-width"><style>{_asset("page.css")}</style></head>'
+            f"<body><h1>{title}</h1>{''.join(self._parts)}"
+            f"{''.join(f'<script>{_asset(name)}</script>' for name in scripts)}</body></html>"
         )
         make_folder(path.parent)
         with all_or_nothing(path) as file:
             file.write(document)
 
 
-def png(figure: Figure) -> bytes:
+def _asset(name: str) -> str:
+    return (files("slpi_ros.reports") / "assets" / name).read_text(encoding="utf-8")
+
+
+def png(figure: "Figure") -> bytes:
     """Return a figure as a PNG file's bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)

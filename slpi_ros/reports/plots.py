@@ -9,10 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from slpi_ros.reports.colours import COLOURS as COLOURS
+from slpi_ros.reports.colours import DESIRED as DESIRED
+from slpi_ros.reports.colours import MEASURED as MEASURED
 
-MEASURED, DESIRED = "#8a97a5", "#1b2733"
-COLOURS = ("#c8553d", "#d99a26", "#2a7f62", "#3b6ea5")
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -55,16 +56,6 @@ def loops(v: FloatArray, y: FloatArray, simulated: FloatArray) -> Figure:
     left.legend(frameon=False)
     right.plot(v, (simulated - y) * 1e9, ".", color=COLOURS[2], markersize=2)
     label(right, "voltage (V)", "model less measured (nm)")
-    return figure
-
-
-def residual(t: FloatArray, error: FloatArray) -> Figure:
-    """Draw an error, shape (N,), metres, over time, shape (N,), seconds, and its histogram."""
-    figure, (left, right) = panels(1, 2, (11, 3.2), width_ratios=(3, 1))
-    left.plot(t, error * 1e9, color=COLOURS[2], linewidth=0.6)
-    label(left, "time (s)", "model less measured (nm)")
-    right.hist(error[np.isfinite(error)] * 1e9, bins=60, orientation="horizontal", color=COLOURS[2])
-    label(right, "samples", "")
     return figure
 
 

@@ -33,7 +33,8 @@ def describe_axis(axis: AxisModel) -> list[str]:
         f"error on blocks left out: {quality.held_out_rms * 1e9:.1f} nm rms; "
         f"sensor noise about {quality.floor_rms * 1e9:.1f} nm rms",
         f"from {quality.samples} samples of {quality.source}",
-        "effects: none",
+        *(f"{effect.name}: {effect.describe()}" for effect in axis.effects),
+        *(() if axis.effects else ("effects: none",)),
     ]
 
 

@@ -1,6 +1,7 @@
 """One axis at run time: its stamps, its limits, its model and memory, and the closed loop if there is one."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import isfinite
 from time import monotonic
 
@@ -11,8 +12,7 @@ from slpi_ros.runtime.health import Drift
 from slpi_ros.runtime.loop import ClosedLoop, LoopSettings
 from slpi_ros.runtime.ramp import Ramp
 from slpi_ros.runtime.rejection import NOT_FINITE, OUT_OF_RANGE, RejectedError
-from slpi_ros.runtime.swap import including, replay, take_over, turning_voltages
-from slpi_ros.runtime.trajectory import twin_of
+from slpi_ros.runtime.swap import including, replay, take_over, turning_voltages, whole_way
 from slpi_ros.stream import AxisStream, Limits, refusal
 
 # What the memory is worth: nobody knows where the stage has been; being wiped; wiped since; kept over a restart.
@@ -89,7 +89,7 @@ class Axis:
     @property
     def went_through(self) -> tuple[float, ...]:
         """Voltages (V) at which the drive turned, oldest first, and last the present one."""
-        return turning_voltages(self._loop.memory if self._loop else self.stream.memory)
+        return whole_way(self._loop.applied if self._loop else self.stream)
 
     def prepare(self, model: AxisModel, went_through: Sequence[float] | None = None) -> AxisStream:
         """Return the stream of a new model, for `use`.
@@ -112,12 +112,15 @@ class Axis:
     def use(self, model: AxisModel, stream: AxisStream) -> None:
         """Go on with a new model; the voltage stays."""
         if self.driven:
-            stream.pace.rate = self.stream.pace.rate
+            stream.resume(self.stream)
         self.model, self.stream, self.driven = model, stream, True
         if self._loop:
-            applied = model.memory()
-            replay(applied, turning_voltages(self._loop.memory))
-            self._loop.swap(including(stream.limits, applied.voltage), applied)
+            memory = model.memory()
+            replay(memory, turning_voltages(self._loop.applied.memory))
+            limits = including(stream.limits, self._loop.voltage)
+            applied = model.stream_from(memory, including(limits, memory.voltage))
+            applied.resume(self._loop.applied)
+            self._loop.swap(limits, applied)
         elif self._loop_settings.enabled:
             self._close_loop()
 
@@ -187,10 +190,12 @@ class Axis:
         """
         stream = self.stream
         dt = stream.pace.counted(ahead)
+        if ahead > dt:
+            stream.wait(ahead - dt)
         v = stream.move(dt, y)
         if self._loop is not None:
-            v = self._loop.correct(dt, y, v, self._now())
-        if stream.memory.displacement == y:
+            v = self._correct(ahead, dt, y, v)
+        if stream.memory.displacement == stream.wish:
             self.held = self.slewing = False
         else:
             missed = stream.missed
@@ -210,9 +215,11 @@ class Axis:
         """
         stream = self.stream
         dt = stream.pace.counted(ahead)
+        if ahead > dt:
+            stream.wait(ahead - dt)
         v = stream.pace.step(stream.voltage, planned, dt, planned_before)
-        stream.drive(v)
-        return self._loop.correct(dt, y, v, self._now()) if self._loop else v
+        stream.drive(v, dt)
+        return self._correct(ahead, dt, y, v) if self._loop else v
 
     def measure(self, displacement: float) -> None:
         """Note a measured displacement (m)."""
@@ -225,7 +232,7 @@ class Axis:
     def start_drive(self, ramp: Ramp) -> None:
         """Leave the desired path, and go where a ramp leads with every `drive`."""
         if self._loop:
-            self.stream.memory.restore(self._loop.memory.snapshot())
+            self.stream.restore(replace(self._loop.applied.snapshot(), rate=self.stream.pace.rate))
         self._ramp = ramp
 
     @property
@@ -236,9 +243,9 @@ class Axis:
     def drive(self, dt: float) -> bool:
         """Move on along the ramp, `dt` (s) later; return whether it has ended."""
         v = self._ramp.step(self.stream.voltage, dt, self.stream.pace)
-        self.stream.drive(v)
+        self.stream.drive(v, dt)
         if self._loop:
-            self._loop.drive(v)
+            self._loop.drive(v, dt)
         return self._ramp.done
 
     def stop_drive(self) -> None:
@@ -255,4 +262,13 @@ class Axis:
 
     def _close_loop(self) -> None:
         stream = self.stream
-        self._loop = ClosedLoop(self._loop_settings, including(stream.limits, stream.voltage), twin_of(stream.memory))
+        self._loop = ClosedLoop(self._loop_settings, including(stream.limits, stream.voltage), stream.twin())
+
+    def _correct(self, ahead: float, dt: float, y: float, v: float) -> float:
+        """Let measurements correct the voltage `v` (V)."""
+        loop = self._loop
+        assert loop
+        loop.applied.coupled = self.stream.coupled
+        if ahead > dt:
+            loop.applied.wait(ahead - dt)
+        return loop.correct(dt, y, v, self._now())

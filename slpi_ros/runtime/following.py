@@ -5,7 +5,8 @@ from math import inf
 
 from slpi_ros.runtime.axis import Axis
 from slpi_ros.runtime.deadlines import Due, Streamer
-from slpi_ros.runtime.trajectory import Plan, Standing, Trajectory, prepare
+from slpi_ros.runtime.plan import Plan, Standing, prepare
+from slpi_ros.runtime.trajectory import Trajectory
 from slpi_ros.stream import ROUNDING, AxisStream
 
 
@@ -19,6 +20,8 @@ class Following:
     Parameters
     ----------
     axes : mapping of name to Axis
+    decouple : callable, optional
+        Told the desired displacements (m) by axis name before the axes move there.
 
     Attributes
     ----------
@@ -26,8 +29,8 @@ class Following:
         Of the last plan: at a voltage limit, or still on their way.
     """
 
-    def __init__(self, axes: Mapping[str, Axis]) -> None:
-        self._axes = axes
+    def __init__(self, axes: Mapping[str, Axis], decouple: Callable[[Mapping[str, float]], None] | None = None) -> None:
+        self._axes, self._decouple = axes, decouple
         self._streamer: Streamer[Plan] = Streamer()
         self._plan: Plan | None = None
         self._streams: dict[str, AxisStream] = {}
@@ -99,6 +102,8 @@ class Following:
             return None
         self._enter(due)
         plan, point = due.points, due.point
+        if self._decouple:
+            self._decouple(dict(zip(plan.trajectory.names, plan.trajectory.positions[point].tolist(), strict=True)))
         for column, name in enumerate(plan.trajectory.names):
             ahead = (due.deadline_ns - self._last_ns[name]) * 1e-9
             self._last_ns[name] = due.deadline_ns

@@ -5,9 +5,8 @@ from math import inf, isfinite
 
 from slpi_ros.control import Feedback, PidGains
 from slpi_ros.errors import SlpiError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.runtime.health import ResidualWindow
-from slpi_ros.stream import Limits, Pace
+from slpi_ros.stream import AxisStream, Limits, Pace
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class LoopSettings:
 
 
 class ClosedLoop:
-    """Feedback of one axis, and the memory that follows the voltage it is really given.
+    """Feedback of one axis, and the model that follows the voltage it is really given.
 
     The inverse model's own memory follows the desired path, as if there were no correction: noise of the sensor must
     not turn it.
@@ -39,22 +38,22 @@ class ClosedLoop:
     settings : LoopSettings
     limits : Limits
         Of the voltage in total.
-    memory : Memory
-        In its present state; owned by the loop from here on.
+    applied : AxisStream
+        In its present state; owned by the loop from here on, which drives it.
     """
 
-    def __init__(self, settings: LoopSettings, limits: Limits, memory: Memory) -> None:
-        self.memory = memory
-        self.residuals = ResidualWindow(memory.displacement)
+    def __init__(self, settings: LoopSettings, limits: Limits, applied: AxisStream) -> None:
+        self.applied = applied
+        self.residuals = ResidualWindow(applied.own)
         self._settings = settings
         self._pace = Pace(limits)
-        self._t, self._wanted = 0.0, memory.voltage
+        self._t, self._wanted = 0.0, applied.voltage
         self._start()
 
     @property
     def voltage(self) -> float:
         """Present voltage in total, volts."""
-        return self.memory.voltage
+        return self.applied.voltage
 
     @property
     def correction(self) -> float:
@@ -66,16 +65,16 @@ class ClosedLoop:
         """Whether the last sample had a measurement to act on."""
         return self._acting
 
-    def swap(self, limits: Limits, memory: Memory) -> None:
-        """Go on with another model's memory; the correction stays."""
+    def swap(self, limits: Limits, applied: AxisStream) -> None:
+        """Go on with another model; the correction stays."""
         self.limit(limits)
-        self.memory = memory
-        self.residuals.forget(memory.displacement)
+        self.applied = applied
+        self.residuals.forget(applied.own)
 
     def settle(self) -> None:
         """Start anew where the axis is, without a correction."""
         self._start()
-        self.residuals.forget(self.memory.displacement)
+        self.residuals.forget(self.applied.own)
 
     def retune(self, settings: LoopSettings) -> None:
         """Go on with other settings, without a jump."""
@@ -111,23 +110,23 @@ class ClosedLoop:
             On the clock of `measure`.
         """
         self._t += dt
-        before = self.memory.voltage
+        before = self.applied.voltage
         self._acting = now - self._measured_at <= self._settings.timeout
         v = wanted = self._give(desired, feedforward)
         if self._pace.limits.acceleration < inf:
             v = self._pace.step(before, wanted, dt, self._wanted)
         self._wanted = wanted
         self._measured_at = -inf
-        self.residuals.expect(self.memory.forward(v))
+        self.residuals.expect(self.applied.drive(v, dt))
         return v
 
-    def drive(self, voltage: float) -> None:
-        """Go to a voltage (V) whatever is desired or measured."""
-        self.residuals.expect(self.memory.forward(voltage))
+    def drive(self, voltage: float, dt: float) -> None:
+        """Go to a voltage (V), `dt` (s) after the last one, whatever is desired or measured."""
+        self.residuals.expect(self.applied.drive(voltage, dt))
 
     def _start(self) -> None:
         """Forget corrections and measurements."""
-        voltage = self.memory.voltage
+        voltage = self.applied.voltage
         self._pace.rest()
         self._t, self._wanted = 0.0, voltage
         self._measured, self._measured_at, self._acting = 0.0, -inf, False

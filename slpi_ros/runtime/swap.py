@@ -37,12 +37,12 @@ def take_over(axis: AxisModel, limits: Limits, went_through: Sequence[float] = (
     try_out(axis, allowed)
     memory = axis.memory()
     if not went_through:
-        return AxisStream(memory, axis.displacement_range, allowed)
+        return axis.stream_from(memory, allowed)
     present = went_through[-1]
     require_near(present, allowed)
     replay(memory, went_through)
     # No jump: a voltage just outside goes inside with the next samples, as fast as it may.
-    stream = AxisStream(memory, axis.displacement_range, including(allowed, present))
+    stream = axis.stream_from(memory, including(allowed, present))
     stream.limits = allowed
     return stream
 
@@ -52,6 +52,12 @@ def turning_voltages(memory: Memory) -> tuple[float, ...]:
     state = memory.snapshot()
     # A primed memory remembers a fall from farther than any stage has been.
     return (*(v for v in state.turn_voltages if abs(v) < FAR / 2), state.voltage)
+
+
+def whole_way(stream: AxisStream) -> tuple[float, ...]:
+    """Return the voltages (V) at which the drive turned, oldest first, and last the command that it lags behind."""
+    turns = turning_voltages(stream.memory)
+    return turns if turns[-1] == stream.voltage else (*turns, stream.voltage)
 
 
 def replay(memory: Memory, voltages: Sequence[float]) -> None:

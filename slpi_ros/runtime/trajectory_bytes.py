@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.runtime.clock import SECOND_NS
+from slpi_ros.runtime.wire import ENCAPSULATION, Reader
 
 # positions, velocities, accelerations, effort
 SEQUENCES = 4
-# Alignment counts from behind the encapsulation.
-ENCAPSULATION = 4
 # Bytes of a point without any numbers.
 SMALLEST_POINT = 24
 
@@ -39,38 +38,6 @@ class TrajectoryArrays:
     positions: NDArray[np.float64]
 
 
-class _Reader:
-    """Reads the parts of a message one by one."""
-
-    def __init__(self, data: bytes) -> None:
-        # The second byte tells the order of bytes: 0 big-endian, 1 little-endian.
-        self.order = "<" if data[1] & 1 else ">"
-        self.data, self.at = data, ENCAPSULATION
-
-    def number(self, kind: str = "I") -> int:
-        self.at += -(self.at - ENCAPSULATION) % 4
-        (value,) = struct.unpack_from(self.order + kind, self.data, self.at)
-        self.at += 4
-        return int(value)
-
-    def string(self) -> str:
-        size = self.number()
-        text = self.data[self.at : self.at + size]
-        if len(text) != size:
-            raise struct.error("a text is cut off")
-        self.at += size
-        return text.rstrip(b"\0").decode()
-
-    def doubles(self) -> tuple[int, int]:
-        """Return how many numbers come, and where they begin."""
-        count = self.number()
-        if count:
-            self.at += -(self.at - ENCAPSULATION) % 8
-        begin = self.at
-        self.at += 8 * count
-        return count, begin
-
-
 @dataclass(frozen=True)
 class _Layout:
     """Where the parts of a point are, relative to its begin."""
@@ -82,7 +49,7 @@ class _Layout:
     size: int
 
     @classmethod
-    def read(cls, reader: _Reader) -> "_Layout":
+    def read(cls, reader: Reader) -> "_Layout":
         begin, counts, offsets, places = reader.at, [], [], []
         for _ in range(SEQUENCES):
             offsets.append(reader.at + -(reader.at - ENCAPSULATION) % 4 - begin)
@@ -104,7 +71,7 @@ def decode_trajectory(data: bytes) -> TrajectoryArrays | None:
 
 
 def _decode(data: bytes) -> TrajectoryArrays | None:
-    reader = _Reader(data)
+    reader = Reader(data)
     start_ns = reader.number("i") * SECOND_NS + reader.number()
     reader.string()
     names = tuple(reader.string() for _ in range(reader.number()))

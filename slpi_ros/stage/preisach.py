@@ -118,6 +118,27 @@ class PreisachStage:
         y_true = np.array([self.step(*sample) for sample in samples], dtype=np.float64)
         return y_true, self._sensor.read(y_true)
 
+    def respond(self, v: FloatArray, relay_voltage: FloatArray) -> FloatArray:
+        """Apply a path of which the relays see something else than the reversible part; amplifier and time have no say.
+
+        Parameters
+        ----------
+        v : ndarray, shape (N,), volts
+            What the reversible part follows.
+        relay_voltage : ndarray, shape (N,), volts
+            What switches the relays, within the threshold range.
+
+        Returns
+        -------
+        ndarray, shape (N,), metres
+            The displacement, without sensor errors.
+        """
+        y = np.empty_like(v)
+        for index, (voltage, seen) in enumerate(zip(v.tolist(), relay_voltage.tolist(), strict=True)):
+            self._relays.step(seen)
+            y[index] = self._bowed(self._sum(voltage))
+        return y
+
     def _step_in_time(self, dynamics: Dynamics, t: float, v: float) -> float:
         self._relays.check(v)
         duration = dynamics.advance(t)
@@ -128,16 +149,19 @@ class PreisachStage:
         return offset + dynamics.follow(duration, self._displacement() - offset)
 
     def _displacement(self) -> float:
-        force = self._sum() - self._bottom
+        return self._bowed(self._sum(self._relays.voltage))
+
+    def _bowed(self, unbowed: float) -> float:
+        force = unbowed - self._bottom
         bow = 4.0 * self.parameters.stiffening * force * (1.0 - force / self.parameters.stroke)
         return self._bottom + force + bow - self._zero
 
-    def _sum(self) -> float:
-        return self._relays.output + self._reversible_gain * self._material.reversible(self._relays.voltage)
+    def _sum(self, voltage: float) -> float:
+        return self._relays.output + self._reversible_gain * self._material.reversible(voltage)
 
     def _unbowed(self, voltage: float) -> float:
         self._relays.step(voltage)
-        return self._sum()
+        return self._sum(voltage)
 
     def _share_stroke(self) -> float:
         """Weight the relays for the wanted hysteresis; return the gain that gives the other part the rest."""

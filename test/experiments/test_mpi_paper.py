@@ -92,7 +92,7 @@ def test_errors_of_fits_are_those_of_the_curves(study, name):
         figures = fit.fitted.maximum, fit.fitted.mean, fit.fitted.root_mean_square
         assert figures == pytest.approx((apart.max(), apart.mean(), np.sqrt(np.mean(apart**2))))
         drive = study.fastest[amplitude]
-        apart = np.abs(fit.model.simulate(drive.v) - drive.y)[-SAMPLES:]
+        apart = np.abs(fit.model.simulate(drive.t, drive.v) - drive.y)[-SAMPLES:]
         assert (fit.following.maximum, fit.following.mean) == pytest.approx((apart.max(), apart.mean()))
 
 

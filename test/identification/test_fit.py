@@ -215,7 +215,7 @@ def test_several_records_share_one_model(recorded):
     assert joint.start.voltage == alone.start.voltage
     assert joint.start.displacement == pytest.approx(alone.start.displacement, abs=2e-8)
     # It is still the model of the first record, to the noise.
-    error = joint.simulate(first.voltage["x"]) - first.displacement["x"]
+    error = joint.simulate(first.t, first.voltage["x"]) - first.displacement["x"]
     assert rms(error) < 1.2 * alone.quality.rms
     assert joint.quality.held_out_rms < 2 * joint.quality.floor_rms
 

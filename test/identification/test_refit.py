@@ -67,7 +67,7 @@ def test_the_new_model_is_a_whole_document(model):
     t, v = small_loops()
     new, _ = refit(model, record_of(t, v, stage(SEED).run(t, v)[1]))
     again = parse_model(format_model(new), "test")
-    np.testing.assert_array_equal(again.axes["x"].simulate(v), new.axes["x"].simulate(v))
+    np.testing.assert_array_equal(again.axes["x"].simulate(t, v), new.axes["x"].simulate(t, v))
     assert again.axes["x"].quality.samples == model.axes["x"].quality.samples + v.size
     assert again.axes["x"].voltage_range == model.axes["x"].voltage_range
 
@@ -85,7 +85,7 @@ def test_classical_model_too():
     t, v = calibration_drive(0.0, 100.0, duration=15.0, rate=200.0, seed=3)
     y = drifted_stage(1.1).run(t, v)[1]
     new, _ = refit(old, record_of(t, v, y))
-    assert rms(new.axes["x"].simulate(v) - y) < 0.7 * rms(old.axes["x"].simulate(v) - y)
+    assert rms(new.axes["x"].simulate(t, v) - y) < 0.7 * rms(old.axes["x"].simulate(t, v) - y)
 
 
 def test_what_cannot_be_updated_is_refused(model):

@@ -42,4 +42,4 @@ def test_a_thinned_fit_is_nearly_as_good(monkeypatch, kind):
     part = slpi_ros.identify(record, kind).axes["x"]
     assert part.quality.samples < 0.6 * whole.quality.samples
     v, y = record.voltage["x"], record.displacement["x"]
-    assert rms(part.simulate(v) - y) < 1.1 * rms(whole.simulate(v) - y)
+    assert rms(part.simulate(record.t, v) - y) < 1.1 * rms(whole.simulate(record.t, v) - y)

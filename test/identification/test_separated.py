@@ -22,6 +22,7 @@ def ramps(*turns):
 
 
 PATH = ramps(0.0, 80, 12, 68, 20, 100, -1)
+TIME = 0.1 * np.arange(PATH.size)
 THRESHOLDS = np.arange(0.0, 50.0, 5.0)
 
 
@@ -55,7 +56,7 @@ def test_recovers_the_weights_of_every_loop():
         # Operators that the loop does not move are not seen.
         moved = got.span[0] - 1 > 2 * THRESHOLDS
         np.testing.assert_allclose(got.model.weights[moved], expected.model.weights[moved], atol=2e-3 * 1e-7)
-    np.testing.assert_allclose(model.axes["x"].simulate(PATH), y, atol=1e-6 * np.ptp(y))
+    np.testing.assert_allclose(model.axes["x"].simulate(TIME, PATH), y, atol=1e-6 * np.ptp(y))
 
 
 def test_loops_close_and_describe_the_record_better_than_at_rest():
@@ -64,7 +65,7 @@ def test_loops_close_and_describe_the_record_better_than_at_rest():
     error = {}
     for at_rest in (True, False):
         axis = identify(record, "slpi-published", loops_at_rest=at_rest).axes["x"]
-        error[at_rest] = rms(axis.simulate(PATH) - y)
+        error[at_rest] = rms(axis.simulate(TIME, PATH) - y)
         assert axis.quality.rms == pytest.approx(error[at_rest])
         gaps = [
             abs(single.memory().forward_array(np.array([0.0, single.span[0], 0.0]))[-1])
@@ -73,15 +74,17 @@ def test_loops_close_and_describe_the_record_better_than_at_rest():
         ]
         assert max(gaps) < 1e-9 * np.ptp(y) if not at_rest else min(gaps) > 1e-3 * np.ptp(y)
     assert error[False] < error[True]
-    assert error[False] < 0.7 * rms(identify(record, "pi").axes["x"].simulate(PATH) - y)
+    assert error[False] < 0.7 * rms(identify(record, "pi").axes["x"].simulate(TIME, PATH) - y)
 
 
 def test_document_gives_the_same_model_back():
     model = identify(stage_record(), "slpi-published")
     again = parse_model(format_model(model), "test")
-    np.testing.assert_array_equal(again.axes["x"].simulate(PATH), model.axes["x"].simulate(PATH))
-    desired = model.axes["x"].simulate(PATH)
-    np.testing.assert_array_equal(again.axes["x"].compensate(desired)[0], model.axes["x"].compensate(desired)[0])
+    np.testing.assert_array_equal(again.axes["x"].simulate(TIME, PATH), model.axes["x"].simulate(TIME, PATH))
+    desired = model.axes["x"].simulate(TIME, PATH)
+    np.testing.assert_array_equal(
+        again.axes["x"].compensate(TIME, desired)[0], model.axes["x"].compensate(TIME, desired)[0]
+    )
 
 
 def test_compensates_a_path_with_the_same_loops():
@@ -138,5 +141,5 @@ def test_noise_of_the_measured_voltage_makes_no_loops():
     axis = identify(record_of(record.t, noisy, record.displacement["x"]), "slpi-published").axes["x"]
     assert len(axis.hysteresis.loops) == len(separate(PATH).loops)
     clean = identify(record, "slpi-published").axes["x"]
-    assert rms(axis.simulate(noisy) - record.displacement["x"]) < 1.2 * clean.quality.rms + 3 * 0.05 * 0.25e-6
+    assert rms(axis.simulate(TIME, noisy) - record.displacement["x"]) < 1.2 * clean.quality.rms + 3 * 0.05 * 0.25e-6
     assert clean.hysteresis.dead_band < 1e-9

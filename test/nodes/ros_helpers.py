@@ -24,9 +24,7 @@ from slpi_ros.hysteresis.family import LoopFamily
 from slpi_ros.model import AxisModel, FitQuality, StageModel, Start
 
 RELIABLE = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
-LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Only what hangs takes as long.
 PATIENCE_S = 60.0
 
@@ -38,9 +36,7 @@ class NodeProcess:
         given = [part for key, value in parameters.items() for part in ("-p", f"{key}:={yaml_of(value)}")]
         command = [sys.executable, "-m", f"slpi_ros.nodes.{name}", "--ros-args", *given, *arguments]
         self._stderr = tempfile.TemporaryFile("w+")  # noqa: SIM115
-        self.process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=self._stderr, start_new_session=True
-        )
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=self._stderr, start_new_session=True)
 
     @property
     def stderr(self) -> str:

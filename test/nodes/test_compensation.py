@@ -37,7 +37,10 @@ def snapshots(made):
 def test_answers_are_the_library_s():
     model = stage_model(("x", "y"))
     made = compensation(("x", "y"))
-    wanted = {axis: model.axis(axis).simulate(voltage_path(3000, seed)) for seed, axis in enumerate("xy")}
+    wanted = {
+        axis: model.axis(axis).simulate(np.arange(3000) * 5e-3, voltage_path(3000, seed))
+        for seed, axis in enumerate("xy")
+    }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HeldAtLimitWarning)
         expected = model.compensate(np.arange(3000) * 5e-3, wanted)
@@ -120,7 +123,7 @@ def test_what_is_just_out_of_reach_is_held_and_the_path_after_it_is_as_before():
 
 def test_slew_is_respected_from_the_first_sample_on():
     made = compensation(slew=500.0)
-    path = stage_model().axis("x").simulate(voltage_path(2000, 3))
+    path = stage_model().axis("x").simulate(np.arange(2000) * 5e-3, voltage_path(2000, 3))
     last = made.voltages[0]
     reached = 0
     for i, y in enumerate(path):
@@ -134,7 +137,7 @@ def test_slew_is_respected_from_the_first_sample_on():
 @pytest.mark.parametrize("slew", [math.inf, 200.0])
 def test_a_new_model_takes_over_where_the_voltage_is(slew):
     made = compensation(slew=slew)
-    path = stage_model().axis("x").simulate(voltage_path(400, 5))
+    path = stage_model().axis("x").simulate(np.arange(400) * 5e-3, voltage_path(400, 5))
     rng = np.random.default_rng(7)
     for i, y in enumerate(path):
         if i % 3 == 0:

@@ -37,7 +37,10 @@ def x_file(tmp_path: Path) -> str:
 
 def desired_path(model, samples, axes=("x",)):
     return np.column_stack(
-        [model.axis(axis).simulate(voltage_path(samples, seed)) for seed, axis in enumerate(axes)]
+        [
+            model.axis(axis).simulate(np.arange(samples) * 5e-3, voltage_path(samples, seed))
+            for seed, axis in enumerate(axes)
+        ]
     )
 
 

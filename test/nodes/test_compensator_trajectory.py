@@ -51,7 +51,9 @@ def library(path: np.ndarray, axes=("x", "y")) -> np.ndarray:
 
 def wide_path(samples: int, axes=("x", "y")) -> np.ndarray:
     model = stage_model(axes)
-    return np.column_stack([model.axis(a).simulate(voltage_path(samples, seed)) for seed, a in enumerate(axes)])
+    return np.column_stack(
+        [model.axis(a).simulate(np.arange(samples), voltage_path(samples, seed)) for seed, a in enumerate(axes)]
+    )
 
 
 def test_a_trajectory_is_given_point_by_point_at_its_times(xy_file):

@@ -42,7 +42,10 @@ def model_file(tmp_path: Path) -> str:
 
 
 def desired(samples: int, seed: int = 0) -> list[list[float]]:
-    paths = [0.95 * MODEL.axis(axis).simulate(voltage_path(samples, seed + i)) for i, axis in enumerate(AXES)]
+    paths = [
+        0.95 * MODEL.axis(axis).simulate(np.arange(samples), voltage_path(samples, seed + i))
+        for i, axis in enumerate(AXES)
+    ]
     return np.column_stack(paths).tolist()
 
 

@@ -42,7 +42,7 @@ QUICK = {"kind": "pi", "diagnostic_period": 0.2}
 
 def write_calibration(path: Path, seed: int = 1, samples: int = 600) -> str:
     v = voltage_path(samples, seed)
-    y = stage_model().axis("x").simulate(v) + np.random.default_rng(seed).normal(0.0, 5e-9, samples)
+    y = stage_model().axis("x").simulate(np.arange(samples), v) + np.random.default_rng(seed).normal(0.0, 5e-9, samples)
     stamps = 1_700_000_000_000_000_000 + np.arange(samples, dtype=np.int64) * 5_000_000
     write_bag(path, Record(stamps, {"x": v}, {"x": y}, hardware_id="stage 7"))
     return str(path)

@@ -17,8 +17,9 @@ from slpi_ros.hysteresis.smpi import AmplitudeScaled
 from slpi_ros.model import AxisModel, FitQuality, Start
 from slpi_ros.runtime import deadlines, rejection
 from slpi_ros.runtime.deadlines import Streamer
+from slpi_ros.runtime.plan import Plan, Resting, Standing, prepare, stream_twin_of
 from slpi_ros.runtime.rejection import RejectedError
-from slpi_ros.runtime.trajectory import Plan, Resting, Standing, Trajectory, prepare, stream_twin_of
+from slpi_ros.runtime.trajectory import Trajectory
 from slpi_ros.stream import LONGEST_STEP, AxisStream, Limits, accepted_range
 
 MS = 1_000_000
@@ -515,7 +516,7 @@ def known_path(limits: Limits, voltage: float = -10.0, step: int = MS) -> Plan:
 
 def test_a_model_that_needs_the_whole_path_gets_it():
     plan = known_path(Limits(-10.0, 110.0))
-    v, held = PATH_MODEL.compensate(1e-6 + 70e-6 * SPREAD)
+    v, held = PATH_MODEL.compensate(np.arange(SPREAD.size), 1e-6 + 70e-6 * SPREAD)
     assert plan.voltages[:, 0].tolist() == v.tolist()
     assert np.ptp(v) > 80
     assert plan.held[:, 0].tolist() == held.tolist() and not plan.slewed.any()

@@ -1,0 +1,134 @@
+"""An attempt at a hidden record: the stage, its drives, and effects of a strength that is still open."""
+
+from collections.abc import Iterable
+from dataclasses import fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.excitation.legs import Room
+from slpi_ros.stage.amplifier import Amplifier
+from slpi_ros.stage.bouc_wen import BoucWen
+from slpi_ros.stage.chain import Physics, own_motion, sensed
+from slpi_ros.stage.parameters import StageParameters
+
+from .drives import drive, log_uniform
+from .nature import DRAWS, NAMES, Nature, Setting
+from .size import beyond_hysteresis, beyond_identified
+
+FloatArray = NDArray[np.float64]
+Base = StageParameters | BoucWen
+
+BASES = ("preisach", "stiffening", "bouc_wen")
+NOISE = (3e-9, 15e-9)
+# A size that was asked for is met within this share of it.
+CLOSE = 0.15
+# Effects that take their time.
+SLOW = {"creep", "thermal_drift"}
+# Seconds. Where the samples allow, records take no less.
+SHORTEST = 20.0
+
+
+class Draw:
+    """One attempt: a stage, its drives, and effects of a strength that is still open."""
+
+    def __init__(self, rng: np.random.Generator, effects: tuple[str, ...], base: str, axes: int, samples: int) -> None:
+        self.rng, self.axes = rng, ("x", "y")[:axes]
+        self.victim = str(rng.choice(self.axes))
+        duration, rate = _timing(rng, effects, samples)
+        self.stage = {axis: _stage(rng, base) for axis in self.axes}
+        self.noise = {axis: float(rng.uniform(*NOISE)) for axis in self.axes}
+        rooms = {axis: Room(0.0, float(rng.uniform(70.0, 110.0)), duration, rate) for axis in self.axes}
+        self.v = {
+            axis: drive(room, effects if axis == self.victim else _others(rng), rng) for axis, room in rooms.items()
+        }
+        self.time_ns = _stamps(rng, self.v[self.victim].size, rate)
+        self.t = (self.time_ns - self.time_ns[0]) * 1e-9
+        room = rooms[self.victim]
+        other = next((axis for axis in self.axes if axis != self.victim), "")
+        setting = Setting(self.t, rate, room.low, room.high, other)
+        self.natures = {effect: DRAWS[effect](rng, setting) for effect in effects}
+        self._own: dict[tuple[object, ...], FloatArray] = {}
+
+    def reading(self, axis: str, physics: Physics) -> FloatArray:
+        """Return what the sensor of an axis shows without noise; the other axes have no effects."""
+        motion = {name: self._motion(name, physics if name == axis else Physics()) for name in self.axes}
+        return sensed(physics, self.t, motion, axis)
+
+    def _motion(self, axis: str, physics: Physics) -> FloatArray:
+        key = (axis, physics.amplifier, physics.viscosity, physics.creep, physics.flexure)
+        if key not in self._own:
+            self._own[key] = own_motion(self.stage[axis], physics, self.t, self.v[axis])
+        return self._own[key]
+
+    def rms(self, physics: Physics) -> float:
+        """Return what a refit of the hysteresis leaves of an effect, metres."""
+        with_it, without = self.reading(self.victim, physics), self.reading(self.victim, Physics())
+        if physics.amplifier and physics.amplifier.clips:
+            return beyond_identified(self.time_ns, self.v[self.victim], with_it)
+        return beyond_hysteresis(self.v[self.victim], with_it - without)
+
+    def strength(self, nature: Nature, wanted: float) -> tuple[float, float]:
+        """Return a strength that leaves about the wanted rms (m), and what it does leave."""
+        strength = float(np.sqrt(nature.weakest * nature.strongest))
+        found = self.rms(nature.physics(strength))
+        for _ in range(3):
+            if abs(found / wanted - 1.0) < CLOSE:
+                break
+            after = float(np.clip(strength * wanted / max(found, 1e-12), nature.weakest, nature.strongest))
+            if after == strength:
+                break
+            strength, found = after, self.rms(nature.physics(after))
+        return strength, found
+
+
+def _timing(rng: np.random.Generator, effects: tuple[str, ...], samples: int) -> tuple[float, float]:
+    """Return duration (s) and samples per second."""
+    rates = [1000.0, 2000.0] if {"resonance", "delay"} & set(effects) else [500.0, 1000.0, 2000.0]
+    rate = float(rng.choice([rate for rate in rates if rate * SHORTEST < samples] or rates[:1]))
+    shortest = 40.0 if SLOW & set(effects) else SHORTEST
+    return min(log_uniform(rng, shortest, 80.0), (samples - 1) / rate), rate
+
+
+def _stage(rng: np.random.Generator, base: str) -> Base:
+    if base == "bouc_wen":
+        softening = float(rng.uniform(0.03, 0.08))
+        return BoucWen(
+            gain=float(rng.uniform(0.2e-6, 0.28e-6)),
+            share=float(rng.uniform(0.25, 0.45)),
+            softening=softening,
+            asymmetry=softening * float(rng.uniform(-0.5, 0.5)),
+            offset=float(rng.uniform(-0.2e-6, 0.2e-6)),
+        )
+    drawn = StageParameters.random(int(rng.integers(2**31)))
+    return drawn if base == "stiffening" else replace(drawn, stiffening=0.0)
+
+
+def _others(rng: np.random.Generator) -> tuple[str, ...]:
+    """Return what the drive of an axis without effects looks as if it were made for."""
+    return (str(rng.choice([name for name in NAMES if name != "cross_coupling"])),)
+
+
+def _stamps(rng: np.random.Generator, count: int, rate: float) -> NDArray[np.int64]:
+    late = rng.uniform(0.0, 0.1, count) if rng.random() < 0.2 else np.zeros(count)
+    start = 1_700_000_000_000_000_000 + int(rng.integers(10**15))
+    return start + np.round((np.arange(count) + late) / rate * 1e9).astype(np.int64)
+
+
+def together(parts: Iterable[Physics]) -> Physics:
+    """Return the physics that has all that each of several has."""
+    found: dict[str, object] = {}
+    for part in parts:
+        for item in fields(part):
+            value = getattr(part, item.name)
+            if item.name == "amplifier" and value and "amplifier" in found:
+                value = _one_amplifier(found["amplifier"], value)
+            if value:
+                found[item.name] = value
+    return Physics(**found)
+
+
+def _one_amplifier(first: Amplifier, second: Amplifier) -> Amplifier:
+    plain = Amplifier()
+    changed = {item.name: getattr(second, item.name) for item in fields(second)}
+    return replace(first, **{name: value for name, value in changed.items() if value != getattr(plain, name)})

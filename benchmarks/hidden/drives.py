@@ -1,0 +1,155 @@
+"""Voltages of hidden records: sections of many kinds, so that no two records are alike."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.excitation.drives import CALIBRATION, excite
+from slpi_ros.excitation.legs import Path, Room
+
+FloatArray = NDArray[np.float64]
+Section = Callable[[Path, np.random.Generator, float], None]
+
+# Ranges of travel per second.
+SLOWEST, FASTEST = 0.15, 4.0
+# So often the package's own drives take the place of the sections.
+OWN_DRIVES = 0.25
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _move(path: Path, rng: np.random.Generator, to: float, slowest: float = SLOWEST, fastest: float = FASTEST) -> None:
+    seconds = max(abs(to - path.at), 0.03) / log_uniform(rng, slowest, fastest)
+    path.to(to, seconds, straight=bool(rng.random() < 0.4))
+
+
+def _spent(path: Path) -> float:
+    return sum(leg.seconds for leg in path.legs)
+
+
+def varied(path: Path, rng: np.random.Generator, seconds: float) -> None:
+    """Go to random levels at random speeds, with a hold now and then."""
+    end = _spent(path) + seconds
+    while _spent(path) < end:
+        _move(path, rng, float(rng.uniform(0.0, 1.0)))
+        if rng.random() < 0.2:
+            path.hold(log_uniform(rng, 0.05, 1.5))
+
+
+def tempos(path: Path, rng: np.random.Generator, seconds: float) -> None:
+    """Run loops of random spans, each at several speeds."""
+    for _ in range(2):
+        low, high = np.sort(rng.uniform(0.0, 1.0, 2))
+        high = min(max(high, low + 0.2), 1.0)
+        for speed in rng.permutation(np.geomspace(0.3, FASTEST, 4)):
+            straight, leg = bool(rng.random() < 0.5), (high - low) / speed
+            for _ in range(max(1, round(seconds / 8 / (2 * leg)))):
+                path.to(high, leg, straight=straight)
+                path.to(low, leg, straight=straight)
+
+
+def peaks(path: Path, rng: np.random.Generator, seconds: float) -> None:
+    """Come up to both ends of the range, at random speeds, and turn at random depths between."""
+    end = _spent(path) + seconds
+    while _spent(path) < end:
+        _move(path, rng, float(rng.uniform(0.9, 1.0)))
+        if rng.random() < 0.3:
+            path.hold(log_uniform(rng, 0.05, 0.5))
+        _move(path, rng, float(rng.choice([rng.uniform(0.0, 0.08), rng.uniform(0.1, 0.85)])))
+
+
+def holds(path: Path, rng: np.random.Generator, seconds: float) -> None:
+    """Move quickly and stay, for short and for long."""
+    end = _spent(path) + seconds
+    while _spent(path) < end:
+        _move(path, rng, float(rng.uniform(0.0, 1.0)), 1.0, FASTEST)
+        path.hold(log_uniform(rng, 0.3, 6.0))
+
+
+def steps(path: Path, rng: np.random.Generator, seconds: float) -> None:
+    """Jump by a small step and stay until it has rung down."""
+    step, pause = log_uniform(rng, 0.004, 0.06), rng.uniform(0.15, 0.5)
+    end = _spent(path) + seconds
+    while _spent(path) < end:
+        _move(path, rng, float(rng.uniform(0.1, 0.9)))
+        for _ in range(int(rng.integers(2, 6))):
+            way = 1.0 if path.at + step < 0.98 and rng.random() < 0.5 else -1.0
+            path.to(max(path.at + way * step, 0.0), float(rng.uniform(0.0, 0.004)), straight=True)
+            path.hold(pause)
+
+
+def ramps(path: Path, rng: np.random.Generator, seconds: float) -> None:
+    """Go up and down slowly and steadily."""
+    end = _spent(path) + seconds
+    while _spent(path) < end:
+        to = float(rng.uniform(0.6, 1.0) if path.at < 0.5 else rng.uniform(0.0, 0.4))
+        path.to(to, abs(to - path.at) / log_uniform(rng, 0.1, 0.5), straight=True)
+
+
+def nests(path: Path, rng: np.random.Generator, seconds: float) -> None:
+    """Run loops within loops that close in on random levels."""
+    end = _spent(path) + seconds
+    while _spent(path) < end:
+        centre, left = rng.uniform(0.2, 0.8), 1.0
+        while left > 0.05:
+            _move(path, rng, centre + (1.0 - centre) * left, 0.4, 2.5)
+            _move(path, rng, centre - centre * left, 0.4, 2.5)
+            left *= rng.uniform(0.5, 0.85)
+
+
+# What a record must hold so that an effect can be told from others.
+NEEDED: dict[str, tuple[Section, ...]] = {
+    "delay": (tempos, varied),
+    "lag": (tempos, varied),
+    "saturation": (peaks,),
+    "rate_dependence": (tempos, varied),
+    "creep": (holds,),
+    "resonance": (steps,),
+    "cross_coupling": (varied,),
+    "thermal_drift": (varied,),
+    "sensor_periodic": (ramps,),
+    "hum": (holds,),
+}
+_ANY: tuple[Section, ...] = (varied, nests, tempos, peaks, holds)
+
+
+def drive(room: Room, effects: tuple[str, ...], rng: np.random.Generator) -> FloatArray:
+    """Draw the voltages of one axis, from rest and back.
+
+    Parameters
+    ----------
+    room : Room
+    effects : tuple of str
+        What the record must make visible.
+
+    Returns
+    -------
+    ndarray, shape (room.steps + 1,), volts
+    """
+    single = [effect for effect in effects if effect != "cross_coupling"]
+    if len(single) == 1 and rng.random() < OWN_DRIVES:
+        return _own(room, single[0], int(rng.integers(2**31)))
+    sections = list(dict.fromkeys(section for effect in effects for section in NEEDED[effect]))
+    sections += [_ANY[index] for index in rng.choice(len(_ANY), 2 if len(sections) < 2 else 1, replace=False)]
+    shares = rng.dirichlet(np.full(len(sections), 8.0)) * 0.9 * room.duration
+    path = Path()
+    path.hold(float(rng.uniform(0.1, 1.0)))
+    for to in (1.0, 0.0, 1.0, 0.0):
+        _move(path, rng, to, 0.6, 1.5)
+    for index in rng.permutation(len(sections)):
+        sections[index](path, rng, float(shares[index]))
+    path.to(0.0, 1.0)
+    path.hold(0.2)
+    return path.voltages(room)
+
+
+def _own(room: Room, effect: str, seed: int) -> FloatArray:
+    """Return a calibration drive and then the drive that is made for an effect, each half of the time."""
+    first = room.steps // 2
+    limits = {"voltage_min": room.low, "voltage_max": room.high, "rate": room.rate, "seed": seed}
+    calibration = excite(duration=first / room.rate, drive=CALIBRATION, **limits)
+    made = excite(duration=(room.steps - first) / room.rate, drive=effect, **limits)
+    return np.concatenate([calibration.voltage["x"], made.voltage["x"][1:]])

@@ -1,0 +1,188 @@
+"""Draws of the ten effects: the physics of each and the parameters by which it is known."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.stage.amplifier import Amplifier
+from slpi_ros.stage.chain import Flexure, Physics, SlowDomains
+from slpi_ros.stage.creep import Creep
+from slpi_ros.stage.surroundings import Hum, Interferometer, Temperature
+from slpi_ros.stage.viscosity import RateLaw, Viscosity
+
+from .drives import log_uniform
+
+FloatArray = NDArray[np.float64]
+Parameters = Mapping[str, float | tuple[float, ...] | Mapping[str, float]]
+
+# Pairs of which nobody could tell that they are two.
+CONFUSABLE = ({"delay", "lag"},)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a draw may look at."""
+
+    t: FloatArray
+    rate: float
+    low: float
+    high: float
+    other: str
+
+
+@dataclass(frozen=True)
+class Nature:
+    """One effect of a strength that is still open, within bounds.
+
+    Parameters
+    ----------
+    weakest, strongest : float
+        Bounds of the strength.
+    physics : callable
+        Strength in, the only part of a stage's physics that is not empty out.
+    parameters : callable
+        Strength in, parameters by the package's names out.
+    """
+
+    weakest: float
+    strongest: float
+    physics: Callable[[float], Physics]
+    parameters: Callable[[float], Parameters]
+
+
+def _delay(rng: np.random.Generator, setting: Setting) -> Nature:
+    return Nature(0.5e-3, 20e-3, lambda s: Physics(amplifier=Amplifier(delay=s)), lambda s: {"seconds": s})
+
+
+def _lag(rng: np.random.Generator, setting: Setting) -> Nature:
+    return Nature(1e-3, 20e-3, lambda s: Physics(amplifier=Amplifier(lag=s)), lambda s: {"time_constant": s})
+
+
+def _saturation(rng: np.random.Generator, setting: Setting) -> Nature:
+    # The strength is the share of the range that is cut off. What a refit leaves of it does not grow with it.
+    depth = log_uniform(rng, 0.03, 0.25)
+    softness = float(rng.uniform(0.05, 0.4)) if rng.random() < 0.3 else 0.0
+    below = float(rng.uniform(0.3, 1.0)) if rng.random() < 0.3 else 0.0
+
+    def limits(strength: float) -> dict[str, float]:
+        span = setting.high - setting.low
+        upper = {"upper": setting.high - strength * span}
+        return upper | ({"lower": setting.low + below * strength * span} if below else {})
+
+    return Nature(depth, depth, lambda s: Physics(amplifier=Amplifier(softness=softness, **limits(s))), limits)
+
+
+def _rate_dependence(rng: np.random.Generator, setting: Setting) -> Nature:
+    exponent = float(rng.uniform(0.3, 0.8)) if rng.random() < 0.5 else 0.0
+    onset, transition = log_uniform(rng, 3.0, 30.0), float(rng.uniform(3.0, 12.0))
+    settling = log_uniform(rng, 0.5e-3, 5e-3)
+    form = "coercivity" if rng.random() < 0.5 else "friction"
+    bounds = (0.02, 6.0) if form == "coercivity" else (5e-9, 1e-6)
+
+    def physics(strength: float) -> Physics:
+        law = RateLaw(strength, exponent=exponent, onset=onset, settling=settling)
+        return Physics(viscosity=Viscosity(law, form, transition))
+
+    return Nature(*bounds, physics, lambda s: {"exponent": exponent} if exponent else {})
+
+
+def _creep(rng: np.random.Generator, setting: Setting) -> Nature:
+    if rng.random() < 0.5:
+        chain = Creep(1.0, float(rng.uniform(0.05, 0.3)), log_uniform(rng, 10.0, 300.0))
+        times, gains = chain.time_constants, chain.gains
+    else:
+        times = np.sort([log_uniform(rng, 0.15, 40.0) for _ in range(int(rng.integers(1, 4)))])
+        gains = rng.uniform(0.5, 1.5, times.size)
+
+    def parameters(strength: float) -> dict[str, tuple[float, ...]]:
+        return {"time_constants": tuple(times.tolist()), "gains": tuple((strength * gains).tolist())}
+
+    return Nature(
+        5e-4,
+        0.08,
+        lambda s: Physics(creep=SlowDomains(**parameters(s))),
+        parameters,
+    )
+
+
+def _resonance(rng: np.random.Generator, setting: Setting) -> Nature:
+    # The strength is one over the damping, of which only the noise can make a weak effect.
+    frequency, damping = log_uniform(rng, 50.0, min(400.0, setting.rate / 5)), log_uniform(rng, 0.012, 0.08)
+    return Nature(
+        1 / (1.2 * damping),
+        1.2 / damping,
+        lambda s: Physics(flexure=Flexure(frequency, 1 / s)),
+        lambda s: {"frequency": frequency, "damping": 1 / s},
+    )
+
+
+def _cross_coupling(rng: np.random.Generator, setting: Setting) -> Nature:
+    sign = float(rng.choice([-1.0, 1.0]))
+    return Nature(
+        1e-3,
+        3e-2,
+        lambda s: Physics(coupling={setting.other: sign * s}),
+        lambda s: {"gains": {setting.other: sign * s}},
+    )
+
+
+def _thermal_drift(rng: np.random.Generator, setting: Setting) -> Nature:
+    duration, sign = float(setting.t[-1]), float(rng.choice([-1.0, 1.0]))
+    form = str(rng.choice(["ramp", "settling", "sine", "wandering"]))
+    time = float(rng.uniform(0.25, 1.0)) * duration if form == "settling" else max(45.0, rng.uniform(0.7, 3) * duration)
+    phase, seed = float(rng.uniform(0, 2 * np.pi)), int(rng.integers(2**31))
+    times = np.linspace(0.0, duration, 41)
+
+    def temperature(strength: float) -> Temperature:
+        return Temperature(sign * strength, form, time, phase, seed)
+
+    return Nature(
+        1e-8,
+        5e-6,
+        lambda s: Physics(temperature=temperature(s)),
+        lambda s: {"times": tuple(times), "values": tuple(temperature(s).path(times))},
+    )
+
+
+def _sensor_periodic(rng: np.random.Generator, setting: Setting) -> Nature:
+    period = float(rng.choice([158e-9, 266e-9, 316e-9, 388e-9, 633e-9]))
+    phase = float(rng.uniform(-np.pi, np.pi))
+    radians = period / (2 * np.pi)
+
+    def interferometer(strength: float) -> Interferometer:
+        return Interferometer(period, strength, phase, "offsets" if strength < 0.15 * radians else "sine")
+
+    return Nature(
+        0.02 * radians,
+        0.6 * radians,
+        lambda s: Physics(interferometer=interferometer(s)),
+        lambda s: {"period": period, "amplitude": s, "phase": phase},
+    )
+
+
+def _hum(rng: np.random.Generator, setting: Setting) -> Nature:
+    frequency = float(rng.choice([50.0, 60.0, 100.0, rng.uniform(30.0, 200.0)], p=[0.35, 0.25, 0.15, 0.25]))
+    phase = float(rng.uniform(-np.pi, np.pi))
+    return Nature(
+        2e-9,
+        1e-6,
+        lambda s: Physics(hum=Hum(frequency, s, phase)),
+        lambda s: {"frequency": frequency, "amplitude": s, "phase": phase},
+    )
+
+
+DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
+    "delay": _delay,
+    "lag": _lag,
+    "saturation": _saturation,
+    "rate_dependence": _rate_dependence,
+    "creep": _creep,
+    "resonance": _resonance,
+    "cross_coupling": _cross_coupling,
+    "thermal_drift": _thermal_drift,
+    "sensor_periodic": _sensor_periodic,
+    "hum": _hum,
+}
+NAMES = tuple(DRAWS)

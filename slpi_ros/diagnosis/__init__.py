@@ -1,0 +1,1 @@
+"""What a model gets wrong on a record, and why."""

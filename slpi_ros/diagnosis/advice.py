@@ -1,0 +1,40 @@
+"""What to record next, where a record does not tell."""
+
+from collections.abc import Sequence
+
+from slpi_ros.excitation.effects import for_effect
+
+# Which drive separates effects that a record leaves open: the first pair that is among them decides.
+SEPARATES = (
+    ({"lag", "delay"}, "lag"),
+    ({"lag", "rate_dependence"}, "rate_dependence"),
+    ({"delay", "rate_dependence"}, "rate_dependence"),
+    ({"creep", "thermal_drift"}, "thermal_drift"),
+    ({"creep", "lag"}, "creep"),
+    ({"creep", "delay"}, "creep"),
+    ({"creep", "rate_dependence"}, "creep"),
+    ({"resonance", "lag"}, "resonance"),
+    ({"resonance", "delay"}, "resonance"),
+)
+OTHER_FREQUENCIES = "This record has one drive frequency; other frequencies tell these apart. "
+ANOTHER_HYSTERESIS = {
+    "loops that do not close": "No model with return-point memory can follow loops that do not close: compensate with "
+    "feedback, and record the drive of `slpi excite --for creep` to see whether they close where time is left.",
+    "loops that depend on level": "Loops between the same two voltages differ with the level they hang on, which no "
+    "model here can follow: identify on drives like those to be compensated, or compensate with feedback.",
+    "loops that depend on bias": "The shape of the loops depends on the bias voltage, which the kind of the given "
+    "model cannot follow: identify this record with kind 'slpi'; no new one is needed.",
+}
+MORE_LOOPS = "Record the drive of `slpi excite`, which visits loops of every size at several speeds, and diagnose that."
+
+
+def separating(names: Sequence[str], *, one_speed: bool) -> str:
+    """Return the experiment that separates effects, the likeliest first, in a sentence."""
+    chosen = next((drive for pair, drive in SEPARATES if pair <= set(names)), names[0])
+    why = for_effect(chosen).why
+    return f"{OTHER_FREQUENCIES if one_speed else ''}Record the drive of `slpi excite --for {chosen}`. {why}"
+
+
+def of_structure(structure: str) -> str:
+    """Return what to do where the hysteresis itself is wrong, in a sentence."""
+    return ANOTHER_HYSTERESIS[structure]

@@ -1,0 +1,162 @@
+"""From a record and a model to what the model gets wrong, why, and the model that gets it right."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from slpi_ros.diagnosis.evidence import evidence_of
+from slpi_ros.diagnosis.explanation import Evidence, Explanation
+from slpi_ros.diagnosis.judge import judged
+from slpi_ros.diagnosis.selection import counts, select
+from slpi_ros.diagnosis.verdict import AxisDiagnosis, Diagnosis
+from slpi_ros.errors import IdentificationError, SlpiError, UsageError
+from slpi_ros.identification.bases import PlayBasis
+from slpi_ros.identification.floor import Floor, floor_of
+from slpi_ros.identification.record import Record
+from slpi_ros.model import AxisModel, StageModel, Start
+
+FloatArray = NDArray[np.float64]
+
+# A model is of another stage when its error is more than this share of the displacement range, and this many times
+# that of one fitted to the record.
+FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
+
+
+def diagnose(
+    record: Record,
+    model: StageModel,
+    *,
+    axes: Sequence[str] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Diagnosis:
+    """Find what a model gets wrong on a record, name the causes, and extend the model by them.
+
+    Parameters
+    ----------
+    record : Record
+    model : StageModel
+        Of the same stage.
+    axes : sequence of str, optional
+        All that record and model share by default.
+    progress : callable
+        Is told what is being done, in a few words.
+
+    Returns
+    -------
+    Diagnosis
+        All errors in it are free-run and held out.
+
+    Raises
+    ------
+    UsageError
+        If record and model are not of one stage, or share no axis.
+    RecordError, IdentificationError
+        If the record says too little.
+    """
+    if model.hardware_id and record.hardware_id and model.hardware_id != record.hardware_id:
+        raise UsageError(
+            f"this model does not belong to this bag: it is of stage '{model.hardware_id}', {record.source} of "
+            f"'{record.hardware_id}'"
+        )
+    chosen = list(axes) if axes else [axis for axis in model.axes if axis in record.axes]
+    if not chosen:
+        raise UsageError(
+            f"{record.source} holds axes {', '.join(record.axes)}, the model {', '.join(model.axes)}: none in common"
+        )
+    found: dict[str, AxisDiagnosis] = {}
+    extended = dict(model.axes)
+    for axis in chosen:
+        try:
+            with threadpool_limits(1):
+                found[axis], extended[axis] = _diagnose_axis(
+                    record, axis, model.axis(axis), lambda what, axis=axis: progress(f"axis {axis}: {what}")
+                )
+        except SlpiError as error:
+            raise type(error)(f"{record.source}: axis '{axis}': {error}") from None
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    return Diagnosis(found, replace(model, axes=extended, created=created), record.source)
+
+
+def _diagnose_axis(
+    record: Record, axis: str, model: AxisModel, progress: Callable[[str], None]
+) -> tuple[AxisDiagnosis, AxisModel]:
+    evidence = evidence_of(record, axis, model)
+    base = Explanation(evidence, model.effects)
+    selection = select(base, _with_loop_family(base, record, axis, model), progress)
+    _require_own(model, base, selection.now)
+    floor = _floor(selection.now)
+    given = _given_rms(model, base, evidence.v, evidence.y)
+    return judged(selection, floor, given), _extended(model, selection.now, floor, record.source)
+
+
+def _with_loop_family(base: Explanation, record: Record, axis: str, model: AxisModel) -> Explanation | None:
+    """Return the explanation by the loop family in place of a kind whose loops are the same everywhere, if it counts."""
+    if model.kind == "slpi":
+        return None
+    family = Explanation(evidence_of(record, axis, None), model.effects)
+    return family if counts(base.held_out, family.held_out) else None
+
+
+def _floor(now: Explanation) -> Floor:
+    evidence = now.evidence
+    residual = np.where(evidence.used, now.residual, np.nan)
+    floor = floor_of(evidence.t, evidence.v, evidence.y, residual)
+    return replace(floor, rms=min(floor.rms, now.held_out.rms))
+
+
+def _given_rms(model: AxisModel, now: Explanation, u: FloatArray, y: FloatArray) -> float:
+    """Return the error (m) of the given hysteresis, driven by `u` (V), against `y` (m), but for the one at rest.
+
+    It starts as it was identified or as the record seems to, whichever suits it better.
+    """
+    evidence = now.evidence
+    starts = [model.start]
+    if model.causal:
+        starts += [Start(float(u[0]), 0.0, history) for history in {evidence.history, model.start.history}]
+    return min(_error_from(start, model, evidence, u, y) for start in starts)
+
+
+def _error_from(start: Start, model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArray) -> float:
+    errors = (replace(model, start=start, effects=()).simulate(evidence.t, u) - y)[evidence.used]
+    return float(np.sqrt(np.mean((errors - np.median(errors)) ** 2)))
+
+
+def _require_own(model: AxisModel, base: Explanation, now: Explanation) -> None:
+    """Refuse a model that has nothing to do with the record, whatever effects there are."""
+    span = float(np.ptp(now.evidence.y[now.evidence.used]))
+    error = min(_given_rms(model, base, base.u, base.target), _given_rms(model, now, now.u, now.target))
+    if error > FOREIGN_SHARE * span and error > FOREIGN_TIMES * base.held_out.rms:
+        raise IdentificationError(
+            f"this model does not belong to this bag: its error is {error * 1e6:.4g} um rms of {span * 1e6:.4g} um, "
+            f"that of one fitted to it {base.held_out.rms * 1e6:.4g} um; give this stage's model, or identify anew"
+        )
+
+
+def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> AxisModel:
+    """Return the model with the effects found, its hysteresis fitted together with them."""
+    evidence = now.evidence
+    hysteresis, at_start = now.hysteresis()
+    y, errors = evidence.y[evidence.used], now.residual[evidence.used]
+    voltage = evidence.v[evidence.used]
+    return replace(
+        model,
+        kind="pi" if isinstance(evidence.basis, PlayBasis) else "slpi",
+        hysteresis=hysteresis,
+        start=Start(float(evidence.v[0]), at_start, evidence.history),
+        voltage_range=(float(voltage.min()), float(voltage.max())),
+        displacement_range=(float(y.min()), float(y.max())),
+        effects=tuple(now.with_uncertainty()),
+        quality=replace(
+            model.quality,
+            rms=float(np.sqrt(np.mean(errors**2))),
+            maximum=float(np.abs(errors).max()),
+            held_out_rms=now.held_out.rms,
+            floor_rms=floor.rms,
+            samples=y.size,
+            source=source,
+        ),
+    )

@@ -1,0 +1,127 @@
+"""What the outcome of the competition means, in words."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.diagnosis import advice
+from slpi_ros.diagnosis.evidence import one_speed
+from slpi_ros.diagnosis.explanation import Explanation
+from slpi_ros.diagnosis.selection import Named, Selection, chance_of_gain, gain
+from slpi_ros.diagnosis.verdict import (
+    AMBIGUOUS,
+    NAMED,
+    NOTHING_FOUND,
+    UNEXPLAINED,
+    AxisDiagnosis,
+    NamedEffect,
+    Traces,
+)
+from slpi_ros.effects.effect import Effect
+from slpi_ros.identification.floor import Floor
+
+FloatArray = NDArray[np.float64]
+
+# What is left is more than the floor when it is this many times as much.
+ABOVE_FLOOR = 1.5
+# No hysteresis model resolves better than this share of the displacement range, even where there is no noise.
+RESOLUTION = 2e-4
+
+
+def judged(selection: Selection, floor: Floor, given_rms: float) -> AxisDiagnosis:
+    """Return what is to be said of one axis.
+
+    Parameters
+    ----------
+    selection : Selection
+    floor : Floor
+        Of the record.
+    given_rms : float, metres
+        Error of the given model as it is.
+    """
+    base, now = selection.base, selection.now
+    effects = _named_effects(selection)
+    verdict = _verdict(selection, effects, floor)
+    return AxisDiagnosis(
+        verdict=verdict,
+        summary=_summary(verdict, selection, effects, floor),
+        floor_rms=floor.rms,
+        floor_source=floor.source,
+        given_rms=given_rms,
+        before_rms=base.held_out.rms,
+        after_rms=now.held_out.rms,
+        effects=effects,
+        next_experiment=_next(verdict, selection, effects),
+        traces=_traces(base, now),
+    )
+
+
+def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
+    fitted = {effect.name: effect for effect in selection.now.with_uncertainty()}
+    whole = selection.base.held_out.rms**2
+    return tuple(
+        NamedEffect(
+            effect=fitted[named.name],
+            gain_percent=100.0 * gain(named.before, named.after),
+            share_of_residual=float(np.clip((named.before.rms**2 - named.after.rms**2) / whole, 0.0, 1.0)),
+            p_value=chance_of_gain(named.before, named.after),
+            alternatives=named.alternatives,
+            evidence=_evidence(fitted[named.name], named),
+        )
+        for named in selection.named
+    )
+
+
+def _evidence(effect: Effect, named: Named) -> str:
+    sentence = effect.describe()
+    gained = (
+        f"with it the error on blocks left out falls from {named.before.rms * 1e9:.3g} to "
+        f"{named.after.rms * 1e9:.3g} nm rms (chance gains as much in {100 * chance_of_gain(named.before, named.after):.2g} % of cases)"
+    )
+    if not named.runner_up:
+        return f"{sentence}; {gained}, and no other effect comes near"
+    other, rms = named.runner_up
+    return f"{sentence}; {gained}, with {other} in its place to {rms * 1e9:.3g} nm"
+
+
+def _left(selection: Selection, floor: Floor) -> bool:
+    """Return whether more is left than noise and the model's resolution."""
+    now = selection.now
+    resolved = RESOLUTION * float(np.ptp(now.evidence.y[now.evidence.used]))
+    return now.held_out.rms > max(ABOVE_FLOOR * floor.rms, resolved)
+
+
+def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor) -> str:
+    if effects:
+        return AMBIGUOUS if effects[0].alternatives else NAMED
+    return UNEXPLAINED if selection.structures or _left(selection, floor) else NOTHING_FOUND
+
+
+def _summary(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor) -> str:
+    before, after = selection.base.held_out.rms * 1e9, selection.now.held_out.rms * 1e9
+    left = f"{after:.3g} nm rms are left, the floor of the record is {floor.rms * 1e9:.3g} nm"
+    found = ", ".join(f"{named.name} ({named.gain_percent:.0f} %)" for named in effects)
+    structure = f"The hysteresis itself is wrong: {', '.join(selection.structures)}. " if selection.structures else ""
+    if verdict == NOTHING_FOUND:
+        return f"Nothing found: {left}."
+    if verdict == UNEXPLAINED:
+        return f"{structure}None of the known effects explains the error: {left}."
+    others = ""
+    if verdict == AMBIGUOUS:
+        others = f" The record cannot tell {effects[0].name} from {', '.join(effects[0].alternatives)}."
+    return f"{structure}Found: {found}.{others} The held-out error falls from {before:.3g} nm; {left}."
+
+
+def _next(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...]) -> str | None:
+    steps = [advice.of_structure(structure) for structure in selection.structures]
+    if verdict == AMBIGUOUS:
+        names = (effects[0].name, *effects[0].alternatives)
+        steps.append(advice.separating(names, one_speed=one_speed(selection.now.evidence)))
+    if verdict == UNEXPLAINED and not steps:
+        steps.append(advice.MORE_LOOPS)
+    return " ".join(steps) or None
+
+
+def _traces(base: Explanation, now: Explanation) -> Traces:
+    evidence = now.evidence
+    contributions = {effect.name: now.predicted - now.prediction_without(effect.name) for effect in now.effects}
+    return Traces(evidence.t, evidence.v, evidence.y, base.predicted, now.predicted, contributions)

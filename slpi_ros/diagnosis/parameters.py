@@ -1,0 +1,126 @@
+"""The parameters of an effect that a fit may change, as one vector."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.effects.effect import Effect
+
+FloatArray = NDArray[np.float64]
+
+# The others (times of a drift, the form of a rate dependence) are chosen, not fitted.
+FREE = {
+    "delay": ("seconds",),
+    "lag": ("time_constant",),
+    "saturation": ("lower", "upper"),
+    "rate_dependence": ("widening", "backlash"),
+    "creep": ("time_constants", "gains"),
+    "resonance": ("frequency", "damping"),
+    "cross_coupling": ("gains",),
+    "thermal_drift": ("values",),
+    "sensor_periodic": ("period", "amplitude", "phase"),
+    "hum": ("frequency", "amplitude", "phase"),
+}
+# What settles sooner (s) is called a lag.
+FASTEST_CREEP = 0.1
+# Least values; what is not named may have either sign.
+LEAST = {
+    "time_constant": 1e-6,
+    "time_constants": FASTEST_CREEP,
+    "damping": 1e-3,
+    "frequency": 1e-3,
+    "period": 1e-9,
+    "amplitude": 0.0,
+}
+# Greatest values, of any effect or of one. What is damped more does not ring, and what creeps more is something else.
+MOST = {"damping": 0.4, "creep.gains": 0.15, "cross_coupling.gains": 0.4}
+# Effects none of whose other parameters may be negative.
+NOT_NEGATIVE = ("creep", "rate_dependence")
+# Parameters that the displacement is linear in, or nearly so at any size.
+LINEAR = ("gains", "values", "widening", "backlash", "seconds")
+# At most so many times its own size may a parameter change in one step.
+LARGEST_STEP = 0.7
+
+
+def names(effect: Effect) -> list[str]:
+    """Return a name for each free parameter: that of the field, with place or axis where there are several."""
+    found = []
+    for name in FREE[effect.name]:
+        value = getattr(effect, name)
+        if isinstance(value, Mapping):
+            found += [f"{name}.{key}" for key in value]
+        elif isinstance(value, tuple):
+            found += [f"{name}.{k}" for k in range(len(value))]
+        elif isfinite(value):
+            found.append(name)
+    return found
+
+
+def free(effect: Effect) -> FloatArray:
+    """Return the free parameters, shape (k,), SI."""
+    values: list[float] = []
+    for name in FREE[effect.name]:
+        value = getattr(effect, name)
+        if isinstance(value, Mapping):
+            values += value.values()
+        elif isinstance(value, tuple):
+            values += value
+        elif isfinite(value):
+            values.append(value)
+    return np.array(values, dtype=np.float64)
+
+
+def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect:
+    """Return the effect with other free parameters, kept where they make sense; `longest`: of time constants, s."""
+    left = values.tolist()
+    changed: dict[str, Any] = {}
+    for name in FREE[effect.name]:
+        value = getattr(effect, name)
+        least = LEAST.get(name, 0.0 if effect.name in NOT_NEGATIVE else -np.inf)
+        most = longest if name == "time_constants" else MOST.get(name, MOST.get(f"{effect.name}.{name}", np.inf))
+        if isinstance(value, Mapping):
+            changed[name] = {key: min(max(left.pop(0), least), most) for key in value}
+        elif isinstance(value, tuple):
+            changed[name] = tuple(min(max(left.pop(0), least), most) for _ in value)
+        elif isfinite(value):
+            changed[name] = min(max(left.pop(0), least), most)
+    return replace(effect, **changed)  # type: ignore[type-var]
+
+
+def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
+    """Return a small step of each free parameter, shape (k,), SI, for derivatives."""
+    dt = float(np.median(np.diff(t)))
+    small = {
+        "seconds": 0.05 * dt,
+        "time_constant": 0.05 * dt,
+        "lower": 1e-3 * float(np.ptp(v)),
+        "upper": 1e-3 * float(np.ptp(v)),
+        "phase": 1e-4,
+    }
+    found = []
+    for name, value in zip(names(effect), free(effect).tolist(), strict=True):
+        scale = {"hum": 1e-3 / float(t[-1] - t[0]), "sensor_periodic": 1e-5 * abs(value)}
+        if name in ("frequency", "period") and effect.name in scale:
+            found.append(scale[effect.name])
+        elif name.partition(".")[0] in ("gains", "widening"):
+            found.append(1e-5)
+        elif name.partition(".")[0] in ("values", "backlash"):
+            found.append(1e-9)
+        else:
+            found.append(small.get(name, 1e-4 * abs(value) + 1e-12))
+    return np.array(found)
+
+
+def bounded(effect: Effect, change: FloatArray) -> FloatArray:
+    """Return a change of the free parameters, shortened where it is larger than a linear fit can be trusted."""
+    limit = LARGEST_STEP * np.abs(free(effect))
+    for k, name in enumerate(names(effect)):
+        if name.partition(".")[0] in LINEAR:
+            limit[k] = np.inf
+        elif name == "phase":
+            limit[k] = LARGEST_STEP
+    return np.clip(change, -limit, limit)

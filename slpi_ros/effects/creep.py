@@ -1,0 +1,146 @@
+"""Creep: after every move the stage goes on, slower and slower."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from scipy.signal import lfilter
+
+from slpi_ros.effects.checks import require
+from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.relaxation import Hold, hold
+from slpi_ros.effects.uniform import Uniform
+
+
+@dataclass(frozen=True)
+class Creep:
+    """Relaxations in parallel, ``y = h + sum_k g_k z_k`` with ``tau_k dz_k/dt = (h - h_0) - z_k``.
+
+    ``h_0`` is the displacement at the start: what rests does not creep.
+
+    Parameters
+    ----------
+    time_constants : tuple of float, length K >= 1, seconds
+    gains : tuple of float, length K
+        Shares of the motion ``h - h_0`` that come later.
+    uncertainty : mapping of str to float
+        Of single elements as ``gains.0``.
+    """
+
+    name: ClassVar[str] = "creep"
+    side: ClassVar[Side] = "displacement"
+    removable: ClassVar[Removable] = "always"
+
+    time_constants: tuple[float, ...]
+    gains: tuple[float, ...]
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be undone."""
+        require(
+            self,
+            ("time_constants", 1 <= len(self.time_constants) <= 100, "1 to 100 numbers"),
+            ("time_constants", all(0 < tau <= 1e7 for tau in self.time_constants), "more than 0 s, at most 1e7 s"),
+            ("gains", len(self.gains) == len(self.time_constants), "one for each time constant"),
+            ("gains", sum(min(g, 0.0) for g in self.gains) > -0.9, "more than -0.9 in sum where they are negative"),
+            ("gains", sum(self.gains) <= 10, "at most 10 in sum"),
+        )
+
+    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the displacement with creep, shape (N,), metres."""
+        grid = Uniform.over(around.t)
+        moved = grid.on(signal)
+        moved = moved - moved[:1]
+        crept = np.zeros_like(moved)
+        for gain, (now, before, kept) in zip(self.gains, self._holds(grid.dt), strict=True):
+            crept += gain * lfilter([now, before], [1.0, -kept], moved)
+        return signal + grid.off(crept)
+
+    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the displacement before creep, shape (N,), metres."""
+        grid = Uniform.over(around.t)
+        crept = grid.on(signal)
+        moved = crept = crept - crept[:1]
+        holds = self._holds(grid.dt)
+        direct = 1.0 + sum(gain * one.now for gain, one in zip(self.gains, holds, strict=True))
+        poles = np.array([one.kept for one in holds])
+        # State z' = kept z + input, output gain (now kept + before) z + direct: the zeros are poles of the inverse.
+        output = np.array([g * (one.before + one.now * one.kept) for g, one in zip(self.gains, holds, strict=True)])
+        zeros = np.linalg.eigvals(np.diag(poles) - output[None, :] / direct)
+        for zero, pole in zip(np.sort(zeros), np.sort(poles), strict=True):
+            moved = lfilter([1.0, -pole], [1.0, -zero], moved)
+        return signal - grid.off(crept - np.real(moved) / direct)
+
+    def describe(self) -> str:
+        """Say how much and how slow."""
+        slow, fast = max(self.time_constants), min(self.time_constants)
+        span = f"{fast:.3g} s" if slow == fast else f"{fast:.3g} to {slow:.3g} s"
+        return f"after a move the stage creeps on by {sum(self.gains) * 100:.3g} % of it, with time constants of {span}"
+
+    def follower(self) -> "CreepFollower":
+        """Return the creep sample by sample."""
+        return CreepFollower(self)
+
+    def _holds(self, dt: float) -> list[Hold]:
+        return [hold(dt, tau) for tau in self.time_constants]
+
+
+class CreepFollower:
+    """Creep sample by sample."""
+
+    def __init__(self, creep: Creep) -> None:
+        self._creep = creep
+        self.start(0.0)
+        self._over(0.0)
+
+    def start(self, x: float) -> None:
+        """Be at rest at `x` (m)."""
+        self._origin, self._input, self._states = x, 0.0, [0.0] * len(self._creep.gains)
+
+    def forward(self, dt: float, x: float) -> float:
+        """Move to the displacement `x` (m), `dt` (s) later; return it with creep (m)."""
+        if dt != self._dt:
+            self._over(dt)
+        moved, last = x - self._origin, self._input
+        crept = self._crept() + self._now * moved
+        self._states = [
+            now * moved + before * last + kept * z
+            for (now, before, kept), z in zip(self._holds, self._states, strict=True)
+        ]
+        self._input = moved
+        return x + crept
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the displacement before creep (m) for one with creep (m)."""
+        if dt != self._dt:
+            self._over(dt)
+        return self._origin + (wanted - self._origin - self._crept()) / (1.0 + self._now)
+
+    def resume(self, other: "CreepFollower", x: float) -> None:
+        """Creep on as another one does, from the displacement `x` (m); what is of another time constant is at rest."""
+        moved = other._input
+        known = dict(zip(other._creep.time_constants, other._states, strict=True))
+        self._origin, self._input = x - moved, moved
+        self._states = [known.get(tau, moved) for tau in self._creep.time_constants]
+
+    def snapshot(self) -> tuple[float, ...]:
+        """Return origin, motion, and the relaxations."""
+        return self._origin, self._input, *self._states
+
+    def restore(self, state: tuple[float, ...]) -> None:
+        """Take over a state from `snapshot`."""
+        self._origin, self._input, *self._states = state
+
+    def _crept(self) -> float:
+        """Return how far it creeps (m) whatever the motion in this step."""
+        crept = self._before * self._input
+        for share, z in zip(self._kept, self._states, strict=True):
+            crept += share * z
+        return crept
+
+    def _over(self, dt: float) -> None:
+        gains, self._dt, self._holds = self._creep.gains, dt, self._creep._holds(dt)
+        self._kept = [gain * one.kept for gain, one in zip(gains, self._holds, strict=True)]
+        self._now = sum(gain * one.now for gain, one in zip(gains, self._holds, strict=True))
+        self._before = sum(gain * one.before for gain, one in zip(gains, self._holds, strict=True))

@@ -1,0 +1,51 @@
+"""Delay: the displacement answers later, or the stamps of the two signals are apart."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from slpi_ros.effects.checks import require
+from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Transport delay, or an offset between the stamps of voltage and displacement.
+
+    Parameters
+    ----------
+    seconds : float, seconds
+        Negative where the displacement's stamps are late.
+    uncertainty : mapping of str to float
+    """
+
+    name: ClassVar[str] = "delay"
+    side: ClassVar[Side] = "voltage"
+    removable: ClassVar[Removable] = "path"
+
+    seconds: float
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no delay."""
+        require(self, ("seconds", abs(self.seconds) <= 100, "from -100 to 100 s"))
+
+    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Shift the signal, shape (N,), to later; the first value is held before."""
+        return np.interp(around.t - self.seconds, around.t, signal) if signal.size else signal.copy()
+
+    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Shift the signal, shape (N,), to earlier: a preview of the path; its end is held."""
+        return np.interp(around.t + self.seconds, around.t, signal) if signal.size else signal.copy()
+
+    def describe(self) -> str:
+        """Say how long it is."""
+        if self.seconds < 0:
+            return f"the displacement is stamped {-self.seconds * 1e3:.3g} ms too late for its voltage"
+        return f"the displacement answers {self.seconds * 1e3:.3g} ms after the voltage"
+
+    def follower(self) -> None:
+        """Return None: without the path ahead there is no preview."""
+        return

@@ -1,0 +1,63 @@
+"""Hum: mains, or another disturbance that is periodic in time."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import pi
+from typing import ClassVar
+
+import numpy as np
+
+from slpi_ros.effects.checks import require
+from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+
+
+@dataclass(frozen=True)
+class Hum:
+    """A sine in time, ``y = x + amplitude sin(2 pi frequency t + phase)``.
+
+    Parameters
+    ----------
+    frequency : float, hertz
+    amplitude : float, metres
+    phase : float, radians
+        At the record's start.
+    uncertainty : mapping of str to float
+    """
+
+    name: ClassVar[str] = "hum"
+    side: ClassVar[Side] = "displacement"
+    removable: ClassVar[Removable] = "record"
+
+    frequency: float
+    amplitude: float
+    phase: float
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no hum."""
+        require(
+            self,
+            ("frequency", 0 < self.frequency <= 1e7, "more than 0 Hz, at most 1e7 Hz"),
+            ("amplitude", 0 <= self.amplitude <= 1e3, "0 m or more, at most 1000 m"),
+            ("phase", abs(self.phase) <= 1e6, "within 1e6 rad"),
+        )
+
+    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the displacement with hum, shape (N,), metres."""
+        return signal + self.wave(around.t)
+
+    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the displacement without hum, shape (N,), metres."""
+        return signal - self.wave(around.t)
+
+    def wave(self, t: FloatArray) -> FloatArray:
+        """Return the hum alone, shape (N,), metres, at times (s)."""
+        return self.amplitude * np.sin(2 * pi * self.frequency * t + self.phase)
+
+    def describe(self) -> str:
+        """Say how large and how fast it is."""
+        return f"the reading hums with {self.amplitude * 1e9:.3g} nm at {self.frequency:.4g} Hz"
+
+    def follower(self) -> None:
+        """Return None: its phase belongs to the record's clock."""
+        return

@@ -1,0 +1,115 @@
+"""Lag of the amplifier: the piezo's voltage follows the command with a time constant."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from scipy.signal import lfilter
+
+from slpi_ros.effects.checks import require
+from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.relaxation import Hold, hold
+from slpi_ros.effects.uniform import Uniform
+
+# The exact inverse of the first-order hold lets the command alternate from sample to sample after every turn. Taking
+# this share of the old input's weight for the new one's damps that to a third with each sample; ramps stay exact.
+DAMPING = 1 / 8
+
+
+@dataclass(frozen=True)
+class Lag:
+    """First-order lag, ``tau du/dt = v - u``.
+
+    Parameters
+    ----------
+    time_constant : float, seconds
+    uncertainty : mapping of str to float
+    """
+
+    name: ClassVar[str] = "lag"
+    side: ClassVar[Side] = "voltage"
+    removable: ClassVar[Removable] = "always"
+
+    time_constant: float
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no lag."""
+        require(self, ("time_constant", 0 < self.time_constant <= 1e4, "more than 0 s, at most 10000 s"))
+
+    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the lagged voltage, shape (N,), volts; exact where the command is linear between samples."""
+        grid = Uniform.over(around.t)
+        now, before, kept = hold(grid.dt, self.time_constant)
+        return grid.off(_filter(np.array([now, before]), np.array([1.0, -kept]), grid.on(signal)))
+
+    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the command, shape (N,), volts: ``u + tau du/dt``."""
+        grid = Uniform.over(around.t)
+        if not grid.dt:
+            return signal.copy()
+        real = hold(grid.dt, self.time_constant)
+        now, before, kept = _damped(real)
+        # The law of the follower, which looks at the voltage really reached, as one filter.
+        law = np.convolve([now, before], [1.0, -kept]) + kept * np.array([0.0, real.now, real.before])
+        return grid.off(_filter(np.array([1.0, -kept, 0.0]), law, grid.on(signal)))
+
+    def describe(self) -> str:
+        """Say how slow it is."""
+        return f"the piezo's voltage lags behind the command with a time constant of {self.time_constant * 1e3:.3g} ms"
+
+    def follower(self) -> "LagFollower":
+        """Return the lag sample by sample."""
+        return LagFollower(self.time_constant)
+
+
+class LagFollower:
+    """A lag sample by sample."""
+
+    def __init__(self, time_constant: float) -> None:
+        self._time_constant = time_constant
+        self._input = self._output = 0.0
+        self._dt, self._hold = 0.0, hold(0.0, time_constant)
+
+    def start(self, x: float) -> None:
+        """Be at rest at `x` (V)."""
+        self._input = self._output = x
+
+    def forward(self, dt: float, x: float) -> float:
+        """Move to the command `x` (V), `dt` (s) later; return the lagged voltage (V)."""
+        now, before, kept = self._over(dt)
+        self._output = now * x + before * self._input + kept * self._output
+        self._input = x
+        return self._output
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the command (V) for a lagged voltage (V); where no time passes, that voltage itself."""
+        if dt <= 0.0:
+            return wanted
+        now, before, kept = _damped(self._over(dt))
+        return (wanted - kept * self._output - before * self._input) / now
+
+    def snapshot(self) -> tuple[float, float]:
+        """Return command and lagged voltage."""
+        return self._input, self._output
+
+    def restore(self, state: tuple[float, float]) -> None:
+        """Take over a state from `snapshot`."""
+        self._input, self._output = state
+
+    def _over(self, dt: float) -> Hold:
+        if dt != self._dt:
+            self._dt, self._hold = dt, hold(dt, self._time_constant)
+        return self._hold
+
+
+def _damped(real: Hold) -> Hold:
+    shift = DAMPING * real.before
+    return Hold(real.now + shift, real.before - shift, real.kept)
+
+
+def _filter(numerator: FloatArray, denominator: FloatArray, signal: FloatArray) -> FloatArray:
+    """Filter a signal, shape (N,), that was at rest before; the filter leaves what rests as it is."""
+    start = signal[:1]
+    return np.asarray(start + lfilter(numerator, denominator, signal - start), dtype=np.float64)

@@ -1,0 +1,82 @@
+"""Saturation: the amplifier clips below what it is commanded."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf, isinf, isnan
+from typing import ClassVar
+
+import numpy as np
+
+from slpi_ros.effects.checks import require_rules
+from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """The voltage at the piezo never leaves a range.
+
+    Parameters
+    ----------
+    lower, upper : float, volts
+        Infinite where there is no limit.
+    uncertainty : mapping of str to float
+    """
+
+    name: ClassVar[str] = "saturation"
+    side: ClassVar[Side] = "voltage"
+    removable: ClassVar[Removable] = "never"
+
+    lower: float = -inf
+    upper: float = inf
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse a range without voltages."""
+        require_rules(
+            self,
+            ("lower", not isnan(self.lower) and self.lower < inf, "a voltage, or -inf for none"),
+            ("upper", self.upper > self.lower, f"more than lower, {self.lower} V"),
+        )
+
+    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the voltage, shape (N,), volts, within the range."""
+        return np.clip(signal, self.lower, self.upper)
+
+    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the voltage, shape (N,), volts, within the range: more is not to be had."""
+        return np.clip(signal, self.lower, self.upper)
+
+    def describe(self) -> str:
+        """Say where it clips."""
+        below, above = f"below {self.lower:.4g} V", f"above {self.upper:.4g} V"
+        where = [text for text, limit in ((below, self.lower), (above, self.upper)) if not isinf(limit)]
+        return f"the amplifier clips {' and '.join(where) or 'nowhere'}"
+
+    def follower(self) -> "SaturationFollower":
+        """Return the limits sample by sample."""
+        return SaturationFollower(self.lower, self.upper)
+
+
+class SaturationFollower:
+    """Limits sample by sample; there is nothing to remember."""
+
+    def __init__(self, lower: float, upper: float) -> None:
+        self.lower, self.upper = lower, upper
+
+    def start(self, x: float) -> None:
+        """Be at rest at `x` (V)."""
+
+    def forward(self, dt: float, x: float) -> float:
+        """Return the voltage (V) within the range."""
+        return min(max(x, self.lower), self.upper)
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the voltage (V) within the range."""
+        return min(max(wanted, self.lower), self.upper)
+
+    def snapshot(self) -> tuple[()]:
+        """Return nothing."""
+        return ()
+
+    def restore(self, state: tuple[()]) -> None:
+        """Take over nothing."""

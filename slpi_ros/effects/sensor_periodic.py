@@ -1,0 +1,113 @@
+"""Periodic error of the sensor: an interferometer's nonlinearity."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import cos, pi, sin
+from typing import ClassVar
+
+import numpy as np
+
+from slpi_ros.effects.checks import require
+from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+
+# Newton's method squares the error with each step, once it is small.
+_STEPS = 60
+_CLOSE = 1e-12
+
+
+@dataclass(frozen=True)
+class SensorPeriodic:
+    """What the sensor adds as the stage moves, ``y = x + amplitude sin(2 pi x / period + phase)``.
+
+    Parameters
+    ----------
+    period : float, metres
+        Half or a quarter of the wavelength.
+    amplitude : float, metres
+        Less than ``period / 2 pi``, so that readings rise with the displacement.
+    phase : float, radians
+    uncertainty : mapping of str to float
+    """
+
+    name: ClassVar[str] = "sensor_periodic"
+    side: ClassVar[Side] = "displacement"
+    removable: ClassVar[Removable] = "always"
+
+    period: float
+    amplitude: float
+    phase: float
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be undone."""
+        require(
+            self,
+            ("period", 1e-12 <= self.period <= 1e3, "from 1e-12 to 1000 m"),
+            ("amplitude", 0 <= self.amplitude * 2 * pi < 0.99 * self.period, "0 or more, less than period / 2 pi"),
+            ("phase", abs(self.phase) <= 1e3, "within 1000 rad"),
+        )
+
+    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return what the sensor reads, shape (N,), metres."""
+        return signal + self.amplitude * np.sin(2 * pi / self.period * signal + self.phase)
+
+    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return where the stage is, shape (N,), metres, for what the sensor reads."""
+        k, amplitude, phase = 2 * pi / self.period, self.amplitude, self.phase
+        low, high, x = signal - amplitude, signal + amplitude, signal.copy()
+        for _ in range(_STEPS):
+            angle = k * x + phase
+            beyond = x + amplitude * np.sin(angle) - signal
+            if not np.any(np.abs(beyond) > _CLOSE * amplitude):
+                break
+            low, high = np.where(beyond < 0, x, low), np.where(beyond > 0, x, high)
+            step = x - beyond / (1 + k * amplitude * np.cos(angle))
+            x = np.where((step < low) | (step > high), (low + high) / 2, step)
+        return x
+
+    def describe(self) -> str:
+        """Say how large it is and how often it repeats."""
+        return (
+            f"the sensor errs by {self.amplitude * 1e9:.3g} nm, again and again with every "
+            f"{self.period * 1e9:.4g} nm of displacement"
+        )
+
+    def follower(self) -> "SensorFollower":
+        """Return the error sample by sample."""
+        return SensorFollower(self)
+
+
+class SensorFollower:
+    """The error of a sensor sample by sample; there is nothing to remember."""
+
+    def __init__(self, sensor: SensorPeriodic) -> None:
+        self._sensor = sensor
+        self._k = 2 * pi / sensor.period
+
+    def start(self, x: float) -> None:
+        """Be at rest at `x` (m)."""
+
+    def forward(self, dt: float, x: float) -> float:
+        """Return what the sensor reads (m) at `x` (m)."""
+        return x + self._sensor.amplitude * sin(self._k * x + self._sensor.phase)
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return where the stage has to be (m) for a reading (m)."""
+        k, amplitude, phase = self._k, self._sensor.amplitude, self._sensor.phase
+        low, high, x = wanted - amplitude, wanted + amplitude, wanted
+        for _ in range(_STEPS):
+            beyond = x + amplitude * sin(k * x + phase) - wanted
+            if abs(beyond) <= _CLOSE * amplitude:
+                break
+            low, high = (x, high) if beyond < 0 else (low, x)
+            x -= beyond / (1 + k * amplitude * cos(k * x + phase))
+            if not low <= x <= high:
+                x = (low + high) / 2
+        return x
+
+    def snapshot(self) -> tuple[()]:
+        """Return nothing."""
+        return ()
+
+    def restore(self, state: tuple[()]) -> None:
+        """Take over nothing."""

@@ -1,0 +1,59 @@
+"""Thermal drift: a slow change that does not follow the voltage."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from slpi_ros.effects.checks import require
+from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+
+
+@dataclass(frozen=True)
+class ThermalDrift:
+    """A displacement that depends on time only, linear between knots and held beyond them.
+
+    Parameters
+    ----------
+    times : tuple of float, length K >= 1, seconds
+        Knots, strictly increasing, from the record's start.
+    values : tuple of float, length K, metres
+    uncertainty : mapping of str to float
+    """
+
+    name: ClassVar[str] = "thermal_drift"
+    side: ClassVar[Side] = "displacement"
+    removable: ClassVar[Removable] = "record"
+
+    times: tuple[float, ...]
+    values: tuple[float, ...]
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no curve."""
+        rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
+        require(
+            self,
+            ("times", 1 <= len(self.times) <= 10000 and rising, "1 to 10000 numbers, strictly increasing"),
+            ("times", all(abs(time) <= 1e9 for time in self.times), "within 1e9 s"),
+            ("values", len(self.values) == len(self.times), "one for each time"),
+            ("values", all(abs(value) <= 1e3 for value in self.values), "within 1000 m"),
+        )
+
+    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the displacement with drift, shape (N,), metres."""
+        return signal + np.interp(around.t, self.times, self.values)
+
+    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the displacement without drift, shape (N,), metres."""
+        return signal - np.interp(around.t, self.times, self.values)
+
+    def describe(self) -> str:
+        """Say how far in which time."""
+        way, span = max(self.values) - min(self.values), self.times[-1] - self.times[0]
+        return f"whatever the voltage, the stage drifts over {way * 1e6:.3g} um within {span:.3g} s of this record"
+
+    def follower(self) -> None:
+        """Return None: it belongs to the record's clock."""
+        return

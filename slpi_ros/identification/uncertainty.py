@@ -1,0 +1,169 @@
+"""How well a record determines the model's curves: a bootstrap of the errors of its blocks.
+
+Whole blocks of the errors change their sign, or not, by chance (wild bootstrap): errors of neighbours are alike, and
+what the record shows only once stays in every resample. The errors are those on blocks left out, which no fit has made
+small.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from slpi_ros.errors import UsageError
+from slpi_ros.identification.linear import SMOOTHNESS, choose, plays, surfaces
+from slpi_ros.identification.problem import Problem
+from slpi_ros.identification.progress import tell
+from slpi_ros.identification.record import Record
+from slpi_ros.identification.samples import Samples, select_samples
+
+FloatArray = NDArray[np.float64]
+
+RESAMPLES = 50
+BLOCKS = 80
+# More samples cost time; so many determine the curves, less surely.
+SAMPLES = 20_000
+_KINDS = {"slpi": (surfaces, SMOOTHNESS), "pi": (plays, SMOOTHNESS[:1])}
+# Voltages of the outermost loop at which the uncertainty is given.
+_CURVE_POINTS = 101
+
+
+@dataclass(frozen=True)
+class CurveUncertainty:
+    """How far the model's curves move with the errors of the record.
+
+    Of a thinned record: all of a long record knows the curves better. What no sample shows, and the roughness penalty
+    decides, is not in it.
+
+    Parameters
+    ----------
+    axis, kind : str
+    resamples : int
+        Fits.
+    v : ndarray, shape (n,), volts
+    rising, falling : ndarray, shape (n,), metres
+        Branches of the outermost loop, from the displacement at its low end.
+    rising_std, falling_std : ndarray, shape (n,), metres
+        Their standard deviations.
+    rms, maximum : float, metres
+        Standard deviation of the displacement predicted for the record's samples.
+    """
+
+    axis: str
+    kind: str
+    resamples: int
+    v: FloatArray
+    rising: FloatArray
+    falling: FloatArray
+    rising_std: FloatArray
+    falling_std: FloatArray
+    rms: float
+    maximum: float
+
+    def line(self) -> str:
+        """Say it in nm."""
+        loop = np.concatenate([self.rising_std, self.falling_std])
+        return (
+            f"curves known to {self.rms * 1e9:.2g} nm rms on the record's path, {self.maximum * 1e9:.2g} nm at worst; "
+            f"outermost loop to {np.sqrt(np.mean(loop**2)) * 1e9:.2g} nm rms (1 sigma, {self.resamples} resamples)"
+        )
+
+
+def curve_uncertainty(
+    record: Record | Sequence[Record],
+    axis: str,
+    kind: str = "slpi",
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    resamples: int = RESAMPLES,
+) -> CurveUncertainty:
+    """Fit a kind of model many times, to a thinned record with other errors.
+
+    Parameters
+    ----------
+    record : Record or sequence of Record
+    axis, kind, start, stop
+        As for `slpi_ros.identify`; kinds ``slpi`` and ``pi``.
+    resamples : int
+
+    Returns
+    -------
+    CurveUncertainty
+
+    Raises
+    ------
+    UsageError
+        If the kind has no uncertainty.
+    SlpiError
+        If the record does not allow a fit.
+    """
+    require_known_uncertainty(kind)
+    records = [record] if isinstance(record, Record) else list(record)
+    samples = [select_samples(part, axis, start, stop).thinned(SAMPLES // len(records)) for part in records]
+    bases, smoothness = _KINDS[kind]
+    with threadpool_limits(1):
+        chosen = choose(samples, bases(samples), smoothness)
+        problem = chosen.problem
+        low, high = (float(extreme([extreme(part.v) for part in samples])) for extreme in (np.min, np.max))
+        v = np.linspace(low, high, _CURVE_POINTS)
+        loop = _outermost(problem, v)
+        solutions = _solutions(problem, chosen.smoothness, resamples)
+        paths = np.array([problem.design.predict(x) for x in solutions])[:, problem.weights > 0] * problem.scale
+        curves = np.array([_branches(loop, x, problem) for x in solutions])
+        rising, falling = _branches(loop, problem.solve(chosen.smoothness), problem)
+    spread = paths.std(axis=0, ddof=1)
+    rising_std, falling_std = curves.std(axis=0, ddof=1)
+    return CurveUncertainty(
+        axis=axis,
+        kind=kind,
+        resamples=resamples,
+        v=v,
+        rising=rising,
+        falling=falling,
+        rising_std=rising_std,
+        falling_std=falling_std,
+        rms=float(np.sqrt(np.mean(spread**2))),
+        maximum=float(spread.max()),
+    )
+
+
+def require_known_uncertainty(kind: str) -> None:
+    """Raise UsageError when there is no uncertainty of models of this kind."""
+    if kind not in _KINDS:
+        raise UsageError(f"the uncertainty of kind '{kind}' is not known; choose one of {', '.join(_KINDS)}")
+
+
+def _solutions(problem: Problem, smoothness: float, resamples: int) -> list[FloatArray]:
+    """Return the parameters of fits to the model's own prediction, with the errors of whole blocks turned about."""
+    rng = np.random.default_rng(0)
+    design, weights = problem.design, problem.weights
+    matrix, _ = design.normal_equations(problem.y, weights)
+    matrix += problem.penalty(smoothness, problem.count)
+    predicted = design.predict(problem.solve(smoothness))
+    left_out = problem.held_out_errors(smoothness) / problem.scale
+    errors = np.where(np.isfinite(left_out), left_out, predicted - problem.y)
+    blocks = np.array_split(np.arange(problem.y.size), BLOCKS)
+    solutions = []
+    for number in range(resamples):
+        tell(f"fits to other errors, {number + 1} of {resamples}")
+        sign = np.repeat(rng.choice((-1.0, 1.0), BLOCKS), [block.size for block in blocks])
+        drawn = weights * (predicted + sign * errors)
+        vector = design.local.T @ drawn + design.at_turns.T @ (design.pick.T @ drawn)
+        solutions.append(problem.constrained(matrix, vector))
+    return solutions
+
+
+def _outermost(problem: Problem, v: FloatArray) -> Problem:
+    """Pose the problem of the outermost loop: up and down again, after a long fall to its low end."""
+    path = np.concatenate([v[:1], v, v[-2::-1]])
+    return Problem.pose([Samples(path, path, np.ones(path.size, dtype=bool), history=1)], problem.basis)
+
+
+def _branches(loop: Problem, x: FloatArray, problem: Problem) -> FloatArray:
+    """Return the rising and the falling branch, shape (2, n), metres, from the low end."""
+    y = loop.design.predict(x[: problem.basis.size + 1])[1:] * problem.scale
+    n = (y.size + 1) // 2
+    return np.asarray([y[:n], y[n - 1 :][::-1]] - y[0])

@@ -1,0 +1,250 @@
+"""Interactive charts: what plotly.js, which the page carries, draws in the reader's browser.
+
+Everything is given in SI; a panel's quantities say in which unit it is shown.
+"""
+
+import base64
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.reports.colours import NOISE
+
+FloatArray = NDArray[np.float64]
+
+# Pixels between panels, and what the names around the outer ones need.
+_GAP = {"row": 80, "column": 62}
+_MARGIN = {"l": 75, "r": 15, "t": 46, "b": 56}
+_WIDTH = 1085
+_GRID = {
+    "gridcolor": "#e4e9ee",
+    "zerolinecolor": "#b9c4ce",
+    "linecolor": "#b9c4ce",
+    "showline": True,
+    "ticks": "outside",
+}
+_SMALL = {"size": 13}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What an axis of a panel shows.
+
+    Parameters
+    ----------
+    name, unit : str
+    scale : float
+        From SI to the unit.
+    digits : str
+        How a value is written, as in d3-format.
+    logarithmic : bool
+    """
+
+    name: str
+    unit: str
+    scale: float = 1.0
+    digits: str = ".4~g"
+    logarithmic: bool = False
+
+    @property
+    def title(self) -> str:
+        """Name and unit."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+    def shown(self, values: FloatArray) -> dict[str, str]:
+        """Return values, SI, in the unit, packed as plotly.js reads them."""
+        packed = np.ascontiguousarray(np.asarray(values) * self.scale, dtype="<f4")
+        return {"dtype": "f4", "bdata": base64.b64encode(packed.tobytes()).decode()}
+
+
+TIME = Quantity("time", "s", digits=".4f")
+VOLTAGE = Quantity("voltage", "V", digits=".3f")
+DISPLACEMENT = Quantity("displacement", "µm", 1e6, ".4f")
+ERROR = Quantity("measured less model", "nm", 1e9, ".1f")
+SAMPLES = Quantity("samples", "", digits=",d")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes.
+
+    Parameters
+    ----------
+    x, y : Quantity
+    share : float
+        Its part of the width (in a row) or the height (in a column), relative to the others.
+    """
+
+    x: Quantity
+    y: Quantity
+    share: float = 1.0
+
+
+@dataclass
+class Chart:
+    """Panels in a row or a column, with one legend: a name that is switched off there goes from every panel.
+
+    Parameters
+    ----------
+    panels : sequence of Panel
+    arrangement : {"row", "column"}
+        Panels in a row share their vertical axis, those in a column their horizontal one, where they show the same
+        quantity: zooming in one zooms the others.
+    height : int
+        Pixels.
+    """
+
+    panels: Sequence[Panel]
+    arrangement: Literal["row", "column"] = "row"
+    height: int = 420
+    _traces: list[dict[str, Any]] = field(default_factory=list, init=False)
+    _shapes: list[dict[str, Any]] = field(default_factory=list, init=False)
+    _ranges: dict[int, list[float]] = field(default_factory=dict, init=False)
+    _legend: set[str] = field(default_factory=set, init=False)
+
+    def line(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, width: float = 1.4) -> None:
+        """Add a line through points, shape (N,) each, SI; NaN interrupts it."""
+        style = {"mode": "lines", "line": {"color": colour, "width": width}}
+        self._add(panel, name, x, y, {"type": "scatter", **style})
+
+    def dots(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, faint: bool = False) -> None:
+        """Add points, shape (N,) each, SI; `faint` ones belong to a line of the same name, which comes later."""
+        style = {"mode": "markers", "marker": {"color": colour, "size": 3, "opacity": 0.3 if faint else 0.55}}
+        self._add(panel, name, x, y, {"type": "scatter", **style}, keyed=not faint)
+
+    def steps(self, panel: int, name: str, edges: FloatArray, counts: FloatArray, colour: str) -> None:
+        """Add a histogram on its side: `counts`, shape (n,), of the classes between `edges`, shape (n + 1,), SI."""
+        style = {"mode": "lines", "line": {"color": colour, "width": 1.2, "shape": "vh"}, "fill": "tozerox"}
+        self._add(panel, name, np.append(counts, 0.0), edges, {"type": "scatter", **style})
+
+    def cells(self, panel: int, edges: FloatArray, values: FloatArray, shade: Quantity, scale: Sequence[Any]) -> None:
+        """Add a map: `values`, shape (n, n), SI, of squares between `edges`, shape (n + 1,); NaN stays empty.
+
+        The first index runs upwards, the second one to the right.
+        """
+        x, y = self.panels[panel].x, self.panels[panel].y
+        start, stop = self._domain(panel)
+        # The few largest values would leave one colour to all others.
+        most = float(np.nanpercentile(values, 98)) if np.isfinite(values).any() else 1.0
+        texts = {"x": x.name, "y": y.name, "z": shade.name}
+        lines = [f"{texts[k]} %{{{k}:{q.digits}}} {q.unit}" for k, q in (("x", x), ("y", y), ("z", shade))]
+        self._traces.append(
+            {
+                "type": "heatmap", "x": x.shown(edges), "y": y.shown(edges),
+                "z": {**shade.shown(values), "shape": ",".join(map(str, values.shape))},
+                "colorscale": [list(stop) for stop in scale], "hoverongaps": False,
+                "zmin": 0, "zmax": most * shade.scale,
+                "hovertemplate": "<br>".join(lines) + "<extra></extra>", **self._anchors(panel),
+                "colorbar": {
+                    "title": {"text": shade.title, "side": "top", "font": _SMALL}, "orientation": "h",
+                    "x": start, "xanchor": "left", "xpad": 0, "len": stop - start, "thickness": 10,
+                    "y": 1.01, "yanchor": "bottom", "ypad": 0, "outlinewidth": 0,
+                },
+            }
+        )  # fmt: skip
+
+    def band(self, panel: int, half_width: float) -> None:
+        """Shade the heights between plus and minus a value, SI; nothing for 0."""
+        if not half_width > 0.0:
+            return
+        y = self.panels[panel].y
+        numbers = self._anchors(panel)
+        self._shapes.append(
+            {
+                "type": "rect", "layer": "below", "fillcolor": NOISE, "opacity": 0.45, "line": {"width": 0},
+                "xref": f"{numbers['xaxis']} domain", "x0": 0, "x1": 1,
+                "yref": numbers["yaxis"], "y0": -half_width * y.scale, "y1": half_width * y.scale,
+            }
+        )  # fmt: skip
+
+    def show(self, panel: int, low: float, high: float) -> None:
+        """Show first only what lies between two heights, SI."""
+        y = self.panels[panel].y
+        ends = np.array([low, high]) * y.scale
+        self._ranges[panel] = (np.log10(ends) if y.logarithmic else ends).tolist()
+
+    def _add(
+        self, panel: int, name: str, x: FloatArray, y: FloatArray, style: dict[str, Any], *, keyed: bool = True
+    ) -> None:
+        across, up = self.panels[panel].x, self.panels[panel].y
+        values = f"%{{y:{up.digits}}} {up.unit}"
+        if self.arrangement == "row":
+            values = f"%{{x:{across.digits}}} {across.unit}<br>{values}"
+        self._traces.append(
+            {
+                "name": _plain(name), "x": across.shown(x), "y": up.shown(y), **style, **self._anchors(panel),
+                "legendgroup": _plain(name), "showlegend": keyed and name not in self._legend,
+                "hovertemplate": f"{values}<extra>{_plain(name)}</extra>",
+            }
+        )  # fmt: skip
+        if keyed:
+            self._legend.add(name)
+
+    def _anchors(self, panel: int) -> dict[str, str]:
+        number = str(panel + 1) if panel else ""
+        return {"xaxis": f"x{number}", "yaxis": f"y{number}"}
+
+    def _domain(self, panel: int) -> tuple[float, float]:
+        """Return the part of the width (in a row) or the height (in a column, from below) that a panel takes."""
+        length = _WIDTH - 90 if self.arrangement == "row" else self.height - _MARGIN["t"] - _MARGIN["b"]
+        gap = _GAP[self.arrangement] / length
+        shares = np.array([part.share for part in self.panels])
+        sizes = shares / shares.sum() * (1.0 - gap * (len(shares) - 1))
+        start = float(sizes[:panel].sum() + gap * panel)
+        stop = start + float(sizes[panel])
+        return (start, stop) if self.arrangement == "row" else (1.0 - stop, 1.0 - start)
+
+    def to_json(self) -> str:
+        """Return what plotly.js reads, with no character that HTML takes for its own."""
+        layout: dict[str, Any] = {
+            "height": self.height, "margin": _MARGIN, "shapes": self._shapes, "dragmode": "zoom",
+            "hovermode": "closest" if self.arrangement == "row" else "x unified",
+            "hoverlabel": {"namelength": -1},
+            "paper_bgcolor": "#fff", "plot_bgcolor": "#fff",
+            "font": {"family": "system-ui, sans-serif", "size": 13, "color": "#1b2733"},
+            "legend": {
+                "orientation": "h", "x": 0, "y": 1, "yref": "container", "yanchor": "top", "itemsizing": "constant"
+            },
+        }  # fmt: skip
+        for panel in range(len(self.panels)):
+            layout.update(self._axes(panel))
+        text = json.dumps({"data": self._traces, "layout": layout}, separators=(",", ":"), allow_nan=False)
+        return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+    def _axes(self, panel: int) -> dict[str, Any]:
+        """Return the layout of a panel's axes."""
+        shown, first = self.panels[panel], self.panels[0]
+        number = str(panel + 1) if panel else ""
+        across: dict[str, Any] = {**_GRID, "title": {"text": shown.x.title, "font": _SMALL}, "anchor": f"y{number}"}
+        up: dict[str, Any] = {
+            **_GRID,
+            "title": {"text": shown.y.title, "font": _SMALL, "standoff": 6},
+            "anchor": f"x{number}",
+        }
+        for axis, quantity in ((across, shown.x), (up, shown.y)):
+            if quantity.logarithmic:
+                axis.update(type="log", exponentformat="none", dtick=1)
+        if panel in self._ranges:
+            up["range"] = self._ranges[panel]
+        if self.arrangement == "row":
+            across["domain"] = self._domain(panel)
+            if panel and shown.y == first.y:
+                up.update(matches="y", title={"text": ""})
+        else:
+            up["domain"] = self._domain(panel)
+            across["unifiedhovertitle"] = {"text": f"%{{x:{shown.x.digits}}} {shown.x.unit}"}
+            if panel and shown.x == first.x:
+                across["matches"] = "x"
+            if panel < len(self.panels) - 1 and shown.x == self.panels[panel + 1].x:
+                across.update(title={"text": ""})
+        return {f"xaxis{number}": across, f"yaxis{number}": up}
+
+
+def _plain(name: str) -> str:
+    """Return a name as plotly.js shows it unchanged: it reads a few tags."""
+    return html.escape(name, quote=False)

@@ -1,0 +1,221 @@
+"""The page of a diagnosis: what the simulation gets wrong, why, what mends it, and what to do next."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.diagnosis.verdict import AMBIGUOUS, NAMED, NOTHING_FOUND, AxisDiagnosis, Diagnosis, NamedEffect, Traces
+from slpi_ros.effects.registry import to_document
+from slpi_ros.reports import charts, residual_views
+from slpi_ros.reports.charts import Curve
+from slpi_ros.reports.colours import AFTER, BEFORE, CAUSES, NOISE
+from slpi_ros.reports.motion import Motion
+from slpi_ros.reports.page import Mood, Page, Share
+
+FloatArray = NDArray[np.float64]
+
+# With effects, errors up to so many times the floor are noise; steps that differ less than this are one (relative).
+_NOISE_ONLY = 1.5
+_SAME = 0.01
+
+BEFORE_NAME, AFTER_NAME = "without effects", "with effects"
+
+
+def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
+    """Write ``report.html`` into `folder` and return its path.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if need be.
+    diagnosis : Diagnosis
+
+    Raises
+    ------
+    SlpiError
+        If it cannot be written.
+    """
+    page = Page(f"Diagnosis of {diagnosis.source or 'a record'}")
+    page.contents(tuple(diagnosis.axes))
+    for name, found in diagnosis.axes.items():
+        page.heading(f"Axis {name}", name)
+        page.verdict(name, f"Axis {name}: {found.summary}", _mood(found), found.verdict)
+        page.tiles(_figures(found))
+        _show_causes(page, found)
+        if found.next_experiment:
+            page.section("Next step")
+            page.text(found.next_experiment)
+        _show_charts(page, name, found)
+    path = folder / "report.html"
+    page.write(path)
+    return path
+
+
+def _mood(found: AxisDiagnosis) -> Mood:
+    if found.verdict == NOTHING_FOUND:
+        return "good"
+    if found.verdict == NAMED:
+        return "good" if found.after_rms <= _NOISE_ONLY * found.floor_rms else "warn"
+    return "warn" if found.verdict == AMBIGUOUS else "bad"
+
+
+def _figures(found: AxisDiagnosis) -> dict[str, str]:
+    figures = {
+        "error of the given model, rms": _nm(found.given_rms),
+        "of its hysteresis, refitted": _nm(found.before_rms),
+    }
+    if found.effects:
+        figures["with the effects found"] = _nm(found.after_rms)
+        if found.before_rms > 0.0:
+            figures["less than without them"] = f"{1.0 - found.after_rms / found.before_rms:.0%}"
+    return figures | {"noise floor, rms": _nm(found.floor_rms)}
+
+
+def _show_causes(page: Page, found: AxisDiagnosis) -> None:
+    """Add what the error is made of, cause by cause, and what each one is worth."""
+    page.section("What the error is made of")
+    page.shares(_shares(found))
+    for named in found.effects:
+        page.subsection(named.name)
+        page.definitions(_cause(named))
+    page.table(("Model", "error, rms (nm)", "times the floor", "gain"), *_steps(found))
+
+
+def _shares(found: AxisDiagnosis) -> list[Share]:
+    """Return the parts of the mean square error before any effect."""
+    parts = [
+        Share(named.name, max(named.share_of_residual, 0.0), colour)
+        for named, colour in zip(found.effects, _colours(len(found.effects)), strict=True)
+    ]
+    left = max(1.0 - sum(part.share for part in parts), 0.0)
+    noise = min((found.floor_rms / found.before_rms) ** 2, left) if found.before_rms > 0.0 else left
+    return [*parts, Share("noise", noise, NOISE), Share("unexplained", left - noise, BEFORE)]
+
+
+def _colours(count: int) -> list[str]:
+    return [CAUSES[k % len(CAUSES)] for k in range(count)]
+
+
+def _cause(named: NamedEffect) -> dict[str, str]:
+    said = {
+        "What it is": named.effect.describe(),
+        "Evidence": named.evidence,
+        "Gain": f"{named.gain_percent:.1f} % less error on blocks left out; "
+        f"{named.share_of_residual:.0%} of the mean square error without effects",
+        "By chance": f"once in {1.0 / named.p_value:.0f} records" if named.p_value > 0.0 else "never seen",
+    }
+    if named.alternatives:
+        said["Could as well be"] = f"{', '.join(named.alternatives)}: this record does not tell them apart"
+    parameters = _parameters(to_document(named.effect))
+    return said | ({"Parameters (SI)": parameters} if parameters else {})
+
+
+def _parameters(document: Mapping[str, object]) -> str:
+    """Return parameters with their standard deviations."""
+    parameters, uncertainty = document.get("parameters"), document.get("uncertainty")
+    if not isinstance(parameters, Mapping) or not isinstance(uncertainty, Mapping):
+        return ""
+    shown = (
+        f"{name} {_value(value)}" + (f" ± {_value(uncertainty[name])}" if name in uncertainty else "")
+        for name, value in parameters.items()
+    )
+    return "; ".join(shown)
+
+
+def _value(value: object) -> str:
+    match value:
+        case float() | int():
+            return f"{value:.4g}"
+        case list() | tuple():
+            return f"[{', '.join(map(_value, value))}]"
+        case Mapping():
+            return ", ".join(f"{name}: {_value(one)}" for name, one in value.items())
+        case _:
+            return str(value)
+
+
+def _steps(found: AxisDiagnosis) -> tuple[list[list[str]], int, str]:
+    """Return the rows of the table of held-out errors, which of them is best, and what it says."""
+
+    def row(name: str, error: float, gain: str = "") -> list[str]:
+        times = f"{error / found.floor_rms:.2f}" if found.floor_rms > 0.0 else ""
+        return [name, f"{error * 1e9:.1f}", times, gain]
+
+    rows = [row("given, as it is", found.given_rms), row("its hysteresis, refitted", found.before_rms)]
+    error = found.before_rms
+    for named in found.effects:
+        error *= 1.0 - named.gain_percent / 100.0
+        rows.append(row(f"and {named.name}", error, f"{named.gain_percent:.1f} %"))
+    if abs(found.after_rms - error) > _SAME * error:
+        rows.append(row("all fitted together", found.after_rms))
+    best = len(rows) - 1
+    caption = (
+        f"Free-run; all but the given model's on blocks left out of the fit. The floor comes from {found.floor_source}."
+    )
+    return [*rows, row("noise floor", found.floor_rms)], best, caption
+
+
+def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
+    """Add the charts of one axis."""
+    traces = found.traces
+    t, v, y = traces.t, traces.voltage, traces.measured
+    page.section("What the simulation gets wrong")
+    if not t.size:
+        page.text("The record holds no sample: there is nothing to draw.")
+        return
+    motion = Motion.of(t, v)
+    models = [Curve(BEFORE_NAME, traces.before, BEFORE)]
+    if found.effects:
+        models.append(Curve(AFTER_NAME, traces.after, AFTER))
+    left = [Curve(model.name, y - model.values, model.colour) for model in models]
+    parts = _parts(traces)
+    drawings = {
+        "time": charts.over_time(t, y, models, found.floor_rms, parts),
+        "motion": residual_views.over_motion(v, left, parts, motion),
+        "rhythm": residual_views.over_rhythm(t, left, parts, motion, found.floor_rms),
+    }
+    captions = {
+        "time": "Over time: displacement, and below what is left of it; the grey band is the noise floor.",
+        "motion": "What is left over voltage (upper and lower line: means where it rises and where it falls), and over "
+        "the speed of the voltage.",
+        "rhythm": "What is left over the time since the last turn or stop, with means, and how it is spread over "
+        "frequencies.",
+    }
+    for what, (chart, said) in drawings.items():
+        page.chart(f"{name}-{what}", chart, f"{captions[what]} {said}")
+    if parts:
+        page.text(
+            "A line with an effect's name is its share of what is left without effects: what it does to the "
+            "displacement, less the part of it that the hysteresis alone had imitated."
+        )
+    page.section("The models over the data")
+    loops, said = charts.loops(v, y, models, motion)
+    page.chart(
+        f"{name}-loops", loops, f"Displacement over voltage; beside it without the straight line through it. {said}"
+    )
+
+
+def _parts(traces: Traces) -> list[Curve]:
+    """Return the share of each effect in what the model without effects leaves; together, what they explain of it.
+
+    The hysteresis alone imitates a part of what effects do; that part is taken from those that it goes against.
+    """
+    effects = {name: values - np.mean(values) for name, values in traces.contributions.items()}
+    if not effects:
+        return []
+    explained = traces.after - traces.before
+    imitated = sum(effects.values()) - (explained - np.mean(explained))
+    weights = np.array([max(float(values @ imitated), 0.0) for values in effects.values()])
+    weights = weights / weights.sum() if weights.any() else np.full(len(effects), 1.0 / len(effects))
+    return [
+        Curve(name, values - weight * imitated, colour)
+        for (name, values), weight, colour in zip(
+            effects.items(), weights.tolist(), _colours(len(effects)), strict=True
+        )
+    ]
+
+
+def _nm(metres: float) -> str:
+    return f"{metres * 1e9:.1f} nm"

@@ -1,0 +1,222 @@
+"""A plan: a trajectory in volts, compensated as one block from where the axes will be when it takes over."""
+
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.runs import monotone_runs
+from slpi_ros.model import AxisModel
+from slpi_ros.runtime import rejection
+from slpi_ros.runtime.deadlines import Streamer, follow, keep_pace, seconds_between
+from slpi_ros.runtime.rejection import RejectedError
+from slpi_ros.runtime.stepping import drive_through, follow_together
+from slpi_ros.runtime.trajectory import Trajectory
+from slpi_ros.stream import LONGEST_STEP, ROUNDING, AxisStream, Limits, accepted_range, refusal
+
+FloatArray = NDArray[np.float64]
+TimeArray = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+AxisPlan = tuple[FloatArray, Mask, Mask]
+
+
+@dataclass(frozen=True)
+class Resting:
+    """An axis that follows known paths only: it has `limits`, and a `voltage` (V), but no memory."""
+
+    limits: Limits
+    voltage: float
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where an axis stands when a trajectory takes over.
+
+    Parameters
+    ----------
+    model : AxisModel
+    axis : AxisStream or Resting
+        The live axis, which is only read; `Resting` where the model is not causal.
+    since_ns : int, nanoseconds
+        When it was given its present voltage.
+    """
+
+    model: AxisModel
+    axis: AxisStream | Resting
+    since_ns: int
+
+    def after(self, voltages: FloatArray, times_ns: TimeArray) -> "Standing":
+        """Return where the axis stands once given voltages, shape (M,), volts, at times, shape (M,), M >= 1."""
+        last, at_ns = float(voltages[-1]), int(times_ns[-1])
+        if isinstance(self.axis, Resting):
+            return replace(self, axis=replace(self.axis, voltage=last), since_ns=at_ns)
+        before = float(voltages[-2]) if voltages.size > 1 else self.axis.voltage
+        axis, elapsed = stream_twin_of(self.axis), seconds_between(times_ns, self.since_ns)
+        if axis.timeless:
+            axis.memory.forward_array(voltages)
+            axis.drive(last)
+        else:
+            drive_through(axis, voltages, elapsed)
+        axis.pace.moved(last - before, min(float(elapsed[-1]), LONGEST_STEP))
+        return replace(self, axis=axis, since_ns=at_ns)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A trajectory in volts.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    voltages : ndarray, shape (N, K), volts
+    held : ndarray of bool, shape (N, K)
+        Where a displacement is out of reach: the axis waits at a voltage limit.
+    slewed : ndarray of bool, shape (N, K)
+        Where the axis is still on its way, at the slew limit.
+    """
+
+    trajectory: Trajectory
+    voltages: FloatArray
+    held: Mask
+    slewed: Mask
+
+    @property
+    def at_once(self) -> bool:
+        """Whether it takes over when it is accepted, not at the time of its first point."""
+        return not self.trajectory.start_ns
+
+    def deadlines_ns(self, now_ns: int) -> TimeArray:
+        """Return when its points are due, shape (N,), nanoseconds, if it is accepted now."""
+        return self.trajectory.deadlines_ns(now_ns)
+
+
+def prepare(
+    trajectory: Trajectory, standing: Mapping[str, Standing], now_ns: int, running: Streamer[Plan] | None = None
+) -> Plan:
+    """Return the plan of a trajectory that arrives now; nothing moves, whatever becomes of it.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        Points whose time has passed are left out.
+    standing : mapping of axis name to Standing
+        The axes as they are now.
+    now_ns : int, nanoseconds
+        A trajectory without start may be started later; that does no harm.
+    running : Streamer of Plan
+        Its points go on until the first one of the new trajectory is due, unless that starts at once.
+
+    Raises
+    ------
+    SlpiError
+        If all of it is in the past, a displacement is far out of reach, or a model cannot follow from where it stands.
+    """
+    trajectory = trajectory.useful_at(now_ns)
+    deadlines = trajectory.deadlines_ns(now_ns)
+    expected = {name: standing[name] for name in trajectory.names}
+    for stretch in running.before(int(deadlines[0])) if running and trajectory.start_ns else []:
+        still = slice(stretch.next, stretch.stop)
+        for column, name in enumerate(stretch.points.trajectory.names):
+            if name in expected:
+                voltages = stretch.points.voltages[still, column]
+                expected[name] = expected[name].after(voltages, stretch.deadlines_ns[still])
+    return _compensate(trajectory, deadlines, {**standing, **expected})
+
+
+def twin_of(memory: Memory) -> Memory:
+    """Return a memory in the same state, which moves on its own."""
+    twin = copy(memory)
+    twin.restore(memory.snapshot())
+    return twin
+
+
+def stream_twin_of(stream: AxisStream) -> AxisStream:
+    """Return a stream in the same state, which moves on its own."""
+    return stream.twin()
+
+
+def _compensate(trajectory: Trajectory, deadlines: TimeArray, standing: Mapping[str, Standing]) -> Plan:
+    shape = trajectory.positions.shape
+    v, held, slewed = np.empty(shape, order="F"), np.empty(shape, np.bool_, "F"), np.empty(shape, np.bool_, "F")
+    paths = {name: np.ascontiguousarray(trajectory.positions[:, i]) for i, name in enumerate(trajectory.names)}
+    for name, y in paths.items():
+        _check_reachable(name, standing[name].model, y, trajectory.cut)
+    together = _with_effects(paths, deadlines, standing)
+    for column, (name, y) in enumerate(paths.items()):
+        if name in together:
+            v[:, column], held[:, column], slewed[:, column] = together[name]
+            continue
+        here = standing[name]
+        elapsed = seconds_between(deadlines, here.since_ns)
+        try:
+            if isinstance(here.axis, Resting):
+                answer = _along_known_path(here.model, here.axis, y, elapsed)
+            else:
+                answer = _from_memory(here.model, here.axis, y, elapsed)
+        except SlpiError as error:
+            raise type(error)(f"axis '{name}': {error}") from None
+        v[:, column], held[:, column], slewed[:, column] = answer
+    return Plan(trajectory, v, held, slewed)
+
+
+def _with_effects(
+    paths: Mapping[str, FloatArray], deadlines: TimeArray, standing: Mapping[str, Standing]
+) -> dict[str, AxisPlan]:
+    """Return the plans of the causal axes if time matters to any of them; they may move along with each other."""
+    streams = {name: here.axis for name, here in standing.items() if isinstance(here.axis, AxisStream)}
+    if all(stream.timeless for name, stream in streams.items() if name in paths):
+        return {}
+    own = {name: path for name, path in paths.items() if name in streams}
+    return follow_together(
+        {name: stream_twin_of(stream) for name, stream in streams.items()},
+        {name: standing[name].model for name in streams},
+        own,
+        {name: seconds_between(deadlines, standing[name].since_ns) for name in own},
+    )
+
+
+def _from_memory(model: AxisModel, axis: AxisStream, y: FloatArray, elapsed: FloatArray) -> AxisPlan:
+    v, late = follow(stream_twin_of(axis), y, elapsed)
+    lowest, highest = v <= axis.limits.lower, v >= axis.limits.upper
+    held, at_limit = np.zeros(v.size, bool), np.flatnonzero(lowest | highest)
+    if at_limit.size:
+        missing, (low, high) = y[at_limit] - _displacements(axis.memory, v, at_limit), model.displacement_range
+        rounding = ROUNDING * (high - low)
+        # At a limit a wish may just be met, or lie on this side of it.
+        held[at_limit] = (lowest[at_limit] & (missing < -rounding)) | (highest[at_limit] & (missing > rounding))
+    return v, held, late & ~held
+
+
+def _displacements(memory: Memory, v: FloatArray, places: NDArray[np.intp]) -> FloatArray:
+    """Return the displacements (m) at some places, shape (M,), of a path of voltages, shape (N,), volts.
+
+    A memory remembers turns only, so it need not see what is between them.
+    """
+    turns = np.array([stop - 1 for _, stop in monotone_runs(v[: places[-1] + 1])])
+    seen = np.union1d(turns, places)
+    return twin_of(memory).forward_array(v[seen])[np.searchsorted(seen, places)]
+
+
+def _along_known_path(model: AxisModel, axis: Resting, y: FloatArray, elapsed: FloatArray) -> AxisPlan:
+    start, (low, high) = model.start.voltage, model.voltage_range
+    if abs(axis.voltage - start) > ROUNDING * (high - low):
+        raise UsageError(
+            f"a path of kind '{model.kind}' begins at {start:g} V, where its model does, but the axis has "
+            f"{axis.voltage:g} V; bring it there first"
+        )
+    wanted, held = model.compensate(np.cumsum(elapsed), y, axis.limits)
+    v = keep_pace(axis.limits, axis.voltage, wanted, elapsed)
+    late = np.abs(v - wanted) > ROUNDING * (high - low)
+    return v, held & ~late, late
+
+
+def _check_reachable(name: str, model: AxisModel, y: FloatArray, cut: int) -> None:
+    accepted = accepted_range(model.displacement_range)
+    if (far := (y < accepted[0]) | (y > accepted[1])).any():
+        at = int(np.argmax(far))
+        what = f"axis '{name}', point {cut + at}: {refusal(float(y[at]), accepted)}"
+        raise RejectedError(rejection.OUT_OF_RANGE, what)

@@ -1,0 +1,106 @@
+"""Effects hidden in bags: drawn, written, forgotten, diagnosed from the bag alone, and only then compared."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import slpi_ros
+from benchmarks.hidden import NAMES, calibration_of, hide
+from benchmarks.hidden.size import beyond_hysteresis
+from slpi_ros.bags import write_bag
+
+SAMPLES = 12_000
+# All ten take minutes: `make bench-diagnosis`.
+FAST = ("lag", "creep", "resonance", "cross_coupling", "sensor_periodic", "hum")
+# Large enough that nobody should miss it; what is found of smaller ones is for the bench to say.
+LARGE = 10.0
+
+
+def diagnosed(hidden, folder):
+    write_bag(folder / "bag", hidden.record)
+    record = slpi_ros.read_bag(folder / "bag")
+    return slpi_ros.diagnose(record, slpi_ros.identify(record))
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_a_hidden_effect_is_named_first(name, tmp_path):
+    hidden = hide(1, [name], size=LARGE, samples=SAMPLES)
+    (truth,) = hidden.truth
+    found = diagnosed(hidden, tmp_path).axes[truth.axis]
+    assert found.effects, found.summary
+    assert name in (found.effects[0].effect.name, *found.effects[0].alternatives), found.summary
+
+
+def test_nothing_is_found_where_nothing_is(tmp_path):
+    found = diagnosed(hide(1, samples=SAMPLES), tmp_path)
+    assert [axis.verdict for axis in found.axes.values()] == ["nothing_found"] * len(found.axes)
+
+
+def test_loops_that_do_not_close_have_no_invented_cause(tmp_path):
+    found = diagnosed(hide(2, base="bouc_wen", axes=1, samples=SAMPLES), tmp_path).axes["x"]
+    assert found.verdict == "unexplained" and not found.effects
+    assert "close" in found.summary
+
+
+def test_two_hidden_effects_are_both_named(tmp_path):
+    hidden = hide(3, ["creep", "hum"], size=LARGE, samples=SAMPLES)
+    found = diagnosed(hidden, tmp_path).axes[hidden.truth[0].axis]
+    assert {each.effect.name for each in found.effects} == {"creep", "hum"}, found.summary
+
+
+@pytest.mark.parametrize("effects", [[], ["creep"], ["cross_coupling", "hum"]])
+def test_a_draw_is_reproducible(effects):
+    one, same, other = (hide(seed, effects, samples=10_000) for seed in (5, 5, 6))
+    for axis in one.record.axes:
+        np.testing.assert_array_equal(one.record.displacement[axis], same.record.displacement[axis])
+    np.testing.assert_array_equal(one.record.time_ns, same.record.time_ns)
+    assert one.record.voltage["x"].shape != other.record.voltage["x"].shape or np.any(
+        one.record.voltage["x"] != other.record.voltage["x"]
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_truth_is_in_the_record(name):
+    hidden = hide(7, [name], samples=10_000)
+    (truth,) = hidden.truth
+    axis = truth.axis
+    assert truth.name == name and 3.0 <= truth.size_over_floor <= 20.0
+    np.testing.assert_allclose(hidden.reading[axis] - truth.contribution, hidden.clean[axis], atol=1e-15)
+    noise = hidden.record.displacement[axis] - hidden.reading[axis]
+    assert np.std(noise) == pytest.approx(hidden.floor[axis], rel=0.05)
+    for other in set(hidden.record.axes) - {axis}:
+        np.testing.assert_array_equal(hidden.reading[other], hidden.clean[other])
+    assert len(hidden.record) <= 10_000 and np.all(np.diff(hidden.record.time_ns) > 0)
+
+
+def test_the_calibration_before_has_no_effect():
+    hidden = hide(7, ["thermal_drift"], base="preisach", axes=1, samples=10_000)
+    left = slpi_ros.identify(calibration_of(hidden)).axes["x"].quality.held_out_rms
+    assert left == pytest.approx(hidden.floor["x"], rel=0.3)
+
+
+def test_a_size_is_what_no_hysteresis_explains():
+    hidden = hide(4, [], base="preisach", axes=1, samples=10_000)
+    v, t, y = hidden.record.voltage["x"], hidden.record.t, hidden.clean["x"]
+    assert beyond_hysteresis(v, y) < 0.002 * np.std(y)
+    ripple = 1e-8 * np.sin(2 * np.pi * 50.0 * t)
+    assert beyond_hysteresis(v, y + ripple) == pytest.approx(1e-8 / np.sqrt(2), rel=0.3)
+    assert beyond_hysteresis(v, 1e-9 * v + ripple) == pytest.approx(beyond_hysteresis(v, ripple), rel=1e-3)
+
+
+def test_a_size_that_is_asked_for_is_met():
+    for size in (1.0, 6.0):
+        (truth,) = hide(8, ["lag"], size=size, samples=10_000).truth
+        assert truth.size_over_floor == pytest.approx(size, rel=0.2)
+
+
+def test_stages_differ():
+    stages = [hide(seed, samples=10_000).stage["x"] for seed in range(3)]
+    assert len({dataclasses.astuple(stage) for stage in stages}) == 3
+
+
+def test_a_size_that_cannot_be(monkeypatch):
+    monkeypatch.setattr("benchmarks.hidden.records.ATTEMPTS", 2)
+    with pytest.raises(RuntimeError, match="no record"):
+        hide(0, ["sensor_periodic"], size=1000.0, samples=2_000)

@@ -1,0 +1,115 @@
+"""Hypothesis strategies: an effect of every kind, and smooth signals for it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.cross_coupling import CrossCoupling
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.effect import Around, Effect
+from slpi_ros.effects.hum import Hum
+from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.rate_dependence import RateDependence
+from slpi_ros.effects.resonance import Resonance
+from slpi_ros.effects.saturation import Saturation
+from slpi_ros.effects.sensor_periodic import SensorPeriodic
+from slpi_ros.effects.thermal_drift import ThermalDrift
+
+FloatArray = NDArray[np.float64]
+
+
+def numbers(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_nan=False, allow_subnormal=False)
+
+
+def powers(low: float, high: float) -> st.SearchStrategy[float]:
+    """Draw positive numbers evenly over the orders of magnitude."""
+    return numbers(np.log10(low), np.log10(high)).map(lambda x: float(10**x))
+
+
+@st.composite
+def creeps(draw: st.DrawFn) -> Creep:
+    gains = draw(st.lists(numbers(-0.02, 0.05).filter(bool), min_size=1, max_size=8))
+    taus = draw(st.lists(powers(1e-3, 1e3), min_size=len(gains), max_size=len(gains)))
+    return Creep(tuple(taus), tuple(gains))
+
+
+@st.composite
+def drifts(draw: st.DrawFn) -> ThermalDrift:
+    values = draw(st.lists(numbers(-1e-6, 1e-6), min_size=1, max_size=5))
+    steps = draw(st.lists(numbers(0.01, 1), min_size=len(values), max_size=len(values)))
+    return ThermalDrift(tuple(np.cumsum(steps).tolist()), tuple(values))
+
+
+@st.composite
+def sensors(draw: st.DrawFn) -> SensorPeriodic:
+    period = draw(powers(1e-7, 1e-5))
+    return SensorPeriodic(period, draw(numbers(0, 0.98)) * period / (2 * np.pi), draw(numbers(-7, 7)))
+
+
+@st.composite
+def saturations(draw: st.DrawFn) -> Saturation:
+    limits = draw(numbers(-20, 30)), draw(numbers(60, 120))
+    return Saturation(draw(st.sampled_from((-np.inf, limits[0]))), draw(st.sampled_from((np.inf, limits[1]))))
+
+
+BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
+    "delay": st.builds(Delay, numbers(-0.2, 0.2)),
+    "lag": st.builds(Lag, powers(1e-4, 1)),
+    "saturation": saturations(),
+    "rate_dependence": st.builds(
+        RateDependence, numbers(0, 0.2), numbers(-1e-7, 1e-7), numbers(0.3, 2), powers(10, 1e4), powers(0.1, 10)
+    ),
+    "creep": creeps(),
+    "resonance": st.builds(Resonance, powers(20, 2000), powers(1e-3, 0.5)),
+    "cross_coupling": st.builds(CrossCoupling, st.dictionaries(st.sampled_from("yz"), numbers(-0.4, 0.4), min_size=1)),
+    "thermal_drift": drifts(),
+    "sensor_periodic": sensors(),
+    "hum": st.builds(Hum, powers(1, 1000), powers(1e-10, 1e-7), numbers(-7, 7)),
+}
+EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__)
+# They change what moves, and leave what rests as it is.
+ABOUT_MOTION = ("delay", "lag", "rate_dependence", "creep", "resonance", "cross_coupling")
+
+
+@dataclass(frozen=True)
+class Record:
+    """A signal, shape (N,), V or m, that begins at rest, and what is around it."""
+
+    signal: FloatArray
+    around: Around
+
+    @property
+    def span(self) -> float:
+        return float(np.ptp(self.signal))
+
+
+@st.composite
+def records(draw: st.DrawFn, side: str) -> Record:
+    """Draw a smooth motion of three tones up to 3 Hz, faded in, at even stamps."""
+    rate, size = draw(st.sampled_from((500.0, 1000.0, 4000.0))), draw(st.integers(1500, 3000))
+    rng = np.random.default_rng(draw(st.integers(0, 10**6)))
+    t = np.arange(size) / rate
+    u = 50 + 40 * _motion(t, rng)
+    others = {"y": 1e-5 * _motion(t, rng)} if draw(st.booleans()) else {}
+    signal = u if side == "voltage" else middle(u) + 1e-6 * _motion(t, rng)
+    return Record(signal, Around(t, u, middle, others))
+
+
+def middle(u):
+    return 2e-7 * u + 1e-9 * u**1.5
+
+
+def _motion(t: FloatArray, rng: np.random.Generator) -> FloatArray:
+    fade = np.sin(np.clip(t / t[-1] * 2, 0, 1) * np.pi / 2) ** 4
+    tones = [np.sin(2 * np.pi * rng.uniform(0.6, 3) * t + rng.uniform(0, 6)) for _ in range(3)]
+    return np.asarray(fade * sum(tones) / 3)
+
+
+@st.composite
+def effects_and_records(draw: st.DrawFn, names: tuple[str, ...] = tuple(BY_NAME)) -> tuple[Effect, Record]:
+    effect = draw(BY_NAME[draw(st.sampled_from(names))])
+    return effect, draw(records(effect.side))

@@ -1,0 +1,327 @@
+import json
+from dataclasses import replace
+
+import control
+import numpy as np
+import pytest
+from effects.cases import ABOUT_MOTION, BY_NAME, EVERY, creeps, effects_and_records, records, sensors
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import lsim
+
+from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.effect import Around, Effect
+from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.registry import EFFECTS, from_document, in_order, to_document
+from slpi_ros.effects.resonance import Resonance
+from slpi_ros.effects.saturation import Saturation
+from slpi_ros.errors import SlpiError
+
+EXACT = ("rate_dependence", "creep", "cross_coupling", "thermal_drift", "sensor_periodic", "hum")
+FOLLOWED = ("lag", "saturation", "creep", "resonance", "sensor_periodic")
+
+
+def test_every_effect_has_its_place():
+    assert list(EFFECTS) == [
+        *("delay", "lag", "saturation", "rate_dependence", "creep", "resonance", "cross_coupling", "thermal_drift"),
+        *("sensor_periodic", "hum"),
+    ]
+    assert set(BY_NAME) == set(EFFECTS)
+    for name, kind in EFFECTS.items():
+        assert kind.name == name
+        assert kind.side == ("voltage" if name in ("delay", "lag", "saturation") else "displacement")
+
+
+@given(effects_and_records(EXACT))
+def test_exact_inverses(drawn):
+    effect, record = drawn
+    back = effect.invert(effect.apply(record.signal, record.around), record.around)
+    np.testing.assert_allclose(back, record.signal, rtol=0, atol=1e-9 * record.span)
+    there = effect.apply(effect.invert(record.signal, record.around), record.around)
+    np.testing.assert_allclose(there, record.signal, rtol=0, atol=1e-9 * record.span)
+
+
+@given(effects_and_records(("lag", "resonance")))
+def test_inverses_that_are_damped(drawn):
+    """On smooth paths, up to 3 Hz at 500 samples per second or more, they are good to a thousandth of the motion."""
+    effect, record = drawn
+    there = effect.apply(effect.invert(record.signal, record.around), record.around)
+    slow = (3 / effect.frequency) ** 2 if isinstance(effect, Resonance) else 0.0
+    np.testing.assert_allclose(there, record.signal, rtol=0, atol=(1e-3 + slow) * record.span)
+
+
+@given(BY_NAME["delay"], records("voltage"))
+def test_delay_is_undone_by_preview(effect, record):
+    back = effect.invert(effect.apply(record.signal, record.around), record.around)
+    t, shift = record.around.t, abs(effect.seconds)
+    known = (t >= t[0] + shift) & (t <= t[-1] - shift)
+    np.testing.assert_allclose(back[known], record.signal[known], rtol=0, atol=1e-3 * max(record.span, 1e-9))
+
+
+@given(BY_NAME["saturation"], records("voltage"))
+def test_saturation_is_a_limit(effect, record):
+    clipped = effect.apply(record.signal, record.around)
+    assert clipped.min() >= effect.lower
+    assert clipped.max() <= effect.upper
+    inside = (record.signal >= effect.lower) & (record.signal <= effect.upper)
+    assert (clipped[inside] == record.signal[inside]).all()
+    assert (effect.invert(clipped, record.around) == clipped).all()
+
+
+@given(effects_and_records(ABOUT_MOTION), st.sampled_from(("apply", "invert")))
+def test_at_rest_nothing_changes(drawn, verb):
+    effect, record = drawn
+    rest = np.full_like(record.signal, record.signal[0])
+    around = replace(record.around, u=np.full_like(rest, 50.0), others={})
+    np.testing.assert_allclose(getattr(effect, verb)(rest, around), rest, rtol=1e-12)
+
+
+@given(effects_and_records(FOLLOWED))
+def test_follower_does_what_apply_does(drawn):
+    effect, record = drawn
+    follower, samples, steps = effect.follower(), record.signal.tolist(), np.diff(record.around.t, prepend=0.0)
+    follower.start(samples[0])
+    followed = [follower.forward(dt, x) for dt, x in zip(steps.tolist(), samples, strict=True)]
+    # Stamps are even to rounding only.
+    expected = effect.apply(record.signal, record.around)
+    np.testing.assert_allclose(followed, expected, rtol=0, atol=1e-8 * record.span)
+
+
+@given(effects_and_records(FOLLOWED), st.data())
+def test_follower_gives_what_is_wanted(drawn, data):
+    """In uneven steps too; and asking moves nothing."""
+    effect, record = drawn
+    if effect.name in ("lag", "resonance"):
+        wanted, accuracy = record.signal, 2e-3 + (6 / effect.frequency if isinstance(effect, Resonance) else 0.0)
+    else:
+        wanted, accuracy = record.signal, 1e-9
+    jitter = np.random.default_rng(data.draw(st.integers(0, 10**6))).uniform(-0.4, 0.4, wanted.size)
+    jitter[[0, -1]] = 0.0
+    t = record.around.t + jitter * record.around.t[1]
+    wanted = np.interp(t, record.around.t, wanted)
+    if isinstance(effect, Saturation):
+        wanted = np.clip(wanted, effect.lower, effect.upper)
+    follower = effect.follower()
+    follower.start(float(wanted[0]))
+    got = []
+    for dt, y in zip(np.diff(t, prepend=0.0).tolist(), wanted.tolist(), strict=True):
+        before = follower.snapshot()
+        x = follower.inverse(dt, y)
+        assert follower.inverse(dt, y) == x
+        assert follower.snapshot() == before
+        got.append(follower.forward(dt, x))
+    np.testing.assert_allclose(got, wanted, rtol=0, atol=accuracy * record.span)
+
+
+@given(effects_and_records((*FOLLOWED, "rate_dependence")), st.integers(1, 1000))
+def test_a_snapshot_is_the_whole_state(drawn, at):
+    effect, record = drawn
+    one, other = effect.follower(), effect.follower()
+
+    def step(follower, dt, y, u):
+        x = follower.inverse(dt, y)
+        if hasattr(follower, "drive"):
+            follower.drive(dt, u)
+        return follower.forward(dt, x)
+
+    steps = np.diff(record.around.t, prepend=0.0).tolist()
+    samples = list(zip(steps, record.signal.tolist(), record.around.u.tolist(), strict=True))
+    for follower in (one, other):
+        if hasattr(follower, "attach"):
+            follower.attach(record.around.middle)
+        follower.start(samples[0][1])
+    for sample in samples[:at]:
+        step(one, *sample)
+    # Through JSON, as a file keeps it.
+    other.restore(_tuples(json.loads(json.dumps(one.snapshot()))))
+    for sample in samples[at : at + 50]:
+        assert step(other, *sample) == pytest.approx(step(one, *sample), rel=1e-9)
+
+
+def _tuples(value):
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+@given(BY_NAME["rate_dependence"], records("displacement"))
+def test_rate_dependence_is_followed_nearly(effect, record):
+    """Backwards only, the rate comes two samples late."""
+    follower, around = effect.follower(), record.around
+    follower.attach(around.middle)
+    follower.start(float(record.signal[0]))
+    followed, steps = [], np.diff(around.t, prepend=0.0).tolist()
+    for dt, x, u in zip(steps, record.signal.tolist(), around.u.tolist(), strict=True):
+        follower.drive(dt, u)
+        followed.append(follower.forward(dt, x))
+    added = effect.apply(record.signal, around) - record.signal
+    missed = np.array(followed) - record.signal - added
+    assert np.sqrt(np.mean(missed**2)) <= 0.2 * np.sqrt(np.mean(added**2)) + 1e-15
+
+
+@given(BY_NAME["lag"], records("voltage"))
+def test_lag_against_lsim(lag, record):
+    t, v = np.arange(record.signal.size) * record.around.t[1], record.signal - record.signal[0]
+    _, expected, _ = lsim(([1.0], [lag.time_constant, 1.0]), v, t)
+    result = lag.apply(v, Around(t))
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-9 * record.span)
+
+
+@given(BY_NAME["resonance"], records("displacement"))
+def test_resonance_against_lsim(mode, record):
+    t, h = np.arange(record.signal.size) * record.around.t[1], record.signal - record.signal[0]
+    w = 2 * np.pi * mode.frequency
+    _, expected, _ = lsim(([w * w], [1.0, 2 * mode.damping * w, w * w]), h, t)
+    np.testing.assert_allclose(mode.apply(h, Around(t)), expected, rtol=0, atol=1e-6 * record.span)
+
+
+@given(creeps(), records("displacement"))
+def test_creep_against_python_control(creep, record):
+    t, h = np.arange(record.signal.size) * record.around.t[1], record.signal - record.signal[0]
+    taus = np.array(creep.time_constants)
+    system = control.ss(np.diag(-1 / taus), (1 / taus)[:, None], np.array([creep.gains]), [[1.0]])
+    expected = control.forced_response(system, t, h).outputs
+    np.testing.assert_allclose(creep.apply(h, Around(t)), expected, rtol=0, atol=1e-9 * record.span)
+
+
+@pytest.mark.parametrize("name", ["lag", "creep", "resonance"])
+@given(st.data())
+def test_uneven_stamps_change_little(name, data):
+    """The same motion sampled evenly and unevenly answers alike."""
+    effect = data.draw(BY_NAME[name])
+    rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    even = np.arange(3000) / 1000.0
+    uneven = np.sort(np.concatenate([[0.0], rng.uniform(0, 3, 2999)]))
+
+    def motion(t):
+        return 1e-5 * np.sin(np.pi * t / 3) ** 4 * np.sin(2 * np.pi * 1.5 * t)
+
+    one, other = (effect.apply(motion(t), Around(t)) for t in (even, uneven))
+    np.testing.assert_allclose(np.interp(even, uneven, other), one, rtol=0, atol=3e-7)
+
+
+@given(sensors(), st.lists(st.floats(-1e-4, 1e-4), min_size=1, max_size=50))
+def test_readings_of_a_sensor_rise(sensor, places):
+    places = np.sort(np.array(places))
+    readings = sensor.apply(places, Around(np.arange(places.size)))
+    assert (np.diff(readings) >= -1e-18).all()
+
+
+def test_a_kick_ends_the_ringing():
+    """After the wish has come to rest, so does the stage, within a fraction of a period."""
+    mode, dt = Resonance(100.0, 0.01), 1e-4
+    t = np.arange(5000) * dt
+    wish = 1e-5 * np.clip(t / 0.05, 0, 1)
+    follower = mode.follower()
+    follower.start(0.0)
+    y = np.array(
+        [follower.forward(d, follower.inverse(d, w)) for d, w in zip(np.diff(t, prepend=0), wish, strict=True)]
+    )
+    rings = mode.apply(wish, Around(t)) - wish
+    settled = t > 0.05 + 0.005
+    assert np.abs(y - wish)[settled].max() < 0.02 * np.abs(rings)[settled].max()
+
+
+def test_no_samples_one_sample_and_no_time():
+    for effect in (Lag(0.01), Creep((0.1,), (0.1,)), Resonance(100.0, 0.1)):
+        for verb in (effect.apply, effect.invert):
+            assert verb(np.empty(0), Around(np.empty(0))).shape == (0,)
+            assert verb(np.array([3.0]), Around(np.array([7.0]))).tolist() == [3.0]
+            assert np.isfinite(verb(np.array([3.0, 5.0, 4.0]), Around(np.zeros(3)))).all()
+
+
+@given(EVERY)
+def test_parameters_survive_the_document(effect):
+    spread = {next(iter(to_document(effect)["parameters"])): 0.5}
+    for one in (effect, replace(effect, uncertainty=spread)):
+        text = json.dumps(to_document(one), allow_nan=False)
+        assert from_document(json.loads(text)) == one
+
+
+@given(st.lists(EVERY, unique_by=lambda effect: effect.name, max_size=10))
+def test_effects_stand_in_the_order_of_the_chain(effects):
+    ordered = in_order(effects)
+    assert sorted(effect.name for effect in effects) == sorted(effect.name for effect in ordered)
+    places = [list(EFFECTS).index(effect.name) for effect in ordered]
+    assert places == sorted(places)
+
+
+def test_an_effect_comes_once():
+    with pytest.raises(SlpiError, match="'lag' comes twice"):
+        in_order([Lag(0.1), Lag(0.2)])
+
+
+@given(EVERY)
+def test_a_description_is_one_sentence(effect):
+    assert len(effect.describe()) > 20
+    assert "\n" not in effect.describe()
+
+
+NONSENSE = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers(-(10**400), 10**400) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+@given(EVERY, st.data())
+def test_hostile_documents_are_refused(effect, data):
+    """With one thing wrong a document is refused in one line, or it is another valid effect."""
+    document = to_document(effect)
+    place = data.draw(st.sampled_from(("name", "parameters", "uncertainty", "one", "missing", "more")))
+    parameters = document["parameters"]
+    key = data.draw(st.sampled_from(sorted(parameters)))
+    if place in document:
+        document[place] = data.draw(NONSENSE)
+    elif place == "one":
+        parameters[key] = data.draw(NONSENSE)
+    elif place == "missing":
+        del parameters[key]
+    else:
+        parameters[data.draw(st.text())] = 1.0
+    try:
+        read: Effect = from_document(document)
+    except SlpiError as error:
+        assert "\n" not in str(error)
+    else:
+        assert from_document(to_document(read)) == read
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("lag", {"time_constant": -1.0}),
+        ("lag", {"time_constant": 0.0}),
+        ("lag", {"time_constant": float("nan")}),
+        ("lag", {"time_constant": None}),
+        ("lag", {"time_constant": True}),
+        ("lag", {"time_constant": "0.1"}),
+        ("lag", {}),
+        ("delay", {"seconds": float("inf")}),
+        ("saturation", {"lower": 5.0, "upper": 5.0}),
+        ("saturation", {"lower": float("nan"), "upper": None}),
+        ("creep", {"time_constants": [], "gains": []}),
+        ("creep", {"time_constants": [1.0], "gains": [0.1, 0.2]}),
+        ("creep", {"time_constants": [1.0], "gains": [-1.0]}),
+        ("creep", {"time_constants": 1.0, "gains": 0.1}),
+        ("resonance", {"frequency": 100.0, "damping": 1.0}),
+        ("resonance", {"frequency": 0.0, "damping": 0.1}),
+        ("cross_coupling", {"gains": {}}),
+        ("cross_coupling", {"gains": {"y": 1.5}}),
+        ("cross_coupling", {"gains": [1.5]}),
+        ("thermal_drift", {"times": [1.0, 1.0], "values": [0.0, 0.0]}),
+        ("sensor_periodic", {"period": 1e-7, "amplitude": 1e-7, "phase": 0.0}),
+        ("hum", {"frequency": -50.0, "amplitude": 1e-9, "phase": 0.0}),
+        ("rate_dependence", {"widening": 0.1, "backlash": 0, "exponent": 0, "reference_rate": 1, "threshold": 1}),
+        ("gremlins", {}),
+        (None, {}),
+        ([], {}),
+    ],
+)
+def test_what_makes_no_sense_is_refused(name, parameters):
+    with pytest.raises(SlpiError, match="^[^\n]+$"):
+        from_document({"name": name, "parameters": parameters})
+
+
+@pytest.mark.parametrize("uncertainty", [{"gain": 1.0}, {"time_constant": -1.0}, {"time_constant": float("nan")}, [1]])
+def test_uncertainties_that_make_no_sense(uncertainty):
+    with pytest.raises(SlpiError):
+        from_document({"name": "lag", "parameters": {"time_constant": 0.1}, "uncertainty": uncertainty})

@@ -1,0 +1,53 @@
+"""Progress: heard by who listens, on a terminal only, and only of long work."""
+
+import io
+
+import pytest
+from identification.records import calibration
+
+import slpi_ros
+from slpi_ros.identification.progress import listening, shown_on, tell
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_only_who_listens_hears():
+    heard = []
+    tell("before")
+    with listening(heard.append):
+        tell("within")
+        with listening(lambda _: None):
+            tell("to another")
+    tell("after")
+    assert heard == ["within"]
+
+
+def test_a_terminal_shows_the_latest_of_long_work_and_is_left_clean():
+    terminal, seconds = Terminal(), iter([0.0, 1.0, 3.0, 4.0])
+    with pytest.raises(RuntimeError), shown_on(terminal, lambda: next(seconds)):
+        for what in ("early", "later", "latest"):
+            tell(what)
+        raise RuntimeError
+    shown = terminal.getvalue()
+    assert "early" not in shown and "3 s: later" in shown and "4 s: latest" in shown
+    assert shown.endswith("\r\x1b[K")
+    tell("nobody listens any more")
+    assert terminal.getvalue() == shown
+
+
+def test_short_work_and_other_streams_show_nothing():
+    for stream in (io.StringIO(), Terminal()):
+        with shown_on(stream, lambda: 0.0):
+            tell("something")
+        assert stream.getvalue() == ""
+
+
+@pytest.mark.parametrize("kind", ["slpi", "slpi-published"])
+def test_an_identification_tells_what_it_does(kind):
+    heard = []
+    with listening(heard.append):
+        slpi_ros.identify(calibration(seed=1, duration=8.0)[0], kind)
+    assert heard[0].startswith("axis x") and sum("left out" in what for what in heard) >= 5

@@ -9,10 +9,12 @@ from std_msgs.msg import Float64MultiArray
 
 from slpi_ros.nodes.qos import COMMANDS
 from slpi_ros.nodes.runner import run
+from slpi_ros.runtime.joint_state_bytes import JointStates
+from slpi_ros.runtime.wire import before_numbers
 
 
 class Echo(Node):
-    """Publishes on ``voltage_command`` for each message on ``desired_displacement``."""
+    """Publishes on ``voltage_command`` for each message on ``desired_displacement``, as rclpy's users write it."""
 
     def __init__(self) -> None:
         super().__init__("echo")
@@ -27,5 +29,21 @@ class Echo(Node):
         self._publisher.publish(self._answer)
 
 
+class BytesEcho(Node):
+    """The same with messages as bytes, as the compensator takes and gives them."""
+
+    def __init__(self) -> None:
+        super().__init__("bytes_echo")
+        self._reader = JointStates()
+        self._before = before_numbers(2)
+        self._publisher = self.create_publisher(Float64MultiArray, "voltage_command", COMMANDS)
+        self.create_subscription(JointState, "desired_displacement", self._on_desired, COMMANDS, raw=True)
+
+    def _on_desired(self, data: bytes) -> None:
+        _, _, numbers = self._reader.read(data)
+        self._publisher.publish(self._before + array("d", numbers).tobytes())
+
+
 if __name__ == "__main__":
-    sys.exit(run(Echo, executor=sys.argv[1] if len(sys.argv) > 1 else "events"))
+    kind, executor = sys.argv[1:3]
+    sys.exit(run({"echo": Echo, "bytes": BytesEcho}[kind], executor=executor))

@@ -1,20 +1,22 @@
-"""A client that sends desired displacements at a steady rate and times the answers, and the processes it talks to."""
+"""Nodes in processes of their own, and a client that sends them desired displacements and times their answers."""
 
 import json
 import os
+import struct
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import rclpy
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -43,9 +45,11 @@ def identified_stage() -> StageModel:
 
 
 @contextmanager
-def node(*command: str) -> Iterator[subprocess.Popen[bytes]]:
+def node(namespace: str, *command: str) -> Iterator[subprocess.Popen[bytes]]:
     """Run a node in a session of its own; end it at last."""
-    process = subprocess.Popen([sys.executable, *command], start_new_session=True)
+    options = [] if "--ros-args" in command else ["--ros-args"]
+    remapping = ["-r", f"__ns:=/{namespace}"]
+    process = subprocess.Popen([sys.executable, *command, *options, *remapping], start_new_session=True)
     try:
         yield process
     finally:
@@ -58,68 +62,87 @@ def node(*command: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @contextmanager
-def compensator(model: StageModel, executor: str = "events", **parameters: object) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the compensator with a model of both axes."""
+def compensator(
+    namespace: str, model: StageModel, executor: str = "events", remap: Sequence[str] = (), **parameters: object
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run the compensator with a model of both axes; remap topics as in ``from:=to``."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "stage.json"
         slpi_ros.save_model(model, path)
         given = {"axes": list(AXES), "model_file": str(path), "executor": executor, **parameters}
         options = [part for name, value in given.items() for part in ("-p", f"{name}:={json.dumps(value)}")]
-        with node("-m", "slpi_ros.nodes.compensator", "--ros-args", *options) as process:
+        options += [part for rule in remap for part in ("-r", rule)]
+        with node(namespace, "-m", "slpi_ros.nodes.compensator", "--ros-args", *options) as process:
             yield process
 
 
 @contextmanager
-def echo(executor: str = "events") -> Iterator[subprocess.Popen[bytes]]:
-    """Run the bare echo node."""
-    with node(str(HERE / "echo_node.py"), executor) as process:
+def echo(namespace: str, kind: str = "echo", executor: str = "events") -> Iterator[subprocess.Popen[bytes]]:
+    """Run an echo node."""
+    with node(namespace, str(HERE / "echo_node.py"), kind, executor) as process:
         yield process
 
 
-@dataclass(frozen=True)
+@dataclass
 class Trip:
-    """What became of a stream of messages.
+    """What became of the messages to one node.
 
     Parameters
     ----------
-    latency : ndarray, shape (answers,), seconds
+    latency : list of ndarray, seconds
+        Of the answers, block by block.
     sent, answered : int
-    cpu : float
-        Share of a core that the node took.
-    resident : ndarray, shape (k,), bytes
+    busy, took : float, seconds
+        Processor time of the node, and time in all.
+    resident : list of int, bytes
         Memory of the node, once a second.
     """
 
-    latency: FloatArray
-    sent: int
-    answered: int
-    cpu: float
-    resident: NDArray[np.int64]
+    latency: list[FloatArray] = field(default_factory=list)
+    sent: int = 0
+    answered: int = 0
+    busy: float = 0.0
+    took: float = 0.0
+    resident: list[int] = field(default_factory=list)
 
     @property
     def lost(self) -> int:
         """Messages without an answer."""
         return self.sent - self.answered
 
+    @property
+    def cpu(self) -> float:
+        """Share of a core that the node took."""
+        return self.busy / self.took
+
     def percentiles(self) -> tuple[float, float]:
         """Return p50 and p99 in microseconds."""
-        p50, p99 = np.percentile(self.latency * 1e6, (50, 99))
+        p50, p99 = np.percentile(np.concatenate(self.latency or [[np.nan]]) * 1e6, (50, 99))
         return float(p50), float(p99)
 
 
 class Client:
-    """Sends at a steady rate and receives in between, in one thread: its own delay is the same for every node."""
+    """Sends at a steady rate and receives in between, in one thread: its own delay is the same for every node.
 
-    def __init__(self) -> None:
+    Messages go and come as bytes, so that the client leaves as much as possible of the machine to the nodes.
+    """
+
+    def __init__(self, namespaces: Sequence[str]) -> None:
         self._node = rclpy.create_node("round_trip_client")
         self._executor = make_executor("events")
         self._executor.add_node(self._node)
-        self._publisher = self._node.create_publisher(JointState, "desired_displacement", DEEP)
-        self._node.create_subscription(Float64MultiArray, "voltage_command", self._on_answer, DEEP)
+        self._publishers = {}
+        for namespace in namespaces:
+            topic = f"/{namespace}/desired_displacement"
+            self._publishers[namespace] = self._node.create_publisher(JointState, topic, DEEP)
+            answers = f"/{namespace}/voltage_command"
+            self._node.create_subscription(Float64MultiArray, answers, self._on_answer, DEEP, raw=True)
         self._received: list[int] = []
         t, y = scan_path(2e-6, 18e-6, duration=20.0, rate=1000.0, seed=5)
         self._path = y.tolist()
-        self._message = JointState(name=list(AXES))
+        marks = (1.2345, 5.4321)
+        self._message = bytearray(serialize_message(JointState(name=list(AXES), position=marks)))
+        self._positions_at = self._message.index(struct.pack("=2d", *marks))
         self._index = 0
 
     def close(self) -> None:
@@ -127,62 +150,66 @@ class Client:
         self._executor.shutdown()
         self._node.destroy_node()
 
-    def run(self, process: subprocess.Popen[bytes], rate: float, seconds: float) -> Trip:
-        """Send for a while to the node that `process` is."""
-        self._wait_for_node()
-        self._send_for(rate, 1.0)
-        self._drain()
-        self._received.clear()
-        cpu, began = _cpu_seconds(process.pid), time.monotonic()
-        sent, resident = self._send_for(rate, seconds, process.pid)
-        self._drain(len(sent))
-        took = time.monotonic() - began
-        answered = min(len(self._received), len(sent))
-        latency = (np.array(self._received[:answered]) - np.array(sent[:answered])) * 1e-9
-        load = (_cpu_seconds(process.pid) - cpu) / took
-        return Trip(latency, len(sent), answered, load, np.array(resident))
+    def wait_for_nodes(self) -> None:
+        """Return once all nodes are there, and have answered for a second."""
+        deadline = time.monotonic() + DISCOVERY_S
+        for namespace, publisher in self._publishers.items():
+            answers = f"/{namespace}/voltage_command"
+            while not (publisher.get_subscription_count() and self._node.count_publishers(answers)):
+                if time.monotonic() > deadline:
+                    raise RuntimeError(f"the node {namespace} did not show up")
+                self._executor.spin_once(timeout_sec=0.1)
+        time.sleep(0.5)
+        for namespace in self._publishers:
+            self._received.clear()
+            self._drain(len(self._send_for(namespace, 1000.0, 1.0, [])))
 
-    def _on_answer(self, _: Float64MultiArray) -> None:
+    def run(self, namespace: str, process: subprocess.Popen[bytes], rate: float, seconds: float, trip: Trip) -> None:
+        """Send for a while to the node that `process` is, and note what becomes of it."""
+        self._received.clear()
+        busy, began = _cpu_seconds(process.pid), time.monotonic()
+        sent = self._send_for(namespace, rate, seconds, trip.resident, process.pid)
+        self._drain(len(sent))
+        trip.took += time.monotonic() - began
+        trip.busy += _cpu_seconds(process.pid) - busy
+        trip.sent += len(sent)
+        trip.answered += len(self._received)
+        # Answers do not tell what they answer: after a loss they cannot be matched.
+        if len(self._received) == len(sent):
+            trip.latency.append((np.array(self._received) - np.array(sent)) * 1e-9)
+
+    def _on_answer(self, _: bytes) -> None:
         self._received.append(time.perf_counter_ns())
 
-    def _wait_for_node(self) -> None:
-        deadline = time.monotonic() + DISCOVERY_S
-        while not (self._publisher.get_subscription_count() and self._node.count_publishers("voltage_command")):
-            if time.monotonic() > deadline:
-                raise RuntimeError("the node did not show up")
-            self._executor.spin_once(timeout_sec=0.1)
-        time.sleep(0.5)
-
-    def _send_for(self, rate: float, seconds: float, pid: int | None = None) -> tuple[list[int], list[int]]:
-        period = round(1e9 / rate)
+    def _send_for(
+        self, namespace: str, rate: float, seconds: float, resident: list[int], pid: int | None = None
+    ) -> list[int]:
+        publisher, period = self._publishers[namespace], round(1e9 / rate)
         sent: list[int] = []
-        resident: list[int] = []
         start = time.perf_counter_ns()
         for k in range(round(seconds * rate)):
             due = start + k * period
             while (left := due - time.perf_counter_ns()) > 0:
                 self._executor.spin_once(timeout_sec=left * 1e-9)
-            self._send()
+            publisher.publish(self._next_message())
             sent.append(time.perf_counter_ns())
             if pid and k % round(rate) == 0:
                 resident.append(_resident(pid))
             # Late for the next: still look for answers now and then.
             if k % 8 == 0:
                 self._executor.spin_once(timeout_sec=0.0)
-        return sent, resident
+        return sent
 
-    def _send(self) -> None:
+    def _next_message(self) -> bytes:
         self._index += 1
         y = self._path[self._index % len(self._path)]
-        now = time.time_ns()
-        stamp = self._message.header.stamp
-        stamp.sec, stamp.nanosec = divmod(now, 1_000_000_000)
-        self._message.position = (y, y)
-        self._publisher.publish(self._message)
+        struct.pack_into("=iI", self._message, 4, *divmod(time.time_ns(), 1_000_000_000))
+        struct.pack_into("=2d", self._message, self._positions_at, y, y)
+        return bytes(self._message)
 
-    def _drain(self, count: int | None = None) -> None:
-        deadline = time.monotonic() + (LAST_ANSWERS_S if count else 1.0)
-        while time.monotonic() < deadline and (count is None or len(self._received) < count):
+    def _drain(self, count: int) -> None:
+        deadline = time.monotonic() + LAST_ANSWERS_S
+        while time.monotonic() < deadline and len(self._received) < count:
             self._executor.spin_once(timeout_sec=0.05)
 
 

@@ -6,20 +6,20 @@ Exit codes: 0 done, 1 the data do not allow it, 2 wrong usage; what is wrong is 
 import argparse
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
-from typing import NoReturn
-
-import numpy as np
 
 from slpi_ros import bags, tables
-from slpi_ros.errors import ModelError, SlpiError, UsageError
-from slpi_ros.excitation.drives import DRIVES, excite
-from slpi_ros.identification.findings import findings, require_usable
-from slpi_ros.identification.fit import KINDS, identify
+from slpi_ros.cli_options import parser
+from slpi_ros.diagnosis.diagnose import diagnose
+from slpi_ros.errors import ModelError, RecordError, SlpiError, UsageError
+from slpi_ros.excitation.drives import excite
+from slpi_ros.files import make_folder
+from slpi_ros.identification.findings import Finding, findings, require_usable
+from slpi_ros.identification.fit import identify
 from slpi_ros.identification.progress import shown_on
 from slpi_ros.identification.quality import assess
 from slpi_ros.identification.record import FloatArray, Record
@@ -32,16 +32,9 @@ from slpi_ros.reports.text import describe_change, describe_model
 from slpi_ros.stream import Limits
 
 
-class _Parser(argparse.ArgumentParser):
-    """A parser that says what is wrong in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code."""
-    options = _parser().parse_args(arguments)
+    options = parser().parse_args(arguments)
     for output in (sys.stdout, sys.stderr):
         # A terminal that cannot show a character gets its number.
         if isinstance(output, TextIOWrapper):
@@ -49,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = partial(_show_warning, options.command)
     try:
         with shown_on(sys.stderr):
-            options.run(options)
+            COMMANDS[options.command](options)
     except SlpiError as error:
         print(f"slpi {options.command}: {_one_line(error)}", file=sys.stderr)
         return error.exit_code
@@ -67,93 +60,6 @@ def _show_warning(command: str, message: Warning | str, *_: object) -> None:
 
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="slpi", description="Hysteresis models of piezo stages: identify, simulate, compensate.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
-
-    command = commands.add_parser("import", help="turn a table of measured data into a bag")
-    command.set_defaults(run=_import)
-    command.add_argument("table", metavar="DATA.csv|DATA.mat")
-    command.add_argument("-o", "--output", metavar="BAG", required=True, help="folder of the new bag")
-    command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
-    command.add_argument("--voltage", metavar="COLUMN", nargs="+", default=(), help="one for all axes or one for each")
-    command.add_argument("--displacement", metavar="COLUMN", nargs="+", default=(), help="one for each axis")
-    command.add_argument("--displacement-unit", default="um", help="m, mm, um or nm, where column names do not say it")
-    command.add_argument(
-        "--axes", metavar="NAME", nargs="+", default=(), help="names of the axes; default: from the columns"
-    )
-    command.add_argument("--hardware-id", metavar="ID", default="", help="which stage it is")
-    command.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
-
-    command = commands.add_parser("identify", help="identify the model of a stage from a bag")
-    command.set_defaults(run=_identify)
-    command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a lone mcap or sqlite3 file")
-    command.add_argument("-o", "--output", metavar="MODEL.json", required=True)
-    command.add_argument("--kind", choices=KINDS, default="slpi")
-    command.add_argument(
-        "--loops-at-rest",
-        action="store_true",
-        help="slpi-published: operators start at rest, as published",
-    )
-    command.add_argument("--topic", default="stage_state")
-    command.add_argument("--voltage-topic", metavar="TOPIC", help="where voltage and displacement are apart")
-    command.add_argument("--displacement-topic", metavar="TOPIC")
-    clocks = ("displacement", "voltage")
-    command.add_argument("--clock", choices=clocks, default=clocks[0], help="whose stamps count")
-    command.add_argument("--voltage-measured", action="store_true", help="voltage is a reading, no command that holds")
-    command.add_argument("--axis", metavar="NAME", nargs="+", help="default: every axis of the bag")
-    command.add_argument("--start", metavar="S", type=float, help="fit only from here on, seconds from the first stamp")
-    command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
-    command.add_argument("--report", metavar="DIR", help="also write a page with plots, of the first bag")
-    command.add_argument("--uncertainty", action="store_true", help="also say how surely the curves are known")
-
-    command = commands.add_parser("excite", help="make the voltages to record for an identification")
-    command.set_defaults(run=_excite)
-    command.add_argument("-o", "--output", metavar="DRIVE.csv", required=True, help="columns time_s, <axis>_V")
-    command.add_argument("--axis", metavar="NAME", nargs="+", default=("x",), help="they move one after the other")
-    command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="never left")
-    command.add_argument("--voltage-max", metavar="V", type=float, required=True)
-    command.add_argument("--slew", metavar="V/S", type=float, default=0.0, help="fastest change; 0: none")
-    command.add_argument("--duration", metavar="S", type=float, default=30.0)
-    command.add_argument("--rate", metavar="HZ", type=float, default=200.0)
-    command.add_argument("--seed", metavar="N", type=int, default=0)
-    command.add_argument(
-        "--for", dest="drive", metavar="EFFECT", choices=DRIVES, default=DRIVES[0],
-        help=f"what the record is to tell from others: {', '.join(DRIVES[1:])}",
-    )  # fmt: skip
-
-    command = commands.add_parser("refit", help="update a model with a new bag; what the bag does not visit stays")
-    command.set_defaults(run=_refit)
-    command.add_argument("model", metavar="MODEL.json")
-    command.add_argument("bag", metavar="BAG")
-    command.add_argument("-o", "--output", metavar="MODEL.json", required=True, help="may be the same file")
-    command.add_argument("--topic", default="stage_state")
-
-    command = commands.add_parser("simulate", help="voltage to displacement")
-    command.set_defaults(run=_simulate)
-    command.add_argument("model", metavar="MODEL.json")
-    command.add_argument("table", metavar="VOLTAGE.csv", help="columns time_s, <axis>_V")
-    command.add_argument("-o", "--output", metavar="DISPLACEMENT.csv", required=True)
-
-    command = commands.add_parser("compensate", help="desired displacement to voltage")
-    command.set_defaults(run=_compensate)
-    command.add_argument("model", metavar="MODEL.json")
-    command.add_argument("table", metavar="DESIRED.csv", help="columns time_s, <axis>_m")
-    command.add_argument("-o", "--output", metavar="VOLTAGE.csv", required=True)
-    command.add_argument("--voltage-min", metavar="V", type=float, default=-np.inf, help="default: what was identified")
-    command.add_argument("--voltage-max", metavar="V", type=float, default=np.inf)
-
-    command = commands.add_parser("experiments", help="compute the two papers' tables and figures anew")
-    command.set_defaults(run=_experiments)
-    command.add_argument("-o", "--output", metavar="DIR", required=True, help="folder of index.html")
-    command.add_argument("--data", metavar="DIR", help="folder of measured records, to be compared too")
-
-    command = commands.add_parser("show", help="say what a model holds")
-    command.set_defaults(run=_show)
-    command.add_argument("model", metavar="MODEL.json")
-    return parser
 
 
 def _import(options: argparse.Namespace) -> None:
@@ -176,9 +82,10 @@ def _identify(options: argparse.Namespace) -> None:
         raise ModelError(f"{target}: cannot be written: no file can be there; choose another place")
     if options.uncertainty:
         require_known_uncertainty(options.kind)
+    if options.report:
+        make_folder(options.report)
     records = bags.read_bags(options.bags, _topics(options), axes=options.axis)
-    for record in records:
-        _judge(record, options)
+    found = [_judged(record, options) for record in records]
     model = identify(records, options.kind, start=options.start, stop=options.stop, loops_at_rest=options.loops_at_rest)
     save_model(model, options.output)
     told = []
@@ -191,7 +98,7 @@ def _identify(options: argparse.Namespace) -> None:
             axis: held_out_truth(records, axis, options.kind, loops_at_rest=options.loops_at_rest, **part)
             for axis in model.axes
         }
-        write_report(Path(options.report), records[0], model, truth=truth)
+        write_report(Path(options.report), records[0], model, truth=truth, found=found[0])
         told += [f"axis {axis}: {line}" for axis, held_out in truth.items() for line in held_out.lines()]
     if options.uncertainty:
         for axis in model.axes:
@@ -209,12 +116,51 @@ def _topics(options: argparse.Namespace) -> str | bags.SeparateTopics:
     return bags.SeparateTopics(voltage, displacement, clock=options.clock, held=not options.voltage_measured)
 
 
-def _judge(record: Record, options: argparse.Namespace) -> None:
-    """Print what the record is good for; stop where it is good for nothing."""
+def _judged(record: Record, options: argparse.Namespace) -> dict[str, list[Finding]]:
+    """Print and return what the record is good for, by axis; stop where it is good for nothing."""
+    judged = {}
     for axis in record.axes:
-        found = findings(assess(record, axis, start=options.start, stop=options.stop))
+        judged[axis] = found = findings(assess(record, axis, start=options.start, stop=options.stop))
         print("\n".join(f"axis {axis}: {finding.level:4} {finding.text}" for finding in found))
         require_usable(found, f"{record.source}: axis '{axis}'")
+    return judged
+
+
+def _diagnose(options: argparse.Namespace) -> None:
+    # Plotting is slow to load, and most commands do without.
+    from slpi_ros.reports.diagnosis_files import PAGE, describe_diagnosis, make_room, write_files
+
+    model = load_model(options.model)
+    folder = Path(options.output)
+    make_room(folder)
+    record = _with_other_axes(options)
+    try:
+        axes = options.axis or [axis for axis in model.axes if axis in record.axes]
+        for axis in axes:
+            record.require_axis(axis)
+            model.axis(axis)
+            require_usable(findings(assess(record, axis)), f"{record.source}: axis '{axis}'")
+        diagnosis = diagnose(record, model, axes=axes)
+    except UsageError as error:
+        # That bag and model do not go together shows only once both have been read.
+        raise ModelError(str(error)) from None
+    write_files(folder, diagnosis)
+    print("\n".join(describe_diagnosis(diagnosis)))
+    print(f"{folder / PAGE}: open it in a browser")
+
+
+def _with_other_axes(options: argparse.Namespace) -> Record:
+    """Return all axes of the bag: each may show on the others. Where that cannot be, only those asked for."""
+    topics = _topics(options)
+    if options.axis and isinstance(topics, bags.SeparateTopics):
+        # There the axes may have no names but those given.
+        return bags.read_bag(options.bag, topics, axes=options.axis)
+    try:
+        return bags.read_bag(options.bag, topics)
+    except RecordError:
+        if not options.axis:
+            raise
+        return bags.read_bag(options.bag, topics, axes=options.axis)
 
 
 def _excite(options: argparse.Namespace) -> None:
@@ -280,6 +226,19 @@ def _experiments(options: argparse.Namespace) -> None:
 
 def _show(options: argparse.Namespace) -> None:
     print("\n".join(describe_model(load_model(options.model))))
+
+
+COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
+    "import": _import,
+    "identify": _identify,
+    "diagnose": _diagnose,
+    "excite": _excite,
+    "refit": _refit,
+    "simulate": _simulate,
+    "compensate": _compensate,
+    "experiments": _experiments,
+    "show": _show,
+}
 
 
 if __name__ == "__main__":

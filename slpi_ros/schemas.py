@@ -2,12 +2,14 @@
 
 import json
 import textwrap
+from collections.abc import Iterator
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
 from jsonschema import Draft202012Validator
 from jsonschema.exceptions import best_match
+from jsonschema.validators import extend
 
 from slpi_ros.errors import ModelError, UsageError
 
@@ -67,5 +69,16 @@ def validate(document: object, name: str, source: str) -> None:
 
 
 @cache
-def _validator(name: str) -> Draft202012Validator:
-    return Draft202012Validator(load_schema(name))
+def _validator(name: str) -> Any:
+    return _QuickValidator(load_schema(name))
+
+
+def _items(validator: Any, schema: Any, values: Any, parent: Any) -> Iterator[Any]:
+    """Check the items of an array; where the least and the largest float are allowed, so are all between."""
+    check = Draft202012Validator.VALIDATORS["items"]
+    floats = isinstance(values, list) and len(values) > 2 and all(type(value) is float for value in values)
+    if not floats or any(True for _ in check(validator, schema, [min(values), max(values)], parent)):
+        yield from check(validator, schema, values, parent)
+
+
+_QuickValidator: Any = extend(Draft202012Validator, {"items": _items})  # type: ignore[no-untyped-call]

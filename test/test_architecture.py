@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
 # From top to bottom. A module may import its own layer and those below it.
 LAYERS = (
-    {"nodes", "cli"},
+    {"nodes", "cli", "cli_options"},
     {"reports", "experiments"},
     {"diagnosis"},
     {

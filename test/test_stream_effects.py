@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE
 from test_model_effects import CREEP, DT, SPAN, T, X, coupled, path, wishes, with_effects
@@ -152,6 +152,7 @@ def test_creep_goes_on_in_a_pause(pause):
 
 
 @pytest.mark.parametrize("effects", SETS, ids=ids)
+@settings(max_examples=20)
 @given(st.integers(0, 300))
 def test_snapshots_and_twins(effects, at):
     axis = with_effects(*effects)

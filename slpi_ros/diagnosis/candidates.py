@@ -1,7 +1,8 @@
 """What each effect would look like in a record, for all of them to compete."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.signal
@@ -58,14 +59,22 @@ def _delay(now: Explanation) -> Iterator[Trial]:
     dt = _step(now)
     for seconds in (-4.0 * dt, 0.5 * dt, 2.0 * dt, 8.0 * dt):
         columns = now.respond(Delay(seconds).apply(now.u, now.around)) - now.h
-        yield Trial(columns[:, None], lambda g, s=seconds: Delay(float(g[0]) * s))
+        yield Trial(columns[:, None], partial(_shifted, seconds))
+
+
+def _shifted(seconds: float, gains: FloatArray) -> Effect:
+    return Delay(float(gains[0]) * seconds)
 
 
 def _lag(now: Explanation) -> Iterator[Trial]:
     dt = _step(now)
-    for tau in dt * np.array([0.5, 2.0, 8.0, 32.0]):
-        columns = now.respond(Lag(float(tau)).apply(now.u, now.around)) - now.h
-        yield Trial(columns[:, None], lambda g, s=float(tau): Lag(float(g[0]) * s) if g[0] > 0 else None)
+    for tau in (0.5 * dt, 2.0 * dt, 8.0 * dt, 32.0 * dt):
+        columns = now.respond(Lag(tau).apply(now.u, now.around)) - now.h
+        yield Trial(columns[:, None], partial(_lagging, tau))
+
+
+def _lagging(tau: float, gains: FloatArray) -> Effect | None:
+    return Lag(float(gains[0]) * tau) if gains[0] > 0 else None
 
 
 def _creep(now: Explanation) -> Iterator[Trial]:
@@ -96,7 +105,11 @@ def _thermal_drift(now: Explanation) -> Iterator[Trial]:
         times = np.linspace(t[0], t[-1], knots)
         # The displacement at rest takes up a constant.
         hats = np.column_stack([np.interp(t, times, row) for row in np.eye(knots)[1:]])
-        yield Trial(hats, lambda g, times=times: ThermalDrift(tuple(times.tolist()), (0.0, *g.tolist())))
+        yield Trial(hats, partial(_drifting, times))
+
+
+def _drifting(times: FloatArray, gains: FloatArray) -> Effect:
+    return ThermalDrift(tuple(times.tolist()), (0.0, *gains.tolist()))
 
 
 def _cross_coupling(now: Explanation) -> Iterator[Trial]:
@@ -162,7 +175,8 @@ def _sensor_periodic(now: Explanation) -> Iterator[Trial]:
         columns = np.column_stack([np.sin(phase), np.cos(phase)])
 
         def effect(g: FloatArray, period: float = period) -> Effect:
-            return SensorPeriodic(period, min(float(np.hypot(*g)), 0.9 * period / (2 * np.pi)), float(np.arctan2(g[1], g[0])))
+            amplitude = min(float(np.hypot(*g)), 0.9 * period / (2 * np.pi))
+            return SensorPeriodic(period, amplitude, float(np.arctan2(g[1], g[0])))
 
         yield Trial(columns, effect)
 
@@ -177,23 +191,27 @@ def _resonance(now: Explanation) -> Iterator[Trial]:
         for damping in (0.02, 0.08):
             one = Resonance(frequency, damping)
             columns = one.apply(now.h, now.around) - now.h
-            yield Trial(columns[:, None], lambda g, one=one: one if g[0] > 0 else None, positive=1)
+            yield Trial(columns[:, None], partial(_ringing, one), positive=1)
+
+
+def _ringing(one: Resonance, gains: FloatArray) -> Effect | None:
+    return one if gains[0] > 0 else None
 
 
 def _rate_dependence(now: Explanation) -> Iterator[Trial]:
     u, t = now.u, now.evidence.t
-    rate = np.abs(np.gradient(u, t))
-    reference = float(np.sqrt(np.mean(rate**2)))
+    reference = float(np.sqrt(np.mean(np.gradient(u, t) ** 2)))
     span = float(np.ptp(u))
-    for exponent in (0.15, 0.4, 0.7):
-        for threshold in (0.02 * span, 0.1 * span, 0.3 * span):
-            widening = RateDependence(1.0, 0.0, exponent, reference, threshold).apply(now.h, now.around) - now.h
-            backlash = (RateDependence(0.0, 1e-6, exponent, reference, threshold).apply(now.h, now.around) - now.h) / 1e-6
+    for exponent in (0.2, 0.5, 0.8):
+        for transition in (0.01 * span, 0.04 * span, 0.12 * span):
+            wider = RateDependence(1.0, 0.0, exponent, reference, transition)
+            behind = RateDependence(0.0, 1e-6, exponent, reference, transition)
+            columns = np.column_stack([one.apply(now.h, now.around) - now.h for one in (wider, behind)])
 
-            def effect(g: FloatArray, exponent: float = exponent, threshold: float = threshold) -> Effect:
-                return RateDependence(float(g[0]), float(g[1]), exponent, reference, threshold)
+            def effect(g: FloatArray, behind: RateDependence = behind) -> Effect | None:
+                return replace(behind, widening=float(g[0]), backlash=1e-6 * float(g[1])) if g.max() > 0 else None
 
-            yield Trial(np.column_stack([widening, backlash]), effect, positive=2)
+            yield Trial(columns, effect, positive=2)
 
 
 def _saturation(now: Explanation) -> Iterator[Effect]:

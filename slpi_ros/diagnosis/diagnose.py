@@ -1,6 +1,6 @@
 """From a record and a model to what the model gets wrong, why, and the model that gets it right."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slpi_ros.diagnosis.evidence import evidence_of
-from slpi_ros.diagnosis.explanation import Evidence, Explanation
+from slpi_ros.diagnosis.evidence import Evidence
+from slpi_ros.diagnosis.explanation import Explanation
+from slpi_ros.diagnosis.gather import evidence_of
 from slpi_ros.diagnosis.judge import judged
 from slpi_ros.diagnosis.selection import counts, select
 from slpi_ros.diagnosis.verdict import AxisDiagnosis, Diagnosis
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.floor import Floor, floor_of
+from slpi_ros.identification.progress import tell
 from slpi_ros.identification.record import Record
 from slpi_ros.model import AxisModel, StageModel, Start
 
@@ -26,13 +28,7 @@ FloatArray = NDArray[np.float64]
 FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
 
 
-def diagnose(
-    record: Record,
-    model: StageModel,
-    *,
-    axes: Sequence[str] | None = None,
-    progress: Callable[[str], None] = lambda _: None,
-) -> Diagnosis:
+def diagnose(record: Record, model: StageModel, *, axes: Sequence[str] | None = None) -> Diagnosis:
     """Find what a model gets wrong on a record, name the causes, and extend the model by them.
 
     Parameters
@@ -42,8 +38,6 @@ def diagnose(
         Of the same stage.
     axes : sequence of str, optional
         All that record and model share by default.
-    progress : callable
-        Is told what is being done, in a few words.
 
     Returns
     -------
@@ -72,21 +66,19 @@ def diagnose(
     for axis in chosen:
         try:
             with threadpool_limits(1):
-                found[axis], extended[axis] = _diagnose_axis(
-                    record, axis, model.axis(axis), lambda what, axis=axis: progress(f"axis {axis}: {what}")
-                )
+                found[axis], extended[axis] = _diagnose_axis(record, axis, model.axis(axis))
         except SlpiError as error:
-            raise type(error)(f"{record.source}: axis '{axis}': {error}") from None
+            where = f"{record.source}: axis '{axis}': "
+            raise type(error)(where + str(error).removeprefix(where)) from None
     created = datetime.now(UTC).isoformat(timespec="seconds")
     return Diagnosis(found, replace(model, axes=extended, created=created), record.source)
 
 
-def _diagnose_axis(
-    record: Record, axis: str, model: AxisModel, progress: Callable[[str], None]
-) -> tuple[AxisDiagnosis, AxisModel]:
+def _diagnose_axis(record: Record, axis: str, model: AxisModel) -> tuple[AxisDiagnosis, AxisModel]:
+    tell(f"axis {axis}: fitting the hysteresis")
     evidence = evidence_of(record, axis, model)
     base = Explanation(evidence, model.effects)
-    selection = select(base, _with_loop_family(base, record, axis, model), progress)
+    selection = select(base, _with_loop_family(base, record, axis, model))
     _require_own(model, base, selection.now)
     floor = _floor(selection.now)
     given = _given_rms(model, base, evidence.v, evidence.y)
@@ -94,7 +86,7 @@ def _diagnose_axis(
 
 
 def _with_loop_family(base: Explanation, record: Record, axis: str, model: AxisModel) -> Explanation | None:
-    """Return the explanation by the loop family in place of a kind whose loops are the same everywhere, if it counts."""
+    """Return the explanation by the loop family, where the kind of the model is another and that counts."""
     if model.kind == "slpi":
         return None
     family = Explanation(evidence_of(record, axis, None), model.effects)

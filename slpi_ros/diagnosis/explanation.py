@@ -1,12 +1,13 @@
 """The hysteresis of one axis with effects around it, fitted to a record together."""
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.diagnosis.evidence import Evidence
 from slpi_ros.diagnosis.joint import Joint, Score
 from slpi_ros.diagnosis.parameters import bounded, free, moved, names, steps
 from slpi_ros.effects.creep import Creep
@@ -14,7 +15,6 @@ from slpi_ros.effects.effect import Around, Effect
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import Hysteresis
-from slpi_ros.identification.bases import Basis, SurfaceBasis
 from slpi_ros.identification.linear import SMOOTHNESS
 from slpi_ros.identification.problem import Problem
 from slpi_ros.identification.samples import Samples
@@ -31,57 +31,6 @@ SOON = 0.025
 ENOUGH = 1e-3
 # Of a step, where all of it is too much.
 SHARES = (1.0, 0.4, 0.1)
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What a record says about one axis.
-
-    Parameters
-    ----------
-    t : ndarray, shape (N,), seconds
-        From the first stamp.
-    v : ndarray, shape (N,), volts
-        As commanded or read.
-    y : ndarray, shape (N,), metres
-    used : ndarray of bool, shape (N,)
-        Samples that are explained; the others (outliers, drop-outs, what came before the memory was known) only move
-        the memory.
-    history : tuple of float, volts
-        As in `slpi_ros.model.Start`.
-    basis : Basis
-        Of the hysteresis.
-    smoothness : float
-    others : mapping of axis name to ndarray, shape (N,), metres
-        How far the other axes of the record have moved since its start.
-    beside : ndarray, shape (N, k), metres
-        Columns that stand beside the hysteresis, whatever their gains.
-    """
-
-    t: FloatArray
-    v: FloatArray
-    y: FloatArray
-    used: NDArray[np.bool_]
-    history: tuple[float, ...]
-    basis: Basis
-    smoothness: float
-    others: Mapping[str, FloatArray] = field(default_factory=dict)
-    beside: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-
-    def __post_init__(self) -> None:
-        """Give `beside` its rows."""
-        if not self.beside.size:
-            object.__setattr__(self, "beside", np.empty((self.t.size, 0)))
-
-    @property
-    def lead(self) -> int:
-        """Number of voltages before the record's first."""
-        return len(self.history)
-
-    def problem(self, u: FloatArray) -> Problem:
-        """Pose the problem of the hysteresis driven by `u`, shape (N,), volts."""
-        low, high = (self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf))
-        return Problem.pose([Samples(np.clip(u, low, high), self.y, self.used).after(self.history)], self.basis)
 
 
 class Explanation:
@@ -173,15 +122,17 @@ class Explanation:
         """Return the displacement (m) half-way between the two branches of the largest loop, at voltages `u` (V)."""
         levels = np.linspace(float(self.u.min()), float(self.u.max()), LEVELS)
         around_twice = np.concatenate([levels, levels[::-1], levels])
-        loop = Samples(around_twice, np.zeros(3 * LEVELS), np.ones(3 * LEVELS, dtype=bool))
+        loop = Samples(around_twice, around_twice, np.ones(3 * LEVELS, dtype=bool))
         y = Problem.pose([loop], self.evidence.basis).design.predict(self._x) * self.joint.problem.scale
         falling, rising = y[LEVELS : 2 * LEVELS][::-1], y[2 * LEVELS :]
-        return np.interp(u, levels, 0.5 * (falling + rising) + self.h[0] - y[0])
+        middle = 0.5 * (falling + rising) + self.h[0] - y[0]
+        return np.asarray(np.interp(u, levels, middle), dtype=np.float64)
 
     def respond(self, u: FloatArray) -> FloatArray:
         """Return what the hysteresis gives (m) for another voltage `u`, shape (N,), volts."""
         evidence = self.evidence
-        return evidence.problem(u).design.predict(self._x)[evidence.lead :] * self.joint.problem.scale
+        response: FloatArray = evidence.problem(u).design.predict(self._x)[evidence.lead :]
+        return response * self.joint.problem.scale
 
     @cached_property
     def tangents(self) -> FloatArray:
@@ -276,7 +227,7 @@ class Explanation:
         effects = []
         for effect in self.effects:
             own = {name: spread.pop(0) for name in names(effect)}
-            effects.append(replace(effect, uncertainty=own))
+            effects.append(replace(effect, uncertainty=own))  # type: ignore[type-var]
         return effects
 
     def smoothed(self) -> "Explanation":

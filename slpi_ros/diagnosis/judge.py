@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.diagnosis import advice
-from slpi_ros.diagnosis.evidence import one_speed
 from slpi_ros.diagnosis.explanation import Explanation
+from slpi_ros.diagnosis.gather import one_speed
 from slpi_ros.diagnosis.selection import Named, Selection, chance_of_gain, gain
 from slpi_ros.diagnosis.verdict import (
     AMBIGUOUS,
@@ -73,9 +73,11 @@ def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
 
 def _evidence(effect: Effect, named: Named) -> str:
     sentence = effect.describe()
+    before, after = named.before.rms * 1e9, named.after.rms * 1e9
+    chance = 100 * chance_of_gain(named.before, named.after)
     gained = (
-        f"with it the error on blocks left out falls from {named.before.rms * 1e9:.3g} to "
-        f"{named.after.rms * 1e9:.3g} nm rms (chance gains as much in {100 * chance_of_gain(named.before, named.after):.2g} % of cases)"
+        f"with it the error on blocks left out falls from {before:.3g} to {after:.3g} nm rms "
+        f"(chance gains as much in {chance:.2g} % of cases)"
     )
     if not named.runner_up:
         return f"{sentence}; {gained}, and no other effect comes near"
@@ -93,16 +95,17 @@ def _left(selection: Selection, floor: Floor) -> bool:
 def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor) -> str:
     if effects:
         return AMBIGUOUS if effects[0].alternatives else NAMED
-    return UNEXPLAINED if selection.structures or _left(selection, floor) else NOTHING_FOUND
+    wrong_kind = "loops that depend on bias" in selection.structures
+    return UNEXPLAINED if wrong_kind or _left(selection, floor) else NOTHING_FOUND
 
 
 def _summary(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor) -> str:
     before, after = selection.base.held_out.rms * 1e9, selection.now.held_out.rms * 1e9
     left = f"{after:.3g} nm rms are left, the floor of the record is {floor.rms * 1e9:.3g} nm"
     found = ", ".join(f"{named.name} ({named.gain_percent:.0f} %)" for named in effects)
-    structure = f"The hysteresis itself is wrong: {', '.join(selection.structures)}. " if selection.structures else ""
     if verdict == NOTHING_FOUND:
         return f"Nothing found: {left}."
+    structure = f"The hysteresis itself is wrong: {', '.join(selection.structures)}. " if selection.structures else ""
     if verdict == UNEXPLAINED:
         return f"{structure}None of the known effects explains the error: {left}."
     others = ""
@@ -112,7 +115,7 @@ def _summary(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...
 
 
 def _next(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...]) -> str | None:
-    steps = [advice.of_structure(structure) for structure in selection.structures]
+    steps = [] if verdict == NOTHING_FOUND else [advice.of_structure(structure) for structure in selection.structures]
     if verdict == AMBIGUOUS:
         names = (effects[0].name, *effects[0].alternatives)
         steps.append(advice.separating(names, one_speed=one_speed(selection.now.evidence)))

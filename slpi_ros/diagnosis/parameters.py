@@ -17,7 +17,7 @@ FREE = {
     "delay": ("seconds",),
     "lag": ("time_constant",),
     "saturation": ("lower", "upper"),
-    "rate_dependence": ("widening", "backlash"),
+    "rate_dependence": ("widening", "backlash", "exponent", "transition"),
     "creep": ("time_constants", "gains"),
     "resonance": ("frequency", "damping"),
     "cross_coupling": ("gains",),
@@ -35,9 +35,11 @@ LEAST = {
     "frequency": 1e-3,
     "period": 1e-9,
     "amplitude": 0.0,
+    "exponent": 0.05,
+    "transition": 1e-3,
 }
 # Greatest values, of any effect or of one. What is damped more does not ring, and what creeps more is something else.
-MOST = {"damping": 0.4, "creep.gains": 0.15, "cross_coupling.gains": 0.4}
+MOST = {"damping": 0.4, "exponent": 3.0, "creep.gains": 0.15, "cross_coupling.gains": 0.4}
 # Effects none of whose other parameters may be negative.
 NOT_NEGATIVE = ("creep", "rate_dependence")
 # Parameters that the displacement is linear in, or nearly so at any size.

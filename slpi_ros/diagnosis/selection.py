@@ -1,6 +1,6 @@
 """The competition: every effect tries to explain what is left, and the best one stays, if its gain is beyond chance."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.candidates import TRIALS, Trial
 from slpi_ros.diagnosis.explanation import Explanation
-from slpi_ros.diagnosis.evidence import one_speed
+from slpi_ros.diagnosis.gather import one_speed
 from slpi_ros.diagnosis.joint import Score
 from slpi_ros.diagnosis.parameters import free
 from slpi_ros.diagnosis.structure import STRUCTURES
 from slpi_ros.effects.effect import Effect
 from slpi_ros.errors import ModelError
+from slpi_ros.identification.progress import tell
 
 FloatArray = NDArray[np.float64]
 
@@ -164,7 +165,7 @@ class Selection:
     structures: tuple[str, ...]
 
 
-def select(base: Explanation, family: Explanation | None, progress: Callable[[str], None]) -> Selection:
+def select(base: Explanation, family: Explanation | None) -> Selection:
     """Add effects as long as one of them counts; drop those that later ones make needless.
 
     Parameters
@@ -173,14 +174,13 @@ def select(base: Explanation, family: Explanation | None, progress: Callable[[st
         Without any.
     family : Explanation, optional
         The same by the loop family, where that does better than the kind of `base`: then effects stand beside it.
-    progress : callable
     """
     structures: tuple[str, ...]
     now, structures = (family, ("loops that depend on bias",)) if family else (base, ())
     start = now
     rivals: dict[str, list[Contender]] = {}
     while len(rivals) < MOST_EFFECTS:
-        progress(f"{len(now.effects)} effects, {now.held_out.rms * 1e9:.3g} nm left")
+        tell(f"{len(now.effects)} effects found, {now.held_out.rms * 1e9:.3g} nm left, trying others")
         found = contenders(now)
         structure, with_structure = _best_structure(now, structures)
         if structure and (not found or _beats(with_structure.held_out, found[0].score)):

@@ -12,6 +12,7 @@ from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
 from slpi_ros.effects.rate_follower import RateFollower
 from slpi_ros.effects.uniform import Uniform
 from slpi_ros.errors import ModelError
+from slpi_ros.hysteresis.runs import monotone_runs
 
 # Samples over which the rate is smoothed where the whole path is known.
 WINDOW = 7
@@ -21,8 +22,8 @@ WINDOW = 7
 class RateDependence:
     """``y = h + (|du/dt| / r)^e (widening (h - m(u)) - backlash z)``.
 
-    ``m`` is the middle of the largest loop, and ``z`` the direction, -1 to 1: a stop operator of the voltage ``u``,
-    divided by its threshold.
+    ``m`` is the middle of the largest loop, and ``z`` the direction of the voltage ``u``, -1 to 1: after a turn it
+    comes round with the way, ``dz = (sign(du) - z) |du| / transition``.
 
     Parameters
     ----------
@@ -34,8 +35,8 @@ class RateDependence:
         ``e``.
     reference_rate : float, V/s
         ``r``.
-    threshold : float, volts
-        Way after which the direction counts in full.
+    transition : float, volts
+        Way after a turn within which the direction comes round, to 1/e.
     uncertainty : mapping of str to float
     """
 
@@ -47,7 +48,7 @@ class RateDependence:
     backlash: float
     exponent: float
     reference_rate: float
-    threshold: float
+    transition: float
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -58,7 +59,7 @@ class RateDependence:
             ("backlash", abs(self.backlash) <= 1, "within 1 m"),
             ("exponent", 0 < self.exponent <= 4, "more than 0, at most 4"),
             ("reference_rate", 1e-9 <= self.reference_rate <= 1e12, "from 1e-9 to 1e12 V/s"),
-            ("threshold", 1e-9 <= self.threshold <= 1e5, "from 1e-9 to 1e5 V"),
+            ("transition", 1e-9 <= self.transition <= 1e5, "from 1e-9 to 1e5 V"),
         )
 
     def apply(self, signal: FloatArray, around: Around) -> FloatArray:
@@ -83,7 +84,7 @@ class RateDependence:
 
     def follower(self) -> RateFollower:
         """Return the effect sample by sample."""
-        return RateFollower(self.widening, self.backlash, self.exponent, self.reference_rate, self.threshold)
+        return RateFollower(self.widening, self.backlash, self.exponent, self.reference_rate, self.transition)
 
     def _drive(self, around: Around) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the loop's middle (m), the speed to the power and the direction, shape (N,) each."""
@@ -101,8 +102,10 @@ class RateDependence:
     def _direction(self, u: FloatArray) -> FloatArray:
         if not self.backlash:
             return np.zeros_like(u)
-        z, stretched = 0.0, []
-        for way in np.diff(u, prepend=u[:1]).tolist():
-            z = min(max(z + way, -self.threshold), self.threshold)
-            stretched.append(z)
-        return np.array(stretched) / self.threshold
+        direction, now = np.zeros_like(u), 0.0
+        for start, stop in monotone_runs(u):
+            turn = u[max(start - 1, 0)]
+            way = float(np.sign(u[stop - 1] - turn))
+            direction[start:stop] = way + (now - way) * np.exp(-np.abs(u[start:stop] - turn) / self.transition)
+            now = float(direction[stop - 1])
+        return direction

@@ -1,7 +1,7 @@
 """Rate dependence sample by sample."""
 
 from collections.abc import Callable
-from math import exp
+from math import copysign, exp
 
 # Share of the latest rate in the smoothed one.
 SMOOTHING = 0.5
@@ -19,15 +19,15 @@ class RateFollower:
 
     Parameters
     ----------
-    widening, backlash, exponent, reference_rate, threshold : float
+    widening, backlash, exponent, reference_rate, transition : float
         As in `RateDependence`.
     """
 
     def __init__(
-        self, widening: float, backlash: float, exponent: float, reference_rate: float, threshold: float
+        self, widening: float, backlash: float, exponent: float, reference_rate: float, transition: float
     ) -> None:
-        self._widening, self._backlash = widening, backlash / threshold
-        self._exponent, self._reference_rate, self._threshold = exponent, reference_rate, threshold
+        self._widening, self._backlash = widening, backlash
+        self._exponent, self._reference_rate, self._transition = exponent, reference_rate, transition
         self._middle: Callable[[float], float] = float
         self.start(0.0)
 
@@ -38,7 +38,7 @@ class RateFollower:
     def start(self, x: float) -> None:
         """Be at rest at `x` (m); the next voltage is the one it rests at."""
         self._u: float | None = None
-        self._rate = self._way = self._wish_rate = self._volts = self._metres = 0.0
+        self._rate = self._direction = self._wish_rate = self._volts = self._metres = 0.0
         self._wish: float | None = x
         self._asked: float | None = None
 
@@ -50,14 +50,14 @@ class RateFollower:
             self._compare(dt, way)
         if self._asked is not None or dt > 0.0:
             self._wish, self._asked = self._asked, None
-        self._way = min(max(self._way + way, -self._threshold), self._threshold)
+        self._direction = self._turned(way)
         self._u = u
 
     def forward(self, dt: float, x: float) -> float:
         """Return the displacement (m) of the wider loops for one of the loops at rest (m)."""
         if self._u is None or not self._rate:
             return x
-        behind = self._backlash * self._way
+        behind = self._backlash * self._direction
         return x + self._speed(self._rate) * (self._widening * (x - self._middle(self._u)) - behind)
 
     def inverse(self, dt: float, wanted: float) -> float:
@@ -66,19 +66,25 @@ class RateFollower:
         if self._u is None or self._wish is None or dt <= 0.0:
             return wanted
         rate = (self._wish_rate + SMOOTHING * ((wanted - self._wish) / dt - self._wish_rate)) * self._volts_per_metre()
-        way = min(max(self._way + rate * dt, -self._threshold), self._threshold)
         speed, middle = self._speed(rate), self._middle(self._u + rate * dt)
-        back = wanted + speed * (self._widening * middle + self._backlash * way)
+        back = wanted + speed * (self._widening * middle + self._backlash * self._turned(rate * dt))
         return back / (1 + speed * self._widening)
 
     def snapshot(self) -> RateState:
-        """Return voltage, rate, way since the turn within the threshold, and what is known of the wishes."""
-        return self._u, self._rate, self._way, self._wish, self._wish_rate, self._volts, self._metres
+        """Return voltage, rate, direction, and what is known of the wishes."""
+        return self._u, self._rate, self._direction, self._wish, self._wish_rate, self._volts, self._metres
 
     def restore(self, state: RateState) -> None:
         """Take over a state from `snapshot`."""
-        self._u, self._rate, self._way, self._wish, self._wish_rate, self._volts, self._metres = state
+        self._u, self._rate, self._direction, self._wish, self._wish_rate, self._volts, self._metres = state
         self._asked = None
+
+    def _turned(self, way: float) -> float:
+        """Return the direction after a way (V)."""
+        if not way:
+            return self._direction
+        toward = copysign(1.0, way)
+        return toward + (self._direction - toward) * exp(-abs(way) / self._transition)
 
     def _speed(self, rate: float) -> float:
         return float((abs(rate) / self._reference_rate) ** self._exponent)

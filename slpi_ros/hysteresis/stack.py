@@ -15,9 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.runs import count_before
-from slpi_ros.hysteresis.shape import FAR, Shape
+from slpi_ros.hysteresis.shape import FAR, Curve, Shape
 
 FloatArray = NDArray[np.float64]
+
+# Turns can be many, curves are large.
+KEPT_CURVES = 64
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class TurningPoints:
     """
 
     __slots__ = (
-        *("_shape", "_rest", "_far", "_turns", "_direction", "_v", "_y"),
+        *("_shape", "_rest", "_far", "_turns", "_left", "_direction", "_v", "_y"),
         # the present branch: origin, curve, where it closes, and how far the quick path may go on it
         *("_v0", "_y0", "_curve", "_u", "_f", "_close", "_reach_u", "_reach_f"),
     )
@@ -94,6 +97,8 @@ class TurningPoints:
         self._direction = state.direction
         self._v, self._y = state.voltage, state.displacement
         self._turns: tuple[list[float], list[float]] = (list(state.turn_voltages), list(state.turn_displacements))
+        # The curve that was left at each turn, where it is known: most are entered again.
+        self._left: list[Curve | None] = [None] * len(state.turn_voltages)
         self._enter_branch()
 
     def _turn_to(self, direction: int) -> None:
@@ -103,27 +108,34 @@ class TurningPoints:
         if self._direction:
             self._turns[0].append(self._v)
             self._turns[1].append(self._y)
+            self._left.append(self._curve)
+            if len(self._left) > KEPT_CURVES:
+                self._left[-KEPT_CURVES - 1] = None
         self._direction = direction
         self._enter_branch()
 
     def _close_loop(self) -> None:
         """Forget the loop that has just closed and go on along the older branch."""
-        for turns in self._turns:
+        older = self._left[-2] if len(self._left) > 1 else None
+        for turns in (*self._turns, self._left):
             del turns[-2:]
-        self._enter_branch()
+        self._enter_branch(older)
 
-    def _enter_branch(self) -> None:
-        """Look up the branch from the last turning point in the present direction, and where it closes."""
+    def _enter_branch(self, known: Curve | None = None) -> None:
+        """Look up the branch from the last turning point in the present direction, and where it closes.
+
+        `known` is its curve, if that has been looked up before.
+        """
         s, shape = self._direction, self._shape
         v_turns, y_turns = self._turns
         if v_turns:
             self._v0, self._y0 = v_turns[-1], y_turns[-1]
-            self._curve = shape.branch(s, self._v0)
+            self._curve = known or shape.branch(s, self._v0)
             self._close = (v_turns[-2], y_turns[-2]) if len(v_turns) > 1 else self._first_closing(s)
         else:
             self._v0, self._y0 = self._rest
             falls_from_low_end = s < 0 and not shape.symmetric_rest
-            self._curve = shape.branch(s, self._v0) if falls_from_low_end else shape.first_rise(self._v0)
+            self._curve = known or (shape.branch(s, self._v0) if falls_from_low_end else shape.first_rise(self._v0))
             self._close = (s * inf, s * inf) if s else self._rest
         self._u, self._f, _ = self._curve
         # Beyond its closing, or far away, a branch is no longer to be followed without a second look.

@@ -1,6 +1,7 @@
 """The compensator's models: from a file, and from the topic ``stage_model`` while it runs."""
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -14,9 +15,17 @@ from slpi_ros.nodes.compensator_report import Reporter
 from slpi_ros.nodes.compensator_settings import CompensatorSettings
 from slpi_ros.runtime.saved_memory import model_id
 
+# Characters; documents of stages have some ten thousand.
+LARGEST = 4_000_000
+
+# A model and its fingerprint.
+Read = tuple[StageModel, str]
+
 
 class Models:
     """Takes models over, and says which one is in use and why another is not.
+
+    To check a document takes as long as many commands, so this is done in the background.
 
     Parameters
     ----------
@@ -36,9 +45,11 @@ class Models:
         reporter: Reporter,
         settings: Callable[[], CompensatorSettings],
     ) -> None:
-        self._log, self._topic = node.get_logger(), node.resolve_topic_name("stage_model")
+        self._node, self._log, self._topic = node, node.get_logger(), node.resolve_topic_name("stage_model")
         self._compensation, self._keeper, self._reporter, self._settings = compensation, keeper, reporter, settings
         self._in_use = ""
+        self._background = ThreadPoolExecutor(1, "stage_model")
+        self._coming: Future[Read] | None = None
 
     def load(self, path: str) -> None:
         """Use the model of a file.
@@ -48,19 +59,42 @@ class Models:
         ModelError
             If there is none, or it cannot serve.
         """
-        self._use(load_model(path), path)
+        model = load_model(path)
+        self._use(model, model_id(model), path)
 
     def on_message(self, message: String) -> None:
-        """Use the model of a message, or say why not: the one before works on."""
-        try:
-            self._use(parse_model(message.data, self._topic), self._topic)
-        except SlpiError as error:
-            self._log.error(f"model refused: {error}")
-            self._reporter.model_refused(str(error))
+        """Use the model of a message soon, or say why not: the one before works on.
 
-    def _use(self, model: StageModel, source: str) -> None:
+        Of those that have not been looked at when a newer one comes, nothing becomes.
+        """
+        if self._coming:
+            self._coming.cancel()
+        if len(message.data) > LARGEST:
+            self._refuse(ModelError(f"{self._topic}: {len(message.data)} characters are more than {LARGEST}"))
+            return
+        self._coming = self._background.submit(_read, message.data, self._topic)
+        self._coming.add_done_callback(self._on_read)
+
+    def _on_read(self, coming: Future[Read]) -> None:
+        """Go on in the thread that the node lives in."""
+        if self._node.executor and not coming.cancelled():
+            self._node.executor.create_task(self._take, coming)
+
+    def _take(self, coming: Future[Read]) -> None:
+        if self._reporter.state == "unconfigured":
+            return
+        try:
+            self._use(*coming.result(), self._topic)
+        except SlpiError as error:
+            self._refuse(error)
+
+    def _refuse(self, error: SlpiError) -> None:
+        self._log.error(f"model refused: {error}")
+        self._reporter.model_refused(str(error))
+
+    def _use(self, model: StageModel, fingerprint: str, source: str) -> None:
         """Take a model over, unless it is the one in use: a latched document may come more than once."""
-        fingerprint, compensation = model_id(model), self._compensation
+        compensation = self._compensation
         if compensation.model is None or fingerprint != self._in_use:
             saved = None if compensation.driven else self._keeper.find(model, self._settings().limits)
             try:
@@ -72,3 +106,8 @@ class Models:
             if compensation.active:
                 self._keeper.save(complete=False)
         self._reporter.model_taken(fingerprint)
+
+
+def _read(text: str, source: str) -> Read:
+    model = parse_model(text, source)
+    return model, model_id(model)

@@ -11,7 +11,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.nodes.compensation import Compensation
 from slpi_ros.runtime.clock import SECOND_NS
-from slpi_ros.runtime.rejection import INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
+from slpi_ros.runtime.rejection import EMPTY, INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
 from slpi_ros.runtime.timing import Timing
 from slpi_ros.runtime.trajectory import Trajectory
 from slpi_ros.runtime.trajectory_bytes import TrajectoryArrays, decode_trajectory
@@ -51,6 +51,7 @@ class TrajectoryFollower:
         self._node, self._compensation = node, compensation
         self._publish, self._resting_since_ns = publish, resting_since_ns
         self.lateness = Timing()
+        self._on_simulated = False
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(SIMULATED_PERIOD, self._on_timer, clock=steady)
         self._timer.cancel()
@@ -63,7 +64,7 @@ class TrajectoryFollower:
         SlpiError
             If it cannot be followed; what was being followed goes on.
         """
-        arrays = decode_trajectory(data) or _read(deserialize_message(data, JointTrajectory))
+        arrays = decode_trajectory(data) or _as_rclpy_reads(data)
         if not arrays.time_from_start_ns.size:
             self.stop()
             return
@@ -82,6 +83,7 @@ class TrajectoryFollower:
         compensation.driving.stop()
         since_ns = self._resting_since_ns() + now_ns - time.monotonic_ns()
         compensation.following.start(trajectory, self._now_ns, since_ns)
+        self._on_simulated = self._simulated
         self._wait()
 
     def stop(self) -> None:
@@ -90,8 +92,13 @@ class TrajectoryFollower:
         self._compensation.following.stop()
 
     def _on_timer(self) -> None:
-        following = self._compensation.following
-        while (deadline_ns := following.next_deadline_ns) is not None and deadline_ns <= (now_ns := self._now_ns()):
+        if self._on_simulated != self._simulated:
+            self.stop()
+            self._node.get_logger().error("use_sim_time was changed: the trajectory's times mean nothing now, stopped")
+            return
+        # One point at a time: others have their turn even where points come faster than they can be given.
+        deadline_ns, now_ns = self._compensation.following.next_deadline_ns, self._now_ns()
+        if deadline_ns is not None and deadline_ns <= now_ns:
             self._compensation.follow(now_ns)
             self._publish()
             self.lateness.note(deadline_ns, now_ns)
@@ -115,14 +122,18 @@ class TrajectoryFollower:
         return int(self._node.get_clock().now().nanoseconds) if self._simulated else time.monotonic_ns()
 
 
-def _read(message: JointTrajectory) -> TrajectoryArrays:
-    """Return what a JointTrajectory says whose points are not alike.
+def _as_rclpy_reads(data: bytes) -> TrajectoryArrays:
+    """Return what a serialized JointTrajectory says whose points are not alike.
 
     Raises
     ------
     RejectedError
-        If a point has not one position for each joint.
+        If it cannot be read, or a point has not one position for each joint.
     """
+    try:
+        message = deserialize_message(data, JointTrajectory)
+    except RuntimeError as error:
+        raise RejectedError(EMPTY, "the message cannot be read; send a JointTrajectory") from error
     stamp, names = message.header.stamp, tuple(message.joint_names)
     for i, point in enumerate(message.points):
         if len(point.positions) != len(names):

@@ -1,15 +1,12 @@
-"""One identification in a process of its own, so that the node that asked for it stays awake."""
+"""One identification in a process of its own."""
 
-import json
-import multiprocessing
-import signal
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 
 from slpi_ros.bags import read_bag
 from slpi_ros.errors import SlpiError
 from slpi_ros.identification.fit import identify
 from slpi_ros.model_file import format_model, save_model
+from slpi_ros.nodes.worker_process import WorkerProcess
 
 
 @dataclass(frozen=True)
@@ -50,48 +47,11 @@ class FitOutcome:
     error: str = ""
 
 
-class FitProcess:
+class FitProcess(WorkerProcess[FitRequest, FitOutcome]):
     """An identification under way."""
 
     def __init__(self, request: FitRequest) -> None:
-        self.request = request
-        # No fork: the threads of the middleware would not survive it.
-        context = multiprocessing.get_context("spawn")
-        self._receiver, sender = context.Pipe(duplex=False)
-        self._process = context.Process(target=work, args=(sender, request), daemon=True)
-        # Ctrl-C reaches the whole group of processes; it is for this one to end the other.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        sender.close()
-
-    def outcome(self) -> FitOutcome | None:
-        """Return what came of it, or None while it is under way; never waits for it."""
-        if not self._receiver.poll():
-            return None
-        try:
-            outcome = FitOutcome(**json.loads(self._receiver.recv_bytes()))
-        except EOFError:
-            self._process.join()
-            outcome = FitOutcome(
-                error=f"{self.request.source}: the identification ended with exit code {self._process.exitcode} "
-                "and no result; look for a lack of memory, or try a shorter part of the record"
-            )
-        self.end()
-        return outcome
-
-    def end(self) -> None:
-        """End it, done or not."""
-        self._process.kill()
-        self._process.join()
-        self._receiver.close()
-
-
-def work(sender: Connection, request: FitRequest) -> None:
-    """Send the outcome of a request: what the process does."""
-    sender.send_bytes(json.dumps(vars(fit(request))).encode())
+        super().__init__(fit, request, FitOutcome, f"{request.source}: the identification")
 
 
 def fit(request: FitRequest) -> FitOutcome:

@@ -1,6 +1,7 @@
 """Node ``identify``: bags in, a latched model out."""
 
 import math
+import os
 import sys
 import time
 from collections import deque
@@ -18,6 +19,7 @@ from slpi_ros.model import StageModel
 from slpi_ros.model_file import parse_model
 from slpi_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.fit_process import FitOutcome, FitProcess, FitRequest
+from slpi_ros.nodes.identify_diagnosis import DiagnosisService, Identified
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, choice, number
 from slpi_ros.nodes.qos import LATCHED
 from slpi_ros.nodes.runner import run
@@ -49,6 +51,11 @@ DECLARATIONS = (
         number=True,
     ),
     Declaration(
+        "diagnosis_directory", "",
+        "Folder that ~/diagnose writes into; empty: the folder NAME_diagnosis beside the output NAME.json, without an "
+        "output a temporary one, which the answer names.",
+    ),
+    Declaration(
         "diagnostic_period", 1.0, "Seconds between two reports on /diagnostics.",
         read_only=True, between=REPORT_PERIOD, number=True,
     ),
@@ -65,11 +72,14 @@ class IdentifySettings:
         What to identify; without bags, what to identify those of the watched folder like.
     watch_directory : str
         "": none.
+    diagnosis_directory : str
+        "": a temporary one.
     diagnostic_period : float, seconds
     """
 
     request: FitRequest
     watch_directory: str
+    diagnosis_directory: str
     diagnostic_period: float
 
     @classmethod
@@ -92,7 +102,13 @@ class IdentifySettings:
         folder = values["watch_directory"]
         if folder:
             BagWatch(folder)
-        return cls(request, folder, number(values, "diagnostic_period", *REPORT_PERIOD))
+        diagnosis = values["diagnosis_directory"] or beside(request.output)
+        return cls(request, folder, diagnosis, number(values, "diagnostic_period", *REPORT_PERIOD))
+
+
+def beside(output: str) -> str:
+    """Return the folder beside the file of a model that its diagnosis goes to; "" for no file."""
+    return f"{os.path.splitext(output)[0]}_diagnosis" if output else ""
 
 
 def bound(values: Values, name: str) -> float | None:
@@ -108,8 +124,8 @@ class Identify(Node):
     """A node that identifies the stage of bags and keeps the model latched on ``stage_model``.
 
     Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`; the service ``~/identify``
-    (``std_srvs/Trigger``) starts anew. A bag that cannot be identified is reported and skipped, and the last good model
-    stays published.
+    (``std_srvs/Trigger``) starts anew, ``~/diagnose`` says what the published model gets wrong on its bag. A bag that
+    cannot be identified is reported and skipped, and the last good model stays published.
 
     Raises
     ------
@@ -127,6 +143,7 @@ class Identify(Node):
         self._watch: BagWatch | None = None
         self._failed = 0
         self._model: StageModel | None = None
+        self._identified: Identified | None = None
         self._error = ""
         # A simulated clock may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -134,13 +151,28 @@ class Identify(Node):
         self.create_timer(self._parameter_set.settings.diagnostic_period, self._report, clock=steady)
         self._watching = self.create_timer(WATCH_PERIOD, self._look_for_bags, clock=steady)
         self.create_service(Trigger, "~/identify", self._on_trigger)
-        self._parameter_set.follow(self._begin)
-        self._begin(self._parameter_set.settings)
+        self._diagnosis = DiagnosisService(
+            self,
+            lambda: self._identified,
+            lambda: self._parameter_set.settings.diagnosis_directory,
+            self._report,
+        )
+        self._settings = self._parameter_set.settings
+        self._parameter_set.follow(self._on_change)
+        self._begin(self._settings)
 
     def destroy_node(self) -> None:
-        """End the identification under way, then destroy the node."""
+        """End the work under way, then destroy the node."""
         self._end_job()
+        self._diagnosis.end()
         super().destroy_node()
+
+    def _on_change(self, settings: IdentifySettings) -> None:
+        """Begin anew, unless only the place of the next diagnosis has changed."""
+        before, self._settings = self._settings, settings
+        moved = settings.diagnosis_directory != before.diagnosis_directory
+        if not moved or replace(settings, diagnosis_directory=before.diagnosis_directory) != before:
+            self._begin(settings)
 
     def _begin(self, settings: IdentifySettings) -> None:
         """Start to identify what the parameters name, in place of what is under way."""
@@ -189,15 +221,17 @@ class Identify(Node):
     def _look(self) -> None:
         """Look whether the identification is done."""
         outcome = self._job.outcome() if self._job else None
-        if outcome:
-            self._job = None
+        if self._job and outcome:
+            request, self._job = self._job.request, None
             self._poll.cancel()
-            self._take(outcome)
+            self._take(request, outcome)
             self._start_next()
 
-    def _take(self, outcome: FitOutcome) -> None:
+    def _take(self, request: FitRequest, outcome: FitOutcome) -> None:
         if outcome.document:
             self._model = parse_model(outcome.document, "identify")
+            self._identified = Identified(request.bags[-1], request.topic, outcome.document)
+            self._diagnosis.forget()
             self._publisher.publish(String(data=outcome.document))
             self.get_logger().info(described(self._model))
         self._error = outcome.error
@@ -215,6 +249,7 @@ class Identify(Node):
             "waiting_bags": len(self._queue),
             "failed": self._failed,
             "last_error": self._error,
+            **self._diagnosis.values,
         }
         for name, axis in model.axes.items() if model else ():
             quality = axis.quality
@@ -231,13 +266,15 @@ class Identify(Node):
         problems = ((ERROR, self._error),) if self._error else ()
         if not problems and not model and not self._job and not self._watch:
             problems = ((WARN, NOTHING_TO_DO),)
+        if self._diagnosis.error:
+            problems = (*problems, (WARN, self._diagnosis.error))
         hardware_id = model.hardware_id if model else ""
         self._diagnostics.report(Health(problems, self._doing(), values, hardware_id))
 
     def _doing(self) -> str:
         if self._job:
             return f"identifying {self._job.request.source} for {time.monotonic() - self._job_start:.0f} s"
-        return described(self._model) if self._model else ""
+        return self._diagnosis.doing or (described(self._model) if self._model else "")
 
 
 def described(model: StageModel) -> str:

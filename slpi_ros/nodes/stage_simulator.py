@@ -13,6 +13,7 @@ from std_msgs.msg import Float64MultiArray
 from slpi_ros.errors import UsageError
 from slpi_ros.nodes.qos import COMMANDS
 from slpi_ros.nodes.runner import run
+from slpi_ros.stage.presets import p11_stage
 from slpi_ros.stage.stage import Stage
 
 LOG_PERIOD = 5.0
@@ -28,9 +29,13 @@ class StageSimulator(Node):
     Subscribes ``voltage_command`` (std_msgs/Float64MultiArray, volts in the order of the axes) and publishes
     ``stage_state`` (sensor_msgs/JointState: ``position`` in metres as measured, ``effort`` in volts as
     applied).
-    Parameters, all read-only: ``axes``, ``seed``, ``noise_rms`` (m), ``rate`` (Hz), ``voltage_min`` and
+    Parameters, all read-only: ``axes``, ``seed``, ``preset``, ``noise_rms`` (m), ``rate`` (Hz), ``voltage_min`` and
     ``voltage_max`` (V; commands beyond them are clipped, as the amplifier saturates), ``hardware_id``, and
     ``answer_commands``: publish one state for each accepted command, or, when false, `rate` states a second.
+
+    Without preset the stage is drawn from the seed, and only its hysteresis counts. Preset "p11" is the creeping and
+    ringing stage of the MPI paper, axes x and y, with noise of its own, of which the seed is; it lives on the node's
+    clock, so that a simulated one may drive it.
 
     Attributes
     ----------
@@ -47,7 +52,7 @@ class StageSimulator(Node):
         super().__init__("stage_simulator")
         self.ignored = 0
         axes = self._axes()
-        self._stage = Stage.random(axes, self._seed(), self._number("noise_rms", 8e-9))
+        self._stage, self._latest = self._make_stage(axes), 0.0
         self._low, self._high = self._limits()
         self._state = JointState(name=axes)
         self._state.header.frame_id = self.declare_parameter("hardware_id", "simulated", _READ_ONLY).value
@@ -74,7 +79,9 @@ class StageSimulator(Node):
             self._publish()
 
     def _apply(self, voltages: Sequence[float]) -> None:
-        self._displacement = self._stage.step(self.get_clock().now().nanoseconds * 1e-9, voltages)
+        # Whatever the clock does, a stage has no way back.
+        self._latest = max(self._latest, self.get_clock().now().nanoseconds * 1e-9)
+        self._displacement = self._stage.step(self._latest, voltages)
         self._state.effort = array("d", voltages)
 
     def _publish(self) -> None:
@@ -90,6 +97,20 @@ class StageSimulator(Node):
         if not axes or not all(axes):
             raise UsageError(f"stage_simulator: axes is {axes}; name at least one axis, none of them empty")
         return axes
+
+    def _make_stage(self, axes: list[str]) -> Stage:
+        preset = self.declare_parameter("preset", "", _READ_ONLY).value
+        seed, noise = self._seed(), self._number("noise_rms", 8e-9)
+        if not preset:
+            return Stage.random(axes, seed, noise)
+        if preset != "p11":
+            raise UsageError(f"stage_simulator: no preset '{preset}'; choose p11, or none")
+        stage = p11_stage(seed)
+        if axes != list(stage.axes):
+            raise UsageError(
+                f"stage_simulator: axes are {', '.join(axes)}, those of preset p11 {', '.join(stage.axes)}; name these"
+            )
+        return stage
 
     def _seed(self) -> int:
         seed = int(self.declare_parameter("seed", 0, _READ_ONLY).value)

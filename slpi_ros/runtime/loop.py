@@ -48,6 +48,8 @@ class ClosedLoop:
         self._settings = settings
         self._pace = Pace(limits)
         self._t, self._wanted = 0.0, applied.voltage
+        self._desired: float | None
+        self._aim: float | None
         self._start()
 
     @property
@@ -90,15 +92,16 @@ class ClosedLoop:
         self._feedback.limits = self._pace.limits = limits
 
     def measure(self, displacement: float, now: float) -> None:
-        """Note a measurement (m) that came at `now` (s)."""
+        """Note a measurement (m) that came at `now` (s): it shows what became of the last sample."""
         if isfinite(displacement):
-            self._measured, self._measured_at = displacement, now
+            self._measured, self._measured_at, self._aim = displacement, now, self._desired
             self.residuals.measure(displacement)
 
     def correct(self, dt: float, desired: float, feedforward: float, now: float) -> float:
         """Return the voltage in total (V).
 
-        A measurement acts once, and only while it is fresh; without one the correction stays.
+        A measurement acts once, and only while it is fresh; without one the correction stays. What counts is how far it
+        was from what was desired when it came: what is desired now, nobody can have measured yet.
 
         Parameters
         ----------
@@ -112,10 +115,10 @@ class ClosedLoop:
         self._t += dt
         before = self.applied.voltage
         self._acting = now - self._measured_at <= self._settings.timeout
-        v = wanted = self._give(desired, feedforward)
+        v = wanted = self._give(desired if self._aim is None else self._aim, feedforward)
         if self._pace.limits.acceleration < inf:
             v = self._pace.step(before, wanted, dt, self._wanted)
-        self._wanted = wanted
+        self._wanted, self._desired = wanted, desired
         self._measured_at = -inf
         self.residuals.expect(self.applied.drive(v, dt))
         return v
@@ -129,6 +132,7 @@ class ClosedLoop:
         voltage = self.applied.voltage
         self._pace.rest()
         self._t, self._wanted = 0.0, voltage
+        self._desired = self._aim = None
         self._measured, self._measured_at, self._acting = 0.0, -inf, False
         self._feedback = Feedback(self._settings.gains, self._pace.limits, voltage)
         self._feedback.hold(0.0, voltage)

@@ -90,7 +90,7 @@ class Record:
 @st.composite
 def records(draw: st.DrawFn, side: str) -> Record:
     """Draw a smooth motion of three tones up to 3 Hz, faded in, at even stamps."""
-    rate, size = draw(st.sampled_from((500.0, 1000.0, 4000.0))), draw(st.integers(1500, 3000))
+    rate, size = draw(st.sampled_from((500.0, 1000.0, 4000.0))), draw(st.integers(700, 1500))
     rng = np.random.default_rng(draw(st.integers(0, 10**6)))
     t = np.arange(size) / rate
     u = 50 + 40 * _motion(t, rng)

@@ -310,7 +310,7 @@ def test_hostile_documents_are_refused(effect, data):
         ("thermal_drift", {"times": [1.0, 1.0], "values": [0.0, 0.0]}),
         ("sensor_periodic", {"period": 1e-7, "amplitude": 1e-7, "phase": 0.0}),
         ("hum", {"frequency": -50.0, "amplitude": 1e-9, "phase": 0.0}),
-        ("rate_dependence", {"widening": 0.1, "backlash": 0, "exponent": 0, "reference_rate": 1, "threshold": 1}),
+        ("rate_dependence", {"widening": 0.1, "backlash": 0, "exponent": 0, "reference_rate": 1, "transition": 1}),
         ("gremlins", {}),
         (None, {}),
         ([], {}),

@@ -39,6 +39,15 @@ def trajectory(names, times_ns, positions, start_ns=0) -> JointTrajectory:
     return message
 
 
+def settle(client: Client, points: int) -> dict[str, str]:
+    """Return the report of the end, once all voltages have come: it may overtake them."""
+    _, values = client.report("the end", points_remaining=0, trajectories=1)
+    given = points - int(values["points_skipped"])
+    client.graph.spin_until(lambda: client.answered >= given, f"{given} points")
+    assert client.answered == given
+    return values
+
+
 def sender(client: Client):
     return client.graph.publisher(JointTrajectory, "/desired_trajectory", RELIABLE)
 
@@ -69,8 +78,7 @@ def test_a_trajectory_is_given_point_by_point_at_its_times(xy_file):
         sender(client).publish(trajectory(["y", "x"], times, path[:, ::-1]))
         client.graph.spin_until(lambda: client.answered >= 1, "the first point")
         client.wish(["x"], [1e-6])
-        _, values = client.report("the end", points_remaining=0, trajectories=1)
-        assert client.answered + int(values["points_skipped"]) == 300
+        values = settle(client, 300)
         expected = library(path)
         places = [int(np.abs(expected - answer).sum(axis=1).argmin()) for answer in client.answers]
         assert np.array(client.answers) == pytest.approx(expected[places], abs=1e-8)
@@ -130,10 +138,9 @@ def test_a_trajectory_keeps_to_the_slew_limit_and_survives_new_limits_and_a_new_
         client.graph.spin_until(lambda: client.answered >= 20, "the first points")
         assert client.graph.set_parameters(client.name, slew_limit=1500.0) == ""
         models.publish(String(data=format_model(stage_model(("x", "y"), stroke=9.5e-6))))
-        _, values = client.report("the end", points_remaining=0, trajectories=1)
+        values = settle(client, 400)
         v = np.vstack([[0.0, 0.0], client.answers])
     assert values["models_refused"] == "0" and values["last_rejection"] == ""
-    assert len(v) + int(values["points_skipped"]) == 401
     assert v.min() >= 0.0 and v.max() <= 100.0
     # A step after skipped points may be as long as theirs together.
     assert np.abs(np.diff(v, axis=0)).max() <= 2000.0 * 2e-3 * (1 + int(values["points_skipped"])) + 1e-9

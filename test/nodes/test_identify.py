@@ -34,15 +34,18 @@ from slpi_ros.identification.fit import identify  # noqa: E402
 from slpi_ros.identification.record import Record  # noqa: E402
 from slpi_ros.model_file import load_model, parse_model  # noqa: E402
 from slpi_ros.nodes.fit_process import FitProcess, FitRequest  # noqa: E402
+from slpi_ros.schemas import validate  # noqa: E402
 
 NAME = "/identify: identify"
 # Quick to fit, and needs no better.
 QUICK = {"kind": "pi", "diagnostic_period": 0.2}
 
 
-def write_calibration(path: Path, seed: int = 1, samples: int = 600) -> str:
+def write_calibration(path: Path, seed: int = 1, samples: int = 600, hum: float = 0.0) -> str:
+    """Write a bag of 200 samples per second, with a hum (m) of 30 Hz."""
     v = voltage_path(samples, seed)
     y = stage_model().axis("x").simulate(np.arange(samples), v) + np.random.default_rng(seed).normal(0.0, 5e-9, samples)
+    y += hum * np.sin(2 * np.pi * 30.0 * np.arange(samples) / 200.0)
     stamps = 1_700_000_000_000_000_000 + np.arange(samples, dtype=np.int64) * 5_000_000
     write_bag(path, Record(stamps, {"x": v}, {"x": y}, hardware_id="stage 7"))
     return str(path)
@@ -51,6 +54,12 @@ def write_calibration(path: Path, seed: int = 1, samples: int = 600) -> str:
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory) -> str:
     return write_calibration(tmp_path_factory.mktemp("bags") / "calibration")
+
+
+@pytest.fixture(scope="module")
+def humming_bag(tmp_path_factory) -> str:
+    """Return a bag long enough to be diagnosed."""
+    return write_calibration(tmp_path_factory.mktemp("bags") / "humming", samples=1500, hum=100e-9)
 
 
 @dataclass
@@ -70,6 +79,13 @@ class Client:
     def failed(self, text: str) -> None:
         status = self.status(lambda status: status.level == b"\2" and text in status.message, text)
         assert "\n" not in status.message
+
+    def diagnose(self) -> Trigger.Response:
+        return self.graph.call(Trigger, "/identify/diagnose", Trigger.Request())
+
+    def diagnosis(self, state: str) -> dict[str, str]:
+        """Return the values of the first report that says so of the diagnosis."""
+        return values_of(self.status(lambda status: values_of(status)["diagnosis.state"] == state, state))
 
     def set(self, **values: object) -> str:
         """Set parameters; return why they were refused, or nothing."""
@@ -213,6 +229,52 @@ def test_trigger_without_anything_to_do():
         assert not answer.success and "no bag" in answer.message
 
 
+def test_a_diagnosis_of_the_model_in_use(humming_bag, tmp_path):
+    with identifying(bags=[humming_bag], kind="slpi", output=str(tmp_path / "stage.json")) as client:
+        client.identified()
+        assert client.diagnosis("none")["diagnosis.folder"] == ""
+        answer = client.diagnose()
+        folder = tmp_path / "stage_diagnosis"
+        assert answer.success and "x: named: Found: hum" in answer.message and "\n" not in answer.message
+        assert str(folder / "report.html") in answer.message and str(folder / "extended_model.json") in answer.message
+        # Reports went on meanwhile.
+        assert client.diagnosis("diagnosing")["diagnosis.bag"] == humming_bag
+        done = client.diagnosis("done")
+        assert done["x.verdict"] == "named" and done["diagnosis.folder"] == str(folder)
+        document = json.loads((folder / "diagnosis.json").read_text())
+        validate(document, "diagnosis", "test")
+        assert [effect["name"] for effect in document["axes"]["x"]["effects"]] == ["hum"]
+        assert load_model(folder / "extended_model.json").axes["x"].effects
+        assert (folder / "report.html").read_text().startswith("<!doctype html>")
+        # What is running stays as it is.
+        assert len(client.models) == 1 and not parse_model(client.models[0].data, "test").axes["x"].effects
+        assert "Traceback" not in client.node.stderr
+
+
+def test_a_diagnosis_that_cannot_be_is_told(bag, tmp_path):
+    (tmp_path / "file").touch()
+    with identifying() as client:
+        answer = client.diagnose()
+        assert not answer.success and "no bag has been identified" in answer.message
+        assert client.set(bags=[bag]) == ""
+        client.identified()
+        answer = client.diagnose()
+        assert not answer.success and "600 usable samples" in answer.message and "\n" not in answer.message
+        failed = client.status(lambda status: "600 usable samples" in status.message, "a warning")
+        assert failed.level == b"\1" and values_of(failed)["diagnosis.state"] == "failed"
+        # Without an output the files would have gone to a temporary folder.
+        Path(values_of(failed)["diagnosis.folder"]).rmdir()
+        assert client.set(diagnosis_directory=str(tmp_path / "file")) == ""
+        answer = client.diagnose()
+        assert not answer.success and "no folder to write into" in answer.message
+        # Where the next one goes is no reason to identify anew; another start is, and then the failure is history.
+        assert len(client.models) == 1
+        assert client.set(diagnosis_directory=str(tmp_path), start=0.5) == ""
+        client.identified(2)
+        assert client.status(lambda status: values_of(status)["diagnosis.state"] == "none", "health").level == b"\0"
+        assert "Traceback" not in client.node.stderr
+
+
 @pytest.mark.parametrize(
     ("parameters", "named"),
     [({"kind": "magic"}, "kind"), ({"watch_directory": "/nowhere"}, "no such folder"), ({"start": "x"}, "start")],
@@ -246,6 +308,33 @@ def test_an_endless_identification_blocks_nothing_and_leaves_nothing(bag, number
         (worker,) = client.graph.spin_until(lambda: children(client.node.process.pid), "the second worker")
         os.kill(worker, signal.SIGSTOP)
         assert client.node.stop(number) == 0
+        assert not Path(f"/proc/{worker}").exists()
+        assert "Traceback" not in client.node.stderr
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds processes in /proc")
+def test_an_endless_diagnosis_blocks_nothing_and_leaves_nothing(bag, tmp_path):
+    with identifying(bags=[bag], diagnosis_directory=str(tmp_path)) as client:
+        client.identified()
+        asked = client.graph.node.create_client(Trigger, "/identify/diagnose")
+        client.graph.spin_until(asked.service_is_ready, "the service")
+        answers = [asked.call_async(Trigger.Request())]
+        (worker,) = client.graph.spin_until(lambda: children(client.node.process.pid), "the worker")
+        os.kill(worker, signal.SIGSTOP)
+        client.diagnosis("diagnosing")
+        # Who asks meanwhile waits for the same one; bags are identified as ever.
+        answers.append(asked.call_async(Trigger.Request()))
+        assert client.graph.call(Trigger, "/identify/identify", Trigger.Request()).success
+        client.identified(2)
+        assert children(client.node.process.pid) == [worker]
+        os.kill(worker, signal.SIGKILL)
+        client.graph.spin_until(lambda: all(answer.done() for answer in answers), "two answers")
+        for answer in answers:
+            assert not answer.result().success and "exit code -9" in answer.result().message
+        asked.call_async(Trigger.Request())
+        (worker,) = client.graph.spin_until(lambda: children(client.node.process.pid), "another worker")
+        os.kill(worker, signal.SIGSTOP)
+        assert client.node.stop() == 0
         assert not Path(f"/proc/{worker}").exists()
         assert "Traceback" not in client.node.stderr
 

@@ -60,6 +60,14 @@ def test_feedback_takes_away_what_the_model_does_not_know():
     assert corrected.axis.correction == pytest.approx(-3.0, abs=0.3)
 
 
+def test_a_measurement_is_held_against_the_wish_that_it_answers():
+    """On a ramp a stage that does what the model says leaves nothing to correct."""
+    bench = Bench(ON)
+    bench.run(START)
+    bench.run(np.linspace(PATH[0], 11e-6, 1000))
+    assert abs(bench.axis.correction) < 1e-6
+
+
 def test_without_feedback_measurements_change_no_voltage():
     heard, deaf = Bench(OFF, 3.0), Bench(OFF, 3.0)
     heard.run(PATH)

@@ -197,7 +197,9 @@ def test_reset_and_ramps_move_the_effects_too(effects):
     assert np.abs(errors[-50:]).max() < 2e-8
 
 
-@pytest.mark.parametrize("limits", [Limits(-10.0, 90.0, 300.0), Limits(-10.0, 90.0, 300.0, 2e4), Limits(-10.0, 35.0, 300.0)])
+@pytest.mark.parametrize(
+    "limits", [Limits(-10.0, 90.0, 300.0), Limits(-10.0, 90.0, 300.0, 2e4), Limits(-10.0, 35.0, 300.0)]
+)
 def test_limits_are_kept_and_told(limits):
     axis, voltages, flags = with_effects(LAG, CREEP, limits=limits), [], set()
     for k in range(1500):

@@ -1,0 +1,68 @@
+"""What the diagnosis says of measured records. What it must not say counts as much."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+import slpi_ros
+from slpi_ros.identification.record import Record
+from slpi_ros.tables import import_table
+
+
+def part(record, start, stop):
+    kept = (record.t >= start) & (record.t < stop)
+    return Record(
+        record.time_ns[kept],
+        {axis: v[kept] for axis, v in record.voltage.items()},
+        {axis: y[kept] for axis, y in record.displacement.items()},
+        record.source,
+    )
+
+
+@pytest.fixture(scope="module")
+def picma(measured_data):
+    record = part(import_table(measured_data / "picma_1hz_decay_grow.csv"), 2.0, 25.0)
+    return slpi_ros.diagnose(record, slpi_ros.identify(record))
+
+
+def test_the_lag_of_the_picma_stack_is_named(picma):
+    (axis,) = picma.axes.values()
+    first = axis.effects[0]
+    assert first.name in ("lag", "delay")
+    assert {"lag", "delay"} <= {first.name, *first.alternatives}
+    seconds = getattr(first.effect, "time_constant", None) or first.effect.seconds
+    assert 12e-3 <= seconds <= 20e-3
+
+
+def test_the_step_of_another_record_agrees_with_the_lag(picma, measured_data):
+    (axis,) = picma.axes.values()
+    record = import_table(measured_data / "picma_1hz_major.csv")
+    (y,) = record.displacement.values()
+    # The voltage stood at 0 V and begins at 1.8 V; then a sine goes on, a parabola in its first tenths of a second.
+    t, y = record.t[:40], y[:40]
+
+    def missed(tau):
+        columns = np.column_stack([np.ones_like(t), t, t**2, np.exp(-t / tau)])
+        return float(np.sum((y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]) ** 2))
+
+    tau = minimize_scalar(missed, bounds=(2e-3, 0.1), method="bounded").x
+    assert 12e-3 <= tau <= 24e-3
+    seconds = getattr(axis.effects[0].effect, "time_constant", None) or axis.effects[0].effect.seconds
+    assert tau == pytest.approx(seconds, rel=0.4)
+
+
+def test_one_frequency_is_ambiguous(measured_data):
+    record = import_table(measured_data / "piezo_150v_1hz.csv")
+    (axis,) = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes.values()
+    assert axis.verdict == "ambiguous"
+    assert {"lag", "creep"} <= {axis.effects[0].name, *axis.effects[0].alternatives}
+    assert "frequenc" in axis.next_experiment
+    assert axis.after_rms <= 0.057e-6
+
+
+def test_loops_that_depend_on_bias_are_told_from_drift(measured_data):
+    record = import_table(measured_data / "afm_double_sine_x.csv")
+    (axis,) = slpi_ros.diagnose(record, slpi_ros.identify(record, "pi")).axes.values()
+    assert "thermal_drift" not in [named.name for named in axis.effects]
+    assert "'slpi'" in axis.next_experiment
+    assert axis.after_rms < 0.3 * axis.before_rms

@@ -1,0 +1,39 @@
+"""The free parameters of every effect as one vector."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+
+from slpi_ros.diagnosis.parameters import FREE, bounded, free, moved, names, steps
+from slpi_ros.effects.registry import EFFECTS
+from effects.cases import EVERY
+
+T, V = np.linspace(0, 10, 1001), np.linspace(0, 100, 1001)
+
+
+def test_every_effect_has_free_parameters():
+    assert FREE.keys() == EFFECTS.keys()
+
+
+@given(EVERY)
+def test_each_free_parameter_has_a_name_and_a_step(effect):
+    values = free(effect)
+    assert len(names(effect)) == values.size == steps(effect, T, V).size
+    assert np.all(steps(effect, T, V) > 0)
+
+
+@given(EVERY)
+def test_moving_by_nothing_keeps_what_makes_sense(effect):
+    once = moved(effect, free(effect))
+    assert moved(once, free(once)) == once
+
+
+@given(EVERY)
+def test_a_step_is_never_lengthened(effect):
+    change = free(effect) + 1.0
+    assert np.all(np.abs(bounded(effect, change)) <= np.abs(change))
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_free_parameters_are_fields(name):
+    assert set(FREE[name]) <= set(EFFECTS[name].__dataclass_fields__)

@@ -20,7 +20,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test demo bench bench-robustness bench-latency bench-soak clean distclean FORCE
+.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-latency bench-soak clean distclean FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -28,6 +28,7 @@ help:
 	@echo 'make demo       build, then simulated stage, calibration, identification and compensation over DDS'
 	@echo 'make bench      build, then the benchmarks'
 	@echo 'make bench-robustness  spoiled records beside clean ones, 8 seeds, 2 minutes'
+	@echo 'make bench-diagnosis   hidden effects: named, missed, invented; about an hour'
 	@echo 'make bench-latency  round trip through the compensator beside a bare echo node, 4 minutes'
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'
 	@echo 'make clean      remove what was built and all caches'
@@ -58,6 +59,9 @@ bench: build
 
 bench-robustness: build
 	$(VENV) benchmarks/robustness.py
+
+bench-diagnosis: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/diagnosis.py
 
 bench-latency: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/latency.py

@@ -63,7 +63,7 @@ def test_from_table_to_bag_to_model_to_voltages(folder, tmp_path):
     np.testing.assert_allclose(reached["x"], wished["x"], rtol=0, atol=1e-9 * np.ptp(wished["x"]))
 
 
-COMMANDS = ("import", "excite", "identify", "refit", "simulate", "compensate", "show", "experiments")
+COMMANDS = ("import", "excite", "identify", "refit", "diagnose", "simulate", "compensate", "show", "experiments")
 
 
 def test_excite_identify_refit(tmp_path):

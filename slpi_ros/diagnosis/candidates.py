@@ -9,7 +9,7 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.explanation import Explanation, left_over
-from slpi_ros.diagnosis.parameters import FASTEST_CREEP, MOST
+from slpi_ros.diagnosis.parameters import FASTEST_CREEP, MOST, plausible
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
@@ -93,8 +93,8 @@ def _creep(now: Explanation) -> Iterator[Trial]:
 
         def effect(g: FloatArray, taus: FloatArray = taus) -> Effect | None:
             seen = g > LEAST_SHARE * g.max()
-            gains = np.minimum(g[seen], MOST["creep.gains"])
-            return Creep(tuple(taus[seen].tolist()), tuple(gains.tolist())) if g.max() > 0 else None
+            gains = np.minimum(g[seen], MOST["creep.gains"]).tolist()
+            return Creep(tuple(taus[seen].tolist()), plausible(taus[seen], gains)) if g.max() > 0 else None
 
         yield Trial(np.column_stack([before, columns]), effect, positive=taus.size)
 

@@ -1,6 +1,6 @@
 """The parameters of an effect that a fit may change, as one vector."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import isfinite
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.effect import Effect
 
 FloatArray = NDArray[np.float64]
@@ -44,6 +45,8 @@ MOST = {"damping": 0.4, "exponent": 3.0, "creep.gains": 0.15, "cross_coupling.ga
 NOT_NEGATIVE = ("creep", "rate_dependence")
 # Parameters that the displacement is linear in, or nearly so at any size.
 LINEAR = ("gains", "values", "widening", "backlash", "seconds")
+# Creep within a second is a few per cent of a move; what comes later by more than this share of it is something else.
+SOON, LARGEST_SOON = 1.0, 0.12
 # At most so many times its own size may a parameter change in one step.
 LARGEST_STEP = 0.7
 
@@ -90,7 +93,18 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
             changed[name] = tuple(min(max(left.pop(0), least), most) for _ in value)
         elif isfinite(value):
             changed[name] = min(max(left.pop(0), least), most)
+    if isinstance(effect, Creep):
+        changed["gains"] = plausible(changed["time_constants"], changed["gains"])
     return replace(effect, **changed)  # type: ignore[type-var]
+
+
+def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[float, ...]:
+    """Return gains of creep, those of quick relaxations lowered where they are too large for creep."""
+    soon = sum(gain for tau, gain in zip(time_constants, gains, strict=True) if tau < SOON)
+    share = min(1.0, LARGEST_SOON / soon) if soon > 0.0 else 1.0
+    return tuple(
+        gain * share if tau < SOON else gain for tau, gain in zip(time_constants, gains, strict=True)
+    )
 
 
 def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from effects.cases import EVERY
 from hypothesis import given
 
 from slpi_ros.diagnosis.parameters import FREE, bounded, free, moved, names, steps
 from slpi_ros.effects.registry import EFFECTS
-from effects.cases import EVERY
 
 T, V = np.linspace(0, 10, 1001), np.linspace(0, 100, 1001)
 

@@ -65,13 +65,13 @@ def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
             share_of_residual=float(np.clip((named.before.rms**2 - named.after.rms**2) / whole, 0.0, 1.0)),
             p_value=chance_of_gain(named.before, named.after),
             alternatives=named.alternatives,
-            evidence=_evidence(fitted[named.name], named),
+            evidence=_evidence(fitted[named.name], named, selection.now.held_out.rms),
         )
         for named in selection.named
     )
 
 
-def _evidence(effect: Effect, named: Named) -> str:
+def _evidence(effect: Effect, named: Named, in_the_end: float) -> str:
     sentence = effect.describe()
     before, after = named.before.rms * 1e9, named.after.rms * 1e9
     chance = 100 * chance_of_gain(named.before, named.after)
@@ -82,7 +82,8 @@ def _evidence(effect: Effect, named: Named) -> str:
     if not named.runner_up:
         return f"{sentence}; {gained}, and no other effect comes near"
     other, rms = named.runner_up
-    return f"{sentence}; {gained}, with {other} in its place to {rms * 1e9:.3g} nm"
+    instead = f"with {other} in its place {rms * 1e9:.3g} nm are left in the end, not {in_the_end * 1e9:.3g}"
+    return f"{sentence}; {gained}; {instead}"
 
 
 def _left(selection: Selection, floor: Floor) -> bool:

@@ -6,6 +6,7 @@ smooth. A gain is looked for only where the old model is wrong beyond what it wa
 that agrees with it must not touch the large ones.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
@@ -13,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from slpi_ros.chain import forward
+from slpi_ros.effects.effect import Around
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.hysteresis.family import LoopFamily
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii
@@ -69,7 +72,7 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
     Parameters
     ----------
     model : StageModel
-        Axes of kind ``slpi`` or ``pi``.
+        Axes of kind ``slpi`` or ``pi``. Effects stay as they are; the hysteresis is fitted to what they leave.
     record : Record
         Within the voltages of the model. Axes that it does not hold stay as they are.
 
@@ -94,6 +97,7 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
     shared = [axis for axis in model.axes if axis in record.axes]
     if not shared:
         raise UsageError(f"{record.source} holds none of the model's axes {', '.join(model.axes)}")
+    record = _without_effects(model, record, shared)
     axes, changes = dict(model.axes), {}
     for name in shared:
         try:
@@ -104,6 +108,30 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
         except SlpiError as error:
             raise type(error)(f"{record.source}: axis '{name}': {error}") from None
     return replace(model, axes=axes, created=datetime.now(UTC).isoformat(timespec="seconds")), changes
+
+
+def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -> Record:
+    """Return the record as it were if the stage had hysteresis alone."""
+    if not any(model.axes[axis].effects for axis in shared):
+        return record
+    t, voltage, displacement = record.t, dict(record.voltage), dict(record.displacement)
+    known = {axis: _held(record.voltage[axis]) for axis in shared}
+    simulated = model.simulate(t, known)
+    for axis in shared:
+        own = model.axes[axis]
+        u = forward(own.chain.before, known[axis], Around(t))
+        displacement[axis] = record.displacement[axis] - (simulated[axis] - replace(own, effects=()).simulate(t, u))
+        voltage[axis] = np.where(np.isfinite(record.voltage[axis]), u, np.nan)
+    return replace(record, voltage=voltage, displacement=displacement)
+
+
+def _held(v: FloatArray) -> FloatArray:
+    """Return a voltage, shape (N,), that stays where it was while it is not known."""
+    known = np.flatnonzero(np.isfinite(v))
+    if not known.size:
+        raise IdentificationError("the voltage is never known; record it")
+    last = np.searchsorted(known, np.arange(v.size), side="right") - 1
+    return v[known[np.maximum(last, 0)]]
 
 
 def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisModel, AxisChange]:

@@ -7,6 +7,8 @@ import pytest
 from identification.records import calibration, record_of, rms, stage
 
 import slpi_ros
+from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.refit import refit
@@ -101,3 +103,15 @@ def test_what_cannot_be_updated_is_refused(model):
     published = slpi_ros.identify(calibration(seed=SEED)[0], "smpi")
     with pytest.raises(UsageError, match="kind 'smpi' cannot be updated"):
         refit(published, record)
+
+
+def test_effects_of_the_model_are_not_taken_for_hysteresis(model):
+    effects = (Lag(0.02), Creep((2.0,), (0.05,)))
+    with_effects = replace(model, axes={"x": replace(model.axes["x"], effects=effects)})
+    t, v = calibration_drive(0.0, 100.0, duration=15.0, rate=200.0, seed=3)
+    y = with_effects.simulate(t, v) + 8e-9 * np.random.default_rng(0).normal(size=t.size)
+    new, changes = refit(with_effects, record_of(t, v, y))
+    assert new.axes["x"].effects == effects
+    assert not changes["x"].drifted
+    assert changes["x"].error_after < 9e-9
+    assert refit(model, record_of(t, v, y))[1]["x"].drifted

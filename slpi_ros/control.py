@@ -126,6 +126,12 @@ class Feedback:
         """Let the correction fade from here on."""
         self._enabled = False
 
+    def forget(self) -> None:
+        """Forget the last measurement: the next one takes over from the present correction."""
+        self._error = self._rate = 0.0
+        self._measured_at = -inf
+        self._taking_over = self._enabled
+
     def retune(self, gains: PidGains) -> None:
         """Go on with other gains.
 

@@ -384,6 +384,15 @@ def test_other_gains_act_in_full_after_the_release_time():
     assert voltages[-1] == pytest.approx(15.0)
 
 
+def test_after_forgetting_the_next_measurement_takes_over_without_a_jump():
+    feedback = taken_over(PidGains(1e6, 1e7))
+    before = feedback.correct(0.1, 3e-6, 0.0, 10.0)
+    feedback.forget()
+    assert feedback.hold(0.1, 10.0) == before
+    assert feedback.correct(0.1, -5e-6, 2e-6, 10.0) == pytest.approx(before)
+    assert feedback.correct(5.0, 0.0, 0.0, 10.0) != pytest.approx(before)
+
+
 def test_without_release_the_correction_stays():
     feedback = taken_over(PidGains(1e6), release_time=INF)
     feedback.correct(0.1, 3e-6, 0.0, 10.0)

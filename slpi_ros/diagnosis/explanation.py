@@ -1,6 +1,6 @@
 """The hysteresis of one axis with effects around it, fitted to a record together."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from slpi_ros.diagnosis.evidence import Evidence
 from slpi_ros.diagnosis.joint import Joint, Score
 from slpi_ros.diagnosis.parameters import bounded, free, moved, names, steps
-from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.creep import Creep, settling
 from slpi_ros.effects.effect import Around, Effect
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
@@ -25,8 +25,6 @@ FloatArray = NDArray[np.float64]
 MOST_TURNS, SETTLED = 15, 0.02
 # Voltages at which the middle of the largest loop is found.
 LEVELS = 60
-# What settles within this share of the record may have begun before it; of what is slower nobody knows.
-SOON = 0.025
 # Steps towards the best parameters end when they gain less than this share of the error.
 ENOUGH = 1e-3
 # Of a step, where all of it is too much.
@@ -63,7 +61,7 @@ class Explanation:
             like.joint if like and same else Joint(evidence.problem(self.u), evidence.smoothness, evidence.lead)
         )
         self.added = np.zeros_like(evidence.y)
-        self._before = np.column_stack([evidence.beside, left_over(self.effects, evidence)])
+        self._before = np.column_stack([evidence.beside, settling(self._relaxations, evidence.t, evidence.used)])
         self._fit()
         if any(effect.side == "displacement" for effect in self.effects):
             for _ in range(MOST_TURNS):
@@ -76,6 +74,30 @@ class Explanation:
     def _fit(self) -> None:
         fit = self.joint.fit(self.target, self._before)
         self._x, self.settling = fit.x, self._before @ fit.gains
+
+    @property
+    def _relaxations(self) -> list[float]:
+        return [tau for effect in self.effects if isinstance(effect, Creep) for tau in effect.time_constants]
+
+    @property
+    def t(self) -> FloatArray:
+        """Time, shape (N,), seconds."""
+        return self.evidence.t
+
+    @property
+    def y(self) -> FloatArray:
+        """Measured displacement, shape (N,), metres."""
+        return self.evidence.y
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Samples that count, shape (N,)."""
+        return self.evidence.used
+
+    @property
+    def others(self) -> Mapping[str, FloatArray]:
+        """Motion of the other axes from their start, shape (N,), metres."""
+        return self.evidence.others
 
     @property
     def target(self) -> FloatArray:
@@ -275,12 +297,3 @@ def alike_in_a_row(errors: FloatArray) -> float:
     correlation = correlation / correlation[0]
     positive = int(np.argmax(correlation <= 0.0)) or correlation.size
     return float(max(1.0, 2.0 * correlation[:positive].sum() - 1.0))
-
-
-def left_over(effects: Sequence[Effect], evidence: Evidence) -> FloatArray:
-    """Return how creep from before the record settles, shape (N, k): a column for each relaxation that soon ends."""
-    used = evidence.t[evidence.used]
-    taus = [tau for effect in effects if isinstance(effect, Creep) for tau in effect.time_constants]
-    since = np.maximum(evidence.t - used[0], 0.0)
-    soon = [np.exp(-since / tau) for tau in taus if tau < SOON * (used[-1] - used[0])]
-    return np.column_stack([np.empty((since.size, 0)), *soon])

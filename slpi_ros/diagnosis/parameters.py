@@ -1,6 +1,6 @@
 """The parameters of an effect that a fit may change, as one vector."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from math import isfinite
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.creep import FASTEST, Creep, plausible
 from slpi_ros.effects.effect import Effect
 
 FloatArray = NDArray[np.float64]
@@ -26,12 +26,10 @@ FREE = {
     "sensor_periodic": ("period", "amplitude", "phase"),
     "hum": ("frequency", "amplitude", "phase"),
 }
-# What settles sooner (s) is called a lag.
-FASTEST_CREEP = 0.1
 # Least values; what is not named may have either sign.
 LEAST = {
     "time_constant": 1e-6,
-    "time_constants": FASTEST_CREEP,
+    "time_constants": FASTEST,
     "damping": 1e-3,
     "frequency": 1e-3,
     "period": 1e-9,
@@ -39,14 +37,12 @@ LEAST = {
     "exponent": 0.05,
     "transition": 1e-3,
 }
-# Greatest values, of any effect or of one. What is damped more does not ring, and what creeps more is something else.
-MOST = {"damping": 0.4, "exponent": 3.0, "creep.gains": 0.15, "cross_coupling.gains": 0.4}
+# Greatest values, of any effect or of one. What is damped more does not ring.
+MOST = {"damping": 0.4, "exponent": 3.0, "cross_coupling.gains": 0.4}
 # Effects none of whose other parameters may be negative.
 NOT_NEGATIVE = ("creep", "rate_dependence")
 # Parameters that the displacement is linear in, or nearly so at any size.
 LINEAR = ("gains", "values", "widening", "backlash", "seconds")
-# Creep within a second is a few per cent of a move; what comes later by more than this share of it is something else.
-SOON, LARGEST_SOON = 1.0, 0.12
 # At most so many times its own size may a parameter change in one step.
 LARGEST_STEP = 0.7
 
@@ -96,15 +92,6 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
     if isinstance(effect, Creep):
         changed["gains"] = plausible(changed["time_constants"], changed["gains"])
     return replace(effect, **changed)  # type: ignore[type-var]
-
-
-def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[float, ...]:
-    """Return gains of creep, those of quick relaxations lowered where they are too large for creep."""
-    soon = sum(gain for tau, gain in zip(time_constants, gains, strict=True) if tau < SOON)
-    share = min(1.0, LARGEST_SOON / soon) if soon > 0.0 else 1.0
-    return tuple(
-        gain * share if tau < SOON else gain for tau, gain in zip(time_constants, gains, strict=True)
-    )
 
 
 def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:

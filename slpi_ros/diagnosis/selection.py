@@ -6,13 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.diagnosis.candidates import TRIALS, Trial
 from slpi_ros.diagnosis.explanation import Explanation
 from slpi_ros.diagnosis.gather import one_speed
 from slpi_ros.diagnosis.joint import Score
 from slpi_ros.diagnosis.parameters import free
 from slpi_ros.diagnosis.structure import STRUCTURES
 from slpi_ros.effects.effect import Effect
+from slpi_ros.effects.form import Form
+from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.identification.progress import tell
 
@@ -25,6 +26,8 @@ MOST_EFFECTS = 4
 # A gain counts when chance gives as much less often than this; two effects differ when chance does so less often.
 CHANCE, ALIKE = 0.01, 0.05
 SURROGATES = 1999
+# Keeps losses of no noise positive (m^2).
+TINY = 1e-30
 # What screening finds less for than this share of the best gain, and of the error, is not tried in full.
 WORTH_TRYING, LEAST_SCREENED = 0.3, 0.01
 # Another effect that explains less than this share of what the best one does is no alternative to it.
@@ -59,7 +62,7 @@ class Contender:
         return next(free(effect).size for effect in self.explanation.effects if effect.name == self.name)
 
 
-def contenders(now: Explanation, names: Iterable[str] = tuple(TRIALS)) -> list[Contender]:
+def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[Contender]:
     """Return the effects, of those with the given names, that explain something of what is left; the best one first."""
     taken = {effect.name for effect in now.effects}
     screened = {name: best for name in names if name not in taken and (best := _screened(name, now))}
@@ -77,29 +80,33 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(TRIALS)) -> list[C
 def _screened(name: str, now: Explanation) -> tuple[float, Effect] | None:
     """Return the best linear form of an effect, and the held-out error (m) with it."""
     best: tuple[float, Effect] | None = None
-    for trial in TRIALS[name](now):
-        rms, effect = _scored(trial, now)
+    for form in EFFECTS[name].fit(now):
+        rms, effect = _scored(form, now)
         if effect is not None and (best is None or rms < best[0]):
             best = rms, effect
     return best
 
 
-def _scored(trial: Trial | Effect, now: Explanation) -> tuple[float, Effect | None]:
-    if not isinstance(trial, Trial):
-        return now.adding(trial).held_out.rms, trial
-    score = now.score(trial.columns, positive=trial.positive)
+def _scored(form: Form | Effect, now: Explanation) -> tuple[float, Effect | None]:
+    if not isinstance(form, Form):
+        return now.adding(form).held_out.rms, form
+    score = now.score(form.columns, positive=form.positive)
     try:
-        return score.rms, trial.effect(score.gains[-(trial.positive or trial.columns.shape[1]) :])
+        return score.rms, form.effect(score.gains[-(form.positive or form.columns.shape[1]) :])
     except ModelError:
         # No effect has such parameters.
         return score.rms, None
 
 
 def chance_of_gain(before: Score, after: Score) -> float:
-    """Return how often chance lowers the losses of the blocks by as much: the sign of each gain is drawn anew."""
-    gain = before.losses - after.losses
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (SURROGATES, gain.size))
-    return float((1 + np.count_nonzero(signs @ gain >= gain.sum())) / (1 + SURROGATES))
+    """Return how often chance lowers the losses of the blocks by as much: the sign of each gain is drawn anew.
+
+    Gains are taken as they are, and in proportion to the losses, so that a single block of large errors does not hide
+    what all others show; the clearer answer counts.
+    """
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (SURROGATES, before.losses.size))
+    gains = (before.losses - after.losses, np.log(np.maximum(before.losses, TINY) / np.maximum(after.losses, TINY)))
+    return min(float((1 + np.count_nonzero(signs @ gain >= gain.sum())) / (1 + SURROGATES)) for gain in gains)
 
 
 def gain(before: Score, after: Score) -> float:

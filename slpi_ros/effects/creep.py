@@ -1,16 +1,29 @@
 """Creep: after every move the stage goes on, slower and slower."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Form, Left, usual_step
 from slpi_ros.effects.relaxation import Hold, hold
 from slpi_ros.effects.uniform import Uniform
+
+# What settles sooner (s) is called a lag.
+FASTEST = 0.1
+# Creep is a few per cent of a move: no relaxation is more than this share of it, nor are all within a second.
+LARGEST, SOON, LARGEST_SOON = 0.15, 1.0, 0.12
+# Relaxations that are looked for: so many single ones; several at once, up to a share of the record. With less than a
+# share of the largest one they are left out.
+SINGLE, SEVERAL, LEAST_SHARE = 7, ((2, 0.1), (2, 0.5), (3, 0.3), (4, 0.7)), 0.02
+# What settles within this share of the record may have begun before it; of what is slower nobody knows.
+SOON_SETTLED = 0.025
 
 
 @dataclass(frozen=True)
@@ -71,6 +84,27 @@ class Creep:
         for zero, pole in zip(np.sort(zeros), np.sort(poles), strict=True):
             moved = lfilter([1.0, -pole], [1.0, -zero], moved)
         return signal - grid.off(crept - np.real(moved) / direct)
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator[Form]:
+        """Yield single relaxations from quick to slow, and several at once."""
+        longest = float(left.t[-1] - left.t[0])
+        shortest = max(10 * usual_step(left.t), FASTEST)
+        if not shortest < 0.5 * longest:
+            return
+        single = [np.array([tau]) for tau in np.geomspace(shortest, 0.5 * longest, SINGLE)]
+        several = [np.geomspace(shortest, share * longest, count) for count, share in SEVERAL]
+        for taus in (*single, *several):
+            creeping = [cls((tau,), (1.0,)).apply(left.h, left.around) - left.h for tau in taus.tolist()]
+            columns = np.column_stack([settling(taus.tolist(), left.t, left.used), *creeping])
+            yield Form(columns, partial(cls._times, taus), positive=taus.size)
+
+    @classmethod
+    def _times(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":
+        seen = gains > LEAST_SHARE * gains.max()
+        if not gains.max() > 0.0:
+            return None
+        return cls(tuple(taus[seen].tolist()), plausible(taus[seen].tolist(), gains[seen].tolist()))
 
     def describe(self) -> str:
         """Say how much and how slow."""
@@ -144,3 +178,19 @@ class CreepFollower:
         self._kept = [gain * one.kept for gain, one in zip(gains, self._holds, strict=True)]
         self._now = sum(gain * one.now for gain, one in zip(gains, self._holds, strict=True))
         self._before = sum(gain * one.before for gain, one in zip(gains, self._holds, strict=True))
+
+
+def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[float, ...]:
+    """Return gains, lowered where they are too large for creep."""
+    gains = [min(gain, LARGEST) for gain in gains]
+    soon = sum(gain for tau, gain in zip(time_constants, gains, strict=True) if tau < SOON)
+    share = min(1.0, LARGEST_SOON / soon) if soon > 0.0 else 1.0
+    return tuple(gain * share if tau < SOON else gain for tau, gain in zip(time_constants, gains, strict=True))
+
+
+def settling(time_constants: Sequence[float], t: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+    """Return how creep from before a record may settle in it, shape (N, k): a column for each that soon ends."""
+    times = t[used]
+    since = np.maximum(t - times[0], 0.0)
+    soon = [np.exp(-since / tau) for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]
+    return np.column_stack([np.empty((t.size, 0)), *soon])

@@ -1,13 +1,15 @@
 """Cross coupling: part of another axis's motion."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Form, Left
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,16 @@ class CrossCoupling:
         """Return what the other axes add, shape (N,), metres."""
         known = (gain * around.others[axis] for axis, gain in self.gains.items() if axis in around.others)
         return sum(known, np.zeros_like(signal))
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator[Form]:
+        """Yield the motion of all other axes."""
+        if left.others:
+            yield Form(np.column_stack(list(left.others.values())), partial(cls._of, tuple(left.others)))
+
+    @classmethod
+    def _of(cls, axes: tuple[str, ...], gains: FloatArray) -> "CrossCoupling":
+        return cls(dict(zip(axes, gains.tolist(), strict=True)))
 
     def describe(self) -> str:
         """Say how much of which axis."""

@@ -1,13 +1,15 @@
 """Delay: the displacement answers later, or the stamps of the two signals are apart."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Form, Left, usual_step
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,18 @@ class Delay:
     def invert(self, signal: FloatArray, around: Around) -> FloatArray:
         """Shift the signal, shape (N,), to earlier: a preview of the path; its end is held."""
         return np.interp(around.t + self.seconds, around.t, signal) if signal.size else signal.copy()
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator[Form]:
+        """Yield shifts by a part of a sample and by some, either way."""
+        dt = usual_step(left.t)
+        for seconds in (-4.0 * dt, 0.5 * dt, 2.0 * dt, 8.0 * dt):
+            column = left.respond(cls(seconds).apply(left.u, left.around)) - left.h
+            yield Form(column[:, None], partial(cls._times, seconds))
+
+    @classmethod
+    def _times(cls, seconds: float, gains: FloatArray) -> "Delay":
+        return cls(seconds * float(gains[0]))
 
     def describe(self) -> str:
         """Say how long it is."""

@@ -4,12 +4,15 @@
 thermal_drift -> sensor_periodic -> hum -> y``
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from slpi_ros.effects.form import Form, Left
 
 FloatArray = NDArray[np.float64]
 
@@ -85,6 +88,10 @@ class Effect(Protocol):
 
     def invert(self, signal: FloatArray, around: Around) -> FloatArray:
         """Return the signal that becomes the given one, shape (N,), volts or metres; the whole path is known."""
+
+    @classmethod
+    def fit(cls, left: "Left") -> "Iterator[Form | Effect]":
+        """Yield what it may be in a record: forms for a fit to judge, linear in their gains, or effects as they are."""
 
     def describe(self) -> str:
         """Say in one sentence what it is, with numbers."""

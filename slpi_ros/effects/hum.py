@@ -1,7 +1,8 @@
 """Hum: mains, or another disturbance that is periodic in time."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from math import pi
 from typing import ClassVar
 
@@ -9,6 +10,10 @@ import numpy as np
 
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Form, Left, amplitude_and_phase, rhythms, wave
+
+# So many lines of a spectrum are tried, from this frequency (Hz) on: slower is drift or creep.
+LINES, SLOWEST = 4, 2.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,16 @@ class Hum:
     def wave(self, t: FloatArray) -> FloatArray:
         """Return the hum alone, shape (N,), metres, at times (s)."""
         return self.amplitude * np.sin(2 * pi * self.frequency * t + self.phase)
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator[Form]:
+        """Yield the strongest lines in the spectrum of what is left."""
+        for frequency in rhythms(left, LINES, SLOWEST):
+            yield Form(wave(2 * np.pi * frequency * left.t), partial(cls._at, frequency))
+
+    @classmethod
+    def _at(cls, frequency: float, gains: FloatArray) -> "Hum":
+        return cls(frequency, *amplitude_and_phase(gains))
 
     def describe(self) -> str:
         """Say how large and how fast it is."""

@@ -1,7 +1,8 @@
 """Lag of the amplifier: the piezo's voltage follows the command with a time constant."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.signal import lfilter
 
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Form, Left, usual_step
 from slpi_ros.effects.relaxation import Hold, hold
 from slpi_ros.effects.uniform import Uniform
 
@@ -54,6 +56,18 @@ class Lag:
         # The law of the follower, which looks at the voltage really reached, as one filter.
         law = np.convolve([now, before], [1.0, -kept]) + kept * np.array([0.0, real.now, real.before])
         return grid.off(_filter(np.array([1.0, -kept, 0.0]), law, grid.on(signal)))
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator[Form]:
+        """Yield lags of a part of a sample and of many."""
+        for samples in (0.5, 2.0, 8.0, 32.0):
+            tau = samples * usual_step(left.t)
+            column = left.respond(cls(tau).apply(left.u, left.around)) - left.h
+            yield Form(column[:, None], partial(cls._times, tau))
+
+    @classmethod
+    def _times(cls, tau: float, gains: FloatArray) -> "Lag | None":
+        return cls(tau * float(gains[0])) if gains[0] > 0 else None
 
     def describe(self) -> str:
         """Say how slow it is."""

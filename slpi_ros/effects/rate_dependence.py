@@ -1,7 +1,8 @@
 """Rate dependence: loops widen as the drive gets faster, more than a linear filter makes them."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -9,10 +10,14 @@ from scipy.signal import savgol_filter
 
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Form, Left
 from slpi_ros.effects.rate_follower import RateFollower
 from slpi_ros.effects.uniform import Uniform
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.runs import monotone_runs
+
+# Powers, and ways as shares of the voltage range, that are looked for.
+EXPONENTS, TRANSITIONS = (0.2, 0.5, 0.8), (0.01, 0.04, 0.12)
 
 # Samples over which the rate is smoothed where the whole path is known.
 WINDOW = 7
@@ -72,6 +77,22 @@ class RateDependence:
         middle, speed, direction = self._drive(around)
         back = signal + speed * (self.widening * middle + self.backlash * direction)
         return np.asarray(back / (1 + speed * self.widening), dtype=np.float64)
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator[Form]:
+        """Yield several powers of the rate, with quick and slow turns."""
+        reference = float(np.sqrt(np.mean(np.gradient(left.u, left.t) ** 2)))
+        for exponent in EXPONENTS:
+            for transition in (float(share * np.ptp(left.u)) for share in TRANSITIONS):
+                one = cls(1.0, 1e-6, exponent, reference, transition)
+                parts = (replace(one, backlash=0.0), replace(one, widening=0.0))
+                columns = np.column_stack([part.apply(left.h, left.around) - left.h for part in parts])
+                yield Form(columns, partial(cls._times, one), positive=2)
+
+    @staticmethod
+    def _times(one: "RateDependence", gains: FloatArray) -> "RateDependence | None":
+        wider, behind = gains.tolist()
+        return replace(one, widening=wider, backlash=behind * one.backlash) if gains.max() > 0 else None
 
     def describe(self) -> str:
         """Say how much at which rate."""

@@ -1,7 +1,8 @@
 """Resonance: a lightly damped flexure mode that rings after every turn."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from math import pi
 from typing import ClassVar
 
@@ -10,9 +11,14 @@ from scipy.signal import lfilter
 
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Form, Left, rhythms, usual_step
 from slpi_ros.effects.mode import Mode
 from slpi_ros.effects.ringing import ResonanceFollower, Unringing
 from slpi_ros.effects.uniform import Uniform
+
+# Modes that are looked for: from this frequency (Hz) to this share of the sampling rate, at so many lines.
+LOWEST, HIGHEST, LINES = 10.0, 0.45, 4
+DAMPINGS = (0.02, 0.08)
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,21 @@ class Resonance:
         padded = np.pad(padded, (0, between), mode="reflect", reflect_type="odd")
         parts = (tap * padded[left + (1 - k) * between :][: wished.size] for k, tap in enumerate(taps))
         return grid.off(sum(parts, np.zeros_like(wished)))
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator[Form]:
+        """Yield modes where the spectrum of what is left has lines, and all over it."""
+        highest = HIGHEST / usual_step(left.t)
+        found = [frequency for frequency in rhythms(left, LINES, LOWEST) if frequency < highest]
+        for frequency in (*found, *np.geomspace(min(2 * LOWEST, highest), highest, 10).tolist()):
+            for damping in DAMPINGS:
+                mode = cls(frequency, damping)
+                column = mode.apply(left.h, left.around) - left.h
+                yield Form(column[:, None], partial(cls._if_seen, mode), positive=1)
+
+    @staticmethod
+    def _if_seen(mode: "Resonance", gains: FloatArray) -> "Resonance | None":
+        return mode if gains[0] > 0 else None
 
     def describe(self) -> str:
         """Say where it rings."""

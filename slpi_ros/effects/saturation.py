@@ -1,6 +1,6 @@
 """Saturation: the amplifier clips below what it is commanded."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from math import inf, isinf, isnan
 from typing import ClassVar
@@ -9,6 +9,10 @@ import numpy as np
 
 from slpi_ros.effects.checks import require_rules
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Left
+
+# Voltages are sorted into so many bins; the stage stands still where it moves by less than this share of the usual.
+BINS, STILL = 200, 0.35
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,26 @@ class Saturation:
     def invert(self, signal: FloatArray, around: Around) -> FloatArray:
         """Return the voltage, shape (N,), volts, within the range: more is not to be had."""
         return np.clip(signal, self.lower, self.upper)
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator["Saturation"]:
+        """Yield limits where the displacement stands still although the voltage goes on."""
+        v, low, width = left.u, float(left.u.min()), float(np.ptp(left.u)) / BINS
+        # Increments over a few samples stand out of the noise.
+        every = max(1, round(width / 4 / max(float(np.mean(np.abs(np.diff(v)))), 1e-12)))
+        both = left.used[every:] & left.used[:-every]
+        dv, dy = (v[every:] - v[:-every])[both], (left.y[every:] - left.y[:-every])[both]
+        middle = 0.5 * (v[every:] + v[:-every])[both]
+        place = np.clip(((middle - low) / width).astype(np.int64), 0, BINS - 1)
+        moved = np.bincount(place, dv**2, BINS)
+        gain = np.bincount(place, dv * dy, BINS) / np.maximum(moved, 1e-300)
+        still = (gain < STILL * np.median(gain[moved > 0])) | (moved == 0)
+        at_top, at_bottom = int(np.argmin(still[::-1])), int(np.argmin(still))
+        upper = low + (BINS - at_top) * width if at_top else np.inf
+        lower = low + at_bottom * width if at_bottom else -np.inf
+        if upper > lower and (at_top or at_bottom):
+            for shift in np.linspace(-1.0, 1.0, 9).tolist():
+                yield cls(lower + shift * width, upper - shift * width)
 
     def describe(self) -> str:
         """Say where it clips."""

@@ -1,7 +1,8 @@
 """Periodic error of the sensor: an interferometer's nonlinearity."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from math import cos, pi, sin
 from typing import ClassVar
 
@@ -9,6 +10,10 @@ import numpy as np
 
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Form, Left, amplitude_and_phase, strongest_lines, wave
+
+# Periods (m) that are looked for, so many of them, in so many bins of displacement.
+SHORTEST, LONGEST, LINES, BINS = 50e-9, 2e-6, 4, 2**14
 
 # Newton's method squares the error with each step, once it is small.
 _STEPS = 60
@@ -64,6 +69,23 @@ class SensorPeriodic:
             step = x - beyond / (1 + k * amplitude * np.cos(angle))
             x = np.where((step < low) | (step > high), (low + high) / 2, step)
         return x
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator[Form]:
+        """Yield the strongest lines in the spectrum of what is left, as it lies over the displacement."""
+        width = float(np.ptp(left.h)) / BINS
+        place = ((left.h[left.used] - float(left.h.min())) / width).astype(np.int64)
+        power = np.abs(np.fft.rfft(np.bincount(place, left.residual[left.used], 4 * BINS)[: 4 * BINS])) ** 2
+        lines = np.fft.rfftfreq(4 * BINS, width)
+        power[(lines < 1 / LONGEST) | (lines > 1 / SHORTEST)] = 0.0
+        for line in strongest_lines(power, lines, LINES, width=6):
+            yield Form(wave(2 * np.pi * line * left.h), partial(cls._of, 1 / line))
+
+    @classmethod
+    def _of(cls, period: float, gains: FloatArray) -> "SensorPeriodic":
+        amplitude, phase = amplitude_and_phase(gains)
+        # A larger one could not be undone.
+        return cls(period, min(amplitude, 0.9 * period / (2 * np.pi)), phase)
 
     def describe(self) -> str:
         """Say how large it is and how often it repeats."""

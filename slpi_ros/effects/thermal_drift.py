@@ -1,13 +1,18 @@
 """Thermal drift: a slow change that does not follow the voltage."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.form import Form, Left
+
+# Knots of the lines that may fit a record.
+KNOTS = (2, 3, 5, 8, 13)
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,19 @@ class ThermalDrift:
     def invert(self, signal: FloatArray, around: Around) -> FloatArray:
         """Return the displacement without drift, shape (N,), metres."""
         return signal - np.interp(around.t, self.times, self.values)
+
+    @classmethod
+    def fit(cls, left: Left) -> Iterator[Form]:
+        """Yield lines of few knots and of more."""
+        for knots in KNOTS:
+            times = np.linspace(left.t[0], left.t[-1], knots)
+            # The displacement at rest takes up a constant.
+            hats = np.column_stack([np.interp(left.t, times, row) for row in np.eye(knots)[1:]])
+            yield Form(hats, partial(cls._through, times))
+
+    @classmethod
+    def _through(cls, times: FloatArray, gains: FloatArray) -> "ThermalDrift":
+        return cls(tuple(times.tolist()), (0.0, *gains.tolist()))
 
     def describe(self) -> str:
         """Say how far in which time."""

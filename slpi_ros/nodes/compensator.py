@@ -9,7 +9,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
@@ -26,11 +25,11 @@ from slpi_ros.nodes.compensator_reset import MemoryReset
 from slpi_ros.nodes.compensator_settings import CompensatorSettings
 from slpi_ros.nodes.compensator_trajectory import TrajectoryFollower
 from slpi_ros.nodes.diagnostics import WARN
+from slpi_ros.nodes.joint_states import as_rclpy_reads
 from slpi_ros.nodes.lifecycle import refuse_impossible_transitions
 from slpi_ros.nodes.parameters import Parameters
 from slpi_ros.nodes.qos import COMMANDS, LATCHED, MEASUREMENTS
 from slpi_ros.nodes.runner import run
-from slpi_ros.runtime.clock import SECOND_NS
 from slpi_ros.runtime.joint_state_bytes import JointStates
 from slpi_ros.runtime.rejection import RejectedError
 from slpi_ros.runtime.wire import before_numbers
@@ -197,7 +196,7 @@ class Compensator(LifecycleNode):
     # Desired and measured displacements
 
     def _on_joint_state(self, data: bytes) -> None:
-        self._answer(*(self._desired.read(data) or _as_rclpy_reads(data)))
+        self._answer(*(self._desired.read(data) or as_rclpy_reads(data)))
 
     def _on_values(self, message: Float64MultiArray) -> None:
         self._answer(0, self._compensation.names, message.data)
@@ -206,7 +205,7 @@ class Compensator(LifecycleNode):
         self._answer(0, self._compensation.names, (message.data,))
 
     def _on_measured(self, data: bytes) -> None:
-        _, names, displacements = self._measured.read(data) or _as_rclpy_reads(data)
+        _, names, displacements = self._measured.read(data) or as_rclpy_reads(data)
         self._compensation.measure(names, displacements)
 
     def _answer(self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float]) -> None:
@@ -284,16 +283,6 @@ class Compensator(LifecycleNode):
                 self._compensation.driving.ramp(safety.voltages, safety.rate)
                 self._driver.start()
         self._fell_silent = silent
-
-
-def _as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
-    """Return stamp (ns), names and positions of a serialized JointState; one that makes no sense names nothing."""
-    try:
-        message = deserialize_message(data, JointState)
-    except RuntimeError:
-        return 0, (), ()
-    stamp = message.header.stamp
-    return stamp.sec * SECOND_NS + stamp.nanosec, message.name, message.position
 
 
 def main() -> int:

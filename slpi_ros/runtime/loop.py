@@ -81,7 +81,12 @@ class ClosedLoop:
     def retune(self, settings: LoopSettings) -> None:
         """Go on with other settings, without a jump."""
         self._settings = settings
-        self._feedback.retune(settings.gains)
+        try:
+            self._feedback.retune(settings.gains)
+        except SlpiError:
+            # The last measurement was beyond reason, which other gains did not show.
+            self._feedback.forget()
+            self._feedback.retune(settings.gains)
         if settings.enabled:
             self._feedback.enable()
         else:

@@ -177,3 +177,8 @@ def test_parameters_of_which_no_stage_can_be_made(parameters, complaint):
     _, said = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert complaint in said and "Traceback" not in said and len(said.splitlines()) == 1
+
+
+def test_the_stage_of_the_mpi_paper_creeps_on_the_nodes_clock():
+    with simulator(preset="p11", axes='["x", "y"]', voltage_min=-20, voltage_max=150) as (bench, process):
+        bench.connect(process)

@@ -68,6 +68,21 @@ def test_a_measurement_is_held_against_the_wish_that_it_answers():
     assert abs(bench.axis.correction) < 1e-6
 
 
+@pytest.mark.parametrize("enabled", [True, False])
+def test_other_gains_after_a_measurement_beyond_reason(enabled):
+    silent = replace(ON, gains=PidGains(0.0, 1e-300), enabled=enabled)
+    bench = Bench(silent)
+    bench.run(START)
+    bench.axis.measure(1e308)
+    bench.axis.move(DT, float(START[-1]))
+    before = bench.axis.voltage
+    bench.axis.retune(replace(silent, gains=PidGains(1e2, 1e8)))
+    assert bench.axis.move(DT, float(START[-1])) == pytest.approx(before, abs=1e-9)
+    # Another takes over, and acts.
+    bench.run(PATH[:500])
+    assert bench.axis.feedback == ("on" if enabled else "off")
+
+
 def test_without_feedback_measurements_change_no_voltage():
     heard, deaf = Bench(OFF, 3.0), Bench(OFF, 3.0)
     heard.run(PATH)

@@ -45,7 +45,7 @@ def measure(model: StageModel, executor: str, seconds: float, rate: float) -> No
         )
 
 
-def main(seconds: float = 20.0, rate: float = 1000.0) -> None:
+def main(seconds: float = 8.0, rate: float = 1000.0) -> None:
     """Print the table."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     print(f"{STARTS} starts of all nodes, {seconds:g} s at {rate:g} Hz each, in blocks of {BLOCK_S:g} s in turn")
@@ -59,7 +59,7 @@ def main(seconds: float = 20.0, rate: float = 1000.0) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--rate", type=float, default=1000.0)
     options = parser.parse_args()
     main(options.seconds, options.rate)

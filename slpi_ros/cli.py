@@ -140,7 +140,7 @@ def _diagnose(options: argparse.Namespace) -> None:
             record.require_axis(axis)
             model.axis(axis)
             require_usable(findings(assess(record, axis)), f"{record.source}: axis '{axis}'")
-        diagnosis = diagnose(record, model, axes=axes)
+        diagnosis = diagnose(record, model, axes=axes, start=options.start, stop=options.stop)
     except UsageError as error:
         # That bag and model do not go together shows only once both have been read.
         raise ModelError(str(error)) from None
@@ -187,7 +187,17 @@ def _refit(options: argparse.Namespace) -> None:
 def _simulate(options: argparse.Namespace) -> None:
     model = load_model(options.model)
     t, voltage = tables.read_table(options.table, "V")
-    tables.write_table(options.output, t, model.simulate(t, _known(voltage, model, options.table)), "m")
+    known = _known(voltage, model, options.table)
+    tables.write_table(options.output, t, model.simulate(t, known), "m")
+    for axis, v in known.items():
+        low, high = model.axes[axis].voltage_range
+        outside = int(((v < low) | (v > high)).sum())
+        if outside:
+            print(
+                f"slpi simulate: axis '{axis}': {outside} of {v.size} voltages lie outside the identified "
+                f"{low:.4g} to {high:.4g} V; there the model is a guess",
+                file=sys.stderr,
+            )
 
 
 def _compensate(options: argparse.Namespace) -> None:

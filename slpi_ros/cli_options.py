@@ -55,8 +55,7 @@ def _identify(command: Any) -> None:
     )
     _where_in_the_bag(command)
     command.add_argument("--axis", metavar="NAME", nargs="+", help="default: every axis of the bag")
-    command.add_argument("--start", metavar="S", type=float, help="fit only from here on, seconds from the first stamp")
-    command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
+    _span(command)
     command.add_argument("--report", metavar="DIR", help="also write a page with plots, of the first bag")
     command.add_argument("--uncertainty", action="store_true", help="also say how surely the curves are known")
 
@@ -70,6 +69,12 @@ def _diagnose(command: Any) -> None:
     )  # fmt: skip
     _where_in_the_bag(command)
     command.add_argument("--axis", metavar="NAME", nargs="+", help="default: every axis that bag and model share")
+    _span(command)
+
+
+def _span(command: Any) -> None:
+    command.add_argument("--start", metavar="S", type=float, help="fit only from here on, seconds from the first stamp")
+    command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
 
 
 def _where_in_the_bag(command: Any) -> None:

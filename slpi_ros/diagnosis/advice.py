@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+from slpi_ros.diagnosis.evidence import Evidence
+from slpi_ros.diagnosis.gather import one_speed
 from slpi_ros.excitation.effects import for_effect
 
 # Which drive separates effects that a record leaves open: the first pair that is among them decides.
@@ -25,14 +27,24 @@ ANOTHER_HYSTERESIS = {
     "loops that depend on bias": "The shape of the loops depends on the bias voltage, which the kind of the given "
     "model cannot follow: identify this record with kind 'slpi'; no new one is needed.",
 }
-MORE_LOOPS = "Record the drive of `slpi excite`, which visits loops of every size at several speeds, and diagnose that."
 
 
-def separating(names: Sequence[str], *, one_speed: bool) -> str:
-    """Return the experiment that separates effects, the likeliest first, in a sentence."""
+def more_loops(evidence: Evidence) -> str:
+    """Return the record that shows most, in a sentence."""
+    return f"Record `{_command(evidence)}`, which visits loops of every size at several speeds, and diagnose that."
+
+
+def separating(names: Sequence[str], evidence: Evidence) -> str:
+    """Return the experiment that separates effects, the likeliest first, in sentences."""
     chosen = next((drive for pair, drive in SEPARATES if pair <= set(names)), names[0])
-    why = for_effect(chosen).why
-    return f"{OTHER_FREQUENCIES if one_speed else ''}Record the drive of `slpi excite --for {chosen}`. {why}"
+    axes = " --axis " + " ".join(["OTHER", "THIS"]) if chosen == "cross_coupling" else ""
+    other = OTHER_FREQUENCIES if one_speed(evidence) else ""
+    return f"{other}Record `{_command(evidence)} --for {chosen}{axes}`. {for_effect(chosen).why}"
+
+
+def _command(evidence: Evidence) -> str:
+    low, high = float(evidence.v.min()), float(evidence.v.max())
+    return f"slpi excite -o drive.csv --voltage-min {low:.4g} --voltage-max {high:.4g}"
 
 
 def of_structure(structure: str) -> str:

@@ -10,9 +10,10 @@ from threadpoolctl import threadpool_limits
 
 from slpi_ros.diagnosis.evidence import Evidence
 from slpi_ros.diagnosis.explanation import Explanation
-from slpi_ros.diagnosis.gather import evidence_of
+from slpi_ros.diagnosis.gather import driven_alike, evidence_of
 from slpi_ros.diagnosis.judge import judged
-from slpi_ros.diagnosis.selection import counts, select
+from slpi_ros.diagnosis.selection import Selection, counts, select
+from slpi_ros.diagnosis.structure import BIAS
 from slpi_ros.diagnosis.verdict import AxisDiagnosis, Diagnosis
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
@@ -25,10 +26,20 @@ FloatArray = NDArray[np.float64]
 
 # A model is of another stage when its error is more than this share of the displacement range, and this many times
 # that of one fitted to the record.
+# Kinds that are fitted to the record together with effects. Of another kind is said that it is the wrong one where its
+# error is so many times that of the loop family.
+REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
 
 
-def diagnose(record: Record, model: StageModel, *, axes: Sequence[str] | None = None) -> Diagnosis:
+def diagnose(
+    record: Record,
+    model: StageModel,
+    *,
+    axes: Sequence[str] | None = None,
+    start: float | None = None,
+    stop: float | None = None,
+) -> Diagnosis:
     """Find what a model gets wrong on a record, name the causes, and extend the model by them.
 
     Parameters
@@ -38,6 +49,8 @@ def diagnose(record: Record, model: StageModel, *, axes: Sequence[str] | None = 
         Of the same stage.
     axes : sequence of str, optional
         All that record and model share by default.
+    start, stop : float, seconds, optional
+        Explain only samples with ``start <= t < stop``, t from the record's first stamp.
 
     Returns
     -------
@@ -66,7 +79,7 @@ def diagnose(record: Record, model: StageModel, *, axes: Sequence[str] | None = 
     for axis in chosen:
         try:
             with threadpool_limits(1):
-                found[axis], extended[axis] = _diagnose_axis(record, axis, model.axis(axis))
+                found[axis], extended[axis] = _diagnose_axis(record, axis, model.axis(axis), start, stop)
         except SlpiError as error:
             where = f"{record.source}: axis '{axis}': "
             raise type(error)(where + str(error).removeprefix(where)) from None
@@ -74,23 +87,37 @@ def diagnose(record: Record, model: StageModel, *, axes: Sequence[str] | None = 
     return Diagnosis(found, replace(model, axes=extended, created=created), record.source)
 
 
-def _diagnose_axis(record: Record, axis: str, model: AxisModel) -> tuple[AxisDiagnosis, AxisModel]:
+def _diagnose_axis(
+    record: Record, axis: str, model: AxisModel, start: float | None, stop: float | None
+) -> tuple[AxisDiagnosis, AxisModel]:
     tell(f"axis {axis}: fitting the hysteresis")
-    evidence = evidence_of(record, axis, model)
+    evidence = evidence_of(record, axis, model, start, stop)
     base = Explanation(evidence, model.effects)
-    selection = select(base, _with_loop_family(base, record, axis, model))
-    _require_own(model, base, selection.now)
+    given = _given_rms(model, evidence, evidence.v, evidence.y)
+    if model.kind in REFITTED:
+        selection = _selected(base, evidence_of(record, axis, None, start, stop) if model.kind == "pi" else None)
+        _require_own(model, base, selection.now)
+        before = base.held_out.rms
+    else:
+        # Such a kind is not fitted anew here: the loop family shows what it gets wrong.
+        selection, before = select(base, None), given
+        if given > WRONG_KIND * base.held_out.rms:
+            selection = replace(selection, structures=(BIAS, *selection.structures))
     floor = _floor(selection.now)
-    given = _given_rms(model, base, evidence.v, evidence.y)
-    return judged(selection, floor, given), _extended(model, selection.now, floor, record.source)
+    found = judged(selection, floor, before, given, driven_alike(record, axis))
+    return found, _extended(model, selection.now, floor, record.source)
 
 
-def _with_loop_family(base: Explanation, record: Record, axis: str, model: AxisModel) -> Explanation | None:
-    """Return the explanation by the loop family, where the kind of the model is another and that counts."""
-    if model.kind == "slpi":
-        return None
-    family = Explanation(evidence_of(record, axis, None), model.effects)
-    return family if counts(base.held_out, family.held_out) else None
+def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
+    """Return the outcome of the competition, beside the loop family where that does better than the kind of `base`."""
+    if of_family is None:
+        return select(base, None)
+    family = Explanation(of_family, base.effects)
+    if counts(base.held_out, family.held_out):
+        return select(base, family)
+    selection = select(base, None)
+    with_effects = Explanation(of_family, selection.now.effects).refined(2)
+    return select(base, family) if counts(selection.now.held_out, with_effects.held_out) else selection
 
 
 def _floor(now: Explanation) -> Floor:
@@ -100,12 +127,11 @@ def _floor(now: Explanation) -> Floor:
     return replace(floor, rms=min(floor.rms, now.held_out.rms))
 
 
-def _given_rms(model: AxisModel, now: Explanation, u: FloatArray, y: FloatArray) -> float:
-    """Return the error (m) of the given hysteresis, driven by `u` (V), against `y` (m), but for the one at rest.
+def _given_rms(model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArray) -> float:
+    """Return the error (m) of the given model, driven by `u` (V), against `y` (m), but for the one at rest.
 
     It starts as it was identified or as the record seems to, whichever suits it better.
     """
-    evidence = now.evidence
     starts = [model.start]
     if model.causal:
         starts += [Start(float(u[0]), 0.0, history) for history in {evidence.history, model.start.history}]
@@ -113,14 +139,15 @@ def _given_rms(model: AxisModel, now: Explanation, u: FloatArray, y: FloatArray)
 
 
 def _error_from(start: Start, model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArray) -> float:
-    errors = (replace(model, start=start, effects=()).simulate(evidence.t, u) - y)[evidence.used]
+    errors = (replace(model, start=start).simulate(evidence.t, u) - y)[evidence.used]
     return float(np.sqrt(np.mean((errors - np.median(errors)) ** 2)))
 
 
 def _require_own(model: AxisModel, base: Explanation, now: Explanation) -> None:
     """Refuse a model that has nothing to do with the record, whatever effects there are."""
     span = float(np.ptp(now.evidence.y[now.evidence.used]))
-    error = min(_given_rms(model, base, base.u, base.target), _given_rms(model, now, now.u, now.target))
+    bare = replace(model, effects=())
+    error = min(_given_rms(bare, one.evidence, one.u, one.target) for one in (base, now))
     if error > FOREIGN_SHARE * span and error > FOREIGN_TIMES * base.held_out.rms:
         raise IdentificationError(
             f"this model does not belong to this bag: its error is {error * 1e6:.4g} um rms of {span * 1e6:.4g} um, "

@@ -45,7 +45,9 @@ OUTLIER = 10.0
 MOST_SAMPLES = 200_000
 
 
-def evidence_of(record: Record, axis: str, model: AxisModel | None) -> Evidence:
+def evidence_of(
+    record: Record, axis: str, model: AxisModel | None, start: float | None = None, stop: float | None = None
+) -> Evidence:
     """Return what a record says about one axis, to be explained by a hysteresis like that of `model`, or a loop family.
 
     Raises
@@ -53,8 +55,14 @@ def evidence_of(record: Record, axis: str, model: AxisModel | None) -> Evidence:
     RecordError, IdentificationError
         If it says too little.
     """
-    samples = select_samples(record, axis, None, None)
+    samples = select_samples(record, axis, start, stop)
     t, others = _clock_and_others(record, axis)
+    t, others = t[: samples.v.size], {name: y[: samples.v.size] for name, y in others.items()}
+    later = np.diff(t, prepend=-np.inf) > 0.0
+    if np.count_nonzero(later) > 0.5 * t.size and not later.all():
+        # Of readings with one stamp the first counts: what depends on time cannot say anything of the others.
+        samples = Samples(samples.v[later], samples.y[later], samples.fitted[later])
+        t, others = t[later], {name: y[later] for name, y in others.items()}
     if samples.v.size > MOST_SAMPLES:
         samples = Samples(samples.v[:MOST_SAMPLES], samples.y[:MOST_SAMPLES], samples.fitted[:MOST_SAMPLES])
         t, others = t[:MOST_SAMPLES], {name: y[:MOST_SAMPLES] for name, y in others.items()}
@@ -85,19 +93,25 @@ def _clock_and_others(record: Record, axis: str) -> tuple[FloatArray, dict[str, 
     driven = np.isfinite(own)
     t, others = record.t, {}
     for name in record.axes:
-        if name != axis and not _common(own, record.voltage[name]):
-            y = record.displacement[name]
-            known = np.isfinite(y)
-            if known.any():
-                others[name] = np.interp(t, t[known], y[known] - y[known][0])[driven]
+        y = record.displacement[name]
+        known = np.isfinite(y)
+        moves = known.any() and np.ptp(y[known]) > 0.0
+        if name != axis and moves and not _common(own, record.voltage[name]):
+            others[name] = np.interp(t, t[known], y[known] - y[known][0])[driven]
     return t[driven], others
+
+
+def driven_alike(record: Record, axis: str) -> tuple[str, ...]:
+    """Return the other axes whose drive cannot be told from that of an axis: nor can their motions."""
+    own = record.voltage[axis]
+    return tuple(name for name in record.axes if name != axis and _common(own, record.voltage[name]))
 
 
 def _common(own: FloatArray, other: FloatArray) -> bool:
     """Return whether two axes have one drive, or the other none: then nothing tells their motions apart."""
     both = np.isfinite(own) & np.isfinite(other)
     if np.count_nonzero(both) < 2 or not np.ptp(other[both]) > 0.0 or not np.ptp(own[both]) > 0.0:
-        return True
+        return False
     return bool(abs(np.corrcoef(own[both], other[both])[0, 1]) > ONE_DRIVE)
 
 

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from slpi_ros.identification.problem import Problem
+from slpi_ros.identification.problem import Problem, blocked_folds
 
 FloatArray = NDArray[np.float64]
 Factor = tuple[FloatArray, bool]
@@ -226,7 +226,10 @@ def _groups(problem: Problem) -> list[NDArray[np.int64]]:
     """
     always = problem.weights > 0
     settled = int(np.flatnonzero(always)[int(BEGINNING * problem.count)])
-    folds = [fold[fold >= settled] for fold in problem.folds()]
+    walk = problem.design.walk
+    # While it has not moved yet the memory does not matter: what shows there comes from outside.
+    judged = (problem.judged & ~walk.first_rise) | (walk.direction == 0)
+    folds = [fold[fold >= settled] for fold in blocked_folds(always & judged)]
     for fold in folds:
         always[fold] = False
     return [np.flatnonzero(always), *folds]

@@ -1,12 +1,14 @@
 """What the outcome of the competition means, in words."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.diagnosis import advice
 from slpi_ros.diagnosis.explanation import Explanation
-from slpi_ros.diagnosis.gather import one_speed
 from slpi_ros.diagnosis.selection import Named, Selection, chance_of_gain, gain
+from slpi_ros.diagnosis.structure import BIAS
 from slpi_ros.diagnosis.verdict import (
     AMBIGUOUS,
     NAMED,
@@ -27,7 +29,9 @@ ABOVE_FLOOR = 1.5
 RESOLUTION = 2e-4
 
 
-def judged(selection: Selection, floor: Floor, given_rms: float) -> AxisDiagnosis:
+def judged(
+    selection: Selection, floor: Floor, before_rms: float, given_rms: float, driven_alike: Sequence[str]
+) -> AxisDiagnosis:
     """Return what is to be said of one axis.
 
     Parameters
@@ -35,19 +39,21 @@ def judged(selection: Selection, floor: Floor, given_rms: float) -> AxisDiagnosi
     selection : Selection
     floor : Floor
         Of the record.
-    given_rms : float, metres
-        Error of the given model as it is.
+    before_rms, given_rms : float, metres
+        Error before any effect, held out, and of the given model as it is.
+    driven_alike : sequence of str
+        Axes that have the drive of this one.
     """
     base, now = selection.base, selection.now
     effects = _named_effects(selection)
     verdict = _verdict(selection, effects, floor)
     return AxisDiagnosis(
         verdict=verdict,
-        summary=_summary(verdict, selection, effects, floor),
+        summary=_summary(verdict, selection, effects, floor, before_rms) + _cannot_tell(driven_alike),
         floor_rms=floor.rms,
         floor_source=floor.source,
         given_rms=given_rms,
-        before_rms=base.held_out.rms,
+        before_rms=before_rms,
         after_rms=now.held_out.rms,
         effects=effects,
         next_experiment=_next(verdict, selection, effects),
@@ -95,15 +101,20 @@ def _left(selection: Selection, floor: Floor) -> bool:
 
 def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor) -> str:
     if effects:
-        return AMBIGUOUS if effects[0].alternatives else NAMED
-    wrong_kind = "loops that depend on bias" in selection.structures
+        return AMBIGUOUS if any(named.alternatives for named in effects) else NAMED
+    wrong_kind = BIAS in selection.structures
     return UNEXPLAINED if wrong_kind or _left(selection, floor) else NOTHING_FOUND
 
 
-def _summary(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor) -> str:
-    before, after = selection.base.held_out.rms * 1e9, selection.now.held_out.rms * 1e9
+def _summary(
+    verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor, before_rms: float
+) -> str:
+    before, after = before_rms * 1e9, selection.now.held_out.rms * 1e9
     left = f"{after:.3g} nm rms are left, the floor of the record is {floor.rms * 1e9:.3g} nm"
-    found = ", ".join(f"{named.name} ({named.gain_percent:.0f} %)" for named in effects)
+    found = ", then ".join(
+        f"{named.name}, which takes away {named.gain_percent:.0f} % of {'the rest' if place else 'the error'}"
+        for place, named in enumerate(effects)
+    )
     if verdict == NOTHING_FOUND:
         return f"Nothing found: {left}."
     structure = f"The hysteresis itself is wrong: {', '.join(selection.structures)}. " if selection.structures else ""
@@ -111,17 +122,24 @@ def _summary(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...
         return f"{structure}None of the known effects explains the error: {left}."
     others = ""
     if verdict == AMBIGUOUS:
-        others = f" The record cannot tell {effects[0].name} from {', '.join(effects[0].alternatives)}."
+        open_ones = (named for named in effects if named.alternatives)
+        others = "".join(f" The record cannot tell {one.name} from {', '.join(one.alternatives)}." for one in open_ones)
     return f"{structure}Found: {found}.{others} The held-out error falls from {before:.3g} nm; {left}."
+
+
+def _cannot_tell(driven_alike: Sequence[str]) -> str:
+    if not driven_alike:
+        return ""
+    return f" Axis {', '.join(driven_alike)} has the same drive: whether it couples into this one cannot be told."
 
 
 def _next(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...]) -> str | None:
     steps = [] if verdict == NOTHING_FOUND else [advice.of_structure(structure) for structure in selection.structures]
     if verdict == AMBIGUOUS:
-        names = (effects[0].name, *effects[0].alternatives)
-        steps.append(advice.separating(names, one_speed=one_speed(selection.now.evidence)))
+        first = next(named for named in effects if named.alternatives)
+        steps.append(advice.separating((first.name, *first.alternatives), selection.now.evidence))
     if verdict == UNEXPLAINED and not steps:
-        steps.append(advice.MORE_LOOPS)
+        steps.append(advice.more_loops(selection.now.evidence))
     return " ".join(steps) or None
 
 

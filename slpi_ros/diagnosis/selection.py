@@ -10,9 +10,11 @@ from slpi_ros.diagnosis.explanation import Explanation
 from slpi_ros.diagnosis.gather import one_speed
 from slpi_ros.diagnosis.joint import Score
 from slpi_ros.diagnosis.parameters import free
-from slpi_ros.diagnosis.structure import STRUCTURES
+from slpi_ros.diagnosis.structure import BIAS, STRUCTURES
+from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.effect import Effect
-from slpi_ros.effects.form import Form
+from slpi_ros.effects.form import Form, usual_step
+from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.identification.progress import tell
@@ -32,8 +34,12 @@ TINY = 1e-30
 WORTH_TRYING, LEAST_SCREENED = 0.3, 0.01
 # Another effect that explains less than this share of what the best one does is no alternative to it.
 ALTERNATIVE = 0.7
+# The same at one drive frequency, where a better fit says little.
+ALTERNATIVE_AT_ONE_SPEED = 0.4
 # What one drive frequency cannot tell apart.
 DYNAMIC = {"delay", "lag", "rate_dependence", "creep"}
+# What shifts the displacement against the voltage.
+SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
 STEPS = 5
 
 
@@ -74,7 +80,20 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
         for name, (rms, effect) in screened.items()
         if error - rms > least
     ]
-    return sorted(found, key=lambda contender: contender.score.rms)
+    return sorted((one for one in found if not _within_a_sample(one)), key=lambda contender: contender.score.rms)
+
+
+def _within_a_sample(contender: Contender) -> bool:
+    """Return whether a shift beside another effect of the same kind is shorter than a sample.
+
+    How a command is held between samples does as much.
+    """
+    effects = {effect.name: effect for effect in contender.explanation.effects}
+    shift = effects[contender.name]
+    if not isinstance(shift, Delay | Lag) or not effects.keys() & SHIFTING - {contender.name}:
+        return False
+    seconds = shift.seconds if isinstance(shift, Delay) else shift.time_constant
+    return abs(seconds) < usual_step(contender.explanation.t)
 
 
 def _screened(name: str, now: Explanation) -> tuple[float, Effect] | None:
@@ -127,7 +146,9 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
     """
     explained, by_other = before.rms**2 - best.score.rms**2, before.rms**2 - other.score.rms**2
     inseparable = one_speed and {best.name, other.name} <= DYNAMIC
-    return by_other >= ALTERNATIVE * explained and (inseparable or chance_of_gain(other.score, best.score) > ALIKE)
+    if inseparable:
+        return by_other >= ALTERNATIVE_AT_ONE_SPEED * explained
+    return by_other >= ALTERNATIVE * explained and chance_of_gain(other.score, best.score) > ALIKE
 
 
 @dataclass(frozen=True)
@@ -183,7 +204,7 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
         The same by the loop family, where that does better than the kind of `base`: then effects stand beside it.
     """
     structures: tuple[str, ...]
-    now, structures = (family, ("loops that depend on bias",)) if family else (base, ())
+    now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
     rivals: dict[str, list[Contender]] = {}
     while len(rivals) < MOST_EFFECTS:

@@ -10,6 +10,8 @@ from slpi_ros.hysteresis.runs import monotone_runs
 
 FloatArray = NDArray[np.float64]
 
+# What a kind of model gets wrong that the loop family gets right.
+BIAS = "loops that depend on bias"
 # Ways (share of the voltage range) over which a material without return-point memory may forget.
 FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
 

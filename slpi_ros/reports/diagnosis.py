@@ -104,7 +104,7 @@ def _cause(named: NamedEffect) -> dict[str, str]:
         "Evidence": named.evidence,
         "Gain": f"{named.gain_percent:.1f} % less error on blocks left out; "
         f"{named.share_of_residual:.0%} of the mean square error without effects",
-        "By chance": f"once in {1.0 / named.p_value:.0f} records" if named.p_value > 0.0 else "never seen",
+        "By chance": f"at most once in {1.0 / named.p_value:.0f} records" if named.p_value > 0.0 else "never seen",
     }
     if named.alternatives:
         said["Could as well be"] = f"{', '.join(named.alternatives)}: this record does not tell them apart"

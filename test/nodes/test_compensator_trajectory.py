@@ -104,26 +104,27 @@ def test_cancel_replace_append_and_refuse(xy_file):
             (["x"], [0], [[np.nan]]), (["x", "x"], [0], [[1e-6] * 2]),
         ):  # fmt: skip
             publisher.publish(trajectory(names, times, rows))
+        publisher.publish(b"\0\1\0\0 no trajectory")
         past = client.graph.node.get_clock().now().nanoseconds - 5 * SECOND_NS
         publisher.publish(trajectory(["x"], [0], [[1e-6]], past))
-        _, values = client.report(trajectories_rejected=7)
+        _, values = client.report(trajectories_rejected=8)
         assert int(values["points_remaining"]) > 1000
         # Appended: what comes before its time goes on, then it takes over.
         start = client.graph.node.get_clock().now().nanoseconds + SECOND_NS // 2
         publisher.publish(trajectory(["y"], [0, 100 * MS], [[4e-6], [5e-6]], start))
-        _, values = client.report(trajectories=9)
+        _, values = client.report(trajectories=10)
         assert 2 < int(values["points_remaining"]) < 500
         client.graph.spin_until(lambda: client.answers[-1][1] > 0, "the appended one")
         client.report(points_remaining=0)
         assert client.answers[-1] == pytest.approx(library(np.array([[3e-6, 4e-6], [3e-6, 5e-6]]))[-1], abs=1e-8)
         # Replaced at once, and cancelled by an empty one.
         publisher.publish(trajectory(["x"], np.arange(2000) * 5 * MS, long))
-        client.report(trajectories=10)
-        publisher.publish(trajectory(["x"], np.arange(2000) * 5 * MS, long + 1e-6))
         client.report(trajectories=11)
+        publisher.publish(trajectory(["x"], np.arange(2000) * 5 * MS, long + 1e-6))
+        client.report(trajectories=12)
         client.graph.spin_until(lambda: client.answers[-1][0] > client.answers[3][0] + 1.0, "the other path")
         publisher.publish(JointTrajectory())
-        _, values = client.report(points_remaining=0, trajectories=12)
+        _, values = client.report(points_remaining=0, trajectories=13)
         held = client.answered
         assert client.ask(["x"], [4e-6])[0] == pytest.approx(client.answers[held - 1][0], abs=1e-8)
         assert client.answered == held + 1

@@ -233,7 +233,7 @@ def test_hostile_models_during_motion(model_file):
         hostile = [
             *cut, good.replace("stage under test", "another stage"), good.replace('"y"', '"z"'),
             good.replace("0.0", "1e999", 1), good + good, "\0" * 1000, good.replace("[0.0, 100.0]", "[300.0, 400.0]"),
-            "{" * 100_000, good.replace('"slpi"', '"smpi"'),
+            " " * 4_000_001, "{" * 100_000, good.replace('"slpi"', '"smpi"'),
         ]  # fmt: skip
         for i, text in enumerate(hostile):
             for k, row in enumerate(rows[4 * i : 4 * i + 4]):

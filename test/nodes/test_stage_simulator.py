@@ -159,6 +159,17 @@ def test_a_stage_that_does_not_answer_publishes_on_its_own():
     assert max(abs(y - true) for y in readings) < 8 * 5e-9
 
 
+def test_the_stage_of_the_mpi_paper_creeps_as_time_goes_by():
+    with simulator(preset="p11", axes="['x', 'y']", voltage_min=-20, voltage_max=150) as (bench, process):
+        bench.connect(process, axes=2)
+        for _ in range(2):
+            bench.send(120.0, 60.0)
+            time.sleep(0.5)
+        bench.spin_until(lambda: len(bench.moved()) >= 2, process)
+        first, later = (list(state.position) for state in bench.moved())
+    assert all(late - early > 1e-7 for early, late in zip(first, later, strict=True))
+
+
 @pytest.mark.parametrize(
     ("parameters", "complaint"),
     [
@@ -169,6 +180,8 @@ def test_a_stage_that_does_not_answer_publishes_on_its_own():
         ({"rate": 0.0, "answer_commands": False}, "rate is 0.0 Hz"),
         ({"rate": "fast"}, "rate is 'fast'"),
         ({"seed": -1}, "seed is -1"),
+        ({"preset": "p11"}, "those of preset p11 x, y"),
+        ({"preset": "best"}, "no preset 'best'"),
         ({"answer_commands": "7"}, "answer_commands"),
     ],
 )
@@ -178,7 +191,3 @@ def test_parameters_of_which_no_stage_can_be_made(parameters, complaint):
     assert process.returncode == 2
     assert complaint in said and "Traceback" not in said and len(said.splitlines()) == 1
 
-
-def test_the_stage_of_the_mpi_paper_creeps_on_the_nodes_clock():
-    with simulator(preset="p11", axes='["x", "y"]', voltage_min=-20, voltage_max=150) as (bench, process):
-        bench.connect(process)

@@ -20,7 +20,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-latency bench-soak clean distclean FORCE
+.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-latency bench-soak bench-trajectory bench-xy clean distclean FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -31,6 +31,8 @@ help:
 	@echo 'make bench-diagnosis   hidden effects: named, missed, invented; about an hour'
 	@echo 'make bench-latency  round trip through the compensator beside a bare echo node, 4 minutes'
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'
+	@echo 'make bench-trajectory  a trajectory of a million points: acceptance and deadlines'
+	@echo 'make bench-xy       the five segments of the MPI paper through the nodes, with and without feedback'
 	@echo 'make clean      remove what was built and all caches'
 	@echo 'make distclean  the same, and .venv'
 	@echo 'PYTHON=/path/to/python3.12 chooses the Python; 3.11 and 3.12 work'
@@ -68,6 +70,12 @@ bench-latency: build
 
 bench-soak: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/soak.py
+
+bench-trajectory: build
+	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/trajectory.py
+
+bench-xy: build
+	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/xy_stage.py
 
 clean:
 	rm -rf build install log .hypothesis .mypy_cache .pytest_cache .ruff_cache

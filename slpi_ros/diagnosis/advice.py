@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from slpi_ros.diagnosis.evidence import Evidence
 from slpi_ros.diagnosis.gather import one_speed
+from slpi_ros.diagnosis.structure import BIAS, LEVEL, NOT_CLOSING
 from slpi_ros.excitation.effects import for_effect
 
 # Which drive separates effects that a record leaves open: the first pair that is among them decides.
@@ -20,11 +21,11 @@ SEPARATES = (
 )
 OTHER_FREQUENCIES = "This record has one drive frequency; other frequencies tell these apart. "
 ANOTHER_HYSTERESIS = {
-    "loops that do not close": "No model with return-point memory can follow loops that do not close: compensate with "
+    NOT_CLOSING: "No model with return-point memory can follow loops that do not close: compensate with "
     "feedback, and record the drive of `slpi excite --for creep` to see whether they close where time is left.",
-    "loops that depend on level": "Loops between the same two voltages differ with the level they hang on, which no "
+    LEVEL: "Loops between the same two voltages differ with the level they hang on, which no "
     "model here can follow: identify on drives like those to be compensated, or compensate with feedback.",
-    "loops that depend on bias": "The shape of the loops depends on the bias voltage, which the kind of the given "
+    BIAS: "The shape of the loops depends on the bias voltage, which the kind of the given "
     "model cannot follow: identify this record with kind 'slpi'; no new one is needed.",
 }
 
@@ -37,7 +38,7 @@ def more_loops(evidence: Evidence) -> str:
 def separating(names: Sequence[str], evidence: Evidence) -> str:
     """Return the experiment that separates effects, the likeliest first, in sentences."""
     chosen = next((drive for pair, drive in SEPARATES if pair <= set(names)), names[0])
-    axes = " --axis " + " ".join(["OTHER", "THIS"]) if chosen == "cross_coupling" else ""
+    axes = " --axis OTHER THIS" if chosen == "cross_coupling" else ""
     other = OTHER_FREQUENCIES if one_speed(evidence) else ""
     return f"{other}Record `{_command(evidence)} --for {chosen}{axes}`. {for_effect(chosen).why}"
 

@@ -24,11 +24,11 @@ from slpi_ros.model import AxisModel, StageModel, Start
 
 FloatArray = NDArray[np.float64]
 
-# A model is of another stage when its error is more than this share of the displacement range, and this many times
-# that of one fitted to the record.
 # Kinds that are fitted to the record together with effects. Of another kind is said that it is the wrong one where its
 # error is so many times that of the loop family.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
+# A model is of another stage when its error is more than this share of the displacement range, and this many times
+# that of one fitted to the record.
 FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
 
 

@@ -63,27 +63,27 @@ def judged(
 
 def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
     fitted = {effect.name: effect for effect in selection.now.with_uncertainty()}
-    whole = selection.base.held_out.rms**2
-    return tuple(
-        NamedEffect(
-            effect=fitted[named.name],
-            gain_percent=100.0 * gain(named.before, named.after),
-            share_of_residual=float(np.clip((named.before.rms**2 - named.after.rms**2) / whole, 0.0, 1.0)),
-            p_value=chance_of_gain(named.before, named.after),
-            alternatives=named.alternatives,
-            evidence=_evidence(fitted[named.name], named, selection.now.held_out.rms),
-        )
-        for named in selection.named
+    return tuple(_named_effect(fitted[named.name], named, selection) for named in selection.named)
+
+
+def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEffect:
+    whole, chance = selection.base.held_out.rms**2, chance_of_gain(named.before, named.after)
+    return NamedEffect(
+        effect=effect,
+        gain_percent=100.0 * gain(named.before, named.after),
+        share_of_residual=float(np.clip((named.before.rms**2 - named.after.rms**2) / whole, 0.0, 1.0)),
+        p_value=chance,
+        alternatives=named.alternatives,
+        evidence=_evidence(effect, named, chance, selection.now.held_out.rms),
     )
 
 
-def _evidence(effect: Effect, named: Named, in_the_end: float) -> str:
+def _evidence(effect: Effect, named: Named, chance: float, in_the_end: float) -> str:
     sentence = effect.describe()
     before, after = named.before.rms * 1e9, named.after.rms * 1e9
-    chance = 100 * chance_of_gain(named.before, named.after)
     gained = (
         f"with it the error on blocks left out falls from {before:.3g} to {after:.3g} nm rms "
-        f"(chance gains as much in {chance:.2g} % of cases)"
+        f"(chance gains as much in {100 * chance:.2g} % of cases)"
     )
     if not named.runner_up:
         return f"{sentence}; {gained}, and no other effect comes near"

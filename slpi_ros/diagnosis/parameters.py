@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.effects.creep import FASTEST, Creep, plausible
 from slpi_ros.effects.effect import Effect
+from slpi_ros.effects.form import usual_step
 
 FloatArray = NDArray[np.float64]
 
@@ -47,32 +48,28 @@ LINEAR = ("gains", "values", "widening", "backlash", "seconds")
 LARGEST_STEP = 0.7
 
 
-def names(effect: Effect) -> list[str]:
-    """Return a name for each free parameter: that of the field, with place or axis where there are several."""
-    found = []
+def _items(effect: Effect) -> list[tuple[str, float]]:
+    """Return name and value of each free parameter: that of the field, with place or axis where there are several."""
+    found: list[tuple[str, float]] = []
     for name in FREE[effect.name]:
         value = getattr(effect, name)
         if isinstance(value, Mapping):
-            found += [f"{name}.{key}" for key in value]
+            found += [(f"{name}.{key}", gain) for key, gain in value.items()]
         elif isinstance(value, tuple):
-            found += [f"{name}.{k}" for k in range(len(value))]
+            found += [(f"{name}.{k}", part) for k, part in enumerate(value)]
         elif isfinite(value):
-            found.append(name)
+            found.append((name, value))
     return found
+
+
+def names(effect: Effect) -> list[str]:
+    """Return a name for each free parameter."""
+    return [name for name, _ in _items(effect)]
 
 
 def free(effect: Effect) -> FloatArray:
     """Return the free parameters, shape (k,), SI."""
-    values: list[float] = []
-    for name in FREE[effect.name]:
-        value = getattr(effect, name)
-        if isinstance(value, Mapping):
-            values += value.values()
-        elif isinstance(value, tuple):
-            values += value
-        elif isfinite(value):
-            values.append(value)
-    return np.array(values, dtype=np.float64)
+    return np.array([value for _, value in _items(effect)], dtype=np.float64)
 
 
 def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect:
@@ -96,7 +93,7 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
 
 def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
     """Return a small step of each free parameter, shape (k,), SI, for derivatives."""
-    dt = float(np.median(np.diff(t)))
+    dt = usual_step(t)
     small = {
         "seconds": 0.05 * dt,
         "time_constant": 0.05 * dt,
@@ -105,7 +102,7 @@ def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
         "phase": 1e-4,
     }
     found = []
-    for name, value in zip(names(effect), free(effect).tolist(), strict=True):
+    for name, value in _items(effect):
         scale = {"hum": 1e-3 / float(t[-1] - t[0]), "sensor_periodic": 1e-5 * abs(value)}
         if name in ("frequency", "period") and effect.name in scale:
             found.append(scale[effect.name])

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,9 +124,15 @@ def chance_of_gain(before: Score, after: Score) -> float:
     Gains are taken as they are, and in proportion to the losses, so that a single block of large errors does not hide
     what all others show; the clearer answer counts.
     """
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (SURROGATES, before.losses.size))
+    signs = _signs(before.losses.size)
     gains = (before.losses - after.losses, np.log(np.maximum(before.losses, TINY) / np.maximum(after.losses, TINY)))
     return min(float((1 + np.count_nonzero(signs @ gain >= gain.sum())) / (1 + SURROGATES)) for gain in gains)
+
+
+@cache
+def _signs(blocks: int) -> FloatArray:
+    """Return the signs of each surrogate, shape (surrogates, blocks): always the same ones."""
+    return np.random.default_rng(0).choice([-1.0, 1.0], (SURROGATES, blocks))
 
 
 def gain(before: Score, after: Score) -> float:

@@ -12,6 +12,8 @@ FloatArray = NDArray[np.float64]
 
 # What a kind of model gets wrong that the loop family gets right.
 BIAS = "loops that depend on bias"
+# What the loop family gets wrong.
+NOT_CLOSING, LEVEL = "loops that do not close", "loops that depend on level"
 # Ways (share of the voltage range) over which a material without return-point memory may forget.
 FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
 
@@ -44,6 +46,6 @@ def _bent(now: Explanation) -> FloatArray:
 
 
 STRUCTURES: Mapping[str, Callable[[Explanation], FloatArray]] = {
-    "loops that do not close": _do_not_close,
-    "loops that depend on level": _bent,
+    NOT_CLOSING: _do_not_close,
+    LEVEL: _bent,
 }

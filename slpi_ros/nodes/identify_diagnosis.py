@@ -10,8 +10,8 @@ from pathlib import Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from slpi_ros.nodes.compensator_reset import LateService
 from slpi_ros.nodes.diagnosis_process import DiagnosisOutcome, DiagnosisProcess, DiagnosisRequest
+from slpi_ros.nodes.late_service import LateService
 
 POLL_PERIOD = 0.1
 NO_MODEL = "nothing to diagnose: no bag has been identified yet"

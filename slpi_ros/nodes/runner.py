@@ -35,16 +35,15 @@ _START_ERRORS = (
 class _Stop:
     """Who asked the running node to end, and why."""
 
-    spinning: bool = False
     requested: bool = False
     signals: int = 0
     failure: SlpiError | None = None
 
     def on_signal(self, *_: object) -> None:
-        """Ask for an orderly end; interrupt at once where nobody would look at the request."""
+        """Ask for an orderly end, of a node that is still being made too: it may hold messages already."""
         self.requested = True
         self.signals += 1
-        if not self.spinning or self.signals > PATIENT_SIGNALS:
+        if self.signals > PATIENT_SIGNALS:
             raise KeyboardInterrupt
 
 
@@ -131,8 +130,6 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
     """Create, spin and destroy the node; raise what made it fail."""
     node = _start(make_node)
     try:
-        # From here on a signal is only noted: one that interrupts the making of an executor leaves a traceback.
-        _stop.spinning = True
         executor = make_executor(getattr(node, "executor_kind", kind))
         executor.add_node(node)
         try:

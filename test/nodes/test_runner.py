@@ -9,7 +9,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from slpi_ros.errors import UsageError  # noqa: E402
-from slpi_ros.nodes.runner import make_executor  # noqa: E402
+from slpi_ros.nodes.runner import PATIENT_SIGNALS, make_executor  # noqa: E402
 
 PATIENCE_S = 60.0
 
@@ -19,6 +19,7 @@ import time
 from rclpy.node import Node
 from std_msgs.msg import String
 from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.nodes import runner
 from slpi_ros.nodes.runner import request_stop, run
 
 what, executor = sys.argv[1:3]
@@ -33,7 +34,10 @@ class Example(Node):
         self.said = self.create_publisher(String, "said", 1)
         if what == "build":
             print("up", flush=True)
-            time.sleep(600)
+            time.sleep(0.5)
+        while what == "hang":
+            print(runner._stop.signals, flush=True)
+            time.sleep(0.05)
         self.create_timer(0.01, self.tick)
 
     def tick(self):
@@ -92,11 +96,24 @@ def test_signal_ends_in_order(executor, number):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_interrupts_a_long_start(number):
+def test_signal_while_the_node_is_made_ends_in_order(number):
+    # it may be subscribed already, and what it holds must not be lost
     process = start("build")
     assert process.stdout.readline() == "up\n"
     process.send_signal(number)
-    assert finish(process)[::2] == (0, "")
+    assert finish(process) == (0, "destroyed\n", "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_interrupt_a_start_that_hangs(number):
+    process = start("hang")
+    for noted in range(PATIENT_SIGNALS + 1):
+        # the system merges signals that wait, so each is sent when the one before has been seen
+        assert any(line == f"{noted}\n" for line in process.stdout)
+        process.send_signal(number)
+    code, output, errors = finish(process)
+    assert (code, errors) == (0, "")
+    assert "destroyed" not in output
 
 
 @both_executors

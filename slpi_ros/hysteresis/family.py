@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.shape import END, Curve
+from slpi_ros.hysteresis.shape import END, FAR, Curve
 
 FloatArray = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ class LoopFamily:
     rise : ndarray, shape (n,), metres
         Displacement of the first rise at the grid's vertices, strictly increasing; its offset does not matter.
     edge_gain : float, metres per volt
-        Slope of every branch outside the grid, positive.
+        Slope of the first rise outside the grid, and of branches longer than the grid, positive.
 
     Raises
     ------
@@ -49,6 +49,7 @@ class LoopFamily:
     _vertices: list[float] = field(init=False, repr=False)
     _ahead: dict[int, FloatArray] = field(init=False, repr=False)
     _lines: dict[int, list[FloatArray]] = field(init=False, repr=False)
+    _edges: dict[int, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the surface and lay its rows and columns out in the order in which branches run through them."""
@@ -68,37 +69,55 @@ class LoopFamily:
         steps = (np.diff(self.grid), np.diff(self.rise), up, down, np.array([self.edge_gain], dtype=np.float64))
         if not all(np.isfinite(step).all() and np.min(step) > 0 for step in steps):
             raise ModelError("loop family: grid, first rise and every row and column of the surface must rise strictly")
-        far = END * self.edge_gain
         object.__setattr__(self, "surface", triangle)
         object.__setattr__(self, "_vertices", self.grid.tolist())
-        object.__setattr__(
-            self,
-            "_ahead",
-            {1: np.append(self.grid, self.grid[-1] + END), -1: np.append(self.grid[::-1], self.grid[0] - END)},
-        )
-        rows = [np.append(triangle[i, i::-1], triangle[i, 0] + far) for i in range(n)]
-        columns = [np.append(triangle[j:, j], triangle[-1, j] + far) for j in range(n)]
+        object.__setattr__(self, "_ahead", {1: self.grid, -1: self.grid[::-1]})
+        rows, columns = [triangle[i, i::-1] for i in range(n)], [triangle[j:, j] for j in range(n)]
         object.__setattr__(self, "_lines", {1: columns, -1: rows})
+        top = self._edge(self.grid[-1] - self.grid[::-1], rows[-1])
+        object.__setattr__(self, "_edges", {1: top, -1: self._edge(self.grid - self.grid[0], columns[0])})
+
+    def _edge(self, u: FloatArray, f: FloatArray) -> FloatArray:
+        """Return the knots, shape (2, n + 1), of the branch that starts where the grid ends, and of all beyond."""
+        return np.array([np.append(u, u[-1] + END), np.append(f, f[-1] + END * self.edge_gain)])
 
     def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return the branch that starts at `v_turn` (V): a row or a column of the surface, interpolated."""
-        vertices, lines, n = self._ahead[direction], self._lines[direction], self.grid.size
+        """Return the branch that starts at `v_turn` (V): a row or a column of the surface, interpolated.
+
+        Beyond the grid the displacement between two turning points depends only on how far apart they are, as for the
+        classical PI model: loops there are like those at the grid's end. A fall from far away, which wipes the memory,
+        comes along the last of them.
+        """
+        n = self.grid.size
+        if direction < 0 and v_turn - self.grid[-1] > FAR / 2:
+            return self._long_fall(v_turn)
         ahead = self._first_vertex_ahead(v_turn, direction)
-        if ahead == n:
-            return Curve.of(np.array([[0.0, END], [0.0, END * self.edge_gain]]))
-        # One column for the turning point itself; the lines already end with the far knot.
-        knots = np.zeros((2, n - ahead + 2))
+        if ahead in (0, n):
+            return Curve.of(self._edges[direction if ahead == n else -direction])
+        head = self._within(direction, v_turn, ahead)
+        edge = self._edges[direction][:, n - ahead :]
+        # A turn next to a vertex may leave, for rounding, no room before the edge's first knot.
+        while edge[0, 0] <= head[0, -1] or edge[1, 0] <= head[1, -1]:
+            edge = edge[:, 1:]
+        return Curve.of(np.concatenate([head, edge], axis=1))
+
+    def _long_fall(self, v_turn: float) -> Curve:
+        above, (u, f) = v_turn - self.grid[-1], self._edges[1]
+        return Curve.of(np.array([np.append(0.0, above + u), np.append(0.0, self.edge_gain * above + f)]))
+
+    def _within(self, direction: int, v_turn: float, ahead: int) -> FloatArray:
+        """Return the knots of a branch as far as the grid goes, shape (2, k); `ahead` is the first vertex on it."""
+        vertices, lines, n = self._ahead[direction], self._lines[direction], self.grid.size
+        # One column for the turning point itself.
+        knots = np.zeros((2, 1 + n - ahead))
         u, f = knots[0, 1:], knots[1, 1:]
         np.subtract(vertices[ahead:], v_turn, out=u)
         u *= direction
         near = ahead if direction > 0 else n - 1 - ahead
-        if ahead:
-            share = float(u[0]) / abs(float(vertices[ahead] - vertices[ahead - 1]))
-            np.multiply(lines[near - direction][1:], share, out=f)
-            f += (1.0 - share) * lines[near]
-        else:
-            np.add(lines[near], self.edge_gain * u[0], out=f)
-        return Curve.of(knots if u[0] > 0.0 else knots[:, 1:])
+        share = float(u[0]) / abs(float(vertices[ahead] - vertices[ahead - 1]))
+        np.multiply(lines[near - direction][1:], share, out=f)
+        f += (1.0 - share) * lines[near]
+        return knots if u[0] > 0.0 else knots[:, 1:]
 
     def _first_vertex_ahead(self, v_turn: float, direction: int) -> int:
         """Index, counted in `direction`, of the first vertex at or ahead of `v_turn`."""

@@ -19,6 +19,8 @@ FloatArray = NDArray[np.float64]
 LEAST_GAIN = 0.02
 # How firmly the first rise is kept parallel to a rise from the low end, where the record does not show it.
 RISE_TIE = 0.1
+# Beyond the grid the largest branches go on as they did over this share of it.
+END_SHARE = 0.1
 # Vertices for which the roughness penalties are dimensioned, so that one weight means the same on every grid.
 REFERENCE_VERTICES = 41
 
@@ -179,7 +181,10 @@ class SurfaceBasis:
         n = self.grid.size
         surface = np.zeros((n, n))
         surface[np.tril_indices(n, -1)] = x[: n * (n - 1) // 2]
-        return LoopFamily(self.grid, surface, x[self._rise_columns] - x[self._rise_columns[0]], gain)
+        last = max(1, round(END_SHARE * n))
+        risen, fallen = surface[-1, 0] - surface[-1 - last, 0], surface[-1, 0] - surface[-1, last]
+        edge_gain = float(risen + fallen) / (2 * last * float(self.grid[1] - self.grid[0]))
+        return LoopFamily(self.grid, surface, x[self._rise_columns] - x[self._rise_columns[0]], edge_gain)
 
     def covered(self, branch_part: sp.csr_array) -> float:
         """Return the share of the surface's vertex pairs that the samples of a `branch_part` touch, 0..1."""

@@ -18,17 +18,27 @@ RISE = np.array([5.0, 6.5, 9.0])
 
 
 def everett(family: LoopFamily, alpha: float, beta: float) -> float:
-    """Displacement between the turning points `alpha` >= `beta`: bilinear on the grid, straight outside it."""
-    g, gain = family.grid, family.edge_gain
-    outside = gain * (max(alpha - max(g[-1], beta), 0.0) + max(min(g[0], alpha) - beta, 0.0))
-    alpha, beta = np.clip((alpha, beta), g[0], g[-1])
+    """Displacement between the turning points `alpha` >= `beta`: bilinear on the grid, beyond it as at its end."""
+    g = family.grid
+    if alpha > g[-1]:
+        alpha, beta = g[-1], beta - (alpha - g[-1])
+    if beta < g[0]:
+        alpha, beta = alpha + (g[0] - beta), g[0]
+    if alpha > g[-1]:
+        return family.surface[-1, 0] + family.edge_gain * (alpha - g[-1])
     i, j = (min(int(np.searchsorted(g, v, side="right")) - 1, g.size - 2) for v in (alpha, beta))
     a, b = (alpha - g[i]) / (g[i + 1] - g[i]), (beta - g[j]) / (g[j + 1] - g[j])
     corner = family.surface
     if i == j:
-        return outside + (a - b) * corner[i + 1, i]
+        return (a - b) * corner[i + 1, i]
     lower, upper = (corner[k, j] * (1 - b) + corner[k, j + 1] * b for k in (i, i + 1))
-    return outside + lower * (1 - a) + upper * a
+    return lower * (1 - a) + upper * a
+
+
+def long_fall(family: LoopFamily, v: float) -> float:
+    """Displacement on the fall that wipes the memory: from the highest vertex, straight outside the grid."""
+    inside = np.clip(v, family.grid[0], family.grid[-1])
+    return family.edge_gain * (v - inside) - everett(family, family.grid[-1], inside)
 
 
 def first_rise(family: LoopFamily, v: float) -> float:
@@ -53,8 +63,8 @@ def displacement(case: Case, history: FloatArray) -> float:
     family, (v_rest, y_rest) = case.shape, case.rest
     if case.primed:
         top = max(history.max(), family.grid[-1], v_rest) + 1.0
-        extrema = [top, *remembered_extrema(np.concatenate([[top], history]))[1:]]
-        y = y_rest + everett(family, top, v_rest)
+        extrema = remembered_extrema(np.concatenate([[top], history]))[1:]
+        y = y_rest + long_fall(family, extrema[0]) - long_fall(family, v_rest)
     else:
         extrema = remembered_extrema(history)
         y = y_rest + first_rise(family, extrema[0]) - first_rise(family, v_rest)
@@ -103,9 +113,10 @@ def test_at_its_vertices_a_family_gives_its_parameters_back(family):
 def test_a_family_in_numbers():
     family = LoopFamily(GRID, SURFACE, RISE, 0.1)
     memory = Memory(family, 0.0, 100.0)
-    v = [5.0, 20.0, 10.0, 5.0, 20.0, 30.0, 40.0, -10.0, 0.0, 40.0]
+    v = [5.0, 20.0, 10.0, 5.0, 20.0, 30.0, 40.0, -10.0, 0.0, 40.0, 30.0, 20.0, 40.0]
     # At 20 V the row is halfway between those of 10 V and 30 V: 1.25 to 10 V, 2.5 to 0 V, hence 1.875 to 5 V.
-    expected = [100.75, 102.75, 101.5, 100.875, 102.75, 104.0, 105.0, 99.0, 100.0, 105.0]
+    # From -10 V it goes as from 0 V, 1 to 0 V and 2.5 to 10 V; from 40 V as from 30 V, 1.25 to 30 V and 2.5 to 20 V.
+    expected = [100.75, 102.75, 101.5, 100.875, 102.75, 104.0, 105.0, 99.0, 100.0, 105.0, 103.75, 102.5, 105.0]
     assert stream_forward(memory, np.array(v)) == pytest.approx(expected, abs=1e-12)
     again = Memory(family, 0.0, 100.0)
     assert stream_inverse(again, np.array(expected)) == pytest.approx(v, abs=1e-9)

@@ -8,6 +8,7 @@ from identification.records import calibration, record_of, rms, stage
 
 import slpi_ros
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
+from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.pi import PrandtlIshlinskii
@@ -50,6 +51,20 @@ def test_unseen_paths_are_followed(seed):
     assert error.mean() < 0.0005 and error.max() < 0.003
     classical = unseen_error(slpi_ros.identify(record, "pi"), seed)
     assert classical.mean() > 25 * error.mean()
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_little_beyond_the_record_the_model_goes_on_as_it_did(seed):
+    """A model that knew nothing but the mean gain out there would be 3 % to 5 % of the stroke off."""
+    driven = stage(seed)
+    t, v = calibration_drive(10.0, 90.0, duration=30.0, rate=200.0, seed=seed)
+    true, measured = driven.run(t, v)
+    model = slpi_ros.identify(record_of(t, v, measured))
+    later, beyond = calibration_drive(6.0, 94.0, duration=20.0, rate=200.0, seed=seed + 100)
+    true = np.concatenate([true, driven.run(t[-1] + 0.005 + later, beyond)[0]])
+    both = np.concatenate([v, beyond])
+    error = (model.simulate(np.arange(both.size) / 200.0, both) - true)[v.size :]
+    assert np.max(np.abs(error - error.mean())) < 0.022 * np.ptp(true)
 
 
 def test_a_classical_stage_is_identified_by_both_kinds():

@@ -7,6 +7,7 @@ grid's spacing; between vertices it is interpolated.
 """
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +17,9 @@ from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.shape import END, FAR, Curve
 
 FloatArray = NDArray[np.float64]
+# A vertex (V, counted in the direction of its branches), the knots of the branch from it, and how they change with
+# every volt that a branch starts before it, as far as the vertex before.
+Gap = tuple[float, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -47,9 +51,8 @@ class LoopFamily:
     edge_gain: float
     symmetric_rest: bool = field(default=False, init=False)
     _vertices: list[float] = field(init=False, repr=False)
-    _ahead: dict[int, FloatArray] = field(init=False, repr=False)
-    _lines: dict[int, list[FloatArray]] = field(init=False, repr=False)
     _edges: dict[int, FloatArray] = field(init=False, repr=False)
+    _gaps: dict[int, list[Gap]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the surface and lay its rows and columns out in the order in which branches run through them."""
@@ -71,11 +74,12 @@ class LoopFamily:
             raise ModelError("loop family: grid, first rise and every row and column of the surface must rise strictly")
         object.__setattr__(self, "surface", triangle)
         object.__setattr__(self, "_vertices", self.grid.tolist())
-        object.__setattr__(self, "_ahead", {1: self.grid, -1: self.grid[::-1]})
         rows, columns = [triangle[i, i::-1] for i in range(n)], [triangle[j:, j] for j in range(n)]
-        object.__setattr__(self, "_lines", {1: columns, -1: rows})
         top = self._edge(self.grid[-1] - self.grid[::-1], rows[-1])
-        object.__setattr__(self, "_edges", {1: top, -1: self._edge(self.grid - self.grid[0], columns[0])})
+        edges = {1: top, -1: self._edge(self.grid - self.grid[0], columns[0])}
+        object.__setattr__(self, "_edges", edges)
+        rising = list(_gaps(self.grid, columns, edges[1]))
+        object.__setattr__(self, "_gaps", {1: rising, -1: list(_gaps(-self.grid[::-1], rows[::-1], edges[-1]))})
 
     def _edge(self, u: FloatArray, f: FloatArray) -> FloatArray:
         """Return the knots, shape (2, n + 1), of the branch that starts where the grid ends, and of all beyond."""
@@ -94,30 +98,18 @@ class LoopFamily:
         ahead = self._first_vertex_ahead(v_turn, direction)
         if ahead in (0, n):
             return Curve.of(self._edges[direction if ahead == n else -direction])
-        head = self._within(direction, v_turn, ahead)
-        edge = self._edges[direction][:, n - ahead :]
-        # A turn next to a vertex may leave, for rounding, no room before the edge's first knot.
-        while edge[0, 0] <= head[0, -1] or edge[1, 0] <= head[1, -1]:
-            edge = edge[:, 1:]
-        return Curve.of(np.concatenate([head, edge], axis=1))
+        vertex, knots, change = self._gaps[direction][ahead - 1]
+        knots = knots + change * (vertex - direction * v_turn)
+        curve = Curve.of(knots if knots[0, 1] > 0.0 else knots[:, 1:])
+        # A turn next to a vertex may leave, for rounding, no room between the grid's end and the knot after it.
+        at = len(curve.u) - ahead - 2
+        if curve.u[at] < curve.u[at + 1] and curve.f[at] < curve.f[at + 1]:
+            return curve
+        return Curve.of(np.delete(curve.knots, at + 1, axis=1))
 
     def _long_fall(self, v_turn: float) -> Curve:
         above, (u, f) = v_turn - self.grid[-1], self._edges[1]
         return Curve.of(np.array([np.append(0.0, above + u), np.append(0.0, self.edge_gain * above + f)]))
-
-    def _within(self, direction: int, v_turn: float, ahead: int) -> FloatArray:
-        """Return the knots of a branch as far as the grid goes, shape (2, k); `ahead` is the first vertex on it."""
-        vertices, lines, n = self._ahead[direction], self._lines[direction], self.grid.size
-        # One column for the turning point itself.
-        knots = np.zeros((2, 1 + n - ahead))
-        u, f = knots[0, 1:], knots[1, 1:]
-        np.subtract(vertices[ahead:], v_turn, out=u)
-        u *= direction
-        near = ahead if direction > 0 else n - 1 - ahead
-        share = float(u[0]) / abs(float(vertices[ahead] - vertices[ahead - 1]))
-        np.multiply(lines[near - direction][1:], share, out=f)
-        f += (1.0 - share) * lines[near]
-        return knots if u[0] > 0.0 else knots[:, 1:]
 
     def _first_vertex_ahead(self, v_turn: float, direction: int) -> int:
         """Index, counted in `direction`, of the first vertex at or ahead of `v_turn`."""
@@ -136,3 +128,14 @@ class LoopFamily:
     def _outside(self, v: FloatArray) -> FloatArray:
         """How far `v` (V) lies above the grid, or (negative) below it."""
         return v - np.clip(v, self.grid[0], self.grid[-1])
+
+
+def _gaps(vertices: FloatArray, lines: Sequence[FloatArray], edge: FloatArray) -> Iterator[Gap]:
+    """Return every gap between neighbouring vertices, whose branches are `lines` on the grid and `edge` beyond it."""
+    for k in range(1, vertices.size):
+        own, before = vertices[k:] - vertices[k], vertices[k:] - vertices[k - 1]
+        # One column for the turning point itself.
+        knots = np.column_stack([np.zeros(2), [own, lines[k]], edge[:, -k - 1 :]])
+        change = np.zeros_like(knots)
+        change[:, 1 : before.size + 1] = ([before, lines[k - 1][1:]] - knots[:, 1 : before.size + 1]) / before[0]
+        yield float(vertices[k]), knots, change

@@ -20,7 +20,7 @@ __all__ = ["Memory", "MemoryState"]
 FloatArray = NDArray[np.float64]
 
 # A monotone run shorter than this is quicker sample by sample than through numpy.interp.
-SHORT_RUN = 32
+SHORT_RUN = 64
 
 
 class Memory(TurningPoints):
@@ -62,14 +62,19 @@ class Memory(TurningPoints):
 
     def forward_array(self, v: FloatArray) -> FloatArray:
         """Move through the voltages `v`, shape (N,), volts; return the displacements, shape (N,), metres."""
-        return self._through(v, 0, -inf, inf)
+        return self._through(v, 0, -inf, inf, None)
 
-    def inverse_array(self, y: FloatArray, lower: float = -inf, upper: float = inf) -> FloatArray:
+    def inverse_array(
+        self, y: FloatArray, lower: float = -inf, upper: float = inf, reached: FloatArray | None = None
+    ) -> FloatArray:
         """Move through the displacements `y`, shape (N,), metres; return the voltages, shape (N,), volts.
 
-        `lower` and `upper` (V) bound the voltage as in `inverse`.
+        `lower` and `upper` (V) bound the voltage as in `inverse`. The displacements that these allow, shape (N,),
+        metres, are written to `reached`, if given.
         """
-        return self._through(y, 1, lower, upper)
+        if reached is not None:
+            reached[:] = y
+        return self._through(y, 1, lower, upper, reached)
 
     def _slide_to_voltage(self, v: float) -> float:
         """Move on along the present branch."""
@@ -129,8 +134,10 @@ class Memory(TurningPoints):
             self._close_loop()
         return self._slide_to_displacement(y, lower, upper)
 
-    def _through(self, x: FloatArray, coordinate: int, lower: float, upper: float) -> FloatArray:
-        """Drive one coordinate (0 voltage, 1 displacement) through `x` and return the other."""
+    def _through(
+        self, x: FloatArray, coordinate: int, lower: float, upper: float, reached: FloatArray | None
+    ) -> FloatArray:
+        """Drive one coordinate (0 voltage, 1 displacement) through `x` and return the other; note what was missed."""
         x = np.ascontiguousarray(x, dtype=np.float64)
         if not x.size:
             return np.empty_like(x)
@@ -146,12 +153,48 @@ class Memory(TurningPoints):
             in_step = start and x[start - 1] == (self._y if coordinate else self._v)
             if stop - start >= SHORT_RUN and in_step:
                 start = self._along_branches(x, out, start, stop, coordinate, lower, upper)
-            samples = x[start:stop].tolist()
-            if coordinate:
-                out[start:stop] = [self.inverse(y, lower, upper) for y in samples]
-            else:
-                out[start:stop] = [self.forward(v) for v in samples]
+            noted = None if reached is None else reached[start:stop]
+            out[start:stop] = self._sample_by_sample(x[start:stop].tolist(), coordinate, lower, upper, noted)
         return out
+
+    def _sample_by_sample(
+        self, run: list[float], coordinate: int, lower: float, upper: float, reached: FloatArray | None
+    ) -> list[float]:
+        """Move through a monotone run; return its answers. Quick where most samples stay on the branch of the last."""
+        answers: list[float] = []
+        while len(answers) < len(run):
+            x = run[len(answers)]
+            answers.append(self.inverse(x, lower, upper) if coordinate else self.forward(x))
+            if x == (self._y if coordinate else self._v):
+                self._slide_through(run, answers, coordinate, lower, upper)
+            elif reached is not None:
+                reached[len(answers) - 1] = self._y
+        return answers
+
+    def _slide_through(
+        self, run: list[float], answers: list[float], coordinate: int, lower: float, upper: float
+    ) -> None:
+        """Answer samples of a run as long as they follow the present one on its branch, within voltage limits."""
+        s, origin = self._direction, (self._v0, self._y0)
+        reach = self._reach_f if coordinate else self._reach_u
+        drive, response, _ = (self._f, self._u, 0) if coordinate else (self._u, self._f, 0)
+        d_origin, r_origin = origin[coordinate], origin[1 - coordinate]
+        last = present = self._y if coordinate else self._v
+        i = bisect_right(drive, s * (present - d_origin), 1)
+        for x in run[len(answers) :]:
+            d = s * (x - d_origin)
+            if not (s * (x - present) > 0.0 and d < reach and d < drive[-1]):
+                break
+            while drive[i] <= d:
+                i += 1
+            d_a, r_a = drive[i - 1], response[i - 1]
+            answer = r_origin + s * (r_a + (d - d_a) * ((response[i] - r_a) / (drive[i] - d_a)))
+            if coordinate and not lower <= answer <= upper:
+                break
+            answers.append(answer)
+            present = x
+        if present != last:
+            self.arrive(*((answers[-1], present) if coordinate else (present, answers[-1])))
 
     def _along_branches(
         self, x: FloatArray, out: FloatArray, start: int, stop: int, coordinate: int, lower: float, upper: float

@@ -183,7 +183,7 @@ def keep_pace(limits: Limits, present: float, wanted: FloatArray, elapsed: Float
     return np.array(v)
 
 
-def follow(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[FloatArray, Mask]:
+def follow(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[FloatArray, Mask, FloatArray]:
     """Move an axis through displacements, as `AxisStream.move` does one by one.
 
     In blocks where the path is slow enough, sample by sample where it is not.
@@ -200,12 +200,13 @@ def follow(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[Floa
     voltages : ndarray, shape (N,), volts
     late : ndarray of bool, shape (N,)
         Where the limits kept the voltage from its goal.
+    reached : ndarray, shape (N,), metres
     """
-    v, late = np.empty_like(y), np.zeros(y.size, bool)
+    v, late, reached = np.empty_like(y), np.zeros(y.size, bool), np.empty_like(y)
     start, block, patience = 0, BLOCK, PATIENCE
     while start < y.size:
         stop = min(start + block, y.size)
-        free = _until_too_fast(stream, y[start:stop], elapsed[start:stop])
+        free = _until_too_fast(stream, y[start:stop], elapsed[start:stop], reached[start:stop])
         v[start : start + free.size] = free
         start += free.size
         if start == stop:
@@ -213,22 +214,24 @@ def follow(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[Floa
             continue
         while start < y.size:
             stop = min(start + patience, y.size)
-            v[start:stop], late[start:stop] = _one_by_one(stream, y[start:stop], elapsed[start:stop])
+            v[start:stop], late[start:stop], reached[start:stop] = _one_by_one(
+                stream, y[start:stop], elapsed[start:stop]
+            )
             start = stop
             if not stream.missed or stream.held:
                 break
         block, patience = BLOCK, min(2 * patience, MOST_PATIENCE)
-    return v, late
+    return v, late, reached
 
 
-def _until_too_fast(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> FloatArray:
-    """Move through `y` up to the first step that is too fast; return the voltages."""
+def _until_too_fast(stream: AxisStream, y: FloatArray, elapsed: FloatArray, reached: FloatArray) -> FloatArray:
+    """Move through `y` up to the first step that is too fast; return the voltages, and note what they reach."""
     memory, limits = stream.memory, stream.limits
     if stream.missed and limits.acceleration < inf:
         # It may have to brake first.
         return np.empty(0)
     start = memory.snapshot()
-    v = memory.inverse_array(y, limits.lower, limits.upper)
+    v = memory.inverse_array(y, limits.lower, limits.upper, reached)
     if limits.slew == limits.acceleration == inf:
         return v
     before = np.concatenate([[start.voltage], v[:-1]])
@@ -271,10 +274,13 @@ def _braking_way(pace: Pace, distance: FloatArray, dt: FloatArray) -> FloatArray
     return np.minimum(acceleration * dt * (np.sqrt(dt * dt + 2.0 * distance / acceleration) - dt), distance)
 
 
-def _one_by_one(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[list[float], list[bool]]:
-    """Move through `y`; return the voltages, and where a displacement was missed."""
-    v, late = [], []
+def _one_by_one(
+    stream: AxisStream, y: FloatArray, elapsed: FloatArray
+) -> tuple[list[float], list[bool], list[float]]:
+    """Move through `y`; return the voltages, where a displacement was missed, and those reached."""
+    v, late, reached = [], [], []
     for wish, dt in zip(y.tolist(), elapsed.tolist(), strict=True):
         v.append(stream.move(stream.pace.counted(dt), wish))
         late.append(stream.missed)
-    return v, late
+        reached.append(stream.memory.displacement)
+    return v, late, reached

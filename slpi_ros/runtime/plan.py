@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.runs import monotone_runs
 from slpi_ros.model import AxisModel
 from slpi_ros.runtime import rejection
 from slpi_ros.runtime.deadlines import Streamer, follow, keep_pace, seconds_between
@@ -180,25 +179,12 @@ def _with_effects(
 
 
 def _from_memory(model: AxisModel, axis: AxisStream, y: FloatArray, elapsed: FloatArray) -> AxisPlan:
-    v, late = follow(stream_twin_of(axis), y, elapsed)
-    lowest, highest = v <= axis.limits.lower, v >= axis.limits.upper
-    held, at_limit = np.zeros(v.size, bool), np.flatnonzero(lowest | highest)
-    if at_limit.size:
-        missing, (low, high) = y[at_limit] - _displacements(axis.memory, v, at_limit), model.displacement_range
-        rounding = ROUNDING * (high - low)
-        # At a limit a wish may just be met, or lie on this side of it.
-        held[at_limit] = (lowest[at_limit] & (missing < -rounding)) | (highest[at_limit] & (missing > rounding))
+    v, late, reached = follow(stream_twin_of(axis), y, elapsed)
+    missing, (low, high) = y - reached, model.displacement_range
+    # At a limit a wish may just be met, or lie on this side of it.
+    rounding = ROUNDING * (high - low)
+    held = (v <= axis.limits.lower) & (missing < -rounding) | (v >= axis.limits.upper) & (missing > rounding)
     return v, held, late & ~held
-
-
-def _displacements(memory: Memory, v: FloatArray, places: NDArray[np.intp]) -> FloatArray:
-    """Return the displacements (m) at some places, shape (M,), of a path of voltages, shape (N,), volts.
-
-    A memory remembers turns only, so it need not see what is between them.
-    """
-    turns = np.array([stop - 1 for _, stop in monotone_runs(v[: places[-1] + 1])])
-    seen = np.union1d(turns, places)
-    return twin_of(memory).forward_array(v[seen])[np.searchsorted(seen, places)]
 
 
 def _along_known_path(model: AxisModel, axis: Resting, y: FloatArray, elapsed: FloatArray) -> AxisPlan:

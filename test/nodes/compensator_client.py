@@ -43,6 +43,11 @@ class Client:
         """Number of answers so far."""
         return len(self._answers)
 
+    @property
+    def reports(self) -> list[dict[str, str]]:
+        """The values of all reports so far."""
+        return [values_of(status) for status in self.graph.statuses(self._role)]
+
     def report(self, what: str = "a report", **wanted: object) -> tuple[Any, dict[str, str]]:
         """Wait for a report with these key-values; return it and all its values."""
         texts = {key: str(value) for key, value in wanted.items()}

@@ -345,3 +345,31 @@ def test_a_report_that_cannot_be_written_is_told_before_the_fit(slpi, folder, tm
     where = ("-o", tmp_path / "m.json", "--report", folder / "model.json")
     code, said, complaints = slpi("identify", folder / "clean", *where)
     assert code == 1 and said == "" and complaints.count("\n") == 1 and "no folder to write into" in complaints
+
+
+def test_a_stage_that_has_changed_is_told_from_a_clean_one(diagnose, clean, tmp_path):
+    moved = {"x": 1.03 * clean.displacement["x"]}
+    code, said, complaints = diagnose(replace(clean, displacement=moved))
+    assert (code, complaints) == (0, "")
+    found = document_in(tmp_path / "out")["axes"]["x"]
+    assert found["effects"] == [] and found["given_rms_m"] > 3.0 * found["before_rms_m"]
+    assert "the stage has changed since (its gain by +3 %)" in found["summary"] and found["summary"] in said
+    assert "slpi refit" in found["next_experiment"]
+
+
+def test_what_is_not_asked_for_is_not_drawn(clean, folder):
+    model = slpi_ros.load_model(folder / "model.json")
+    y = clean.displacement["x"].copy()
+    y[2000:2100] = np.nan
+    diagnosis = slpi_ros.diagnose(replace(clean, displacement={"x": y}), model, start=float(clean.t[500]))
+    traces = diagnosis.axes["x"].traces
+    assert traces.t.size == SAMPLES - 600 and traces.t[0] == pytest.approx(clean.t[500])
+    assert np.isin(traces.measured, y).all()
+    assert np.max(np.abs(traces.measured - traces.before)) < 20 * NOISE
+
+
+def test_digits_without_noise_are_explained_by_nothing(clean):
+    record = replace(clean, displacement={"x": np.round(2e-7 * clean.voltage["x"], 11)})
+    found = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"]
+    assert found.verdict == "nothing_found"
+    assert 0.5e-12 < found.floor_rms < 10e-12

@@ -20,6 +20,7 @@ SEPARATES = (
     ({"resonance", "delay"}, "resonance"),
 )
 OTHER_FREQUENCIES = "This record has one drive frequency; other frequencies tell these apart. "
+UP_TO_DATE = "`slpi refit` with this record brings the model up to date; no other one is needed for that."
 ANOTHER_HYSTERESIS = {
     NOT_CLOSING: "No model with return-point memory can follow loops that do not close: compensate with "
     "feedback, and record the drive of `slpi excite --for creep` to see whether they close where time is left.",

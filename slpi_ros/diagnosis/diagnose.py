@@ -11,15 +11,16 @@ from threadpoolctl import threadpool_limits
 from slpi_ros.diagnosis.evidence import Evidence
 from slpi_ros.diagnosis.explanation import Explanation
 from slpi_ros.diagnosis.gather import driven_alike, evidence_of
-from slpi_ros.diagnosis.judge import judged
+from slpi_ros.diagnosis.judge import Given, judged
 from slpi_ros.diagnosis.selection import Selection, counts, select
 from slpi_ros.diagnosis.structure import BIAS
 from slpi_ros.diagnosis.verdict import AxisDiagnosis, Diagnosis
-from slpi_ros.errors import IdentificationError, SlpiError, UsageError
+from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.floor import Floor, floor_of
 from slpi_ros.identification.progress import tell
 from slpi_ros.identification.record import Record
+from slpi_ros.identification.refit import require_own
 from slpi_ros.model import AxisModel, StageModel, Start
 
 FloatArray = NDArray[np.float64]
@@ -27,9 +28,6 @@ FloatArray = NDArray[np.float64]
 # Kinds that are fitted to the record together with effects. Of another kind is said that it is the wrong one where its
 # error is so many times that of the loop family.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
-# A model is of another stage when its error is more than this share of the displacement range, and this many times
-# that of one fitted to the record.
-FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
 
 
 def diagnose(
@@ -93,18 +91,18 @@ def _diagnose_axis(
     tell(f"axis {axis}: fitting the hysteresis")
     evidence = evidence_of(record, axis, model, start, stop)
     base = Explanation(evidence, model.effects)
-    given = _given_rms(model, evidence, evidence.v, evidence.y)
+    given, gain = _error_of(model, evidence, evidence.v, evidence.y)
     if model.kind in REFITTED:
         selection = _selected(base, evidence_of(record, axis, None, start, stop) if model.kind == "pi" else None)
-        _require_own(model, base, selection.now)
+        own = _require_own(model, base, selection.now)
         before = base.held_out.rms
     else:
         # Such a kind is not fitted anew here: the loop family shows what it gets wrong.
-        selection, before = select(base, None), given
+        selection, before, own = select(base, None), given, given
         if given > WRONG_KIND * base.held_out.rms:
             selection = replace(selection, structures=(BIAS, *selection.structures))
     floor = _floor(selection.now)
-    found = judged(selection, floor, before, given, driven_alike(record, axis))
+    found = judged(selection, floor, before, Given(given, gain, own), driven_alike(record, axis))
     return found, _extended(model, selection.now, floor, record.source)
 
 
@@ -127,10 +125,11 @@ def _floor(now: Explanation) -> Floor:
     return replace(floor, rms=min(floor.rms, now.held_out.rms))
 
 
-def _given_rms(model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArray) -> float:
+def _error_of(model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArray) -> tuple[float, float]:
     """Return the error (m) of the given model, driven by `u` (V), against `y` (m), but for the one at rest.
 
-    It starts as it was identified or as the record seems to, whichever suits it better.
+    Beside it stands by which share `y` moves more. It starts as it was identified or as the record seems to, whichever
+    suits it better.
     """
     starts = [model.start]
     if model.causal:
@@ -138,21 +137,22 @@ def _given_rms(model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArra
     return min(_error_from(start, model, evidence, u, y) for start in starts)
 
 
-def _error_from(start: Start, model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArray) -> float:
-    errors = (replace(model, start=start).simulate(evidence.t, u) - y)[evidence.used]
-    return float(np.sqrt(np.mean((errors - np.median(errors)) ** 2)))
+def _error_from(
+    start: Start, model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArray
+) -> tuple[float, float]:
+    simulated = replace(model, start=start).simulate(evidence.t, u)[evidence.used]
+    errors, moved = simulated - y[evidence.used], simulated - simulated.mean()
+    gain = float(moved @ -errors / max(float(moved @ moved), 1e-300))
+    return float(np.sqrt(np.mean((errors - np.median(errors)) ** 2))), gain
 
 
-def _require_own(model: AxisModel, base: Explanation, now: Explanation) -> None:
-    """Refuse a model that has nothing to do with the record, whatever effects there are."""
-    span = float(np.ptp(now.evidence.y[now.evidence.used]))
+def _require_own(model: AxisModel, base: Explanation, now: Explanation) -> float:
+    """Refuse a model that has nothing to do with the record, whatever effects there are; return its error (m)."""
+    span = max(float(np.ptp(now.evidence.y[now.evidence.used])), float(np.ptp(model.displacement_range)))
     bare = replace(model, effects=())
-    error = min(_given_rms(bare, one.evidence, one.u, one.target) for one in (base, now))
-    if error > FOREIGN_SHARE * span and error > FOREIGN_TIMES * base.held_out.rms:
-        raise IdentificationError(
-            f"this model does not belong to this bag: its error is {error * 1e6:.4g} um rms of {span * 1e6:.4g} um, "
-            f"that of one fitted to it {base.held_out.rms * 1e6:.4g} um; give this stage's model, or identify anew"
-        )
+    error = min(_error_of(bare, one.evidence, one.u, one.target)[0] for one in (base, now))
+    require_own(error, base.held_out.rms, span)
+    return error
 
 
 def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> AxisModel:

@@ -36,6 +36,8 @@ class Evidence:
         How far the other axes of the record have moved since its start.
     beside : ndarray, shape (N, k), metres
         Columns that stand beside the hysteresis, whatever their gains.
+    seen : ndarray of bool, shape (N,), optional
+        Samples whose displacement is known and asked for: those used by default.
     """
 
     t: FloatArray
@@ -47,9 +49,12 @@ class Evidence:
     smoothness: float
     others: Mapping[str, FloatArray] = field(default_factory=dict)
     beside: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    seen: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
 
     def __post_init__(self) -> None:
-        """Give `beside` its rows."""
+        """Give `beside` its rows, and `seen` what is used."""
+        if not self.seen.size:
+            object.__setattr__(self, "seen", self.used)
         if not self.beside.size:
             object.__setattr__(self, "beside", np.empty((self.t.size, 0)))
 

@@ -76,7 +76,7 @@ def evidence_of(
     used = samples.fitted & ~_outliers(residual, samples.fitted)
     if beginning.only_wiped or _beginning_disagrees(residual, used, samples.wiped):
         used = used & samples.wiped
-    return replace(evidence, used=used)
+    return replace(evidence, used=used, seen=samples.fitted)
 
 
 def _beginning_disagrees(residual: FloatArray, used: NDArray[np.bool_], wiped: NDArray[np.bool_]) -> bool:

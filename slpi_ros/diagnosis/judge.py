@@ -1,6 +1,7 @@
 """What the outcome of the competition means, in words."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +24,35 @@ from slpi_ros.identification.floor import Floor
 
 FloatArray = NDArray[np.float64]
 
+# The given model is out of date when its error is so many times that of one fitted to the record.
+STALE = 1.5
 # What is left is more than the floor when it is this many times as much.
 ABOVE_FLOOR = 1.5
 # No hysteresis model resolves better than this share of the displacement range, even where there is no noise.
 RESOLUTION = 2e-4
 
 
+@dataclass(frozen=True)
+class Given:
+    """How well the given model does as it is.
+
+    Parameters
+    ----------
+    rms : float, metres
+        Its error, free-run from its own start, but for the displacement at rest.
+    gain : float
+        By which share the stage moves more than it says.
+    hysteresis_rms : float, metres
+        The same of its hysteresis, with effects that were found if that is less.
+    """
+
+    rms: float
+    gain: float
+    hysteresis_rms: float
+
+
 def judged(
-    selection: Selection, floor: Floor, before_rms: float, given_rms: float, driven_alike: Sequence[str]
+    selection: Selection, floor: Floor, before_rms: float, given: Given, driven_alike: Sequence[str]
 ) -> AxisDiagnosis:
     """Return what is to be said of one axis.
 
@@ -39,8 +61,10 @@ def judged(
     selection : Selection
     floor : Floor
         Of the record.
-    before_rms, given_rms : float, metres
-        Error before any effect, held out, and of the given model as it is.
+    before_rms : float, metres
+        Error before any effect, held out.
+    given : Given
+        Of the given model.
     driven_alike : sequence of str
         Axes that have the drive of this one.
     """
@@ -49,14 +73,16 @@ def judged(
     verdict = _verdict(selection, effects, floor)
     return AxisDiagnosis(
         verdict=verdict,
-        summary=_summary(verdict, selection, effects, floor, before_rms) + _cannot_tell(driven_alike),
+        summary=_of_given(given, selection, before_rms)
+        + _summary(verdict, selection, effects, floor, before_rms)
+        + _cannot_tell(driven_alike),
         floor_rms=floor.rms,
         floor_source=floor.source,
-        given_rms=given_rms,
+        given_rms=given.rms,
         before_rms=before_rms,
         after_rms=now.held_out.rms,
         effects=effects,
-        next_experiment=_next(verdict, selection, effects),
+        next_experiment=_next(verdict, selection, effects, stale=_stale(given, selection, before_rms)),
         traces=_traces(base, now),
     )
 
@@ -106,6 +132,22 @@ def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floo
     return UNEXPLAINED if wrong_kind or _left(selection, floor) else NOTHING_FOUND
 
 
+def _stale(given: Given, selection: Selection, before_rms: float) -> bool:
+    """Return whether the given model is wrong where one of its kind, fitted to the record, is not."""
+    resolved = RESOLUTION * float(np.ptp(selection.now.evidence.y[selection.now.evidence.used]))
+    return BIAS not in selection.structures and given.hysteresis_rms > max(STALE * before_rms, resolved)
+
+
+def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
+    error, anew = given.rms * 1e9, before_rms * 1e9
+    if _stale(given, selection, before_rms):
+        return (
+            f"The given model is off by {error:.3g} nm rms on this record, one fitted to it by {anew:.3g} nm: the "
+            f"stage has changed since (its gain by {100 * given.gain:+.2g} %), or it is used otherwise now. "
+        )
+    return f"The given model is off by {error:.3g} nm rms on this record. " if BIAS in selection.structures else ""
+
+
 def _summary(
     verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor, before_rms: float
 ) -> str:
@@ -116,9 +158,11 @@ def _summary(
         for place, named in enumerate(effects)
     )
     if verdict == NOTHING_FOUND:
-        return f"Nothing found: {left}."
+        return f"No effect found: {left}."
     structure = f"The hysteresis itself is wrong: {', '.join(selection.structures)}. " if selection.structures else ""
     if verdict == UNEXPLAINED:
+        if BIAS in selection.structures:
+            return f"{structure}None of the known effects is needed: with loops that depend on bias {left}."
         return f"{structure}None of the known effects explains the error: {left}."
     others = ""
     if verdict == AMBIGUOUS:
@@ -133,8 +177,9 @@ def _cannot_tell(driven_alike: Sequence[str]) -> str:
     return f" Axis {', '.join(driven_alike)} has the same drive: whether it couples into this one cannot be told."
 
 
-def _next(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...]) -> str | None:
-    steps = [] if verdict == NOTHING_FOUND else [advice.of_structure(structure) for structure in selection.structures]
+def _next(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], *, stale: bool) -> str | None:
+    steps = [advice.UP_TO_DATE] if stale else []
+    steps += [] if verdict == NOTHING_FOUND else [advice.of_structure(structure) for structure in selection.structures]
     if verdict == AMBIGUOUS:
         first = next(named for named in effects if named.alternatives)
         steps.append(advice.separating((first.name, *first.alternatives), selection.now.evidence))
@@ -144,6 +189,7 @@ def _next(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...]) 
 
 
 def _traces(base: Explanation, now: Explanation) -> Traces:
-    evidence = now.evidence
-    contributions = {effect.name: now.predicted - now.prediction_without(effect.name) for effect in now.effects}
-    return Traces(evidence.t, evidence.v, evidence.y, base.predicted, now.predicted, contributions)
+    evidence, seen = now.evidence, now.evidence.seen
+    parts = {effect.name: now.predicted - now.prediction_without(effect.name) for effect in now.effects}
+    t, v, y, before, after = (x[seen] for x in (evidence.t, evidence.v, evidence.y, base.predicted, now.predicted))
+    return Traces(t, v, y, before, after, {name: part[seen] for name, part in parts.items()})

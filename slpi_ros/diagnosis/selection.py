@@ -42,6 +42,8 @@ DYNAMIC = {"delay", "lag", "rate_dependence", "creep"}
 # What shifts the displacement against the voltage.
 SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
 STEPS = 5
+# An error below this share of the displacement range is rounding: no sensor shows more.
+FINEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,8 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
     rivals: dict[str, list[Contender]] = {}
-    while len(rivals) < MOST_EFFECTS:
+    finest = FINEST * float(np.ptp(now.evidence.y[now.evidence.used]))
+    while len(rivals) < MOST_EFFECTS and now.held_out.rms > finest:
         tell(f"{len(now.effects)} effects found, {now.held_out.rms * 1e9:.3g} nm left, trying others")
         found = contenders(now)
         structure, with_structure = _best_structure(now, structures)

@@ -19,7 +19,7 @@ class Delay:
     Parameters
     ----------
     seconds : float, seconds
-        Negative where the displacement's stamps are late.
+        Negative where the displacement's stamps are early, or those of the voltage late.
     uncertainty : mapping of str to float
     """
 
@@ -57,7 +57,7 @@ class Delay:
     def describe(self) -> str:
         """Say how long it is."""
         if self.seconds < 0:
-            return f"the displacement is stamped {-self.seconds * 1e3:.3g} ms too late for its voltage"
+            return f"the displacement is stamped {-self.seconds * 1e3:.3g} ms too early for its voltage"
         return f"the displacement answers {self.seconds * 1e3:.3g} ms after the voltage"
 
     def follower(self) -> None:

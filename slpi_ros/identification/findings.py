@@ -76,14 +76,17 @@ def _warn_if(problem: bool, text: str, consequence: str) -> Finding:
 
 
 def _clock(clock: ClockQuality) -> Iterator[Finding]:
+    if clock.duplicates > 0.5 * clock.samples:
+        text = f"{_of(clock.duplicates, clock.samples)} with the stamp of the one before: nothing can be said of time"
+        yield Finding("warn", f"{text}; record the stamps of the sensor")
+        return
     period = clock.period or 1.0
     text = f"{clock.samples} samples in {clock.duration:.6g} s, {1.0 / period:.5g} per second"
     jitter = clock.jitter / period
     yield _warn_if(jitter > _JITTER, f"{text}, jitter {jitter:.1%} of the period", "lags will be uncertain")
     if clock.lost:
-        yield Finding(
-            "warn", f"{_of(clock.lost, clock.samples)} missing between others, {clock.longest_gap:.4g} s at most"
-        )
+        text = f"{clock.lost} samples missing between {clock.samples} others, {clock.longest_gap:.4g} s at most"
+        yield Finding("warn", text)
     if clock.unseen:
         yield Finding(
             "warn", f"{clock.unseen} gaps within which the voltage moved: unseen turns leave the memory in doubt"
@@ -123,7 +126,7 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
     if stuck := signal.stuck - signal.clipped:
         text = f"{name} stuck for {_of(stuck, samples)}, up to {signal.longest_stuck} in a row"
         slow = ": the sensor is slower than the record" if stuck > 0.5 * samples else ""
-        yield Finding("warn", text + slow)
+        yield Finding("warn", f"{text}{slow}; where noise should tell them apart they are not fitted")
     if signal.stale:
         text = f"{name} stale, a reading of before, in {_of(signal.stale, samples)}"
         yield Finding("warn" if signal.stale > _OUTLIERS * samples else "ok", text)

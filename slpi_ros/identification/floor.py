@@ -28,6 +28,10 @@ _OUTLIER, _CUT_GAUSSIAN, _CUTS = 2.5, 0.95460, 5
 _ROBUST_FITS = 3
 
 
+# Smaller than this share of the range it is the rounding of numbers.
+NO_NOISE = 1e-9
+
+
 @dataclass(frozen=True)
 class Floor:
     """How well a record repeats itself.
@@ -70,16 +74,27 @@ def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray |
     """
     signal = y if residual is None else residual
     usable = np.isfinite(v) & np.isfinite(signal)
-    t, v, signal = t[usable], v[usable], signal[usable]
+    t, v, y, signal = t[usable], v[usable], y[usable], signal[usable]
     if t.size < _FEWEST_READINGS:
         raise RecordError(f"{t.size} samples have no noise floor; give at least {_FEWEST_READINGS}")
+    found = _seen(t, v, signal, alone=residual is not None)
+    step = readings.digit(y)
+    if found.rms < step / np.sqrt(12.0):
+        return Floor(step / np.sqrt(12.0), f"digits: {step * 1e9:.3g} nm from one reading to the next")
+    if found.rms < NO_NOISE * np.ptp(y):
+        return Floor(0.0, f"no noise in {found.source}")
+    return found
+
+
+def _seen(t: FloatArray, v: FloatArray, signal: FloatArray, *, alone: bool) -> Floor:
     for name, seen in (("repeats", _repeats(t, v, signal)), ("holds", _holds(t, v, signal))):
         parts = list(seen)
         pooled = np.concatenate([np.empty(0), *parts])
         if pooled.size >= FEWEST:
             what = {"repeats": "moves made again", "holds": "pieces of holds"}[name]
             return Floor(robust_rms(pooled), f"{name}: {len(parts)} {what}, {pooled.size} samples")
-    return _from_high_frequencies(t, v, signal, alone=residual is not None)
+    noise = readings.noise(signal, t) if alone else readings.noise(signal, t, v)
+    return Floor(noise, f"high frequencies: {signal.size} samples, each beside its neighbours; slow noise is not seen")
 
 
 def robust_rms(x: FloatArray) -> float:
@@ -90,14 +105,6 @@ def robust_rms(x: FloatArray) -> float:
         spread = float(np.sqrt(np.mean(size[size <= _OUTLIER * spread] ** 2))) / _CUT_GAUSSIAN
     # Where most are equal (coarse digits), nothing is an outlier.
     return spread or float(np.sqrt(np.mean(x**2)))
-
-
-def _from_high_frequencies(t: FloatArray, v: FloatArray, signal: FloatArray, *, alone: bool) -> Floor:
-    noise = readings.noise(signal, t) if alone else readings.noise(signal, t, v)
-    step = readings.digit(signal)
-    if noise < step / np.sqrt(12.0):
-        return Floor(step / np.sqrt(12.0), f"digits: {step * 1e9:.3g} nm from one reading to the next")
-    return Floor(noise, f"high frequencies: {signal.size} samples, each beside its neighbours; slow noise is not seen")
 
 
 def _repeats(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatArray]:

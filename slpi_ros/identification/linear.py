@@ -12,7 +12,7 @@ from slpi_ros.identification.multi_slope import MultiSlopeBasis
 from slpi_ros.identification.problem import FIRST_SMOOTHNESS, Problem
 from slpi_ros.identification.progress import tell
 from slpi_ros.identification.samples import Samples
-from slpi_ros.identification.start import Beginning, choose_start
+from slpi_ros.identification.start import Beginning, choose_start, warn_of_beginning, warn_of_rest
 from slpi_ros.model import Start
 
 FloatArray = NDArray[np.float64]
@@ -85,8 +85,14 @@ def fit_linear(
     ------
     IdentificationError
         If the samples do not determine the model.
+
+    Warns
+    -----
+    BeginningWarning
+        If the beginning of a record does not agree with the rest.
     """
     chosen = choose(samples, bases, smoothness, share=share)
+    warn_of_rest(samples, chosen.beginnings)
     fitted = [
         beginning.of(part.thinned(round(share * FIT_SAMPLES / len(samples))))
         for beginning, part in zip(chosen.beginnings, samples, strict=True)
@@ -94,7 +100,10 @@ def fit_linear(
     problem = chosen.problem
     if sum(part.v.size for part in fitted) > problem.y.size:
         problem = Problem.pose(fitted, problem.basis).reweighted()
-    return _solved(fitted, problem, chosen.smoothness, chosen.beginnings)
+    result = _solved(fitted, problem, chosen.smoothness, chosen.beginnings)
+    judged = problem.judged[problem.weights > 0]
+    warn_of_beginning(result.errors[~judged], result.errors[judged])
+    return result
 
 
 @dataclass(frozen=True)

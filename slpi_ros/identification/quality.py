@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.identification import drive, readings
 from slpi_ros.identification.record import Record
-from slpi_ros.identification.samples import NEAR_END, select_samples
+from slpi_ros.identification.samples import NEAR_END, part_of, select_samples
 
 FloatArray = NDArray[np.float64]
 
@@ -174,10 +174,10 @@ def assess(record: Record, axis: str, *, start: float | None = None, stop: float
     # A long record leaves no room for what is not needed any more.
     del samples
     t, v, y = record.t, record.voltage[axis], record.displacement[axis]
-    until = slice(0, int(np.searchsorted(t, np.inf if stop is None else stop)))
+    part = slice(*part_of(t, start, stop))
+    until = slice(0, part.stop)
     driven = np.isfinite(v[until])
     when = t[until] if driven.all() else t[until][driven]
-    part = slice(int(np.searchsorted(t, -np.inf if start is None else start)), until.stop)
     voltage, displacement = _signals(t[part], v[part], y[part])
     return Quality(
         axis=axis,

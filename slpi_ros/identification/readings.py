@@ -151,6 +151,23 @@ def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: fl
     return repeats.where(due | (improbable & (moved > 0.0)))
 
 
+def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
+    """Return the readings that repeat the one before, three and more in a row, though noise should tell them apart.
+
+    Digits coarser than the noise repeat readings too; of such a displacement, shape (N,), metres, none is returned.
+    """
+    repeats = Repeats.within(y)
+    if not np.any(repeats.length > 2):
+        return np.empty(0, np.int64)
+    noise_rms, step = noise(y, v), digit(y)
+    if noise_rms <= step:
+        return np.empty(0, np.int64)
+    repeats = frozen(y, v, spread(y) / spread(v), noise_rms, step)
+    repeats = repeats.where(repeats.length > 2)
+    again = [np.arange(first + 1, first + length) for first, length in zip(repeats.first, repeats.length, strict=True)]
+    return np.concatenate([np.empty(0, np.int64), *again])
+
+
 def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repeats:
     """Return the repeats of a voltage that it must have missed: the displacement moves on, and then the voltage jumps.
 

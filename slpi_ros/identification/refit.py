@@ -38,6 +38,9 @@ UNCHANGED = (0.0, 1e-4)
 SMOOTH = 30.0
 # The stage has changed when the old model's error on the new record is this many times the one it was identified with.
 BEYOND_REPEATABILITY = 2.0
+# A model is of another stage when its error is more than this share of the displacement range, and this many times
+# that of one fitted to the record.
+FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
 
 
 @dataclass(frozen=True)
@@ -100,13 +103,13 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
     record = _without_effects(model, record, shared)
     axes, changes = dict(model.axes), {}
     for name in shared:
+        where = f"{record.source}: axis '{name}': "
         try:
+            samples = select_samples(record, name, None, None)
             with threadpool_limits(1):
-                axes[name], changes[name] = _refit_axis(
-                    model.axes[name], select_samples(record, name, None, None), record.source
-                )
+                axes[name], changes[name] = _refit_axis(model.axes[name], samples, record.source)
         except SlpiError as error:
-            raise type(error)(f"{record.source}: axis '{name}': {error}") from None
+            raise type(error)(where + str(error).removeprefix(where)) from None
     return replace(model, axes=axes, created=datetime.now(UTC).isoformat(timespec="seconds")), changes
 
 
@@ -148,6 +151,8 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
     problem = Problem.pose([samples], basis).reweighted()
     old_errors = problem.errors(_solved(problem, x_old / problem.scale))
     repeatability = max(old.quality.held_out_rms, noise_rms(old_errors))
+    anew = problem.residual()[problem.weights > 0] * problem.scale
+    require_own(_rms(old_errors), _rms(anew), max(samples.spread[1], float(np.ptp(old.displacement_range))))
     drifted = _rms(old_errors) > BEYOND_REPEATABILITY * repeatability
     x = _solved(problem, x_old / problem.scale, *(CHANGED if drifted else UNCHANGED))
     errors = problem.errors(x)
@@ -186,6 +191,23 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
         ),
     )
     return new, change
+
+
+def require_own(error: float, fitted_anew: float, span: float) -> None:
+    """Refuse a model that has nothing to do with a record.
+
+    Parameters
+    ----------
+    error, fitted_anew : float, metres
+        rms errors of the model, and of one fitted to the record.
+    span : float, metres
+        Range of displacements.
+    """
+    if error > FOREIGN_SHARE * span and error > FOREIGN_TIMES * fitted_anew:
+        raise IdentificationError(
+            f"this model does not belong to this bag: its error is {error * 1e6:.4g} um rms of {span * 1e6:.4g} um, "
+            f"that of one fitted to it {fitted_anew * 1e6:.4g} um; give this stage's model, or identify anew"
+        )
 
 
 def _same_start(new: Start, old: Start, repeatability: float) -> bool:

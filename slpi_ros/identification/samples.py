@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.runs import monotone_runs
+from slpi_ros.identification.readings import stuck
 from slpi_ros.identification.record import Record
 from slpi_ros.identification.voltage import without_noise
 
@@ -18,6 +19,8 @@ FEWEST = 50
 # More than this need time and memory, and tell nothing new.
 ENOUGH = 1_000_000
 NEVER_TURNS = "the voltage never turns back; drive it up and down over the range to be used"
+# A displacement that falls where the voltage rises does so clearly: this correlation is none of chance.
+CLEARLY = 0.3
 # The memory counts as wiped once the voltage has come this near to both ends of its range (share of the range).
 NEAR_END = 0.02
 
@@ -143,8 +146,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
         )
     # In order, so that the part to be used is a slice: a long record leaves no room for copies.
     t = record.t
-    first = np.searchsorted(t, -np.inf if start is None else start)
-    until = np.searchsorted(t, np.inf if stop is None else stop)
+    first, until = part_of(t, start, stop)
     t = t[:until]
     v, y = record.voltage[axis][:until], record.displacement[axis][:until]
     fitted = np.isfinite(y)
@@ -154,13 +156,24 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
         v, y, fitted = v[driven], y[driven], fitted[driven]
     count = int(np.count_nonzero(fitted))
     if count < FEWEST:
-        raise RecordError(
-            f"{where}: {count} usable samples of {len(record)} between start and stop; at least {FEWEST} are needed"
-        )
+        part = "" if start is None and stop is None else f" between start and stop, of {record.t[-1]:.6g} s in all"
+        raise RecordError(f"{where}: {count} usable samples of {len(record)}{part}; at least {FEWEST} are needed")
     if count < fitted.size:
         y = np.where(fitted, y, 0.0)
     _require_motion(v, y, fitted, where)
+    known = slice(None) if count == fitted.size else np.flatnonzero(fitted)
+    # A sensor that hangs says nothing, as one that is silent.
+    again = stuck(y[known], v[known])
+    fitted[again if count == fitted.size else np.flatnonzero(fitted)[again]] = False
     return Samples(without_noise(t if driven.all() else t[driven], v), y, fitted)
+
+
+def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int, int]:
+    """Return the samples ``first:until`` with ``start <= t < stop`` (s) of times in order; UsageError without order."""
+    low, high = -np.inf if start is None else start, np.inf if stop is None else stop
+    if not low < high:
+        raise UsageError(f"start {start} s is not before stop {stop} s; give seconds from the first stamp, in order")
+    return int(np.searchsorted(t, low)), int(np.searchsorted(t, high))
 
 
 def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> None:
@@ -179,7 +192,7 @@ def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], whe
             )
     if not turns:
         raise IdentificationError(f"{where}: {NEVER_TURNS}")
-    if (v - v.mean()) @ (y - y.mean()) < 0:
+    if np.corrcoef(v, y)[0, 1] < -CLEARLY:
         raise RecordError(f"{where}: displacement falls where voltage rises; change the sign of one of them")
 
 

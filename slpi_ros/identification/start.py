@@ -1,6 +1,7 @@
 """What moved the stage before the record began? Nobody knows; the record tells which assumption explains it best."""
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,8 +16,14 @@ FloatArray = NDArray[np.float64]
 MIDDLE_LOOPS = 20
 # Another start than rest must explain the record this much better than rest does.
 BETTER = 0.9
+# The beginning of a record disagrees with the rest when its error is this many times as large.
+DISAGREES = 3.0
 # What came before the memory was wiped is left out when it makes the rest of the record fit this much worse.
 MISLEADING = 1.1
+
+
+class BeginningWarning(UserWarning):
+    """The beginning of a record does not agree with the rest, whatever went before."""
 
 
 class Fit(Protocol):
@@ -94,6 +101,34 @@ def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> Beginning:
             only_wiped = True
             history = history or candidates[-1]
     return Beginning(history, only_wiped)
+
+
+def warn_of_rest(samples: Sequence[Samples], beginnings: Sequence[Beginning]) -> None:
+    """Warn of how many samples are left aside, as no history explains them."""
+    pairs = zip(samples, beginnings, strict=True)
+    aside = sum(np.count_nonzero(part.fitted & ~part.wiped) for part, beginning in pairs if beginning.only_wiped)
+    if aside:
+        count = sum(np.count_nonzero(part.fitted) for part in samples)
+        warnings.warn(
+            f"{aside} of {count} samples are left aside: what comes before the voltage has gone over its whole range "
+            "does not agree with the rest, whatever went before; `slpi diagnose` tells whether it is something else",
+            BeginningWarning,
+            stacklevel=3,
+        )
+
+
+def warn_of_beginning(before: FloatArray, after: FloatArray) -> None:
+    """Warn where errors (m) from before the memory was wiped are much larger than those from after it."""
+    if before.size and after.size:
+        first, rest = (float(np.sqrt(np.mean(errors**2))) * 1e9 for errors in (before, after))
+        if first > DISAGREES * rest:
+            warnings.warn(
+                f"{before.size} of {before.size + after.size} samples, before the voltage has gone over its whole "
+                f"range, are off by {first:.3g} nm rms and never left out; the others by {rest:.3g} nm; "
+                "`slpi diagnose` tells whether there is something beside the hysteresis",
+                BeginningWarning,
+                stacklevel=3,
+            )
 
 
 def _residual(fit: Fit, samples: Samples) -> FloatArray:

@@ -4,6 +4,7 @@ The same blocks are predicted by the classical PI model, fitted to the same othe
 no model can come.
 """
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,6 +21,7 @@ from slpi_ros.identification.floor import Floor, floor_of
 from slpi_ros.identification.readings import noise
 from slpi_ros.identification.record import Record
 from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.start import BeginningWarning
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -150,7 +152,9 @@ def held_out_truth(
     fit = fit_of(kind, loops_at_rest=loops_at_rest)
     parts = [_Part.of(one, axis, start, stop, SAMPLES // len(records)) for one in records]
     samples = [part.samples for part in parts]
-    with threadpool_limits(1):
+    with threadpool_limits(1), warnings.catch_warnings():
+        # What the fit of the whole record leaves aside has been said.
+        warnings.simplefilter("ignore", BeginningWarning)
         error = fit(samples).held_out
         classical = error if kind == CLASSICAL else _classical(samples)
     left_out = np.isfinite(error)
@@ -160,7 +164,8 @@ def held_out_truth(
     t = np.concatenate([part.t for part in parts])[left_out]
     v = np.concatenate([part.samples.v for part in parts])[left_out]
 
-    floors = sorted((_floor(part) for part in parts), key=lambda floor: floor.rms)
+    ends = np.cumsum([part.t.size for part in parts])[:-1]
+    floors = sorted(map(_floor, parts, np.split(left_out, ends)), key=lambda floor: floor.rms)
 
     def cut(classes: Iterator[tuple[str, Mask]]) -> tuple[Slice, ...]:
         return tuple(_slice(name, error[chosen], classical[chosen]) for name, chosen in classes if chosen.any())
@@ -188,9 +193,8 @@ def _classical(samples: Sequence[Samples]) -> FloatArray:
         return np.full(sum(part.v.size for part in samples), np.nan)
 
 
-def _floor(part: _Part) -> Floor:
-    samples = part.samples
-    return floor_of(part.t, samples.v, np.where(samples.fitted, samples.y, np.nan))
+def _floor(part: _Part, judged: Mask) -> Floor:
+    return floor_of(part.t, part.samples.v, np.where(judged, part.samples.y, np.nan))
 
 
 def _slice(name: str, error: FloatArray, classical: FloatArray) -> Slice:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.signal import lsim
 
 from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.effect import Around, Effect
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.registry import EFFECTS, from_document, in_order, to_document
@@ -253,6 +254,13 @@ def test_an_effect_comes_once():
 def test_a_description_is_one_sentence(effect):
     assert len(effect.describe()) > 20
     assert "\n" not in effect.describe()
+
+
+def test_a_stamp_ahead_of_its_voltage_is_called_early():
+    t = np.arange(100) * 1e-3
+    ahead = Delay(-0.02).apply(t, Around(t))
+    assert ahead[10] == pytest.approx(t[30]), "what the voltage is 20 ms later"
+    assert "20 ms too early" in Delay(-0.02).describe()
 
 
 NONSENSE = st.recursive(

@@ -107,3 +107,13 @@ def test_a_voltage_that_rests_or_never_turns(v):
 def test_too_few_samples_are_told():
     with pytest.raises(RecordError, match="4 samples have no noise floor"):
         floor_of(np.arange(6.0), np.arange(6.0), np.array([1.0, 2.0, 3.0, np.nan, 5.0, np.inf]))
+
+
+def test_no_floor_lies_below_the_digits_and_none_is_none():
+    t = np.arange(0.0, 20.0, 0.005)
+    # Each move is made several times, on the same readings.
+    v = 50.0 - 50.0 * np.cos(2 * np.pi * t) * np.where(t % 5.0 < 4.0, 1.0, 0.7)
+    exact = stage(1, noise=0.0).run(t, v)[1]
+    floor = floor_of(t, v, np.round(exact, 8))
+    assert floor.rms == pytest.approx(1e-8 / np.sqrt(12.0), rel=0.1) and floor.source.startswith("digits: 10 nm")
+    assert floor_of(t, v, 2e-7 * v).rms == 0.0

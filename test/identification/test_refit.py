@@ -115,3 +115,11 @@ def test_effects_of_the_model_are_not_taken_for_hysteresis(model):
     assert not changes["x"].drifted
     assert changes["x"].error_after < 9e-9
     assert refit(model, record_of(t, v, y))[1]["x"].drifted
+
+
+def test_the_record_of_another_stage_is_refused(model):
+    record, _ = calibration(seed=SEED + 1)
+    foreign = replace(record, displacement={"x": 1.6 * record.displacement["x"]})
+    with pytest.raises(IdentificationError, match="this model does not belong to this bag") as refusal:
+        refit(model, foreign)
+    assert str(refusal.value).count("axis 'x'") == 1

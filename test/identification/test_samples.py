@@ -1,4 +1,7 @@
-"""Thinning a long record: fewer samples, the same memory."""
+"""Which samples of a record count, and how a long one is thinned."""
+
+import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,9 +10,11 @@ from hypothesis import strategies as st
 from identification.records import calibration, rms
 
 import slpi_ros
+from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.loops import separate
 from slpi_ros.identification import linear
-from slpi_ros.identification.samples import Samples
+from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.start import BeginningWarning
 
 paths = st.lists(st.integers(0, 8), min_size=1, max_size=80).map(lambda values: np.array(values, dtype=np.float64))
 
@@ -43,3 +48,57 @@ def test_a_thinned_fit_is_nearly_as_good(monkeypatch, kind):
     assert part.quality.samples < 0.6 * whole.quality.samples
     v, y = record.voltage["x"], record.displacement["x"]
     assert rms(part.simulate(record.t, v) - y) < 1.1 * rms(whole.simulate(record.t, v) - y)
+
+
+def test_a_sensor_that_hangs_says_nothing():
+    record, _ = calibration(seed=1)
+    y = record.displacement["x"].copy()
+    # In the middle of a move, for 0.4 s.
+    y[2000:2080] = y[1999]
+    hanging = replace(record, displacement={"x": y})
+    y = y.copy()
+    y[2000:2080] = np.nan
+    silent = replace(record, displacement={"x": y})
+    assert np.count_nonzero(select_samples(hanging, "x", None, None).fitted) == y.size - 80
+    error = slpi_ros.identify(hanging).axes["x"].quality.held_out_rms
+    assert error == pytest.approx(slpi_ros.identify(silent).axes["x"].quality.held_out_rms, rel=0.02)
+
+
+def test_coarse_digits_and_rests_are_no_sensor_that_hangs():
+    record, true = calibration(seed=1)
+    for y in (np.round(record.displacement["x"], 7), true):
+        fitted = select_samples(replace(record, displacement={"x": y}), "x", None, None).fitted
+        assert fitted.all()
+
+
+@pytest.mark.parametrize(("start", "stop"), [(20.0, 10.0), (5.0, 5.0), (np.nan, None), (None, np.nan)])
+def test_a_part_out_of_order_is_wrong_usage(start, stop):
+    with pytest.raises(UsageError, match="is not before stop"):
+        select_samples(calibration(seed=1)[0], "x", start, stop)
+
+
+def test_a_part_beyond_the_record_is_told_its_length():
+    with pytest.raises(RecordError, match="0 usable samples of 4001 between start and stop, of 20 s in all"):
+        select_samples(calibration(seed=1)[0], "x", 30.0, None)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_has_nothing_to_do_with_the_voltage_has_no_wrong_sign(seed):
+    record, _ = calibration(seed=1)
+    noise = 1e-6 * np.random.default_rng(seed).standard_normal(len(record))
+    with pytest.raises(IdentificationError, match="does not explain the displacement"):
+        slpi_ros.identify(replace(record, displacement={"x": noise}))
+    with pytest.raises(RecordError, match="change the sign"):
+        slpi_ros.identify(replace(record, displacement={"x": -record.displacement["x"]}))
+
+
+def test_a_beginning_that_disagrees_is_told():
+    record, _ = calibration(seed=1)
+    first = np.arange(len(record)) < np.flatnonzero(select_samples(record, "x", None, None).wiped)[0]
+    # Another axis moves as long as this one has not gone over its range, and couples into it.
+    disturbed = record.displacement["x"] + np.where(first, 4e-7 * np.sin(9.0 * record.t), 0.0)
+    with pytest.warns(BeginningWarning, match="slpi diagnose"):
+        slpi_ros.identify(replace(record, displacement={"x": disturbed}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", BeginningWarning)
+        slpi_ros.identify(record)

@@ -1,7 +1,6 @@
 """The simulated stage as a process of its own, over DDS."""
 
 import math
-import os
 import signal
 import subprocess
 import sys
@@ -22,15 +21,7 @@ from std_msgs.msg import Float64MultiArray  # noqa: E402
 from slpi_ros.stage.stage import Stage  # noqa: E402
 
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-# one domain for each test process, below the range where DDS meets ephemeral ports
-DOMAIN = 1 + os.getpid() % 100
 PATIENCE_S = 30.0
-
-
-@pytest.fixture(autouse=True)
-def loopback(monkeypatch):
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
 
 
 def start(**parameters) -> subprocess.Popen[str]:
@@ -83,7 +74,7 @@ class Bench:
 def simulator(**parameters):
     process = start(**parameters)
     context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
+    rclpy.init(context=context)
     bench = Bench(context)
     try:
         yield bench, process

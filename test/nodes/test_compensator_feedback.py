@@ -30,7 +30,7 @@ class DriftedStage:
     def __init__(self, client: Client, offset: float) -> None:
         self._client, self._offset = client, offset
         self._memory = stage_model().axis("x").memory()
-        self._measured = client.graph.publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
+        self.publisher = client.graph.publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
         self._sent = 0
 
     def follow(self, wishes: list[float]) -> np.ndarray:
@@ -40,7 +40,7 @@ class DriftedStage:
             (voltage,) = self._client.ask(["x"], [y], START_NS + self._sent * PERIOD_NS)
             self._sent += 1
             place = self._memory.forward(voltage + self._offset)
-            self._measured.publish(JointState(name=["other", "x"], position=[1.0, place]))
+            self.publisher.publish(JointState(name=["other", "x"], position=[1.0, place]))
             errors.append(place - y)
         return np.array(errors)
 
@@ -62,7 +62,10 @@ def test_feedback_corrects_what_the_model_does_not_know_and_the_drift_is_told(x_
         with_feedback = stage.follow(PATH[::-1])
         # On the way a measurement may come one wish late; at rest all have come.
         stage.follow(PATH[:1] * 200)
-        _, values = client.report(**{"x.feedback": "on"})
+        told = len(client.reports)
+        client.graph.spin_until(lambda: len(client.reports) > told + 1, "a report that was made at rest")
+        values = client.reports[-1]
+        assert values["x.feedback"] == "on"
         assert np.abs(without).mean() > 3e-7
         assert np.abs(with_feedback).mean() < 0.1 * np.abs(without).mean()
         assert float(values["x.correction_V"]) == pytest.approx(-4.0, abs=1.0)
@@ -81,3 +84,23 @@ def test_without_measurements_the_feedback_holds_and_says_so(x_file):
         client.graph.wait_for_status(
             f"{client.name}: compensator", lambda status: "feedback holds" in status.message, "the lack"
         )
+
+
+def test_a_measurement_that_cannot_be_is_told_and_moves_nothing(x_file):
+    """A wrong unit, and a sensor that fails: whatever comes between the good ones."""
+    with compensator(model_file=x_file, feedback=True, slew_limit=2000.0, **GAINS) as client:
+        client.connect()
+        stage = DriftedStage(client, 2.0)
+        stage.follow([5e-6] * 200)
+        measured, rested = stage.publisher, client.answers[-1]
+        for i, absurd in enumerate((5.0, -1e300, float("nan"), float("-inf"), 1e-3)):
+            measured.publish(JointState(name=["other", "x"], position=[1.0, absurd]))
+            client.report(measurements_rejected=i + 1)
+            stage.follow([5e-6])
+        assert np.abs(np.array(client.answers[-5:]) - rested).max() < 0.1
+        status, values = client.report(**{
+            "measurements_rejected.not_finite": 2, "measurements_rejected.out_of_range": 3, "rejected": 0,
+        })  # fmt: skip
+        assert "axis 'x': measured displacement 1000 um is far outside" in values["last_rejection"]
+        warned = [status for status in client.statuses() if "measurements rejected, the last: axis 'x'" in status.message]
+        assert warned and warned[0].level == b"\1"

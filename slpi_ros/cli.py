@@ -13,13 +13,14 @@ from io import TextIOWrapper
 from pathlib import Path
 
 from slpi_ros import bags, tables
-from slpi_ros.cli_options import parser
+from slpi_ros.cli_options import TOPIC, parser
+from slpi_ros.column_choice import Wishes
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import excite
 from slpi_ros.files import make_folder
 from slpi_ros.identification.findings import Finding, findings, require_usable
-from slpi_ros.identification.fit import identify
+from slpi_ros.identification.fit import fit_of, identify
 from slpi_ros.identification.progress import shown_on
 from slpi_ros.identification.quality import assess
 from slpi_ros.identification.record import FloatArray, Record
@@ -63,20 +64,24 @@ def _one_line(error: BaseException) -> str:
 
 
 def _import(options: argparse.Namespace) -> None:
-    record = tables.import_table(
-        options.table,
+    wishes = Wishes(
         time=options.time,
-        voltage=options.voltage,
-        displacement=options.displacement,
+        voltage=tuple(options.voltage),
+        displacement=tuple(options.displacement),
         displacement_unit=options.displacement_unit,
-        axes=options.axes,
+        axes=tuple(options.axes),
     )
+    record, told = tables.import_told(options.table, wishes)
     record = replace(record, hardware_id=options.hardware_id)
     bags.write_bag(options.output, record, storage=options.storage)
     print(f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s")
+    print("\n".join(told))
 
 
 def _identify(options: argparse.Namespace) -> None:
+    topics = _topics(options)
+    fit_of(options.kind, loops_at_rest=options.loops_at_rest)
+    _require_another_file(options.output, *options.bags)
     target = Path(options.output)
     if target.is_dir() or not target.parent.is_dir():
         raise ModelError(f"{target}: cannot be written: no file can be there; choose another place")
@@ -84,7 +89,7 @@ def _identify(options: argparse.Namespace) -> None:
         require_known_uncertainty(options.kind)
     if options.report:
         make_folder(options.report)
-    records = bags.read_bags(options.bags, _topics(options), axes=options.axis)
+    records = bags.read_bags(options.bags, topics, axes=options.axis)
     found = [_judged(record, options) for record in records]
     model = identify(records, options.kind, start=options.start, stop=options.stop, loops_at_rest=options.loops_at_rest)
     save_model(model, options.output)
@@ -98,7 +103,7 @@ def _identify(options: argparse.Namespace) -> None:
             axis: held_out_truth(records, axis, options.kind, loops_at_rest=options.loops_at_rest, **part)
             for axis in model.axes
         }
-        write_report(Path(options.report), records[0], model, truth=truth, found=found[0])
+        write_report(Path(options.report), records[0], model, truth=truth, found=found[0], **part)
         told += [f"axis {axis}: {line}" for axis, held_out in truth.items() for line in held_out.lines()]
     if options.uncertainty:
         for axis in model.axes:
@@ -111,9 +116,14 @@ def _topics(options: argparse.Namespace) -> str | bags.SeparateTopics:
     voltage, displacement = options.voltage_topic, options.displacement_topic
     if bool(voltage) != bool(displacement):
         raise UsageError("--voltage-topic and --displacement-topic go together; give both, or --topic")
-    if not voltage:
-        return str(options.topic)
-    return bags.SeparateTopics(voltage, displacement, clock=options.clock, held=not options.voltage_measured)
+    if voltage and options.topic is not None:
+        raise UsageError("--topic does not go with --voltage-topic and --displacement-topic; give it, or both of them")
+    if voltage:
+        held = not options.voltage_measured
+        return bags.SeparateTopics(voltage, displacement, clock=options.clock or "displacement", held=held)
+    if options.clock or options.voltage_measured:
+        raise UsageError("--clock and --voltage-measured are for --voltage-topic and --displacement-topic; give both")
+    return TOPIC if options.topic is None else str(options.topic)
 
 
 def _judged(record: Record, options: argparse.Namespace) -> dict[str, list[Finding]]:
@@ -130,10 +140,11 @@ def _diagnose(options: argparse.Namespace) -> None:
     # Plotting is slow to load, and most commands do without.
     from slpi_ros.reports.diagnosis_files import PAGE, describe_diagnosis, make_room, write_files
 
+    topics = _topics(options)
     model = load_model(options.model)
     folder = Path(options.output)
     make_room(folder)
-    record = _with_other_axes(options)
+    record = _with_other_axes(options, topics)
     try:
         axes = options.axis or [axis for axis in model.axes if axis in record.axes]
         for axis in axes:
@@ -149,9 +160,8 @@ def _diagnose(options: argparse.Namespace) -> None:
     print(f"{folder / PAGE}: open it in a browser")
 
 
-def _with_other_axes(options: argparse.Namespace) -> Record:
+def _with_other_axes(options: argparse.Namespace, topics: str | bags.SeparateTopics) -> Record:
     """Return all axes of the bag: each may show on the others. Where that cannot be, only those asked for."""
-    topics = _topics(options)
     if options.axis and isinstance(topics, bags.SeparateTopics):
         # There the axes may have no names but those given.
         return bags.read_bag(options.bag, topics, axes=options.axis)
@@ -179,12 +189,14 @@ def _excite(options: argparse.Namespace) -> None:
 
 
 def _refit(options: argparse.Namespace) -> None:
+    _require_another_file(options.output, options.bag)
     model, changes = refit(load_model(options.model), bags.read_bag(options.bag, options.topic))
     save_model(model, options.output)
     print("\n".join(line for axis, change in changes.items() for line in describe_change(axis, change)))
 
 
 def _simulate(options: argparse.Namespace) -> None:
+    _require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
     t, voltage = tables.read_table(options.table, "V")
     known = _known(voltage, model, options.table)
@@ -201,18 +213,27 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _compensate(options: argparse.Namespace) -> None:
+    _require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
     t, desired = tables.read_table(options.table, "m")
     check_time(t)
+    known = _known(desired, model, options.table)
     limits = Limits(options.voltage_min, options.voltage_max)
     try:
-        answers = model.command(t, _known(desired, model, options.table), limits)
+        answers = model.command(t, known, limits)
     except SlpiError as error:
         raise type(error)(f"{options.table}, {error}") from None
     for axis, (_, held) in answers.items():
         if held.any():
             print(f"slpi compensate: axis '{axis}': {held_message(held)}", file=sys.stderr)
     tables.write_table(options.output, t, {axis: v for axis, (v, _) in answers.items()}, "V")
+
+
+def _require_another_file(output: str, *inputs: str) -> None:
+    """Refuse to write over what is read."""
+    for path in map(Path, inputs):
+        if path.exists() and Path(output).exists() and path.samefile(output):
+            raise UsageError(f"{output}: is also read from; give another file to write (-o)")
 
 
 def _known(columns: dict[str, FloatArray], model: StageModel, table: str) -> dict[str, FloatArray]:

@@ -1,6 +1,7 @@
 """What the command line ``slpi`` can be told."""
 
 import argparse
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -8,12 +9,32 @@ import numpy as np
 from slpi_ros.excitation.drives import DRIVES
 from slpi_ros.identification.fit import KINDS
 
+# Where a bag holds voltage and displacement, if nothing else is said.
+TOPIC = "stage_state"
+
 
 class _Parser(argparse.ArgumentParser):
     """A parser that says what is wrong in one line."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+class _EachOnce(argparse.Action):
+    """Several names, none of them twice."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        names = list(values or ())
+        for name in names:
+            if names.count(name) > 1:
+                raise argparse.ArgumentError(self, f"'{name}' comes more than once; name each axis once")
+        setattr(namespace, self.dest, names)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -33,12 +54,17 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _import(command: Any) -> None:
-    command.add_argument("table", metavar="DATA.csv|DATA.mat")
+    command.add_argument(
+        "table", metavar="DATA.csv|DATA.mat",
+        help="columns by comma, semicolon or tab; their names say the units, as in x_nm, x (nm), x [nm] or x in nm",
+    )  # fmt: skip
     command.add_argument("-o", "--output", metavar="BAG", required=True, help="folder of the new bag")
     command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
     command.add_argument("--voltage", metavar="COLUMN", nargs="+", default=(), help="one for all axes or one for each")
     command.add_argument("--displacement", metavar="COLUMN", nargs="+", default=(), help="one for each axis")
-    command.add_argument("--displacement-unit", default="um", help="m, mm, um or nm, where column names do not say it")
+    command.add_argument(
+        "--displacement-unit", help="m, mm, um, nm or pm, where column names do not say it; default: um"
+    )
     command.add_argument(
         "--axes", metavar="NAME", nargs="+", default=(), help="names of the axes; default: from the columns"
     )
@@ -54,7 +80,7 @@ def _identify(command: Any) -> None:
         "--loops-at-rest", action="store_true", help="slpi-published: operators start at rest, as published"
     )
     _where_in_the_bag(command)
-    command.add_argument("--axis", metavar="NAME", nargs="+", help="default: every axis of the bag")
+    _axes(command, help="default: every axis of the bag")
     _span(command)
     command.add_argument("--report", metavar="DIR", help="also write a page with plots, of the first bag")
     command.add_argument("--uncertainty", action="store_true", help="also say how surely the curves are known")
@@ -68,8 +94,12 @@ def _diagnose(command: Any) -> None:
         help="folder of diagnosis.json, extended_model.json and report.html",
     )  # fmt: skip
     _where_in_the_bag(command)
-    command.add_argument("--axis", metavar="NAME", nargs="+", help="default: every axis that bag and model share")
+    _axes(command, help="default: every axis that bag and model share")
     _span(command)
+
+
+def _axes(command: Any, **told: Any) -> None:
+    command.add_argument("--axis", metavar="NAME", nargs="+", action=_EachOnce, **told)
 
 
 def _span(command: Any) -> None:
@@ -78,17 +108,17 @@ def _span(command: Any) -> None:
 
 
 def _where_in_the_bag(command: Any) -> None:
-    command.add_argument("--topic", default="stage_state")
+    command.add_argument("--topic", help=f"default: {TOPIC}")
     command.add_argument("--voltage-topic", metavar="TOPIC", help="where voltage and displacement are apart")
     command.add_argument("--displacement-topic", metavar="TOPIC")
     clocks = ("displacement", "voltage")
-    command.add_argument("--clock", choices=clocks, default=clocks[0], help="whose stamps count")
+    command.add_argument("--clock", choices=clocks, help=f"whose stamps count there; default: {clocks[0]}")
     command.add_argument("--voltage-measured", action="store_true", help="voltage is a reading, no command that holds")
 
 
 def _excite(command: Any) -> None:
     command.add_argument("-o", "--output", metavar="DRIVE.csv", required=True, help="columns time_s, <axis>_V")
-    command.add_argument("--axis", metavar="NAME", nargs="+", default=("x",), help="they move one after the other")
+    _axes(command, default=("x",), help="they move one after the other")
     command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="never left")
     command.add_argument("--voltage-max", metavar="V", type=float, required=True)
     command.add_argument("--slew", metavar="V/S", type=float, default=0.0, help="fastest change; 0: none")
@@ -105,7 +135,7 @@ def _refit(command: Any) -> None:
     command.add_argument("model", metavar="MODEL.json")
     command.add_argument("bag", metavar="BAG")
     command.add_argument("-o", "--output", metavar="MODEL.json", required=True, help="may be the same file")
-    command.add_argument("--topic", default="stage_state")
+    command.add_argument("--topic", default=TOPIC)
 
 
 def _simulate(command: Any) -> None:

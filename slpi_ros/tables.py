@@ -3,20 +3,17 @@
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.csv_table import CsvTable, load_csv
-from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.column_choice import Choice, Wishes, choose
+from slpi_ros.column_names import Column
+from slpi_ros.csv_table import CsvTable, called, load_csv
+from slpi_ros.errors import RecordError
 from slpi_ros.files import all_or_nothing
 from slpi_ros.identification.record import FloatArray, Record
 from slpi_ros.mat_table import MatTable, load_mat
-
-_METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
-_VOLTS = {"kV": 1e3, "V": 1.0, "mV": 1e-3}
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 # message stamps count seconds in int32
 _TIME_END = 2.0**31
@@ -28,28 +25,31 @@ def import_table(
     time: str | None = None,
     voltage: Sequence[str] = (),
     displacement: Sequence[str] = (),
-    displacement_unit: str = "um",
+    displacement_unit: str | None = None,
     axes: Sequence[str] = (),
 ) -> Record:
     """Read measured data from any source; the names of the columns say what they are.
 
-    A unit at the end of a name (``_s``, ``_ms``, ``_V``, ``_mV``, ``_um``, ...) is honoured.
+    A unit in a name is honoured, as in ``time_ms``, ``Voltage (mV)``, ``x [nm]`` or ``displacement in nm``; case
+    counts only where it decides. Without one, values are seconds, volts and micrometres.
 
     Parameters
     ----------
     path : path
-        Comma-separated, with the names of the columns in the first line; or a MATLAB file of numeric arrays, up to
-        version 7, whose name ends in ``.mat``: its vectors are the columns.
+        A text file of columns separated by comma, semicolon or tab, the latter two also with decimal commas, whose
+        names stand above the numbers; or a MATLAB file of numeric arrays, up to version 7, whose name ends in
+        ``.mat``: its vectors are the columns.
     time : str, optional
-        Column of time; by default ``time_s``, else the first that begins with "time".
+        Column of time; by default ``time_s``, else the first that begins with "time" (or is ``t``) and says its
+        unit, else the first that begins so.
     voltage : sequence of str
         Columns of voltage, one for all axes or one for each displacement; by default those that begin with
-        "voltage" or end in ``_V``.
+        "voltage" or say a unit of voltage.
     displacement : sequence of str
-        Columns of displacement, one for each axis; by default those that begin with "displacement", else
-        ``<axis>_m`` (or another unit) where there is ``<axis>_V``.
-    displacement_unit : {"um", "m", "mm", "nm"}
-        Unit of displacement columns whose names do not end in one.
+        Columns of displacement, one for each axis; by default those that begin with "displacement", else with
+        "position", else ``<axis>_m`` (or another unit) where there is ``<axis>_V``, else x, y and z with a unit.
+    displacement_unit : {"um", "m", "mm", "nm", "pm"}, optional
+        Unit of displacement columns whose names do not say one; by default "um".
     axes : sequence of str
         Names of the axes; by default those in the displacement columns' names, and ``x`` where there is none.
 
@@ -62,24 +62,69 @@ def import_table(
     Raises
     ------
     RecordError
-        If the file, a column or a value is not what it should be.
+        If the file, a column, its unit or a value is not what it should be.
     UsageError
-        If an option is wrong.
+        If an option is wrong, contradicts the name of a column, or gives one column two roles.
     """
-    if displacement_unit not in _METRES:
-        raise UsageError(f"no displacement unit '{displacement_unit}'; choose {', '.join(_METRES)}")
-    table = _load(Path(path))
-    clock = time or _time_column(table)
-    moved = tuple(displacement) or _displacement_columns(table)
-    driven = _one_for_each(moved, tuple(voltage) or _voltage_columns(table, moved), table.path)
-    names = _axis_names(moved, tuple(axes), table.path)
-    values = table.read((clock, *moved, *driven))
-    return Record(
-        time_ns=_nanoseconds(values[clock] * _scale(clock, _SECONDS, "s"), clock, table),
-        voltage={n: values[c] * _scale(c, _VOLTS, "V") for n, c in zip(names, driven, strict=True)},
-        displacement={n: values[c] * _scale(c, _METRES, displacement_unit) for n, c in zip(names, moved, strict=True)},
+    wishes = Wishes(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
+    return import_told(path, wishes)[0]
+
+
+def import_told(path: str | os.PathLike[str], wishes: Wishes) -> tuple[Record, tuple[str, ...]]:
+    """Do as `import_table`, and tell what was taken for what.
+
+    Parameters
+    ----------
+    path : path
+        As of `import_table`.
+    wishes : Wishes
+        The other parameters of `import_table`.
+
+    Returns
+    -------
+    record : Record
+        In volts and metres.
+    lines : tuple of str
+        Columns, units and ranges, a line for each axis; before them one about time if its unit was assumed.
+    """
+    record, choice = _imported(Path(path), wishes)
+    return record, tuple(_told(record, choice))
+
+
+def _imported(path: Path, wishes: Wishes) -> tuple[Record, Choice]:
+    table = load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
+    choice = choose(table, wishes)
+    values = table.read([column.name for column in choice.columns()])
+    record = Record(
+        time_ns=_nanoseconds(_si(values, choice.time), choice.time.name, table),
+        voltage={axis: _si(values, column) for axis, column in choice.voltage.items()},
+        displacement={axis: _si(values, column) for axis, column in choice.displacement.items()},
         source=str(path),
     )
+    return record, choice
+
+
+def _si(values: Mapping[str, FloatArray], column: Column) -> FloatArray:
+    return values[column.name] * column.scale
+
+
+def _told(record: Record, choice: Choice) -> Iterable[str]:
+    """Yield lines that say what was taken for what."""
+    if choice.time.assumed:
+        yield f"time: column '{choice.time.name}' taken as {choice.time.unit}"
+    for axis in record.axes:
+        voltage = _told_column(choice.voltage[axis], record.voltage[axis], "V")
+        displacement = _told_column(choice.displacement[axis], record.displacement[axis] * 1e6, "um")
+        yield f"axis {axis}: {voltage}, {displacement}"
+
+
+def _told_column(column: Column, values: FloatArray, unit: str) -> str:
+    """Return name and range of a column, and whether its unit was assumed."""
+    known = values[np.isfinite(values)]
+    assumed = " (unit assumed)" if column.assumed else ""
+    if not known.size:
+        return f"{column.name} without a value"
+    return f"{column.name} {known.min():.5g} to {known.max():.5g} {unit}{assumed}"
 
 
 def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -109,11 +154,12 @@ def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, d
     columns = {n.removesuffix(ending): n for n in table.columns if n.endswith(ending) and n != ending}
     if not columns:
         raise RecordError(f"{path}: no column <axis>{ending}; there is {table.listing()}")
-    values = table.read(("time_s", *columns.values()))
+    time = called("time_s", table.columns)
+    values = table.read((time, *columns.values()))
     for column, samples in values.items():
         table.require(np.isfinite(samples), column, samples, "every cell needs a finite number")
-    _require_order(values["time_s"], "time_s", table)
-    return values["time_s"], {axis: values[column] for axis, column in columns.items()}
+    _require_order(values[time], time, table)
+    return values[time], {axis: values[column] for axis, column in columns.items()}
 
 
 def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[str, FloatArray], suffix: str) -> None:
@@ -149,83 +195,8 @@ def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[st
         file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
 
 
-def _load(path: Path) -> CsvTable | MatTable:
-    return load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
-
-
-def _displacement_columns(table: CsvTable | MatTable) -> tuple[str, ...]:
-    """Return the columns that hold displacement, by their names."""
-    if found := tuple(n for n in table.columns if n.startswith("displacement")):
-        return found
-    driven = {axis for axis, unit in (_split(n, _VOLTS) for n in table.columns) if unit}
-    split = {n: _split(n, _METRES) for n in table.columns}
-    found = tuple(n for n, (axis, unit) in split.items() if unit and axis in driven)
-    return found or _missing(table, "displacement column", "displacement")
-
-
-def _voltage_columns(table: CsvTable | MatTable, moved: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns that hold voltage, sorted as the displacements where they name the same axes."""
-    found = tuple(n for n in table.columns if n.startswith("voltage") or n.endswith("_V"))
-    by_axis = {_split(n, _VOLTS)[0]: n for n in found}
-    axes = [_split(n, _METRES)[0] for n in moved]
-    if len(found) == len(by_axis) and sorted(axes) == sorted(by_axis):
-        return tuple(by_axis[axis] for axis in axes)
-    return found or _missing(table, "voltage column", "voltage")
-
-
-def _time_column(table: CsvTable | MatTable) -> str:
-    """Return the column that holds time."""
-    found = [n for n in table.columns if n.startswith("time")] or _missing(table, "time column", "time")
-    return "time_s" if "time_s" in found else found[0]
-
-
-def _missing(table: CsvTable | MatTable, what: str, option: str) -> NoReturn:
-    raise RecordError(
-        f"{table.path}: no {what}; there is {table.listing()}; name one of them (--{option} or {option}=)"
-    )
-
-
-def _split(column: str, units: Mapping[str, float]) -> tuple[str, str]:
-    """Return axis and unit of a name such as ``displacement_x_um`` or ``x_V``; the unit is "" if none."""
-    stem, _, unit = column.rpartition("_")
-    if unit not in units:
-        stem, unit = column, ""
-    for word in ("displacement", "voltage"):
-        stem = stem.removeprefix(word)
-    return stem.strip("_") or "x", unit
-
-
-def _scale(column: str, units: Mapping[str, float], default: str) -> float:
-    return units[_split(column, units)[1] or default]
-
-
 def _ending(suffix: str) -> str:
     return f"_{suffix.strip('_')}"
-
-
-def _one_for_each(moved: Sequence[str], driven: Sequence[str], path: Path) -> tuple[str, ...]:
-    """Return one voltage column for each displacement column."""
-    if len(driven) == 1:
-        return tuple(driven) * len(moved)
-    if len(driven) != len(moved):
-        raise RecordError(
-            f"{path}: {len(driven)} voltage columns ({', '.join(driven)}) for {len(moved)} of displacement "
-            f"({', '.join(moved)}); name one voltage for all or one for each (--voltage or voltage=)"
-        )
-    return tuple(driven)
-
-
-def _axis_names(moved: Sequence[str], axes: Sequence[str], path: Path) -> tuple[str, ...]:
-    """Return one name for each displacement column, no two alike."""
-    names = tuple(axes) or tuple(_split(column, _METRES)[0] for column in moved)
-    if len(names) != len(moved):
-        raise UsageError(f"{path}: {len(names)} axes for the displacement columns {', '.join(moved)}")
-    if len(set(names)) < len(names):
-        raise RecordError(
-            f"{path}: displacement columns {', '.join(moved)} are axes {', '.join(names)}, two of them the "
-            "same; choose the columns (--displacement or displacement=)"
-        )
-    return names
 
 
 def _nanoseconds(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> NDArray[np.int64]:

@@ -17,8 +17,9 @@ LAYERS = (
     {"reports", "experiments"},
     {"diagnosis"},
     {
-        *("alignment", "bag_files", "bag_watch", "bag_writer", "bags", "cdr", "csv_table", "joint_state"),
-        *("mat_table", "mcap_file", "message_blocks", "message_types", "signals", "sqlite_file", "tables"),
+        *("alignment", "bag_files", "bag_watch", "bag_writer", "bags", "cdr", "column_choice", "column_names"),
+        *("csv_table", "joint_state", "mat_table", "mcap_file", "message_blocks", "message_types", "signals"),
+        *("sqlite_file", "tables"),
     },
     {"excitation", "identification"},
     {

@@ -84,6 +84,26 @@ def test_help_tells_every_command():
     assert all(command in text for command in COMMANDS)
 
 
+def test_an_import_tells_what_it_took_for_what(tmp_path):
+    lines = ["Stage 7", "Zeit;Spannung;Weg [nm]", "0,0;0;-500", "0,5;100,5;19800"]
+    (tmp_path / "d.csv").write_text("\n".join(lines), encoding="latin-1")
+    columns = ("--time", "zeit", "--voltage", "spannung", "--displacement", "weg [nm]")
+    done = slpi("import", tmp_path / "d.csv", "-o", tmp_path / "b", *columns)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[1:] == [
+        "time: column 'Zeit' taken as s",
+        "axis Weg: Spannung 0 to 100.5 V (unit assumed), Weg [nm] -0.5 to 19.8 um",
+    ]
+
+
+def test_a_table_is_named_once_in_a_message(folder, tmp_path):
+    path = another_axis(folder, tmp_path)[0][2]
+    for command, suffix in (("compensate", "m"), ("simulate", "V")):
+        write_table(path, np.arange(3.0), {"z": np.zeros(3)}, suffix)
+        line = one_line(slpi(command, folder / "pi.json", path, "-o", tmp_path / "v.csv"), 1)
+        assert line.startswith(f"slpi {command}: {path}: column of axis 'z'") and line.count(str(path)) == 1
+
+
 def test_unreachable_displacements_are_held_and_told(folder, tmp_path):
     t = np.arange(300) / 100
     top = slpi_ros.load_model(folder / "pi.json").axes["x"].displacement_range[1]
@@ -174,6 +194,36 @@ def no_such_column(folder, tmp_path):
     return ("import", tmp_path / "d.csv", "-o", tmp_path / "b", "--voltage", "u"), 1, "u"
 
 
+def unknown_unit(folder, tmp_path):
+    (tmp_path / "d.csv").write_text("time_s,voltage_V,displacement_inch\n0,1,2\n1,2,3\n")
+    return ("import", tmp_path / "d.csv", "-o", tmp_path / "b"), 1, "'inch' is no unit of displacement"
+
+
+def contradicted_unit(folder, tmp_path):
+    (tmp_path / "d.csv").write_text("time_s,voltage_V,displacement_um\n0,1,2\n1,2,3\n")
+    return ("import", tmp_path / "d.csv", "-o", tmp_path / "b", "--displacement-unit", "nm"), 2, "in um by its name"
+
+
+def column_in_two_roles(folder, tmp_path):
+    (tmp_path / "d.csv").write_text("time_s,drive,displacement_um\n0,1,2\n1,2,3\n")
+    columns = ("--voltage", "drive", "--displacement", "drive")
+    return ("import", tmp_path / "d.csv", "-o", tmp_path / "b", *columns), 2, "'drive' twice"
+
+
+def compensate_over_its_table(folder, tmp_path):
+    (tmp_path / "y.csv").write_text("time_s,x_m\n0,1e-6\n1,2e-6\n")
+    return ("compensate", folder / "pi.json", tmp_path / "y.csv", "-o", tmp_path / "y.csv"), 2, "is also read from"
+
+
+def compensate_over_its_model(folder, tmp_path):
+    (tmp_path / "link.json").symlink_to(folder / "pi.json")
+    return ("compensate", folder / "pi.json", folder / "desired.csv", "-o", tmp_path / "link.json"), 2, "also read"
+
+
+def simulate_over_its_table(folder, tmp_path):
+    return ("simulate", folder / "pi.json", folder / "voltage.csv", "-o", folder / "voltage.csv"), 2, "also read from"
+
+
 def existing_bag(folder, tmp_path):
     (tmp_path / "d.csv").write_text("time_s,voltage_V,displacement_um\n0,1,2\n1,2,3\n")
     return ("import", tmp_path / "d.csv", "-o", folder / "bag"), 1, "bag"
@@ -203,6 +253,8 @@ def nothing(folder, tmp_path):
 CASES = (
     truncated, wrong_version, binary_model, no_model, another_axis, far_command, nan_command, backwards_command, no_bag,
     truncated_bag, wrong_topic, wrong_axis, empty_window, constant_voltage, no_such_column, existing_bag,
+    unknown_unit, contradicted_unit, column_in_two_roles, compensate_over_its_table, compensate_over_its_model,
+    simulate_over_its_table,
     unwritable_model, two_bags, unknown_kind, unknown_command, nothing,
 )  # fmt: skip
 

@@ -100,24 +100,30 @@ def _within_a_sample(contender: Contender) -> bool:
 
 
 def _screened(name: str, now: Explanation) -> tuple[float, Effect] | None:
-    """Return the best linear form of an effect, and the held-out error (m) with it."""
-    best: tuple[float, Effect] | None = None
-    for form in EFFECTS[name].fit(now):
-        rms, effect = _scored(form, now)
-        if effect is not None and (best is None or rms < best[0]):
-            best = rms, effect
-    return best
+    """Return the linear form of an effect that does best, and the held-out error (m) with it.
+
+    A simpler form that does as well, as far as the record can tell, stands for it: what is more than that goes astray
+    where the record ends.
+    """
+    tried = [scored for form in EFFECTS[name].fit(now) if (scored := _scored(form, now))]
+    if not tried:
+        return None
+    best = min(tried, key=lambda one: one[0].rms)
+    equal = [one for one in tried if one is best or chance_of_gain(one[0], best[0]) > ALIKE]
+    score, effect = min(equal, key=lambda one: (free(one[1]).size, one[0].rms))
+    return score.rms, effect
 
 
-def _scored(form: Form | Effect, now: Explanation) -> tuple[float, Effect | None]:
+def _scored(form: Form | Effect, now: Explanation) -> tuple[Score, Effect] | None:
     if not isinstance(form, Form):
-        return now.adding(form).held_out.rms, form
+        return now.adding(form).held_out, form
     score = now.score(form.columns, positive=form.positive)
     try:
-        return score.rms, form.effect(score.gains[-(form.positive or form.columns.shape[1]) :])
+        effect = form.effect(score.gains[-(form.positive or form.columns.shape[1]) :])
     except ModelError:
         # No effect has such parameters.
-        return score.rms, None
+        return None
+    return (score, effect) if effect is not None else None
 
 
 def chance_of_gain(before: Score, after: Score) -> float:

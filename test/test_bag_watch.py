@@ -1,12 +1,13 @@
 """Which bags of a folder are complete."""
 
 import os
+import time
 
 import numpy as np
 import pytest
 
 from slpi_ros.bag_watch import BagWatch
-from slpi_ros.bags import write_bag
+from slpi_ros.bags import BagWriter, write_bag
 from slpi_ros.errors import UsageError
 from slpi_ros.identification.record import Record
 
@@ -56,3 +57,63 @@ def test_a_folder_that_goes_holds_none(tmp_path):
     assert watch.look() == []
     with pytest.raises(UsageError, match="no such folder"):
         BagWatch(folder)
+
+
+def rest(path, seconds):
+    """Let a bag look as if nothing had been written to it for so long."""
+    last = time.time_ns() - int(seconds * 1e9)
+    for part in (*path.rglob("*"), path):
+        os.utime(part, ns=(last, last))
+
+
+@pytest.fixture
+def unfinished(tmp_path):
+    """Return a folder with one bag of every kind that is never finished, and with what is no bag."""
+    write(tmp_path / "elsewhere" / "whole", 10**18)
+    (lone,) = (tmp_path / "elsewhere" / "whole").glob("*.mcap")
+    watched = tmp_path / "watched"
+    for name, part in (("killed", "killed_0.mcap"), ("other", "other_0.db3.zstd"), ("notes", "notes.txt")):
+        (watched / name).mkdir(parents=True)
+        (watched / name / part).write_bytes(lone.read_bytes()[:-5])
+    (watched / "junk.mcap").write_bytes(b"junk")
+    (watched / "junk.txt").write_bytes(b"junk")
+    (watched / ".hidden.mcap").touch()
+    BagWriter(watched / "ours")
+    return watched
+
+
+def test_what_has_not_grown_for_long_is_abandoned(unfinished):
+    watch = BagWatch(unfinished, patience=30.0)
+    names = [".ours.partial", "junk.mcap", "killed", "other"]
+    assert watch.look() == [] and watch.abandoned == ()
+    for path in unfinished.iterdir():
+        rest(path, 29.0)
+    assert watch.look() == [] and watch.abandoned == ()
+    for path in unfinished.iterdir():
+        rest(path, 31.0)
+    assert watch.look() == [] and watch.abandoned == tuple(unfinished / name for name in names)
+
+
+def test_what_was_abandoned_stays_watched(unfinished):
+    watch = BagWatch(unfinished, patience=30.0)
+    for path in unfinished.iterdir():
+        rest(path, 31.0)
+    watch.look()
+    # One grows, one goes, one is mended.
+    with (unfinished / "junk.mcap").open("ab") as file:
+        file.write(b"more")
+    for path in ("other_0.db3.zstd", ""):
+        (unfinished / "other" / path).unlink() if path else (unfinished / "other").rmdir()
+    (unfinished / "killed" / "metadata.yaml").write_text("x")
+    assert watch.look() == [unfinished / "killed"]
+    assert watch.abandoned == (unfinished / ".ours.partial",)
+
+
+def test_a_part_that_grows_keeps_its_bag(unfinished):
+    watch = BagWatch(unfinished, patience=30.0)
+    rest(unfinished / "killed", 31.0)
+    watch.look()
+    assert unfinished / "killed" in watch.abandoned
+    (unfinished / "killed" / "killed_0.mcap").touch()
+    watch.look()
+    assert unfinished / "killed" not in watch.abandoned

@@ -16,6 +16,8 @@ STEEPEST = math.pi / 2
 FEWEST_STEPS = 3
 # A drive of more samples is a mistake.
 MOST_STEPS = 10_000_000
+# No stage takes more, volts: a larger one is a slip.
+MOST_VOLTAGE = 10_000.0
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,10 @@ class Room:
         """Refuse what leaves no room."""
         if not -math.inf < self.low < self.high < math.inf:
             raise UsageError(f"drive: limits {self.low} V and {self.high} V; the first must be the lower one")
+        if max(-self.low, self.high) > MOST_VOLTAGE:
+            raise UsageError(
+                f"drive: limits {self.low:g} V and {self.high:g} V; give at most {MOST_VOLTAGE:g} V either way"
+            )
         if not (0 < self.duration < math.inf and 0 < self.rate < math.inf):
             raise UsageError(f"drive: {self.duration} s at {self.rate} Hz; both must be more than 0")
         if self.duration * self.rate > MOST_STEPS:

@@ -3,10 +3,46 @@
 from dataclasses import dataclass
 
 from slpi_ros.bags import read_bag
-from slpi_ros.errors import SlpiError
+from slpi_ros.errors import RecordError, SlpiError
 from slpi_ros.identification.fit import identify
+from slpi_ros.identification.record import Record
+from slpi_ros.model import StageModel
 from slpi_ros.model_file import format_model, save_model
 from slpi_ros.nodes.worker_process import WorkerProcess
+
+
+@dataclass(frozen=True)
+class StageIdentity:
+    """What tells a stage from others.
+
+    Parameters
+    ----------
+    hardware_id : str
+        "": not known.
+    axes : tuple of str
+    """
+
+    hardware_id: str
+    axes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, model: StageModel, before: "StageIdentity | None") -> "StageIdentity":
+        """Return the stage of a model; its hardware id may be known from `before`, where the model does not say."""
+        return cls(model.hardware_id or (before.hardware_id if before else ""), tuple(model.axes))
+
+    def require(self, record: Record) -> None:
+        """Raise RecordError for a record of another stage."""
+        other, lacking = "", [axis for axis in self.axes if axis not in record.axes]
+        if lacking:
+            other = f"no axis '{lacking[0]}', only {', '.join(record.axes)}"
+        if record.hardware_id and self.hardware_id and record.hardware_id != self.hardware_id:
+            other = f"of stage '{record.hardware_id}'"
+        if other:
+            name = f" of stage '{self.hardware_id}'" if self.hardware_id else ""
+            raise RecordError(
+                f"{record.source}: {other}, and skipped: the published model{name} holds {', '.join(self.axes)}; give "
+                "each stage a node and a folder of its own, or name this bag in the parameter bags"
+            )
 
 
 @dataclass(frozen=True)
@@ -24,6 +60,8 @@ class FitRequest:
         Part of the record to fit.
     output : str
         File that gets the model too; "": none.
+    stage : StageIdentity, optional
+        The only stage whose bags are wanted; by default any.
     """
 
     bags: tuple[str, ...]
@@ -32,6 +70,7 @@ class FitRequest:
     start: float | None
     stop: float | None
     output: str
+    stage: StageIdentity | None = None
 
     @property
     def source(self) -> str:
@@ -59,6 +98,9 @@ def fit(request: FitRequest) -> FitOutcome:
     document = ""
     try:
         records = [read_bag(bag, request.topic) for bag in request.bags]
+        if request.stage:
+            for record in records:
+                request.stage.require(record)
         model = identify(records, request.kind, start=request.start, stop=request.stop)
         document = format_model(model)
         if request.output:

@@ -1,123 +1,32 @@
 """Node ``identify``: bags in, a latched model out."""
 
-import math
-import os
 import sys
 import time
 from collections import deque
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from slpi_ros.bag_watch import BagWatch
-from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.identification.fit import KINDS
+from slpi_ros.bag_watch import PATIENCE, BagWatch
+from slpi_ros.errors import SlpiError
 from slpi_ros.model import StageModel
 from slpi_ros.model_file import parse_model
 from slpi_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Health
-from slpi_ros.nodes.fit_process import FitOutcome, FitProcess, FitRequest
+from slpi_ros.nodes.fit_process import FitOutcome, FitProcess, FitRequest, StageIdentity
 from slpi_ros.nodes.identify_diagnosis import DiagnosisService, Identified
-from slpi_ros.nodes.parameters import Declaration, Parameters, Values, choice, number
+from slpi_ros.nodes.identify_settings import DECLARATIONS, IdentifySettings
+from slpi_ros.nodes.parameters import Parameters
 from slpi_ros.nodes.qos import LATCHED
 from slpi_ros.nodes.runner import run
 
 POLL_PERIOD = 0.1
 WATCH_PERIOD = 0.5
 NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
-REPORT_PERIOD = (0.05, 3600.0)
-
-DECLARATIONS = (
-    Declaration(
-        "bags", [""],
-        "Bags to identify in one fit: rosbag2 folders, or lone mcap or db3 files. Setting a parameter later identifies "
-        "anew.",
-    ),
-    Declaration(
-        "watch_directory", "",
-        "Folder: every bag completed there is identified too, the newest one there at once; empty: none.",
-    ),
-    Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
-    Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}."),
-    Declaration("output", "", "File to write the model to as well; empty: none."),
-    Declaration(
-        "start", math.nan, "Fit from here on, seconds from the bag's first stamp; NaN or negative: from the first.",
-        number=True,
-    ),
-    Declaration(
-        "stop", math.nan, "Fit up to here, seconds from the bag's first stamp; NaN or negative: to the last.",
-        number=True,
-    ),
-    Declaration(
-        "diagnosis_directory", "",
-        "Folder that ~/diagnose writes into; empty: the folder NAME_diagnosis beside the output NAME.json, without an "
-        "output a temporary one, which the answer names.",
-    ),
-    Declaration(
-        "diagnostic_period", 1.0, "Seconds between two reports on /diagnostics.",
-        read_only=True, between=REPORT_PERIOD, number=True,
-    ),
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class IdentifySettings:
-    """What the node is told by its parameters.
-
-    Parameters
-    ----------
-    request : FitRequest
-        What to identify; without bags, what to identify those of the watched folder like.
-    watch_directory : str
-        "": none.
-    diagnosis_directory : str
-        "": a temporary one.
-    diagnostic_period : float, seconds
-    """
-
-    request: FitRequest
-    watch_directory: str
-    diagnosis_directory: str
-    diagnostic_period: float
-
-    @classmethod
-    def of(cls, values: Values) -> "IdentifySettings":
-        """Make the settings of all parameters by name.
-
-        Raises
-        ------
-        UsageError
-            If a value makes no sense.
-        """
-        bags = tuple(bag for bag in values["bags"] if bag)
-        if not values["topic"]:
-            raise UsageError("parameter topic is empty; name the topic of the bag, as in stage_state")
-        kind = choice(values, "kind", KINDS)
-        start, stop = bound(values, "start"), bound(values, "stop")
-        if start is not None and stop is not None and not start < stop:
-            raise UsageError(f"parameter start is {start:g} s and stop {stop:g} s; start before you stop")
-        request = FitRequest(bags, values["topic"], kind, start, stop, values["output"])
-        folder = values["watch_directory"]
-        if folder:
-            BagWatch(folder)
-        diagnosis = values["diagnosis_directory"] or beside(request.output)
-        return cls(request, folder, diagnosis, number(values, "diagnostic_period", *REPORT_PERIOD))
-
-
-def beside(output: str) -> str:
-    """Return the folder beside the file of a model that its diagnosis goes to; "" for no file."""
-    return f"{os.path.splitext(output)[0]}_diagnosis" if output else ""
-
-
-def bound(values: Values, name: str) -> float | None:
-    """Return a time of the record, seconds; None where NaN or a negative number says that there is none."""
-    given = values[name]
-    if isinstance(given, float) and math.isnan(given):
-        return None
-    seconds = number(values, name, -math.inf, math.inf)
-    return seconds if seconds >= 0 else None
 
 
 class Identify(Node):
@@ -125,7 +34,8 @@ class Identify(Node):
 
     Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`; the service ``~/identify``
     (``std_srvs/Trigger``) starts anew, ``~/diagnose`` says what the published model gets wrong on its bag. A bag that
-    cannot be identified is reported and skipped, and the last good model stays published.
+    cannot be identified is reported and skipped, and the last good model stays published; so is a bag of the watched
+    folder that is of another stage than that model.
 
     Raises
     ------
@@ -139,8 +49,11 @@ class Identify(Node):
         self._publisher = self.create_publisher(String, "stage_model", LATCHED)
         self._diagnostics = Diagnostics(self, "identify")
         self._job: FitProcess | None = None
-        self._queue: deque[FitRequest] = deque()
+        self._asked: FitRequest | None = None
+        self._waiting: deque[Path] = deque()
         self._watch: BagWatch | None = None
+        self._abandoned: set[Path] = set()
+        self._stage: StageIdentity | None = None
         self._failed = 0
         self._model: StageModel | None = None
         self._identified: Identified | None = None
@@ -170,6 +83,9 @@ class Identify(Node):
     def _on_change(self, settings: IdentifySettings) -> None:
         """Begin anew, unless only the place of the next diagnosis has changed."""
         before, self._settings = self._settings, settings
+        if settings.watch_directory != before.watch_directory:
+            # Who names another folder may mean another stage.
+            self._stage = None
         moved = settings.diagnosis_directory != before.diagnosis_directory
         if not moved or replace(settings, diagnosis_directory=before.diagnosis_directory) != before:
             self._begin(settings)
@@ -178,21 +94,24 @@ class Identify(Node):
         """Start to identify what the parameters name, in place of what is under way."""
         self._end_job()
         self._error = ""
-        self._queue.clear()
+        self._waiting.clear()
+        self._asked = settings.request if settings.request.bags else None
         self._watch = BagWatch(settings.watch_directory) if settings.watch_directory else None
-        if settings.request.bags:
-            self._queue.append(settings.request)
-        elif not self._watch:
+        if not self._asked and not self._watch:
             self.get_logger().warning(NOTHING_TO_DO)
         self._look_for_bags()
         self._start_next()
         self._report()
 
     def _look_for_bags(self) -> None:
-        """Queue the bags that have been completed in the watched folder."""
+        """Queue the bags that have been completed in the watched folder; tell once of those that will not be."""
         for bag in self._watch.look() if self._watch else ():
             self.get_logger().info(f"{bag} is complete")
-            self._queue.append(replace(self._parameter_set.settings.request, bags=(str(bag),)))
+            self._waiting.append(bag)
+        abandoned = set(self._watch.abandoned) if self._watch else set()
+        for bag in sorted(abandoned - self._abandoned):
+            self.get_logger().warning(abandonment([bag]))
+        self._abandoned = abandoned
         self._start_next()
 
     def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -208,9 +127,18 @@ class Identify(Node):
 
     def _start_next(self) -> None:
         """Start the next identification in the queue, unless one is under way."""
-        if self._queue and not self._job:
-            self._job, self._job_start = FitProcess(self._queue.popleft()), time.monotonic()
+        request = None if self._job else self._next_request()
+        if request:
+            self._job, self._job_start = FitProcess(request), time.monotonic()
             self._poll.reset()
+
+    def _next_request(self) -> FitRequest | None:
+        """Return what the parameters ask for, then bag by bag of the watched folder."""
+        request, self._asked = self._asked, None
+        if not request and self._waiting:
+            bag = str(self._waiting.popleft())
+            request = replace(self._parameter_set.settings.request, bags=(bag,), stage=self._stage)
+        return request
 
     def _end_job(self) -> None:
         self._poll.cancel()
@@ -230,6 +158,7 @@ class Identify(Node):
     def _take(self, request: FitRequest, outcome: FitOutcome) -> None:
         if outcome.document:
             self._model = parse_model(outcome.document, "identify")
+            self._stage = StageIdentity.of(self._model, request.stage)
             self._identified = Identified(request.bags[-1], request.topic, outcome.document)
             self._diagnosis.forget()
             self._publisher.publish(String(data=outcome.document))
@@ -246,7 +175,8 @@ class Identify(Node):
             "state": "identifying" if self._job else "waiting",
             "model.created": model.created if model else "",
             "model.hardware_id": model.hardware_id if model else "",
-            "waiting_bags": len(self._queue),
+            "waiting_bags": len(self._waiting),
+            "abandoned_bags": len(self._abandoned),
             "failed": self._failed,
             "last_error": self._error,
             **self._diagnosis.values,
@@ -266,6 +196,8 @@ class Identify(Node):
         problems = ((ERROR, self._error),) if self._error else ()
         if not problems and not model and not self._job and not self._watch:
             problems = ((WARN, NOTHING_TO_DO),)
+        if self._abandoned:
+            problems = (*problems, (WARN, abandonment(sorted(self._abandoned))))
         if self._diagnosis.error:
             problems = (*problems, (WARN, self._diagnosis.error))
         hardware_id = model.hardware_id if model else ""
@@ -275,6 +207,14 @@ class Identify(Node):
         if self._job:
             return f"identifying {self._job.request.source} for {time.monotonic() - self._job_start:.0f} s"
         return self._diagnosis.doing or (described(self._model) if self._model else "")
+
+
+def abandonment(bags: Sequence[Path]) -> str:
+    """Say in one line which bags seem abandoned, and what to do."""
+    return (
+        f"{', '.join(map(str, bags))}: not complete, and not grown for {PATIENCE:g} s: the recording seems abandoned; "
+        "if it is, mend it (`ros2 bag reindex` for a folder, `mcap recover` for a file) or delete it"
+    )
 
 
 def described(model: StageModel) -> str:

@@ -108,8 +108,10 @@ class Chart:
     _legend: set[str] = field(default_factory=set, init=False)
 
     def line(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, width: float = 1.4) -> None:
-        """Add a line through points, shape (N,) each, SI; NaN interrupts it."""
-        style = {"mode": "lines", "line": {"color": colour, "width": width}}
+        """Add a line through points, shape (N,) each, SI; NaN interrupts it, and a point between two NaN is a dot."""
+        style: dict[str, Any] = {"mode": "lines", "line": {"color": colour, "width": width}}
+        if _alone(y).any():
+            style |= {"mode": "lines+markers", "marker": {"color": colour, "size": width}}
         self._add(panel, name, x, y, {"type": "scatter", **style})
 
     def dots(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, faint: bool = False) -> None:
@@ -161,6 +163,20 @@ class Chart:
                 "yref": numbers["yaxis"], "y0": -half_width * y.scale, "y1": half_width * y.scale,
             }
         )  # fmt: skip
+
+    def span(self, panel: int, name: str, start: float, stop: float, colour: str) -> None:
+        """Shade from one place along the horizontal axis to another, SI; all of a name have one entry in the legend."""
+        x = self.panels[panel].x
+        numbers = self._anchors(panel)
+        self._shapes.append(
+            {
+                "type": "rect", "layer": "below", "fillcolor": colour, "line": {"width": 0},
+                "xref": numbers["xaxis"], "x0": start * x.scale, "x1": stop * x.scale,
+                "yref": f"{numbers['yaxis']} domain", "y0": 0, "y1": 1,
+                "name": _plain(name), "legendgroup": _plain(name), "showlegend": name not in self._legend,
+            }
+        )  # fmt: skip
+        self._legend.add(name)
 
     def show(self, panel: int, low: float, high: float) -> None:
         """Show first only what lies between two heights, SI."""
@@ -243,6 +259,12 @@ class Chart:
             if panel < len(self.panels) - 1 and shown.x == self.panels[panel + 1].x:
                 across.update(title={"text": ""})
         return {f"xaxis{number}": across, f"yaxis{number}": up}
+
+
+def _alone(y: FloatArray) -> NDArray[np.bool_]:
+    """Return which points, shape (N,), are finite, but none beside them."""
+    finite = np.pad(np.isfinite(y), 1)
+    return np.asarray(finite[1:-1] & ~finite[:-2] & ~finite[2:])
 
 
 def _plain(name: str) -> str:

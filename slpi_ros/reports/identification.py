@@ -1,6 +1,7 @@
 """The page of an identification: what was measured, what the model makes of it, and what is left."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,21 @@ from slpi_ros.reports.page import Mood, Page
 from slpi_ros.reports.text import describe_axis
 
 FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # Held-out errors up to so many times the noise are noise; from the other one on there is something to be found.
 _NOISE_ONLY, _MORE_THAN_NOISE = 1.5, 3.0
+
+
+@dataclass(frozen=True)
+class _Traces:
+    """One axis: time (s), voltage (V), displacement as measured and as simulated (m), and what was fitted."""
+
+    t: FloatArray
+    v: FloatArray
+    y: FloatArray
+    simulated: FloatArray
+    fitted: Mask
 
 
 def write_report(
@@ -32,6 +45,8 @@ def write_report(
     *,
     truth: Mapping[str, HeldOutTruth] | None = None,
     found: Mapping[str, Sequence[Finding]] | None = None,
+    start: float | None = None,
+    stop: float | None = None,
 ) -> Path:
     """Write ``report.html`` into `folder` and return its path.
 
@@ -46,6 +61,8 @@ def write_report(
         Errors on blocks left out, for the tables.
     found : mapping of axis name to sequence of Finding, optional
         The quality of the record; found anew by default.
+    start, stop : float, seconds, optional
+        The part of the record that was fitted, as for `slpi_ros.identify`; the rest is drawn, but counts nowhere.
 
     Raises
     ------
@@ -58,6 +75,7 @@ def write_report(
         record.require_axis(name)
     driven = np.logical_and.reduce([np.isfinite(record.voltage[name]) for name in model.axes])
     t = record.t[driven]
+    fitted = (t >= (-np.inf if start is None else start)) & (t < (np.inf if stop is None else stop))
     simulated = model.simulate(t, {name: record.voltage[name][driven] for name in model.axes})
     for name, axis in model.axes.items():
         told = (truth or {}).get(name)
@@ -69,11 +87,13 @@ def write_report(
         page.section("The model")
         page.lines(describe_axis(axis))
         page.section("The record")
-        page.findings(_findings(record, name) if found is None else found.get(name, ()))
+        page.findings(_findings(record, name, start, stop) if found is None else found.get(name, ()))
+        if not fitted.all():
+            page.text(_part(t, fitted))
         if t.size:
             floor = told.floor.rms if told else axis.quality.floor_rms
             v, y = record.voltage[name][driven], record.displacement[name][driven]
-            _show(page, name, t, v, y, simulated[name], floor)
+            _show(page, name, _Traces(t, v, y, simulated[name], fitted), floor)
         else:
             page.text("The record holds no voltage of this axis: there is nothing to draw.")
     path = folder / "report.html"
@@ -119,7 +139,7 @@ def _figures(axis: AxisModel, truth: HeldOutTruth | None) -> dict[str, str]:
             "samples fitted": f"{quality.samples:,}",
         }
     return figures | {
-        "largest error on the record": _nm(quality.maximum),
+        "largest error where fitted": _nm(quality.maximum),
         "stroke": f"{_stroke(axis) * 1e6:.4g} µm",
         "of the model seen": f"{quality.covered:.0%}",
     }
@@ -134,10 +154,10 @@ def _nm(metres: float) -> str:
     return f"{metres * 1e9:.1f} nm" if np.isfinite(metres) else "none"
 
 
-def _findings(record: Record, name: str) -> list[Finding]:
+def _findings(record: Record, name: str, start: float | None, stop: float | None) -> list[Finding]:
     """Return what is found about the record; a reason where it is good for nothing."""
     try:
-        return findings(assess(record, name))
+        return findings(assess(record, name, start=start, stop=stop))
     except SlpiError as error:
         return [Finding("stop", str(error))]
 
@@ -176,25 +196,37 @@ def _row(part: Slice, floor: float) -> list[str]:
     return [part.name, f"{part.samples:,}", rms, times, largest, classical, ratio]
 
 
-def _show(
-    page: Page, name: str, t: FloatArray, v: FloatArray, y: FloatArray, simulated: FloatArray, noise: float
-) -> None:
+def _part(t: FloatArray, fitted: Mask) -> str:
+    """Say which samples were fitted."""
+    if not fitted.any():
+        return "Nothing of this record was fitted."
+    first, last = t[fitted][[0, -1]].tolist()
+    return (
+        f"Fitted were the samples from {first:.6g} s to {last:.6g} s, of {t[0]:.6g} s to {t[-1]:.6g} s. The others are "
+        f"drawn as '{charts.UNFITTED}'; no figure, no histogram and no map counts them. Voltage before the part that "
+        "was fitted still moves the memory."
+    )
+
+
+def _show(page: Page, name: str, traces: _Traces, noise: float) -> None:
     """Add the charts of one axis."""
-    motion, left = Motion.of(t, v), y - simulated
-    models = [Curve("model", simulated, AFTER)]
+    t, v, y, fitted = traces.t, traces.v, traces.y, traces.fitted
+    motion, left = Motion.of(t, v), y - traces.simulated
+    models = [Curve("model", traces.simulated, AFTER)]
     page.section("The record and the model, free-run from its start")
-    loops, said = charts.loops(v, y, models, motion)
+    loops, said = charts.loops(v, y, models, motion, fitted)
     beside = "Displacement over voltage; beside it without the straight line through it, so that the loops open."
     page.chart(f"{name}-loops", loops, f"{beside} {said}")
-    over_time, said = charts.over_time(t, y, models, noise)
+    over_time, said = charts.over_time(t, y, models, noise, fitted=fitted)
     page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus and minus the noise. {said}")
     page.section("What the model leaves")
-    over_voltage, said = charts.over_voltage(v, left, motion, noise)
+    over_voltage, said = charts.over_voltage(v, left, motion, noise, fitted)
     how = "Over voltage, where it rises and where it falls, and how often each value comes."
     page.chart(f"{name}-residual", over_voltage, f"{how} {said}")
     page.chart(
         f"{name}-coverage",
-        charts.coverage(v, left, motion),
-        "What the record visited: from which voltage a branch began, and where on it the samples lie. Branches above "
-        "the diagonal rise, those below it fall. Where it is white the model only continues smoothly.",
+        charts.coverage(v, np.where(fitted, left, np.nan), motion),
+        "What was fitted: from which voltage a branch began, and where on it the fitted samples lie. Branches above "
+        "the diagonal rise, those below it fall. Where it is white nothing was fitted: there the model only continues "
+        "smoothly.",
     )

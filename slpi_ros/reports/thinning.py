@@ -13,6 +13,8 @@ LINE_POINTS, CLOUD_POINTS = 5000, 1500
 def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
     """Return the samples that draw lines as all of them would: of each stretch every signal's extremes, and the ends.
 
+    Where a signal is NaN for as long as a stretch, one of them is kept too: a line is interrupted there.
+
     Parameters
     ----------
     *signals : ndarray, shape (N,)
@@ -36,10 +38,18 @@ def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
         padded[:size] = signal
         rows = padded.reshape(stretches, length)
         offset = np.arange(stretches) * length
+        kept.append(_holes(signal, length))
         kept += [offset + np.argmin(np.where(np.isnan(rows), np.inf, rows), axis=1)]
         kept += [offset + np.argmax(np.where(np.isnan(rows), -np.inf, rows), axis=1)]
     found = np.unique(np.concatenate(kept))
     return found[found < size]
+
+
+def _holes(signal: FloatArray, length: int) -> IntArray:
+    """Return where a signal, shape (N,), is NaN for `length` samples or more: the first of each such row."""
+    missing = np.pad(np.isnan(signal), 1).astype(np.int8)
+    first, after = np.flatnonzero(np.diff(missing) > 0), np.flatnonzero(np.diff(missing) < 0)
+    return first[after - first >= length]
 
 
 def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArray:

@@ -4,7 +4,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,13 +41,20 @@ NAME = "/identify: identify"
 QUICK = {"kind": "pi", "diagnostic_period": 0.2}
 
 
-def write_calibration(path: Path, seed: int = 1, samples: int = 600, hum: float = 0.0) -> str:
+def write_calibration(
+    path: Path,
+    seed: int = 1,
+    samples: int = 600,
+    hum: float = 0.0,
+    axes: Sequence[str] = ("x",),
+    hardware_id: str = "stage 7",
+) -> str:
     """Write a bag of 200 samples per second, with a hum (m) of 30 Hz."""
     v = voltage_path(samples, seed)
     y = stage_model().axis("x").simulate(np.arange(samples), v) + np.random.default_rng(seed).normal(0.0, 5e-9, samples)
     y += hum * np.sin(2 * np.pi * 30.0 * np.arange(samples) / 200.0)
     stamps = 1_700_000_000_000_000_000 + np.arange(samples, dtype=np.int64) * 5_000_000
-    write_bag(path, Record(stamps, {"x": v}, {"x": y}, hardware_id="stage 7"))
+    write_bag(path, Record(stamps, dict.fromkeys(axes, v), dict.fromkeys(axes, y), hardware_id=hardware_id))
     return str(path)
 
 
@@ -221,6 +228,70 @@ def test_bags_completed_in_the_watched_folder_are_identified(tmp_path):
         answer = client.graph.call(Trigger, "/identify/identify", Trigger.Request())
         assert answer.success and str(new) in answer.message
         client.identified(3)
+
+
+def test_a_bag_whose_recording_was_killed_is_told_once_and_stays_watched(tmp_path):
+    whole, killed, junk = tmp_path / "elsewhere", tmp_path / "watched" / "killed", tmp_path / "watched" / "junk.mcap"
+    write_calibration(whole)
+    (recorded,) = whole.glob("*.mcap")
+    killed.mkdir(parents=True)
+    (killed / recorded.name).write_bytes(recorded.read_bytes())
+    junk.write_bytes(b"junk")
+    long_ago = time.time() - 3600.0
+    for path in (killed / recorded.name, killed, junk):
+        os.utime(path, (long_ago, long_ago))
+    with identifying(watch_directory=str(killed.parent)) as client:
+        told = client.status(lambda status: "abandoned" in status.message, "a word on what was abandoned")
+        assert told.level == b"\1" and str(killed) in told.message and str(junk) in told.message
+        assert "ros2 bag reindex" in told.message and "delete" in told.message and "\n" not in told.message
+        assert values_of(told)["abandoned_bags"] == "2"
+        later = time.monotonic() + 1.5
+        client.graph.spin_until(lambda: time.monotonic() > later, "a few looks")
+        assert client.node.stderr.count("abandoned") == 2
+        junk.unlink()
+        (killed / "metadata.yaml").write_bytes((whole / "metadata.yaml").read_bytes())
+        assert source_of(client.identified()) == str(killed)
+        healthy = client.status(lambda status: status.level == b"\0", "health")
+        assert values_of(healthy)["abandoned_bags"] == "0"
+
+
+@pytest.mark.parametrize(
+    ("other", "why"),
+    [({"hardware_id": "stage 8"}, "stage 'stage 8'"), ({"axes": ("y",)}, "no axis 'x'")],
+    ids=["another stage", "another axis"],
+)
+def test_a_bag_of_another_stage_replaces_no_model(tmp_path, other, why):
+    watched, output = tmp_path / "watched", tmp_path / "model.json"
+    write_calibration(watched / "first")
+    with identifying(watch_directory=str(watched), output=str(output)) as client:
+        first = client.identified()
+        # Which stage it is may be left open, but not forgotten.
+        nameless = write_calibration(watched / "nameless", seed=2, hardware_id="", axes=("x", "y"))
+        assert source_of(client.identified(2)) == nameless
+        assert set(json.loads(client.models[1].data)["axes"]) == {"x", "y"}
+        write_calibration(watched / "again", seed=3, axes=("x", "y"))
+        again = client.identified(3)
+        strange = write_calibration(watched / "strange", seed=4, **{"axes": ("x", "y"), **other})
+        client.failed(strange)
+        status = client.status(lambda status: why in status.message, why)
+        assert "a node and a folder of its own" in status.message
+        assert output.read_text() == again != first
+        answer = client.graph.call(Trigger, "/identify/identify", Trigger.Request())
+        assert answer.success and strange in answer.message
+        client.failed(strange)
+        assert len(client.models) == 3
+        # Who names it means it.
+        assert client.set(bags=[strange]) == ""
+        assert strange in client.identified(4)
+
+
+def test_the_stage_of_another_folder_is_another_one(tmp_path):
+    mine = write_calibration(tmp_path / "mine" / "bag")
+    yours = write_calibration(tmp_path / "yours" / "bag", axes=("y",), hardware_id="stage 8")
+    with identifying(watch_directory=str(tmp_path / "mine")) as client:
+        assert source_of(client.identified()) == mine
+        assert client.set(watch_directory=str(tmp_path / "yours")) == ""
+        assert yours in client.identified(2)
 
 
 def test_trigger_without_anything_to_do():

@@ -1,12 +1,13 @@
 """The page of an identification: its numbers, whatever the record, and in a real browser."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from identification.records import calibration, record_of
 from reports.browser import Browser
-from reports.pages import parsed, trace
+from reports.pages import parsed, trace, unpacked
 
 import slpi_ros
 from slpi_ros.errors import UsageError
@@ -82,8 +83,87 @@ def test_charts_hold_record_and_model(written, identified):
     _, error = trace(charts["x-held-out"], "slpi")
     _, classical = trace(charts["x-held-out"], "classical PI")
     assert np.nanmin(error) < 0.0 == np.nanmax(error) and np.nanmin(classical) == 0.0 < np.nanmax(classical)
-    counts, _ = trace(charts["x-residual"], "all samples", "y2")
+    counts, _ = trace(charts["x-residual"], "fitted samples", "y2")
     assert counts.sum() == len(record)
+    assert "not fitted" not in json.dumps(charts)
+
+
+def maps_of(chart):
+    """Return the maps of a chart, each shape (n, n); 0 where they are empty."""
+    maps = [one["z"] for one in chart["data"] if one["type"] == "heatmap"]
+    return [np.nan_to_num(unpacked(z)).reshape([int(n) for n in z["shape"].split(",")]) for z in maps]
+
+
+def test_what_was_not_fitted_is_marked_and_counts_nowhere(identified, written, tmp_path):
+    record, model = identified
+    path = write_report(tmp_path, record, model, truth={"x": truth_of(record)}, start=3.0, stop=9.0)
+    charts, whole = parsed(path).charts, parsed(written).charts
+    fitted = (record.t >= 3.0) & (record.t < 9.0)
+    left = (record.displacement["x"] - model.simulate(record.t, record.voltage["x"]))[fitted]
+    counts, errors = maps_of(charts["x-coverage"])
+    all_counts, _ = maps_of(whole["x-coverage"])
+    # Each sample lies where it lies in the whole record: what was before still says where branches began.
+    assert counts.sum() == fitted.sum() and np.all(counts <= all_counts)
+    assert np.isclose((counts * errors**2).sum(), ((left * 1e9) ** 2).sum(), rtol=1e-5)
+    assert trace(charts["x-residual"], "fitted samples", "y2")[0].sum() == fitted.sum()
+    # Nothing is hidden: the rest is there, but apart.
+    assert np.isfinite(trace(charts["x-residual"], "not fitted")[1]).any()
+    for name in ("measured", "model"):
+        lines = [trace(charts["x-loops"], part)[1] for part in (name, f"{name}, not fitted")]
+        assert all(np.isfinite(line).any() for line in lines)
+        assert np.array_equal(*map(np.isfinite, (lines[0], np.where(np.isfinite(lines[1]), np.nan, 0.0))))
+    shaded = [shape for shape in charts["x-time"]["layout"]["shapes"] if shape.get("name") == "not fitted"]
+    spans = [(shape["xref"], pytest.approx(shape["x0"]), pytest.approx(shape["x1"])) for shape in shaded]
+    ends = ((0.0, 3.0), (9.0, record.t[-1]))
+    assert sorted(spans, key=str) == sorted([(x, *span) for x in ("x", "x2") for span in ends], key=str)
+    assert [shape["showlegend"] for shape in shaded] == [True, False, False, False]
+    assert "from 3 s to 8.995 s" in path.read_text(encoding="utf-8")
+
+
+def test_the_legend_hides_what_was_not_fitted(identified, tmp_path):
+    browser = Browser(tmp_path / "profile")
+    try:
+        browser.open(write_report(tmp_path, *identified, start=3.0, stop=9.0))
+        shaded = (
+            "[...document.querySelectorAll('#x-time .shapelayer path')]"
+            ".filter(path => path.style.fill === 'rgb(251, 236, 203)').length"
+        )
+        assert browser.run(shaded) == 4
+        browser.click_legend("x-time", "not fitted")
+        browser.until(f"{shaded} === 0")
+        browser.click_legend("x-time", "not fitted")
+        browser.until(f"{shaded} === 4")
+        assert not browser.complaints()
+    finally:
+        browser.close()
+
+
+@pytest.mark.parametrize("duration", [15.0, 60.0])
+def test_no_reading_is_a_gap(duration, tmp_path):
+    t = np.arange(round(duration * 200)) / 200.0
+    v = 0.5 + 0.4 * np.sin(2.0 * t)
+    y = 1e-6 * (1.0 + v)
+    missing = (t > 3.0) & (t < 4.5)
+    y[missing] = np.nan
+    charts = parsed(write_report(tmp_path, record_of(t, v, y), small_model())).charts
+    for axis, name in (("y", "measured"), ("y2", "model")):
+        when, drawn = trace(charts["x-time"], name, axis)
+        inside = (when > 3.001) & (when < 4.499)
+        assert np.isnan(drawn[inside]).all() and inside.any() and np.isfinite(drawn[~inside]).all()
+    assert np.nanmin(trace(charts["x-loops"], "measured")[1]) > 1.09
+    assert trace(charts["x-residual"], "fitted samples", "y2")[0].sum() == maps_of(charts["x-coverage"])[0].sum()
+    assert maps_of(charts["x-coverage"])[0].sum() == np.count_nonzero(~missing)
+
+
+def test_a_sensor_slower_than_the_record_is_seen(tmp_path):
+    t = np.arange(1000) / 200.0
+    v = 0.5 + 0.4 * np.sin(2.0 * t)
+    y = np.where(np.arange(t.size) % 4, np.nan, 1e-6 * v)
+    chart = parsed(write_report(tmp_path, record_of(t, v, y), small_model())).charts["x-time"]
+    assert {one["name"]: one["mode"] for one in chart["data"] if one["yaxis"] == "y"} == {
+        "measured": "lines+markers",
+        "model": "lines",
+    }
 
 
 def test_nothing_is_taken_from_elsewhere(written):

@@ -37,3 +37,15 @@ def test_clouds_keep_extremes_of_finite_samples(size, most, seed):
     assert np.isfinite(y[kept]).all() and np.all(np.diff(kept) > 0) and kept.size <= most
     if np.isfinite(y).any():
         assert y[kept].max() == np.nanmax(y) and y[kept].min() == np.nanmin(y)
+
+
+def test_a_long_hole_stays_one():
+    y = np.sin(np.arange(100_000) / 777.0)
+    y[40_430:40_560] = np.nan
+    y[::2001] = np.nan
+    # As long as a stretch of 101 samples, but none of them is missing as a whole.
+    kept = thin_line(y, most=2_000)
+    holes = kept[np.isnan(y[kept])]
+    assert np.any((holes >= 40_430) & (holes < 40_560))
+    # One reading that is missing is less than a stretch, and interrupts nothing.
+    assert np.all((holes >= 40_430) & (holes < 40_560) | (holes == 0))

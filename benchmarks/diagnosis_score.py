@@ -112,7 +112,10 @@ def _compared(hidden: Hidden, axis: str, found) -> AxisOutcome:
             wrong = parameter_errors(each, effect, hidden)
             contribution = found.traces.contributions.get(each.name)
             if contribution is not None:
-                wrong["contribution"] = contribution_error(hidden.record.voltage[axis], contribution, each)
+                seen = np.isin(hidden.record.t, found.traces.t)
+                wrong["contribution"] = contribution_error(
+                    hidden.record.voltage[axis][seen], contribution, each.contribution[seen]
+                )
             errors |= {(each.name, parameter): error for parameter, error in wrong.items()}
     return AxisOutcome(
         verdict=found.verdict,
@@ -134,9 +137,9 @@ def _best_rms(hidden: Hidden, axis: str, truth: tuple[Truth, ...]) -> float:
     return float(slpi_ros.identify(without).axes[axis].quality.held_out_rms)
 
 
-def contribution_error(v, found, truth: Truth) -> float:
+def contribution_error(v, found, truth) -> float:
     """Return the rms of what is wrong with a contribution, beyond what hysteresis takes up, relative to the truth."""
-    return beyond_hysteresis(v, found - truth.contribution) / beyond_hysteresis(v, truth.contribution)
+    return beyond_hysteresis(v, found - truth) / beyond_hysteresis(v, truth)
 
 
 def parameter_errors(truth: Truth, effect, hidden: Hidden) -> dict[str, float]:

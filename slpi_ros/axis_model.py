@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.chain import Chain, Middle, backward, forward, loop_middle
+from slpi_ros.chain import Chain, Middle, backward, forward, loop_middle, reaching
 from slpi_ros.effect_stream import EffectStream
 from slpi_ros.effects.effect import Around, Effect
 from slpi_ros.effects.registry import in_order
@@ -153,9 +153,9 @@ class AxisModel:
         if not self.effects:
             return self._forward_array(v)
         around = Around(t - t[:1])
-        u = forward(self.chain.before, v, around)
+        u, aside = reaching(self.chain.before, v, around)
         middle = self._middle if self.chain.rate_dependence else None
-        return forward(self.chain.own, self._forward_array(u), replace(around, u=u, middle=middle))
+        return forward(self.chain.own, self._forward_array(u) + aside, replace(around, u=u, middle=middle))
 
     def seen(self, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
         """Return the displacement that a sensor sees, shape (N,), metres.
@@ -208,9 +208,30 @@ class AxisModel:
         chain, (lowest, highest) = self.chain, self.chain.clipped
         between = replace(allowed, lower=max(allowed.lower, lowest), upper=max(min(allowed.upper, highest), lowest))
         around = Around(t - t[:1], middle=self._middle if chain.rate_dependence else None)
+        if chain.coercivity and self.causal:
+            return self._through_play(around, own, allowed, between)
         h, u = chain.hysteresis_for(own, around, lambda h: self._invert_hysteresis(h, between)[0])
         held = self._missed(h, u, between)
-        wanted = backward(chain.before, u, around)
+        return self._kept(backward(chain.before, u, around), held, allowed)
+
+    def _through_play(
+        self, around: Around, own: FloatArray, allowed: Limits, between: Limits
+    ) -> tuple[FloatArray, Mask]:
+        """Return what `command` does where the hysteresis sees the voltage through a play: one sample after another."""
+        chain = self.chain
+        h = backward(chain.own, own, around)
+        stream = EffectStream(
+            self.memory(), self.displacement_range, between, replace(chain, before=chain.before[-1:], own=(), shared=())
+        )
+        u, held = np.empty_like(h), np.zeros(h.size, dtype=np.bool_)
+        for place, (dt, wish) in enumerate(
+            zip(np.diff(around.t, prepend=around.t[:1]).tolist(), h.tolist(), strict=True)
+        ):
+            u[place] = stream.move(dt, wish)
+            held[place] = stream.held
+        return self._kept(backward(chain.before[:-1], u, around), held, allowed)
+
+    def _kept(self, wanted: FloatArray, held: Mask, allowed: Limits) -> tuple[FloatArray, Mask]:
         v = np.clip(wanted, allowed.lower, allowed.upper)
         width = self.voltage_range[1] - self.voltage_range[0]
         return v, held | (np.abs(v - wanted) > ROUNDING * width)

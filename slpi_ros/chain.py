@@ -1,6 +1,6 @@
 """The effects around the hysteresis of one axis, along whole paths."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,6 +58,12 @@ class Chain:
         return first if isinstance(first, RateDependence) else None
 
     @property
+    def coercivity(self) -> RateDependence | None:
+        """The effect through which the hysteresis sees the voltage; None: there is none."""
+        last = self.before[-1] if self.before else None
+        return last if isinstance(last, RateDependence) else None
+
+    @property
     def gains(self) -> Mapping[str, float]:
         """How much of which other axis comes in, metres per metre."""
         return next((effect.gains for effect in self.shared if isinstance(effect, CrossCoupling)), {})
@@ -87,20 +93,34 @@ class Chain:
         inverse : callable
             The inverse hysteresis from its start: metres to volts.
         """
-        rate = self.rate_dependence
+        rate, coercivity = self.rate_dependence, self.coercivity
         h = backward(self.own[1:] if rate else self.own, own, around)
         u = inverse(h)
-        if not rate:
+        if not rate and not coercivity:
             return h, u
         slower, last_change = h, np.inf
         for _ in range(_TRIALS):
-            tried = rate.invert(slower, replace(around, u=u))
+            if rate:
+                tried = rate.invert(slower, replace(around, u=u))
+            elif coercivity:
+                tried = slower - coercivity.aside(coercivity.invert(u, around), u)
             change = float(np.abs(tried - h).max(initial=0.0))
             if not change < last_change:
                 break
             h, last_change = tried, change
             u = inverse(h)
         return h, u
+
+
+def reaching(effects: Sequence[Effect], v: FloatArray, around: Around) -> tuple[FloatArray, FloatArray]:
+    """Return what effects let a command reach the hysteresis, and what goes round it: shape (N,), volts and metres."""
+    u, aside = v, np.zeros_like(v)
+    for effect in effects:
+        if effect.side == "voltage":
+            before, u = u, effect.apply(u, around)
+            if isinstance(effect, RateDependence):
+                aside = effect.aside(before, u)
+    return u, aside
 
 
 def forward(effects: tuple[Effect, ...], signal: FloatArray, around: Around) -> FloatArray:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.chain import Chain
+from slpi_ros.effects.coercivity import CoercivityFollower
 from slpi_ros.effects.creep import CreepFollower
 from slpi_ros.effects.effect import DrivenFollower, Follower
 from slpi_ros.effects.rate_dependence import RateDependence
@@ -17,6 +18,9 @@ from slpi_ros.stream import LONGEST_STEP, ROUNDING, AxisStream, Limits, StreamSt
 
 FloatArray = NDArray[np.float64]
 Followers = dict[str, Follower]
+
+# A coercivity depends on the voltage that it leads to, but little: so often it is tried again.
+TRIALS = 4
 
 
 class EffectStream(AxisStream):
@@ -56,6 +60,8 @@ class EffectStream(AxisStream):
             for effect in chain.before
             if effect.name != "saturation" and (follower := effect.follower())
         }
+        played = self._before.get(RateDependence.name)
+        self._play = played if isinstance(played, CoercivityFollower) else None
         self._own: Followers = {effect.name: follower for effect in chain.own if (follower := effect.follower())}
         self._sensor: Followers = {effect.name: follower for effect in chain.shared if (follower := effect.follower())}
         for follower in self._before.values():
@@ -66,7 +72,8 @@ class EffectStream(AxisStream):
             rate.attach(lambda u: float(middle(np.array(u))))
             rate.drive(0.0, memory.voltage)
         self._v, self._place = memory.voltage, memory.displacement
-        self._late = self._stuck = False
+        # What the last wish asks of the voltage beyond what it gives (m or V), and of the axis as a whole (m).
+        self._missing = self._short = 0.0
 
     @property
     def limits(self) -> Limits:
@@ -90,12 +97,17 @@ class EffectStream(AxisStream):
     @property
     def missed(self) -> bool:
         """Whether the last wish is not met, for whatever limit."""
-        return self._late
+        return self._missing != 0.0
 
     @property
     def held(self) -> bool:
-        """Whether the last wish could not be met: the voltage waits at one of its limits."""
-        return self._late and (self._stuck or self._v in (self.limits.lower, self.limits.upper))
+        """Whether the voltage waits at the limit beyond which the last wish lies."""
+        limits = self.pace.limits
+        # What goes through effects comes to a limit but for rounding; what undoes them may ask for a detour.
+        if min(self._missing, self._short) > 0.0:
+            return self._v >= limits.upper - ROUNDING * (1.0 + abs(limits.upper))
+        below = max(self._missing, self._short) < 0.0
+        return below and self._v <= limits.lower + ROUNDING * (1.0 + abs(limits.lower))
 
     def unseen(self, y: float) -> float:
         """Return the place (m) at which a sensor sees the displacement `y` (m)."""
@@ -116,19 +128,20 @@ class EffectStream(AxisStream):
             # The voltage has stayed: only the last part of a pause may lead to the new one.
             counted = LONGEST_STEP
             self.wait(dt - counted)
-        h = self.unseen(y) - self.coupled
+        h = wish = self.unseen(y) - self.coupled
         for follower in reversed(self._own.values()):
             h = follower.inverse(counted, h)
         v = self._move_before(dt, counted, h) if self._before else self._move_at_once(dt, h)
         self.wish, self._v = h, v
         self._answer(counted)
+        self._short = wish - self._place
         return v
 
     def drive(self, voltage: float, dt: float = 0.0) -> float:
         """Move to a voltage (V), `dt` (s) after the last one, whatever is wished for; return the displacement (m)."""
         self._v = self._goal = voltage
         self.memory.forward(self._reaching(dt, voltage))
-        self.wish, self._late = self.memory.displacement, False
+        self.wish, self._missing = self.memory.displacement, 0.0
         self._answer(dt)
         return self._seen()
 
@@ -151,12 +164,12 @@ class EffectStream(AxisStream):
 
     def resume(self, before: AxisStream) -> None:
         """Go on where another model's stream has been; its voltage stays, and what its effects have begun."""
-        self.pace.rate, self._v, self._goal = before.pace.rate, before.voltage, before.voltage
-        if not self._before:
-            self.memory.forward(before.voltage)
-        for follower in self._before.values():
-            # The command jumps there, and no time passes.
-            follower.forward(0.0, before.voltage)
+        self.pace.go_on(before.pace)
+        self._v = self._goal = before.voltage
+        if self._play and isinstance(before, EffectStream) and before._play:
+            self._play.restore(before._play.snapshot())
+        # The command jumps there, and no time passes.
+        self.memory.forward(self._reaching(0.0, before.voltage))
         if isinstance(before, EffectStream):
             for name, follower in self._own.items():
                 other = before._own.get(name)
@@ -168,31 +181,60 @@ class EffectStream(AxisStream):
         """Return a stream in the same state, which moves on its own."""
         twin = super().twin()
         assert isinstance(twin, EffectStream)
-        twin._before, twin._own, twin._sensor = deepcopy((self._before, self._own, self._sensor))
+        twin._before, twin._own, twin._sensor, twin._play = deepcopy(
+            (self._before, self._own, self._sensor, self._play)
+        )
         return twin
 
     def _move_at_once(self, dt: float, h: float) -> float:
         """Move where the command reaches the hysteresis as it is."""
         v = super().move(dt, h)
-        self._late = abs(self.memory.displacement - h) > self._rounding
+        self._missing = self._beyond_rounding(h)
         return v
 
     def _move_before(self, dt: float, counted: float, h: float) -> float:
         """Move where something stands between command and hysteresis."""
         memory, pace = self.memory, self.pace
-        limits, state = pace.limits, memory.snapshot()
-        goal = u = memory.inverse(h, limits.lower, limits.upper)
-        self._stuck = abs(memory.displacement - h) > self._rounding
+        state = memory.snapshot()
+        goal, aside = self._played(h)
+        u = memory.voltage
+        self._missing = self._beyond_rounding(h - aside)
         for follower in reversed(self._before.values()):
-            goal = follower.inverse(counted, goal)
+            if follower is not self._play:
+                goal = follower.inverse(counted, goal)
         v = pace.step(self._v, goal, dt, self._goal)
-        self._late = self._stuck or abs(v - goal) > ROUNDING * (1.0 + abs(goal))
+        if not self._missing and abs(goal - v) > ROUNDING * (1.0 + abs(goal)):
+            self._missing = goal - v
         self._goal = goal
         reached = self._reaching(counted, v)
         if reached != u:
             memory.restore(state)
             memory.forward(reached)
         return v
+
+    def _beyond_rounding(self, h: float) -> float:
+        """Return how far (m) the hysteresis is from where it is asked to be; 0 where that is rounding."""
+        missing = h - self.memory.displacement
+        return missing if abs(missing) > self._rounding else 0.0
+
+    def _played(self, h: float) -> tuple[float, float]:
+        """Move the memory for a wish (m); return the voltage (V) it takes before the play, and what goes round (m)."""
+        memory, limits, play = self.memory, self.pace.limits, self._play
+        if not play:
+            return memory.inverse(h, limits.lower, limits.upper), 0.0
+        state, rest = memory.snapshot(), memory.displacement
+        v, direction = play.within(h - rest)
+        if v is not None:
+            return v, play.between(v, memory.voltage)
+        u, aside = memory.voltage, 0.0
+        for _ in range(TRIALS):
+            v = play.ahead(u, direction)
+            aside = play.between(v, u)
+            wanted = max(h - aside, rest) if direction > 0 else min(h - aside, rest)
+            memory.restore(state)
+            u = memory.inverse(wanted, limits.lower, limits.upper)
+        v = play.ahead(u, direction)
+        return v, play.between(v, u)
 
     def _reaching(self, dt: float, v: float) -> float:
         """Let a command (V) go through to the hysteresis; return the voltage (V) that arrives."""
@@ -202,7 +244,7 @@ class EffectStream(AxisStream):
 
     def _answer(self, dt: float) -> None:
         """Let the effects follow what the hysteresis does."""
-        place = self.memory.displacement
+        place = self.memory.displacement + (self._play.aside if self._play else 0.0)
         if rate := self._driven():
             rate.drive(dt, self.memory.voltage)
         for follower in self._own.values():

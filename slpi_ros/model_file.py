@@ -80,6 +80,17 @@ def parse_model(text: str, source: str) -> StageModel:
         validate(document, "model", source)
     except RecursionError:
         raise ModelError(f"{source}: not a model document: nested too deeply; identify the stage again") from None
+    return model_from(document, source)
+
+
+def model_from(document: dict[str, Any], source: str) -> StageModel:
+    """Build a model from a document that follows the schema; `source` names it in messages.
+
+    Raises
+    ------
+    ModelError
+        If its numbers contradict each other.
+    """
     try:
         axes = {name: _axis_from(axis) for name, axis in document["axes"].items()}
     except (ModelError, OverflowError) as error:

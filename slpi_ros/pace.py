@@ -72,11 +72,16 @@ class Pace:
         Of the last step.
     """
 
-    __slots__ = ("limits", "rate")
+    __slots__ = ("_dt", "limits", "rate")
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
-        self.rate = 0.0
+        self.rate = self._dt = 0.0
+
+    @property
+    def in_motion(self) -> bool:
+        """Whether the limit of acceleration forbids to stand still at the next sample."""
+        return abs(self.rate) > self.limits.acceleration * self._dt
 
     def counted(self, elapsed: float) -> float:
         """Return how much of the time since the last step (s) counts; after a pause the voltage starts from rest."""
@@ -127,11 +132,15 @@ class Pace:
     def moved(self, way: float, dt: float) -> None:
         """Remember how fast the last step went: `way` (V) in `dt` (s)."""
         if dt > 0.0:
-            self.rate = way / dt
+            self.rate, self._dt = way / dt, dt
 
     def rest(self) -> None:
         """Start anew from a voltage at rest."""
         self.rate = 0.0
+
+    def go_on(self, before: "Pace") -> None:
+        """Go on as fast as another pace has been going."""
+        self.rate, self._dt = before.rate, before._dt
 
     def _ways(self, present: float, dt: float) -> tuple[float, float]:
         """Return how far (V) down and up slew, acceleration and room to brake allow."""

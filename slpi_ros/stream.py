@@ -174,7 +174,7 @@ class AxisStream:
 
     def resume(self, before: "AxisStream") -> None:
         """Go on where another model's stream has been; its voltage stays, and what its effects have begun."""
-        self.pace.rate = before.pace.rate
+        self.pace.go_on(before.pace)
         if self.voltage != before.voltage:
             self.drive(before.voltage)
 
@@ -202,8 +202,9 @@ class AxisStream:
 
     @property
     def held(self) -> bool:
-        """Whether the last wish could not be met: the voltage waits at one of its limits."""
-        return self.missed and self.memory.voltage in (self.limits.lower, self.limits.upper)
+        """Whether the voltage waits at the limit beyond which the last wish lies."""
+        missing, v, limits = self.wish - self.memory.displacement, self.memory.voltage, self.pace.limits
+        return (missing > self._rounding and v >= limits.upper) or (missing < -self._rounding and v <= limits.lower)
 
     @property
     def missed(self) -> bool:
@@ -218,10 +219,10 @@ def accepted_range(displacement_range: tuple[float, float]) -> tuple[float, floa
     return low - margin, high + margin
 
 
-def refusal(y: float, accepted: tuple[float, float]) -> str:
-    """Say that the displacement `y` (m) is refused."""
+def refusal(y: float, accepted: tuple[float, float], kind: str = "desired") -> str:
+    """Say that the displacement `y` (m), desired or measured, is refused."""
     return (
-        f"desired displacement {y * 1e6:.6g} um is far outside what the model was identified on "
+        f"{kind} displacement {y * 1e6:.6g} um is far outside what the model was identified on "
         f"(accepted: {accepted[0] * 1e6:.6g} to {accepted[1] * 1e6:.6g} um); "
         "check units and offset, or identify on a larger range"
     )

@@ -147,6 +147,30 @@ def test_what_is_met_is_not_held():
     assert not stream.held
 
 
+@pytest.mark.parametrize("limits", [Limits(0.0, 100.0, 50.0), Limits(0.0, 100.0, 50.0, 1e3)])
+@pytest.mark.parametrize("within", [True, False])
+def test_an_axis_that_leaves_its_limit_as_fast_as_it_may_is_not_held(limits, within):
+    """Neither is one on its way to a limit: only there, and if the wish lies beyond it."""
+    stream = stream_of(limits=limits)
+    for k in range(400):
+        v = stream.step(0.01 * k, 10e-6 if within else 16e-6)
+        assert stream.held == (v == 100.0)
+    assert stream.missed != within and stream.held != within
+    assert v - 9.0 < stream.step(4.0, 6e-6) <= v and stream.missed and not stream.held
+
+
+@given(streams(st.just(np.inf) | fractions(1, 1000)))
+def test_held_is_what_would_stay_however_fast_it_might_go(drawn):
+    case, limits, samples = drawn
+    stream = stream_of(case, limits, everywhere(case))
+    for t, y in samples:
+        v = stream.step(t, y)
+        if stream.missed:
+            assert stream.held == (stream.twin().memory.inverse(y, limits.lower, limits.upper) == v)
+        else:
+            assert not stream.held
+
+
 def test_check_agrees_with_step_on_what_no_voltage_reaches():
     """A range as wide as that is in no record, but may be in a document."""
     flat = Case(PrandtlIshlinskii(np.array([0.0]), np.array([1e-9])), (0.0, 0.0), False, (0.0, 100.0), ())

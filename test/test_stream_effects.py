@@ -116,6 +116,21 @@ def test_a_slow_axis_is_missed_but_not_held():
     assert not stream.held
 
 
+@pytest.mark.parametrize("effects", SETS, ids=ids)
+def test_an_axis_at_a_limit_is_held_only_where_its_wish_lies_beyond(effects):
+    limits = Limits(20.0, 60.0, 100.0)
+    for wish, held in ((6e-6, False), (12e-6, True)):
+        stream = with_effects(*effects).stream(limits)
+        assert stream.step(0.0, wish) == limits.lower
+        assert stream.missed and not stream.held
+        on_the_way = [(stream.step(k * DT, wish) < limits.upper - 1e-6, stream.held) for k in range(1, 800)]
+        assert sum(way for way, _ in on_the_way) > 10
+        assert not any(there for way, there in on_the_way if way)
+        assert stream.held == stream.missed == held
+    assert stream.step(800 * DT, 6e-6) < limits.upper
+    assert stream.missed and not stream.held
+
+
 def test_memory_follows_what_reaches_the_hysteresis():
     """A short kick of the command does not turn the hysteresis as far as it goes itself."""
     stream = with_effects(LAG).stream()

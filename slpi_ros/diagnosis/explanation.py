@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.chain import reaching
 from slpi_ros.diagnosis.evidence import Evidence
 from slpi_ros.diagnosis.joint import Joint, Score
 from slpi_ros.diagnosis.parameters import bounded, free, moved, names, steps
@@ -46,27 +47,25 @@ class Explanation:
     u : ndarray, shape (N,), volts
         What drives the hysteresis.
     added : ndarray, shape (N,), metres
-        What the effects behind the hysteresis add.
+        What the effects add behind the hysteresis, or lead round it.
     settling : ndarray, shape (N,), metres
         What still goes on at the start of the record from moves before it.
     """
 
-    def __init__(
-        self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None
-    ) -> None:
+    def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
-        self.u = self._drive(self.effects)
+        self.u, self._aside = reaching(self.effects, evidence.v, Around(evidence.t))
         same = like is not None and np.array_equal(like.u, self.u)
         self.joint: Joint = (
             like.joint if like and same else Joint(evidence.problem(self.u), evidence.smoothness, evidence.lead)
         )
-        self.added = np.zeros_like(evidence.y)
+        self.added = self._aside
         self._before = np.column_stack([evidence.beside, settling(self._relaxations, evidence.t, evidence.used)])
         self._fit()
         if any(effect.side == "displacement" for effect in self.effects):
             for _ in range(MOST_TURNS):
                 h, before = self.joint.predict(self._x), self.added
-                self.added = self._behind(self.effects, h, self.u) - h
+                self.added = self._behind(self.effects, h + self._aside, self.u) - h
                 self._fit()
                 if np.ptp(self.added - before) < SETTLED * np.std(self.target - h):
                     break
@@ -124,14 +123,6 @@ class Explanation:
         """What effects may look at."""
         return Around(self.evidence.t, self.u, self._middle, self.evidence.others)
 
-    def _drive(self, effects: Sequence[Effect]) -> FloatArray:
-        """Return the voltage that reaches the hysteresis, shape (N,), volts."""
-        u = self.evidence.v
-        for effect in effects:
-            if effect.side == "voltage":
-                u = effect.apply(u, Around(self.evidence.t))
-        return u
-
     def _behind(self, effects: Sequence[Effect], h: FloatArray, u: FloatArray) -> FloatArray:
         """Return the displacement, shape (N,), metres, that effects make of what the hysteresis gives, `h`."""
         around = replace(self.around, u=u)
@@ -171,8 +162,9 @@ class Explanation:
 
     def _whole(self, effects: Sequence[Effect]) -> FloatArray:
         """Return the prediction, shape (N,), metres, of the same hysteresis with other effects."""
-        u = self._drive(effects)
-        return self.settling + self._behind(effects, self.h if np.array_equal(u, self.u) else self.respond(u), u)
+        u, aside = reaching(effects, self.evidence.v, Around(self.evidence.t))
+        h = self.h if np.array_equal(u, self.u) else self.respond(u)
+        return self.settling + self._behind(effects, h + aside, u)
 
     def prediction_without(self, name: str) -> FloatArray:
         """Return what it would give, shape (N,), metres, if one of its effects were not there and all else as it is."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from slpi_ros.effects.creep import FASTEST, Creep, plausible
 from slpi_ros.effects.effect import Effect
 from slpi_ros.effects.form import usual_step
+from slpi_ros.effects.rate_dependence import RateDependence
 
 FloatArray = NDArray[np.float64]
 
@@ -27,6 +28,8 @@ FREE = {
     "sensor_periodic": ("period", "amplitude", "phase"),
     "hum": ("frequency", "amplitude", "phase"),
 }
+# Of a rate dependence that is a coercivity.
+COERCIVE = ("coercivity", "exponent", "onset", "settling", "reversible")
 # Least values; what is not named may have either sign.
 LEAST = {
     "time_constant": 1e-6,
@@ -37,21 +40,31 @@ LEAST = {
     "amplitude": 0.0,
     "exponent": 0.05,
     "transition": 1e-3,
+    "coercivity": 1e-6,
+    "settling": 1e-4,
+    "onset": 0.1,
+    "reversible": -np.inf,
 }
 # Greatest values, of any effect or of one. What is damped more does not ring.
-MOST = {"damping": 0.4, "exponent": 3.0, "cross_coupling.gains": 0.4}
+MOST = {"damping": 0.4, "exponent": 3.0, "settling": 0.05, "cross_coupling.gains": 0.4}
 # Effects none of whose other parameters may be negative.
 NOT_NEGATIVE = ("creep", "rate_dependence")
 # Parameters that the displacement is linear in, or nearly so at any size.
-LINEAR = ("gains", "values", "widening", "backlash", "seconds")
+LINEAR = ("gains", "values", "widening", "backlash", "seconds", "reversible")
 # At most so many times its own size may a parameter change in one step.
 LARGEST_STEP = 0.7
+
+
+def _free_fields(effect: Effect) -> tuple[str, ...]:
+    if isinstance(effect, RateDependence) and effect.side == "voltage":
+        return COERCIVE
+    return FREE[effect.name]
 
 
 def _items(effect: Effect) -> list[tuple[str, float]]:
     """Return name and value of each free parameter: that of the field, with place or axis where there are several."""
     found: list[tuple[str, float]] = []
-    for name in FREE[effect.name]:
+    for name in _free_fields(effect):
         value = getattr(effect, name)
         if isinstance(value, Mapping):
             found += [(f"{name}.{key}", gain) for key, gain in value.items()]
@@ -76,7 +89,7 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
     """Return the effect with other free parameters, kept where they make sense; `longest`: of time constants, s."""
     left = values.tolist()
     changed: dict[str, Any] = {}
-    for name in FREE[effect.name]:
+    for name in _free_fields(effect):
         value = getattr(effect, name)
         least = LEAST.get(name, 0.0 if effect.name in NOT_NEGATIVE else -np.inf)
         most = longest if name == "time_constants" else MOST.get(name, MOST.get(f"{effect.name}.{name}", np.inf))

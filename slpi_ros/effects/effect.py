@@ -2,6 +2,8 @@
 
 ``v -> delay -> lag -> saturation -> HYSTERESIS -> rate_dependence -> creep -> resonance -> cross_coupling ->
 thermal_drift -> sensor_periodic -> hum -> y``
+
+A rate dependence that is a coercivity comes last before the hysteresis instead, and part of the voltage goes round it.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -76,8 +78,11 @@ class Effect(Protocol):
     """One effect: a frozen dataclass whose fields are its parameters, SI units, and their `uncertainty`."""
 
     name: ClassVar[str]
-    side: ClassVar[Side]
     removable: ClassVar[Removable]
+
+    @property
+    def side(self) -> Side:
+        """What it acts on."""
 
     @property
     def uncertainty(self) -> Mapping[str, float]:

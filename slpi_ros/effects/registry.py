@@ -1,7 +1,7 @@
 """The effects by name: how each is written in a document and read back."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from math import isinf
 from typing import Any, get_origin
 
@@ -68,11 +68,12 @@ def from_document(document: Any) -> Effect:
         raise ModelError(f"no effect {found!r}; this version knows {', '.join(EFFECTS)}")
     given, kind = _mapping(name, "parameters", _member(document, "parameters")), EFFECTS[name]
     wanted = {item.name: item for item in fields(kind) if item.name != "uncertainty"}
-    if given.keys() != wanted.keys():
+    needed = {key for key, item in wanted.items() if item.default is MISSING}
+    if not needed <= given.keys() <= wanted.keys():
         raise ModelError(
             f"effect '{name}' has parameters {', '.join(map(str, given))[:80]!r}; give {', '.join(wanted)}"
         )
-    read = {key: _read(name, item, given[key]) for key, item in wanted.items()}
+    read = {key: _read(name, wanted[key], value) for key, value in given.items()}
     spread = _mapping(name, "uncertainty", document.get("uncertainty", {}))
     uncertainty = {str(key): _number(name, f"uncertainty of {str(key)[:40]!r}", value) for key, value in spread.items()}
     effect: Effect = kind(**read, uncertainty=uncertainty)

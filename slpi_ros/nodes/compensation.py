@@ -1,7 +1,7 @@
 """The compensator without ROS: a desired message in, the voltages of all axes out, or nothing moved."""
 
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from time import monotonic
 
 from slpi_ros.control import PidGains
@@ -9,7 +9,8 @@ from slpi_ros.coupling import Coupling
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.model import StageModel
 from slpi_ros.runtime import rejection
-from slpi_ros.runtime.axis import ASSUMED, RESTORED, Axis
+from slpi_ros.runtime.admission import check, match
+from slpi_ros.runtime.axis import Axis
 from slpi_ros.runtime.clock import SECOND_NS, TimeRules
 from slpi_ros.runtime.counts import Counts
 from slpi_ros.runtime.driving import Driving
@@ -112,7 +113,7 @@ class Compensation:
         for axis, one, stream in prepared:
             axis.use(one, stream)
             if saved:
-                axis.memory_state = RESTORED if saved[axis.name].certain else ASSUMED
+                axis.trust = saved[axis.name].trust(one.voltage_range)
         self.model = model
         coupling = Coupling({axis.name: model.axis(axis.name).chain.gains for axis in self.axes})
         streams = {axis.name: axis.stream for axis in self.axes}
@@ -162,7 +163,8 @@ class Compensation:
         """Answer messages from now on, starting at the present voltages, or no longer."""
         self.active = active
         for axis in self.axes:
-            axis.restart()
+            axis.stamps.restart()
+            axis.rest()
 
     # Messages
 
@@ -198,7 +200,7 @@ class Compensation:
         counts.received += 1
         try:
             axes = self._axes_of(names, len(displacements))
-            self._check(axes, stamp_ns, displacements, now_ns)
+            check(axes, stamp_ns, displacements, now_ns, self._max_age_ns)
         except RejectedError as error:
             counts.by_cause[error.cause] += 1
             raise
@@ -206,7 +208,7 @@ class Compensation:
             self._decouple(dict(zip(names, displacements, strict=True)))
         held = slewing = gap = jump = began = False
         if self.driving.on:
-            self.driving.stop()
+            self.driving.hold(but=axes)
         for axis, y in zip(axes, displacements, strict=True):
             ahead = axis.stamps.accept(stamp_ns) if stamp_ns else axis.stamps.arrive(now_ns)
             was_held = axis.held
@@ -229,11 +231,24 @@ class Compensation:
         return held
 
     def measure(self, names: Sequence[str], displacements: Sequence[float]) -> None:
-        """Note measured displacements (m) of the axes among the names; what is not finite is left out."""
+        """Note measured displacements (m) of the axes among the names.
+
+        Raises
+        ------
+        RejectedError
+            If an axis cannot be there; that is counted and not used, the others are.
+        """
+        rejected: RejectedError | None = None
         for name, y in zip(names, displacements, strict=False):
             axis = self._by_name.get(name)
             if axis:
-                axis.measure(y)
+                try:
+                    axis.measure(y)
+                except RejectedError as error:
+                    self.counts.measured_by_cause[error.cause] += 1
+                    rejected = RejectedError(error.cause, f"axis '{name}': {error}")
+        if rejected:
+            raise rejected
 
     def drive(self, dt: float) -> bool:
         """Move all axes on where they are driven, `dt` (s) later; return whether all have arrived."""
@@ -241,9 +256,16 @@ class Compensation:
         self._show()
         return arrived
 
+    def hold(self, but: Collection[str] = ()) -> None:
+        """Leave the axes where they are or come to rest, but those named, which have somewhere to go."""
+        self.driving.hold([axis for axis in self.axes if axis.name in but])
+
     def follow(self, now_ns: int) -> None:
         """Move on to the points of trajectories that are due, nanoseconds on their clock."""
         self.following.step(now_ns)
+        names = self.following.names
+        if not names or any(axis.in_motion and axis.name not in names for axis in self.axes):
+            self.hold(but=names)
         self._show()
 
     def _decouple(self, desired: Mapping[str, float]) -> None:
@@ -266,45 +288,12 @@ class Compensation:
         if self.driving.resetting:
             raise RejectedError(rejection.RESETTING, "the memory is being reset; wait until reset_memory answers")
         if self.following.on:
-            raise RejectedError(
-                rejection.FOLLOWING, "a trajectory is being followed; wait, or stop it with an empty one"
-            )
+            raise RejectedError(rejection.FOLLOWING, self.following.busy)
         if count != len(names):
-            raise RejectedError(
-                rejection.LENGTH, f"{len(names)} axes but {count} displacements; send one for each axis"
-            )
+            raise RejectedError(rejection.LENGTH, f"{len(names)} axes but {count} displacements; send one for each")
         # Most senders name the same axes every time.
         if names != self._last_names:
-            self._last_axes = self._match(names)
+            self._last_axes = match(names, self._by_name)
             # What may change is copied.
             self._last_names = names[:]
         return self._last_axes
-
-    def _match(self, names: Sequence[str]) -> list[Axis]:
-        if not names:
-            raise RejectedError(rejection.EMPTY, "no axis is named; name the axes to move")
-        if len(set(names)) != len(names):
-            raise RejectedError(rejection.DUPLICATE_AXIS, f"{', '.join(names)}: an axis is named twice; name each once")
-        unknown = [name for name in names if name not in self._by_name]
-        if unknown:
-            raise RejectedError(
-                rejection.UNKNOWN_AXIS, f"no axis '{unknown[0]}'; this node moves {', '.join(self.names)}"
-            )
-        return [self._by_name[name] for name in names]
-
-    def _check(self, axes: Sequence[Axis], stamp_ns: int, displacements: Sequence[float], now_ns: int) -> None:
-        """Reject what an axis would refuse: first for what is asked, then for when."""
-        axis = axes[0]
-        try:
-            for axis, y in zip(axes, displacements, strict=True):
-                axis.check(y)
-            if stamp_ns:
-                for axis in axes:
-                    axis.stamps.check(stamp_ns)
-        except RejectedError as error:
-            raise RejectedError(error.cause, f"axis '{axis.name}': {error}") from None
-        if stamp_ns and 0 < self._max_age_ns < now_ns - stamp_ns:
-            age = (now_ns - stamp_ns) * 1e-9
-            raise RejectedError(
-                rejection.STALE, f"stamped {age:.6g} s ago, longer than max_age; check delays and clocks"
-            )

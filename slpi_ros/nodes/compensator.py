@@ -23,6 +23,7 @@ from slpi_ros.nodes.compensator_priority import ask_for_priority
 from slpi_ros.nodes.compensator_report import Reporter
 from slpi_ros.nodes.compensator_reset import MemoryReset
 from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.compensator_silence import Silence
 from slpi_ros.nodes.compensator_trajectory import TrajectoryFollower
 from slpi_ros.nodes.diagnostics import WARN
 from slpi_ros.nodes.joint_states import as_rclpy_reads
@@ -66,16 +67,17 @@ class Compensator(LifecycleNode):
         self._desired, self._measured = JointStates(), JointStates()
         self._before_voltages = before_numbers(len(told.axes))
         self._failure: SlpiError | None = None
-        self._excursions = self._accepted_before = 0
-        self._fell_silent = False
+        self._excursions = 0
+        self._notes_voltages = told.memory_file != ""
         self._keeper = MemoryKeeper(self, self._compensation, told.memory_file)
-        self._driver = Driver(self, self._compensation, self._publish)
-        self._reporter = Reporter(self, self._compensation, lambda: self._settings)
-        self._follower = TrajectoryFollower(
-            self, self._compensation, self._publish_point, lambda: self._reporter.silent_since_ns
-        )
+        self._driver = Driver(self, self._compensation, self._publish, lambda: self._silence.given_ns)
+        self._silence = Silence(self._compensation, self._driver, lambda: self._settings)
+        self._reporter = Reporter(self, self._compensation, lambda: self._settings, self._silence)
+        self._follower = TrajectoryFollower(self, self._compensation, self._publish_point, self._driver)
         self._reporter.lateness = self._follower.lateness
-        self._reset = MemoryReset(self, self._compensation, self._driver, self._reporter, lambda: self._settings)
+        self._reset = MemoryReset(
+            self, self._compensation, self._driver, self._reporter, self._silence, lambda: self._settings
+        )
         self._models = Models(self, self._compensation, self._keeper, self._reporter, lambda: self._settings)
         # A simulated clock may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -144,8 +146,8 @@ class Compensator(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Answer from now on, starting at the present voltages."""
         self._keeper.save(complete=False)
-        self._accepted_before = self._compensation.counts.accepted
         self._compensation.activate(True)
+        self._silence.begin()
         self._reporter.enter("active")
         return super().on_activate(state)
 
@@ -174,6 +176,7 @@ class Compensator(LifecycleNode):
 
     def destroy_node(self) -> None:
         """End the activity in order, and the node."""
+        self._models.end()
         self._end_activity()
         super().destroy_node()
 
@@ -185,6 +188,8 @@ class Compensator(LifecycleNode):
         safety = self._settings.safety
         if safety.ramps_on_deactivate and self._compensation.model:
             self._driver.ramp_now(safety.voltages, safety.rate)
+        else:
+            self._driver.stop_now()
         self._compensation.activate(False)
         self._keeper.save(complete=True)
 
@@ -206,7 +211,12 @@ class Compensator(LifecycleNode):
 
     def _on_measured(self, data: bytes) -> None:
         _, names, displacements = self._measured.read(data) or as_rclpy_reads(data)
-        self._compensation.measure(names, displacements)
+        try:
+            self._compensation.measure(names, displacements)
+        except RejectedError as error:
+            self._reporter.last_rejection = str(error)
+            self.get_logger().warning(f"measurement rejected: {error}", throttle_duration_sec=LOG_PERIOD)
+            self._reporter.report_at_least(WARN)
 
     def _answer(self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float]) -> None:
         """Publish the voltages for one message, or count why not."""
@@ -223,7 +233,7 @@ class Compensator(LifecycleNode):
         self._publish()
         answered = monotonic_ns()
         self._reporter.timing.note(arrived, answered)
-        self._reporter.silent_since_ns = answered
+        self._silence.given_ns = answered
         if held:
             self._on_held()
 
@@ -237,6 +247,7 @@ class Compensator(LifecycleNode):
             self._reporter.last_rejection = str(error)
             self.get_logger().warning(f"trajectory rejected: {error}", throttle_duration_sec=LOG_PERIOD)
         else:
+            self._silence.after_trajectory()
             self.get_logger().info(
                 f"trajectory: {following.remaining} points to come; of the new ones {following.points_held} wait at a "
                 f"voltage limit, {following.points_slewing} are slowed down by the slew limit"
@@ -245,13 +256,16 @@ class Compensator(LifecycleNode):
 
     def _publish_point(self) -> None:
         self._publish()
-        self._reporter.silent_since_ns = monotonic_ns()
+        self._silence.given_ns = monotonic_ns()
         if not self._compensation.following.on:
             self._reporter.report()
 
     def _publish(self) -> None:
         # As bytes: to make a message of them takes longer than to compensate an axis.
-        self._publisher.publish(self._before_voltages + self._compensation.voltages.tobytes())
+        voltages = self._compensation.voltages.tobytes()
+        self._publisher.publish(self._before_voltages + voltages)
+        if self._notes_voltages:
+            self._keeper.note(voltages)
 
     def _on_held(self) -> None:
         """Warn, once for each excursion."""
@@ -272,17 +286,8 @@ class Compensator(LifecycleNode):
             self._keeper.save(complete=False)
 
     def _watch(self) -> None:
-        """Go to the safe voltages once commands have stopped."""
-        safety = self._settings.safety
-        silent = 0.0 < safety.command_timeout < self._reporter.silence and not self._compensation.following.on
-        if silent and not self._fell_silent:
-            self._reporter.report_at_least(WARN)
-            # Nothing moves before it has been told to.
-            commanded = self._compensation.counts.accepted > self._accepted_before
-            if safety.ramps_on_timeout and commanded and not self._compensation.driving.on:
-                self._compensation.driving.ramp(safety.voltages, safety.rate)
-                self._driver.start()
-        self._fell_silent = silent
+        if self._silence.watch():
+            self._reporter.report()
 
 
 def main() -> int:

@@ -7,8 +7,16 @@ from rclpy.node import Node
 from slpi_ros.errors import SlpiError
 from slpi_ros.model import StageModel
 from slpi_ros.nodes.compensation import Compensation
-from slpi_ros.runtime.axis import KNOWN, RESTORED
-from slpi_ros.runtime.saved_memory import SavedAxis, SavedMemory, load_memory, model_id, save_memory
+from slpi_ros.runtime.last_voltages import LastVoltages
+from slpi_ros.runtime.memory_trust import KNOWN, RESTORED
+from slpi_ros.runtime.saved_memory import (
+    SavedAxis,
+    SavedMemory,
+    last_voltages,
+    load_memory,
+    model_id,
+    save_memory,
+)
 from slpi_ros.stream import Limits
 
 LOG_PERIOD = 60.0
@@ -28,13 +36,11 @@ class MemoryKeeper:
     def __init__(self, node: Node, compensation: Compensation, path: str) -> None:
         self._log = node.get_logger()
         self._compensation, self._path = compensation, path
-        self._last: SavedMemory | None = None
+        self._saved: SavedMemory | None = None
+        self._last: LastVoltages | None = None
 
     def find(self, model: StageModel, limits: Sequence[Limits]) -> Mapping[str, SavedAxis] | None:
-        """Return where the axes were when the node last ended; None when nobody knows.
-
-        After a crash they may have moved on since: what is best known then counts as assumed.
-        """
+        """Return where the axes were when the node last ended; None when nobody knows."""
         if not self._path:
             return None
         try:
@@ -45,9 +51,7 @@ class MemoryKeeper:
         except SlpiError as error:
             self._log.warning(str(error))
             return None
-        return {
-            name: SavedAxis(axis.went_through, axis.certain and saved.complete) for name, axis in saved.axes.items()
-        }
+        return saved.axes
 
     def save(self, complete: bool) -> None:
         """Write the memory, if it has changed; `complete`: nothing will move until the node has ended."""
@@ -59,10 +63,32 @@ class MemoryKeeper:
             for axis in self._compensation.axes
         }
         memory = SavedMemory(model_id(model), complete, axes)
-        if memory == self._last:
+        if memory == self._saved:
             return
         try:
-            save_memory(memory, self._path)
-            self._last = memory
+            mark = save_memory(memory, self._path)
+            self._saved = memory
+            if complete:
+                self._stop_noting()
+            elif self._last:
+                self._last.mark = mark
+            else:
+                self._last = last_voltages(self._path, mark)
         except SlpiError as error:
-            self._log.error(str(error), throttle_duration_sec=LOG_PERIOD)
+            self._complain(error)
+
+    def note(self, voltages: bytes) -> None:
+        """Note what has just been given, for a life after a crash; called for each command."""
+        if self._last:
+            try:
+                self._last.note(voltages)
+            except SlpiError as error:
+                self._complain(error)
+
+    def _stop_noting(self) -> None:
+        if self._last:
+            self._last.discard()
+            self._last = None
+
+    def _complain(self, error: SlpiError) -> None:
+        self._log.error(str(error), throttle_duration_sec=LOG_PERIOD)

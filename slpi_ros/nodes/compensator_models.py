@@ -8,18 +8,13 @@ from std_msgs.msg import String
 
 from slpi_ros.errors import ModelError, SlpiError
 from slpi_ros.model import StageModel
-from slpi_ros.model_file import load_model, parse_model
+from slpi_ros.model_file import load_model
 from slpi_ros.nodes.compensation import Compensation
 from slpi_ros.nodes.compensator_memory import MemoryKeeper
 from slpi_ros.nodes.compensator_report import Reporter
 from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.model_reading import Read, Reading
 from slpi_ros.runtime.saved_memory import model_id
-
-# Characters; documents of stages have some ten thousand.
-LARGEST = 4_000_000
-
-# A model and its fingerprint.
-Read = tuple[StageModel, str]
 
 
 class Models:
@@ -49,7 +44,7 @@ class Models:
         self._compensation, self._keeper, self._reporter, self._settings = compensation, keeper, reporter, settings
         self._in_use = ""
         self._background = ThreadPoolExecutor(1, "stage_model")
-        self._coming: Future[Read] | None = None
+        self._reading: Reading | None = None
 
     def load(self, path: str) -> None:
         """Use the model of a file.
@@ -65,26 +60,34 @@ class Models:
     def on_message(self, message: String) -> None:
         """Use the model of a message soon, or say why not: the one before works on.
 
-        Of those that have not been looked at when a newer one comes, nothing becomes.
+        Of those that have not been read when a newer one comes, nothing becomes.
         """
-        if self._coming:
-            self._coming.cancel()
-        if len(message.data) > LARGEST:
-            self._refuse(ModelError(f"{self._topic}: {len(message.data)} characters are more than {LARGEST}"))
+        self.end()
+        try:
+            self._reading = Reading(message.data, self._topic)
+        except SlpiError as error:
+            self._refuse(error)
             return
-        self._coming = self._background.submit(_read, message.data, self._topic)
-        self._coming.add_done_callback(self._on_read)
+        self._background.submit(self._reading.read).add_done_callback(self._on_read)
 
-    def _on_read(self, coming: Future[Read]) -> None:
+    def end(self) -> None:
+        """Leave what is being read."""
+        if self._reading:
+            self._reading.cancel()
+            self._reading = None
+
+    def _on_read(self, coming: Future[Read | None]) -> None:
         """Go on in the thread that the node lives in."""
-        if self._node.executor and not coming.cancelled():
+        if self._node.executor:
             self._node.executor.create_task(self._take, coming)
 
-    def _take(self, coming: Future[Read]) -> None:
+    def _take(self, coming: Future[Read | None]) -> None:
         if self._reporter.state == "unconfigured":
             return
         try:
-            self._use(*coming.result(), self._topic)
+            read = coming.result()
+            if read:
+                self._use(*read, self._topic)
         except SlpiError as error:
             self._refuse(error)
 
@@ -106,8 +109,3 @@ class Models:
             if compensation.active:
                 self._keeper.save(complete=False)
         self._reporter.model_taken(fingerprint)
-
-
-def _read(text: str, source: str) -> Read:
-    model = parse_model(text, source)
-    return model, model_id(model)

@@ -9,6 +9,7 @@ from rclpy.node import Node
 from slpi_ros.model import StageModel
 from slpi_ros.nodes.compensation import Compensation
 from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.compensator_silence import Silence
 from slpi_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Health
 from slpi_ros.runtime.axis import Axis
 from slpi_ros.runtime.timing import Timing, TimingReport
@@ -25,6 +26,7 @@ class Reporter:
     compensation : Compensation
     settings : callable
         Returns the present ones.
+    silence : Silence
 
     Attributes
     ----------
@@ -34,29 +36,27 @@ class Reporter:
         Of the messages.
     lateness : Timing
         Of the points of trajectories.
-    silent_since_ns : int, nanoseconds
-        When the last command was accepted, or the node activated, on ``time.monotonic_ns``.
     last_rejection : str
     """
 
-    def __init__(self, node: Node, compensation: Compensation, settings: Callable[[], CompensatorSettings]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        compensation: Compensation,
+        settings: Callable[[], CompensatorSettings],
+        silence: Silence,
+    ) -> None:
         self.state = "unconfigured"
         self.timing = self.lateness = Timing()
-        self.silent_since_ns = time.monotonic_ns()
         self.last_rejection = ""
-        self._compensation, self._settings = compensation, settings
+        self._compensation, self._settings, self._silence = compensation, settings, silence
         self._models_refused, self._model_error, self._model_id = 0, "", ""
         self._diagnostics = Diagnostics(node, "compensator")
         self._start_window()
 
-    @property
-    def silence(self) -> float:
-        """Seconds without an accepted command while active."""
-        return (time.monotonic_ns() - self.silent_since_ns) * 1e-9 if self.state == "active" else 0.0
-
     def enter(self, state: str) -> None:
         """Report a new state of the lifecycle."""
-        self.state, self.silent_since_ns = state, time.monotonic_ns()
+        self.state = state
         self.report()
 
     def model_taken(self, fingerprint: str) -> None:
@@ -101,9 +101,9 @@ class Reporter:
             return self.state
         if self._compensation.driving.resetting:
             return "resetting the memory"
-        if self._compensation.following.on:
-            return f"following a trajectory; memory {self._memory()}"
-        return f"compensating; memory {self._memory()}"
+        doing = self._compensation.following.doing or "compensating"
+        doubts = [f" (axis '{axis.name}': {axis.trust.doubt})" for axis in self._compensation.axes if axis.trust.doubt]
+        return f"{doing}; memory {self._memory()}{''.join(doubts)}"
 
     def _memory(self) -> str:
         return ", ".join(dict.fromkeys(axis.memory_state for axis in self._compensation.axes))
@@ -116,6 +116,8 @@ class Reporter:
             "accepted": counts.accepted,
             "rejected": counts.rejected,
             **{f"rejected.{cause}": count for cause, count in counts.by_cause.items()},
+            "measurements_rejected": counts.measurements_rejected,
+            **{f"measurements_rejected.{cause}": count for cause, count in counts.measured_by_cause.items()},
             "last_rejection": self.last_rejection,
             "held_at_limit": counts.held_at_limit,
             "excursions": counts.excursions,
@@ -169,13 +171,13 @@ class Reporter:
         yield rejected > 0, WARN, f"{rejected} messages rejected, the last: {self.last_rejection}"
         refused = counts.trajectories_rejected - window.trajectories_rejected
         yield refused > 0, WARN, f"{refused} trajectories rejected, the last: {self.last_rejection}"
+        unused = counts.measurements_rejected - window.measurements_rejected
+        yield unused > 0, WARN, f"{unused} measurements rejected, the last: {self.last_rejection}"
         held = counts.held_at_limit - window.held_at_limit
         yield held > 0, WARN, f"{held} times held at a voltage limit"
         jumps = counts.time_jumps - window.time_jumps
         yield jumps > 0, WARN, f"the clock of the stamps was set back {jumps} times"
-        timeout, ends = settings.safety.command_timeout, settings.safety.ramps_on_timeout
-        said = f"no command for {self.silence:.3g} s; voltages {'go to the safe ones' if ends else 'are held'}"
-        yield 0 < timeout < self.silence, WARN, said
+        yield self._silence.said != "", WARN, self._silence.said
         if ready:
             for axis in self._compensation.axes:
                 yield from _axis_problems(axis, settings.drift_alarm, counts.accepted > window.accepted)
@@ -192,6 +194,7 @@ def _axis_values(axis: Axis) -> dict[str, object]:
     values = {
         "voltage_V": f"{axis.voltage:.4f}",
         "memory": axis.memory_state,
+        "memory_doubt": axis.trust.doubt,
         "covered": f"{quality.covered:.3f}" if quality else "",
         "held_out_rms_nm": f"{quality.held_out_rms * 1e9:.2f}" if quality else "",
         "feedback": axis.feedback,

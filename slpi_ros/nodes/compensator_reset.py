@@ -1,7 +1,6 @@
 """The compensator's service ``~/reset_memory``."""
 
 from collections.abc import Callable
-from time import monotonic_ns
 
 from rclpy.node import Node
 
@@ -9,7 +8,9 @@ from slpi_ros.nodes.compensation import Compensation
 from slpi_ros.nodes.compensator_driver import Driver
 from slpi_ros.nodes.compensator_report import Reporter
 from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.compensator_silence import Silence
 from slpi_ros.nodes.late_service import LateService
+from slpi_ros.runtime.memory_trust import KNOWN
 
 
 class MemoryReset:
@@ -21,6 +22,7 @@ class MemoryReset:
     compensation : Compensation
     driver : Driver
     reporter : Reporter
+    silence : Silence
     settings : callable
         Returns the present ones.
     """
@@ -31,9 +33,11 @@ class MemoryReset:
         compensation: Compensation,
         driver: Driver,
         reporter: Reporter,
+        silence: Silence,
         settings: Callable[[], CompensatorSettings],
     ) -> None:
         self._compensation, self._driver, self._reporter, self._settings = compensation, driver, reporter, settings
+        self._silence = silence
         self._service = LateService(node, "~/reset_memory", self._start)
 
     def _start(self) -> str:
@@ -42,7 +46,7 @@ class MemoryReset:
         if not compensation.active or compensation.model is None:
             return "not reset: there must be a model, and the node must be active"
         if compensation.following.on:
-            return "not reset: a trajectory is being followed; wait, or stop it with an empty one"
+            return f"not reset: {compensation.following.busy}"
         if not compensation.driving.resetting:
             finals = settings.safety.voltages if settings.reset.to_safe else compensation.voltages
             compensation.driving.reset(settings.reset.cycles, settings.reset.rate, finals)
@@ -51,8 +55,14 @@ class MemoryReset:
         return ""
 
     def _on_end(self, arrived: bool) -> None:
-        self._reporter.silent_since_ns = monotonic_ns()
-        voltages = ", ".join(f"{v:.6g}" for v in self._compensation.voltages)
-        said = f"memory known; voltages {voltages} V" if arrived else "interrupted; the memory is assumed"
-        self._service.answer(arrived, said)
+        self._silence.after_reset()
+        axes, voltages = self._compensation.axes, ", ".join(f"{v:.6g}" for v in self._compensation.voltages)
+        doubts = [f"axis '{axis.name}': {axis.trust.doubt}" for axis in axes if axis.memory_state != KNOWN]
+        if not arrived:
+            said = "interrupted; the memory is assumed"
+        elif doubts:
+            said = f"memory assumed; voltages {voltages} V; {'; '.join(doubts)}"
+        else:
+            said = f"memory known; voltages {voltages} V"
+        self._service.answer(not doubts, said)
         self._reporter.report()

@@ -10,11 +10,13 @@ from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.nodes.compensation import Compensation
+from slpi_ros.nodes.compensator_driver import Driver
 from slpi_ros.runtime.clock import SECOND_NS
 from slpi_ros.runtime.rejection import EMPTY, INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
 from slpi_ros.runtime.timing import Timing
 from slpi_ros.runtime.trajectory import Trajectory
 from slpi_ros.runtime.trajectory_bytes import TrajectoryArrays, decode_trajectory
+from slpi_ros.stream import LONGEST_STEP
 
 # How often a simulated clock is looked at, seconds.
 SIMULATED_PERIOD = 0.001
@@ -32,8 +34,8 @@ class TrajectoryFollower:
     compensation : Compensation
     publish : callable
         Publishes the present voltages.
-    resting_since_ns : callable
-        Returns when voltages were last given to all axes, nanoseconds on ``time.monotonic_ns``.
+    driver : Driver
+        Brings axes to rest where a trajectory leaves them in motion.
 
     Attributes
     ----------
@@ -46,10 +48,10 @@ class TrajectoryFollower:
         node: Node,
         compensation: Compensation,
         publish: Callable[[], None],
-        resting_since_ns: Callable[[], int],
+        driver: Driver,
     ) -> None:
         self._node, self._compensation = node, compensation
-        self._publish, self._resting_since_ns = publish, resting_since_ns
+        self._publish, self._driver = publish, driver
         self.lateness = Timing()
         self._on_simulated = False
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -80,16 +82,22 @@ class TrajectoryFollower:
         trajectory = Trajectory.of(
             arrays.names, arrays.time_from_start_ns, arrays.positions, start_ns, axes=compensation.names
         )
-        compensation.driving.stop()
-        since_ns = self._resting_since_ns() + now_ns - time.monotonic_ns()
-        compensation.following.start(trajectory, self._now_ns, since_ns)
+        given_ns = self._driver.given_ns + now_ns - time.monotonic_ns()
+        driven = [axis.name for axis in compensation.axes if axis.on_ramp]
+        following = compensation.following
+        following.start(trajectory, self._now_ns, given_ns, driven)
+        soon = (following.next_deadline_ns or 0) - self._now_ns() <= LONGEST_STEP * SECOND_NS
+        compensation.hold(but=following.names if soon or following.under_way else ())
+        self._driver.go_on()
         self._on_simulated = self._simulated
         self._wait()
 
     def stop(self) -> None:
-        """Leave the axes where they are."""
+        """Leave the axes where they are, or come to rest."""
         self._timer.cancel()
-        self._compensation.following.stop()
+        if self._compensation.following.on:
+            self._compensation.following.stop()
+            self._driver.stop()
 
     def _on_timer(self) -> None:
         if self._on_simulated != self._simulated:
@@ -102,6 +110,7 @@ class TrajectoryFollower:
             self._compensation.follow(now_ns)
             self._publish()
             self.lateness.note(deadline_ns, now_ns)
+            self._driver.go_on()
         self._wait()
 
     def _wait(self) -> None:

@@ -71,9 +71,7 @@ class Parameters(Generic[Settings]):
         If the values given at the start make no settings.
     """
 
-    def __init__(
-        self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]
-    ) -> None:
+    def __init__(self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]) -> None:
         self._node, self._make = node, make
         self._values: dict[str, Any] = {
             entry.name: node.declare_parameter(entry.name, entry.default, entry.descriptor()).value
@@ -127,8 +125,11 @@ def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: fl
         Unless all are finite numbers from `low` to `high`.
     """
     given = values[name]
-    one = isinstance(given, bool | int | float)
-    several = [given] * len(axes) if one else list(given) if isinstance(given, Sequence) else []
+    if isinstance(given, Sequence) and not isinstance(given, str):
+        # Arrays are shown as the lists that they were given as.
+        given = several = list(given)
+    else:
+        several = [given] * len(axes)
     if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in several):
         several = []
     if len(several) != len(axes):

@@ -1,8 +1,6 @@
 """One axis at run time: its stamps, its limits, its model and memory, and the closed loop if there is one."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from math import isfinite
 from time import monotonic
 
 from slpi_ros.errors import UsageError
@@ -10,13 +8,11 @@ from slpi_ros.model import AxisModel
 from slpi_ros.runtime.clock import Stamps
 from slpi_ros.runtime.health import Drift
 from slpi_ros.runtime.loop import ClosedLoop, LoopSettings
-from slpi_ros.runtime.ramp import Ramp
-from slpi_ros.runtime.rejection import NOT_FINITE, OUT_OF_RANGE, RejectedError
-from slpi_ros.runtime.swap import including, replay, take_over, turning_voltages, whole_way
-from slpi_ros.stream import AxisStream, Limits, refusal
-
-# What the memory is worth: nobody knows where the stage has been; being wiped; wiped since; kept over a restart.
-ASSUMED, RESETTING, KNOWN, RESTORED = "assumed", "resetting", "known", "restored"
+from slpi_ros.runtime.memory_trust import MemoryTrust
+from slpi_ros.runtime.ramp import Brake, Ramp
+from slpi_ros.runtime.rejection import implausible
+from slpi_ros.runtime.swap import go_on, including, take_over, turning_voltages, whole_way
+from slpi_ros.stream import AxisStream, Limits
 
 
 class Axis:
@@ -38,18 +34,18 @@ class Axis:
     model : AxisModel or None
     stream : AxisStream
         Its feedforward; there once a model is.
-    memory_state : str
-        `ASSUMED`, `RESETTING`, `KNOWN` or `RESTORED`.
+    trust : MemoryTrust
+        What the memory is worth.
     driven : bool
         Whether it has had a model: before, nobody knows what voltage it has.
-    held : bool
-        Whether the last sample waits at a voltage limit.
-    slewing : bool
-        Whether the last sample is still on its way.
+    on_ramp : bool
+        Whether it is driven on its own.
+    held, slewing : bool
+        Whether the last sample waits at a voltage limit, or is still on its way.
     """
 
     stream: AxisStream
-    _ramp: Ramp
+    _ramp: Ramp | Brake
 
     def __init__(
         self, name: str, place: int, limits: Limits, loop_settings: LoopSettings, now: Callable[[], float] = monotonic
@@ -57,17 +53,23 @@ class Axis:
         self.name, self.place, self.limits = name, place, limits
         self.stamps = Stamps()
         self.model: AxisModel | None = None
-        self.memory_state = ASSUMED
+        self.trust = MemoryTrust()
         self.held = self.slewing = False
         self._loop_settings = loop_settings
         self._loop: ClosedLoop | None = None
-        self.driven = False
+        self.driven = self.on_ramp = False
+        self._given_at = 0.0
         self._now = now
 
     @property
     def voltage(self) -> float:
         """Present voltage, volts."""
         return self._loop.voltage if self._loop else self.stream.voltage
+
+    @property
+    def memory_state(self) -> str:
+        """What the memory is worth, in a word."""
+        return self.trust.state
 
     @property
     def correction(self) -> float:
@@ -114,13 +116,9 @@ class Axis:
         if self.driven:
             stream.resume(self.stream)
         self.model, self.stream, self.driven = model, stream, True
+        self.trust = self.trust.over(model.voltage_range)
         if self._loop:
-            memory = model.memory()
-            replay(memory, turning_voltages(self._loop.applied.memory))
-            limits = including(stream.limits, self._loop.voltage)
-            applied = model.stream_from(memory, including(limits, memory.voltage))
-            applied.resume(self._loop.applied)
-            self._loop.swap(limits, applied)
+            self._loop.swap(*go_on(model, stream.limits, self._loop.applied))
         elif self._loop_settings.enabled:
             self._close_loop()
 
@@ -164,8 +162,8 @@ class Axis:
         elif settings.enabled and self.driven:
             self._close_loop()
 
-    def check(self, y: float) -> None:
-        """Reject a desired displacement (m) that is no number or far outside what the model was identified on.
+    def check(self, y: float, kind: str = "desired") -> None:
+        """Reject a displacement (m), desired or measured, that is no number or far outside what was identified.
 
         Raises
         ------
@@ -173,11 +171,8 @@ class Axis:
             With the cause `not_finite` or `out_of_range`.
         """
         low, high = self.stream.accepted
-        if low <= y <= high:
-            return
-        if not isfinite(y):
-            raise RejectedError(NOT_FINITE, f"displacement is {y} m; send finite ones only")
-        raise RejectedError(OUT_OF_RANGE, refusal(y, self.stream.accepted))
+        if not low <= y <= high:
+            raise implausible(y, (low, high), kind)
 
     def move(self, ahead: float, y: float) -> float:
         """Return the voltage (V) for the desired displacement `y` (m), `ahead` (s) after the last sample.
@@ -222,18 +217,38 @@ class Axis:
         return self._correct(ahead, dt, y, v) if self._loop else v
 
     def measure(self, displacement: float) -> None:
-        """Note a measured displacement (m)."""
+        """Note a measured displacement (m).
+
+        Raises
+        ------
+        RejectedError
+            As `check`; it is not used then.
+        """
         if not self.driven:
             return
+        self.check(displacement, "measured")
         if self._loop is None:
             self._close_loop()
         self._loop.measure(displacement, self._now())  # type: ignore[union-attr]
 
-    def start_drive(self, ramp: Ramp) -> None:
+    @property
+    def in_motion(self) -> bool:
+        """Whether the limit of acceleration forbids to leave it where it is."""
+        return self.driven and (self._loop if self._loop and not self.on_ramp else self.stream).pace.in_motion
+
+    def start_drive(self, ramp: Ramp | Brake) -> None:
         """Leave the desired path, and go where a ramp leads with every `drive`."""
-        if self._loop:
-            self.stream.restore(replace(self._loop.applied.snapshot(), rate=self.stream.pace.rate))
-        self._ramp = ramp
+        if not self.on_ramp:
+            self._given_at = self._now()
+            if self._loop:
+                self.stream.restore(self._loop.applied.snapshot())
+                self.stream.pace.go_on(self._loop.pace)
+        self._ramp, self.on_ramp = ramp, True
+
+    def brake(self) -> None:
+        """Come to rest with every `drive`, as gently as the limit of acceleration asks for."""
+        if not (self.on_ramp and isinstance(self._ramp, Brake)):
+            self.start_drive(Brake())
 
     @property
     def arrived(self) -> bool:
@@ -241,24 +256,34 @@ class Axis:
         return self._ramp.done
 
     def drive(self, dt: float) -> bool:
-        """Move on along the ramp, `dt` (s) later; return whether it has ended."""
+        """Move on along the ramp, `dt` (s) later; return whether there is nowhere to go."""
+        if not self.on_ramp:
+            return True
         v = self._ramp.step(self.stream.voltage, dt, self.stream.pace)
         self.stream.drive(v, dt)
         if self._loop:
             self._loop.drive(v, dt)
+        self._given_at = self._now()
+        if self._ramp.done:
+            self.stream.pace.rest()
         return self._ramp.done
 
     def stop_drive(self) -> None:
-        """Take up desired displacements again, from where the axis is."""
+        """Take up desired displacements again, from where the axis is and as fast as it is; without effect when off."""
+        if not self.on_ramp:
+            return
+        self.on_ramp = False
         if self._loop:
-            self._loop.settle()
-        self.restart()
+            self._loop.settle(self.stream.pace)
+        # A voltage at rest has time; one in motion goes on.
+        self.stamps.restart(self._now() - self._given_at if self.in_motion else 0.0)
 
-    def restart(self) -> None:
-        """Let no time have passed at the next sample."""
-        self.stamps.restart()
+    def rest(self) -> None:
+        """Start from a voltage at rest at the next sample."""
         if self.driven:
             self.stream.pace.rest()
+        if self._loop:
+            self._loop.pace.rest()
 
     def _close_loop(self) -> None:
         stream = self.stream
@@ -271,4 +296,5 @@ class Axis:
         loop.applied.coupled = self.stream.coupled
         if ahead > dt:
             loop.applied.wait(ahead - dt)
+            loop.pace.rest()
         return loop.correct(dt, y, v, self._now())

@@ -38,7 +38,8 @@ class Stamps:
     def __init__(self, jump_ns: int = SECOND_NS) -> None:
         self.jump_ns = jump_ns
         self._last_ns: int | None = None
-        self._restarted = False
+        # Seconds that have passed without a stamp; None: stamps tell.
+        self._restarted: float | None = None
 
     def check(self, stamp_ns: int) -> None:
         """Reject a stamp (ns) that is not newer than the last one, unless the clock was set back.
@@ -59,14 +60,15 @@ class Stamps:
     def accept(self, stamp_ns: int) -> float:
         """Go on to a stamp (ns) that `check` lets pass; return the seconds since the last one.
 
-        They are 0 for the first stamp and after a restart, and negative where the clock was set back.
+        They are 0 for the first stamp, what `restart` says after that, and negative where the clock was set back.
         """
         last, self._last_ns = self._last_ns, stamp_ns
-        restarted, self._restarted = self._restarted, False
-        if last is None:
-            return 0.0
-        ahead = (stamp_ns - last) * 1e-9
-        return min(ahead, 0.0) if restarted else ahead
+        elapsed = self._restarted
+        if elapsed is None and last is not None:
+            return (stamp_ns - last) * 1e-9
+        self._restarted = None
+        ahead = (stamp_ns - last) * 1e-9 if last is not None else 0.0
+        return min(ahead, 0.0) or elapsed or 0.0
 
     def arrive(self, now_ns: int) -> float:
         """Go on with a sample that has no stamp but that of its arrival (ns): it is never late."""
@@ -75,6 +77,6 @@ class Stamps:
             now_ns = last
         return self.accept(now_ns)
 
-    def restart(self) -> None:
-        """Let the next stamp count as the first; what is older than the last one stays late."""
-        self._restarted = True
+    def restart(self, elapsed: float = 0.0) -> None:
+        """Let the next stamp come `elapsed` (s) after the voltage; what is older than the last one stays late."""
+        self._restarted = elapsed

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
-from slpi_ros.runtime.rejection import CAUSES
+from slpi_ros.runtime.rejection import CAUSES, MEASURED_CAUSES
 
 
 @dataclass
@@ -24,6 +24,8 @@ class Counts:
         Accepted ones after which time started anew, because the clock had been set back.
     by_cause : dict of str to int
         Rejected ones.
+    measured_by_cause : dict of str to int
+        Measured displacements of axes that were not used.
     trajectories, trajectories_rejected : int
         Those that were sent, and those of them that could not be followed.
     """
@@ -36,6 +38,7 @@ class Counts:
     gaps: int = 0
     time_jumps: int = 0
     by_cause: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CAUSES, 0))
+    measured_by_cause: dict[str, int] = field(default_factory=lambda: dict.fromkeys(MEASURED_CAUSES, 0))
     trajectories: int = 0
     trajectories_rejected: int = 0
 
@@ -44,6 +47,11 @@ class Counts:
         """All rejected messages."""
         return self.received - self.accepted
 
+    @property
+    def measurements_rejected(self) -> int:
+        """All measured displacements that were not used."""
+        return sum(self.measured_by_cause.values())
+
     def copy(self) -> "Counts":
         """Return the present counts, which do not count on."""
-        return replace(self, by_cause=dict(self.by_cause))
+        return replace(self, by_cause=dict(self.by_cause), measured_by_cause=dict(self.measured_by_cause))

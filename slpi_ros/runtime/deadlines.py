@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.runtime.clock import SECOND_NS
 from slpi_ros.runtime.rejection import NOT_FINITE, TIME_BACKWARDS, RejectedError
-from slpi_ros.stream import LONGEST_STEP, AxisStream, Limits, Pace
+from slpi_ros.stream import LONGEST_STEP, AxisStream, Pace
 
 FloatArray = NDArray[np.float64]
 TimeArray = NDArray[np.int64]
@@ -95,6 +95,11 @@ class Streamer(Generic[Points]):
         return sum(stretch.stop - stretch.next for stretch in self._stretches)
 
     @property
+    def coming(self) -> list[Points]:
+        """Those of which points are still to be applied, in order."""
+        return [stretch.points for stretch in self._stretches]
+
+    @property
     def next_deadline_ns(self) -> int | None:
         """When the next point is due, nanoseconds; None: there is none, the voltages stay."""
         return int(self._stretches[0].deadlines_ns[self._stretches[0].next]) if self._stretches else None
@@ -166,21 +171,6 @@ def seconds_between(times_ns: TimeArray, since_ns: int) -> FloatArray:
     elapsed[1:] = np.diff(times_ns)
     elapsed *= 1e-9
     return elapsed
-
-
-def keep_pace(limits: Limits, present: float, wanted: FloatArray, elapsed: FloatArray) -> FloatArray:
-    """Go from the present voltage (V) from one wanted voltage to the next, shape (N,), volts, as far as limits allow.
-
-    `elapsed`, shape (N,), seconds, as in `follow`.
-    """
-    if limits.slew == limits.acceleration == inf:
-        return wanted
-    pace, before, v = Pace(limits), present, []
-    for goal, dt in zip(wanted.tolist(), elapsed.tolist(), strict=True):
-        present = pace.step(present, goal, pace.counted(dt), before)
-        before = goal
-        v.append(present)
-    return np.array(v)
 
 
 def follow(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[FloatArray, Mask, FloatArray]:
@@ -274,9 +264,7 @@ def _braking_way(pace: Pace, distance: FloatArray, dt: FloatArray) -> FloatArray
     return np.minimum(acceleration * dt * (np.sqrt(dt * dt + 2.0 * distance / acceleration) - dt), distance)
 
 
-def _one_by_one(
-    stream: AxisStream, y: FloatArray, elapsed: FloatArray
-) -> tuple[list[float], list[bool], list[float]]:
+def _one_by_one(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[list[float], list[bool], list[float]]:
     """Move through `y`; return the voltages, where a displacement was missed, and those reached."""
     v, late, reached = [], [], []
     for wish, dt in zip(y.tolist(), elapsed.tolist(), strict=True):

@@ -1,8 +1,9 @@
 """All axes driven on their own: to a safe voltage, or to a known memory."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
-from slpi_ros.runtime.axis import ASSUMED, KNOWN, RESETTING, Axis
+from slpi_ros.runtime.axis import Axis
+from slpi_ros.runtime.memory_trust import KNOWN, RESETTING, MemoryTrust
 from slpi_ros.runtime.ramp import Ramp
 from slpi_ros.runtime.reset import decaying_turns
 
@@ -25,6 +26,7 @@ class Driving:
 
     def __init__(self, axes: Sequence[Axis]) -> None:
         self._axes = axes
+        self._spans: list[tuple[float, float]] = []
         self.on = self.resetting = False
 
     def reset(self, cycles: int, rate: float, finals: Sequence[float]) -> None:
@@ -41,7 +43,8 @@ class Driving:
         for axis, final in zip(self._axes, finals, strict=True):
             limits = axis.stream.limits
             axis.start_drive(Ramp(decaying_turns(limits, limits.clip(final), cycles), rate))
-            axis.memory_state = RESETTING
+            axis.trust = MemoryTrust(RESETTING)
+        self._spans = [(axis.stream.voltage,) * 2 for axis in self._axes]
         self.on = self.resetting = True
 
     def ramp(self, goals: Sequence[float], rate: float) -> None:
@@ -51,20 +54,45 @@ class Driving:
             axis.start_drive(Ramp([goal], rate))
         self.on = True
 
+    def hold(self, but: Collection[Axis] = ()) -> None:
+        """Let the axes `but` go, and leave the others where they are: at rest, or where they come to rest."""
+        if self.resetting:
+            self.stop()
+        for axis in self._axes:
+            if axis not in but and axis.in_motion:
+                axis.brake()
+                continue
+            axis.stop_drive()
+            if axis not in but:
+                axis.rest()
+        self.on = any(axis.on_ramp for axis in self._axes)
+
+    def rest(self) -> None:
+        """Know that the axes have been at rest for a while."""
+        for axis in self._axes:
+            axis.rest()
+
     def step(self, dt: float) -> bool:
         """Move all axes on, `dt` (s) later; return whether all have arrived."""
         arrived = [axis.drive(dt) for axis in self._axes]
+        if self.resetting:
+            reached = [axis.stream.voltage for axis in self._axes]
+            self._spans = [(min(low, v), max(high, v)) for (low, high), v in zip(self._spans, reached, strict=True)]
         return all(arrived)
 
     def stop(self) -> None:
         """Take up desired displacements again, from where the axes are; without effect when off.
 
-        A reset that has not come to its end leaves the memory assumed.
+        A reset that has not come to its end, or has not spanned what the model was identified on, leaves the memory
+        assumed.
         """
         if not self.on:
             return
         for axis in self._axes:
             axis.stop_drive()
-            if self.resetting:
-                axis.memory_state = KNOWN if axis.arrived else ASSUMED
+        if self.resetting:
+            for axis, span in zip(self._axes, self._spans, strict=True):
+                axis.trust = MemoryTrust(doubt="the reset was interrupted")
+                if axis.arrived and axis.model:
+                    axis.trust = MemoryTrust(KNOWN, spanned=span).over(axis.model.voltage_range)
         self.on = self.resetting = False

@@ -1,21 +1,21 @@
 """All axes along trajectories: which voltages are due, and what becomes of a plan when things change."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from math import inf
 
 from slpi_ros.runtime.axis import Axis
 from slpi_ros.runtime.deadlines import Due, Streamer
 from slpi_ros.runtime.plan import Plan, Standing, prepare
 from slpi_ros.runtime.trajectory import Trajectory
-from slpi_ros.stream import ROUNDING, AxisStream
+from slpi_ros.stream import ROUNDING
 
 
 class Following:
     """Moves axes along trajectories. All times are nanoseconds on one clock.
 
     While nothing comes in between, the voltages are those that were planned. Once something has - another model, new
-    limits, points that were too late - the rest of the path is compensated sample by sample, from where the axes
-    really are.
+    limits, points that were too late, a path before it that became another - the rest of the path is compensated sample
+    by sample, from where the axes really are.
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ class Following:
         self._axes, self._decouple = axes, decouple
         self._streamer: Streamer[Plan] = Streamer()
         self._plan: Plan | None = None
-        self._streams: dict[str, AxisStream] = {}
         self._as_planned = False
+        self._now: Callable[[], int] = int
         self._last_ns = dict.fromkeys(axes, 0)
         self.points_held = self.points_slewing = 0
 
@@ -58,7 +58,34 @@ class Following:
         """When the next point is due, nanoseconds; None: there is none."""
         return self._streamer.next_deadline_ns
 
-    def start(self, trajectory: Trajectory, now: Callable[[], int], resting_since_ns: int) -> None:
+    @property
+    def names(self) -> set[str]:
+        """Axes that have points to come."""
+        return {name for plan in self._streamer.coming for name in plan.trajectory.names}
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the next point is not the first of its trajectory."""
+        return self.on and self._streamer.coming[0] is self._plan
+
+    @property
+    def doing(self) -> str:
+        """What is being done with a trajectory; "" without one."""
+        if not self.on:
+            return ""
+        wait = ((self.next_deadline_ns or 0) - self._now()) * 1e-9
+        if wait < 1.0:
+            return "following a trajectory"
+        return f"waiting for a trajectory that {'goes on' if self._plan else 'begins'} in {wait:.0f} s"
+
+    @property
+    def busy(self) -> str:
+        """Why desired displacements have to wait, and what to do."""
+        return f"{self.doing}; wait, or cancel it with an empty one"
+
+    def start(
+        self, trajectory: Trajectory, now: Callable[[], int], given_ns: int, driven: Collection[str] = ()
+    ) -> None:
         """Let a trajectory take over from what is being followed: at once, or when its first point is due.
 
         Parameters
@@ -67,22 +94,24 @@ class Following:
         now : callable
             Returns the time, nanoseconds. A long trajectory takes a while to compensate; one that starts at once starts
             after that.
-        resting_since_ns : int, nanoseconds
-            When axes that no trajectory has moved were given their voltage.
+        given_ns : int, nanoseconds
+            When axes that no trajectory moves were given their voltage.
+        driven : collection of str
+            Axes that something else moves meanwhile.
 
         Raises
         ------
         SlpiError
             If it cannot be followed; what was being followed goes on.
         """
-        if not self.on:
-            self._last_ns = dict.fromkeys(self._axes, resting_since_ns)
+        self._last_ns.update(dict.fromkeys(driven if self.on else self._axes, given_ns))
         standing = {
             name: Standing(axis.model, axis.stream, self._last_ns[name])
             for name, axis in self._axes.items()
             if axis.model
         }
         plan = prepare(trajectory, standing, now(), self._streamer)
+        self._now = now
         self.points_held, self.points_slewing = (int(mask.any(axis=1).sum()) for mask in (plan.held, plan.slewed))
         self._streamer.start(plan, now())
 
@@ -93,7 +122,7 @@ class Following:
         self._streamer.cancel()
         self._plan = None
         for axis in self._axes.values():
-            axis.restart()
+            axis.stamps.restart()
 
     def step(self, now_ns: int) -> int | None:
         """Move on to the latest point that is due; return its deadline (ns), None when none is due."""
@@ -114,12 +143,12 @@ class Following:
 
     def _enter(self, due: Due[Plan]) -> None:
         """Notice what makes the plan no longer hold."""
-        streams = {name: self._axes[name].stream for name in due.points.trajectory.names}
+        here = [(origin, self._axes[name].stream) for name, origin in due.points.origins.items()]
         if due.points is not self._plan:
-            self._plan, self._as_planned = due.points, due.point == 0
-        elif due.skipped or any(streams[name] is not self._streams[name] for name in streams):
+            self._plan = due.points
+            self._as_planned = all(origin.is_here(stream) for origin, stream in here)
+        if due.skipped or not all(origin.is_of(stream) for origin, stream in here):
             self._as_planned = False
-        self._streams = streams
 
     def _move(self, axis: Axis, plan: Plan, point: int, column: int, ahead: float) -> None:
         wish = float(plan.trajectory.positions[point, column])

@@ -1,7 +1,7 @@
 """The closed loop of one axis: its measurements correct the voltage, and say how healthy the model is."""
 
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf
 
 from slpi_ros.control import Feedback, PidGains
 from slpi_ros.errors import SlpiError
@@ -40,13 +40,20 @@ class ClosedLoop:
         Of the voltage in total.
     applied : AxisStream
         In its present state; owned by the loop from here on, which drives it.
+
+    Attributes
+    ----------
+    applied : AxisStream
+    pace : Pace
+        Of the voltage in total.
     """
 
     def __init__(self, settings: LoopSettings, limits: Limits, applied: AxisStream) -> None:
         self.applied = applied
         self.residuals = ResidualWindow(applied.own)
         self._settings = settings
-        self._pace = Pace(limits)
+        self.pace = Pace(limits)
+        self.pace.go_on(applied.pace)
         self._t, self._wanted = 0.0, applied.voltage
         self._desired: float | None
         self._aim: float | None
@@ -73,8 +80,9 @@ class ClosedLoop:
         self.applied = applied
         self.residuals.forget(applied.own)
 
-    def settle(self) -> None:
-        """Start anew where the axis is, without a correction."""
+    def settle(self, pace: Pace) -> None:
+        """Start anew where the axis is, going on at a pace, without a correction."""
+        self.pace.go_on(pace)
         self._start()
         self.residuals.forget(self.applied.own)
 
@@ -94,13 +102,12 @@ class ClosedLoop:
 
     def limit(self, limits: Limits) -> None:
         """Go on within other limits."""
-        self._feedback.limits = self._pace.limits = limits
+        self._feedback.limits = self.pace.limits = limits
 
     def measure(self, displacement: float, now: float) -> None:
-        """Note a measurement (m) that came at `now` (s): it shows what became of the last sample."""
-        if isfinite(displacement):
-            self._measured, self._measured_at, self._aim = displacement, now, self._desired
-            self.residuals.measure(displacement)
+        """Note a finite measurement (m) that came at `now` (s): it shows what became of the last sample."""
+        self._measured, self._measured_at, self._aim = displacement, now, self._desired
+        self.residuals.measure(displacement)
 
     def correct(self, dt: float, desired: float, feedforward: float, now: float) -> float:
         """Return the voltage in total (V).
@@ -121,8 +128,8 @@ class ClosedLoop:
         before = self.applied.voltage
         self._acting = now - self._measured_at <= self._settings.timeout
         v = wanted = self._give(desired if self._aim is None else self._aim, feedforward)
-        if self._pace.limits.acceleration < inf:
-            v = self._pace.step(before, wanted, dt, self._wanted)
+        if self.pace.limits.acceleration < inf:
+            v = self.pace.step(before, wanted, dt, self._wanted)
         self._wanted, self._desired = wanted, desired
         self._measured_at = -inf
         self.residuals.expect(self.applied.drive(v, dt))
@@ -135,11 +142,10 @@ class ClosedLoop:
     def _start(self) -> None:
         """Forget corrections and measurements."""
         voltage = self.applied.voltage
-        self._pace.rest()
         self._t, self._wanted = 0.0, voltage
         self._desired = self._aim = None
         self._measured, self._measured_at, self._acting = 0.0, -inf, False
-        self._feedback = Feedback(self._settings.gains, self._pace.limits, voltage)
+        self._feedback = Feedback(self._settings.gains, self.pace.limits, voltage)
         self._feedback.hold(0.0, voltage)
         if self._settings.enabled:
             self._feedback.enable()

@@ -1,19 +1,20 @@
 """A plan: a trajectory in volts, compensated as one block from where the axes will be when it takes over."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import SlpiError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.model import AxisModel
 from slpi_ros.runtime import rejection
-from slpi_ros.runtime.deadlines import Streamer, follow, keep_pace, seconds_between
+from slpi_ros.runtime.deadlines import Streamer, follow, seconds_between
 from slpi_ros.runtime.rejection import RejectedError
 from slpi_ros.runtime.stepping import drive_through, follow_together
+from slpi_ros.runtime.swap import whole_way
 from slpi_ros.runtime.trajectory import Trajectory
 from slpi_ros.stream import LONGEST_STEP, ROUNDING, AxisStream, Limits, accepted_range, refusal
 
@@ -24,35 +25,25 @@ AxisPlan = tuple[FloatArray, Mask, Mask]
 
 
 @dataclass(frozen=True)
-class Resting:
-    """An axis that follows known paths only: it has `limits`, and a `voltage` (V), but no memory."""
-
-    limits: Limits
-    voltage: float
-
-
-@dataclass(frozen=True)
 class Standing:
     """Where an axis stands when a trajectory takes over.
 
     Parameters
     ----------
     model : AxisModel
-    axis : AxisStream or Resting
-        The live axis, which is only read; `Resting` where the model is not causal.
+    axis : AxisStream
+        The live axis, which is only read.
     since_ns : int, nanoseconds
         When it was given its present voltage.
     """
 
     model: AxisModel
-    axis: AxisStream | Resting
+    axis: AxisStream
     since_ns: int
 
     def after(self, voltages: FloatArray, times_ns: TimeArray) -> "Standing":
         """Return where the axis stands once given voltages, shape (M,), volts, at times, shape (M,), M >= 1."""
         last, at_ns = float(voltages[-1]), int(times_ns[-1])
-        if isinstance(self.axis, Resting):
-            return replace(self, axis=replace(self.axis, voltage=last), since_ns=at_ns)
         before = float(voltages[-2]) if voltages.size > 1 else self.axis.voltage
         axis, elapsed = stream_twin_of(self.axis), seconds_between(times_ns, self.since_ns)
         if axis.timeless:
@@ -62,6 +53,35 @@ class Standing:
             drive_through(axis, voltages, elapsed)
         axis.pace.moved(last - before, min(float(elapsed[-1]), LONGEST_STEP))
         return replace(self, axis=axis, since_ns=at_ns)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a plan expects an axis when it takes over.
+
+    Parameters
+    ----------
+    axis : AxisStream
+        The live axis of the time when the plan was made.
+    limits : Limits
+        At that time.
+    went_through : tuple of float, volts
+        What its memory will know by then, and last its voltage.
+    """
+
+    axis: AxisStream
+    limits: Limits
+    went_through: tuple[float, ...]
+
+    def is_of(self, axis: AxisStream) -> bool:
+        """Whether neither model nor limits have changed since."""
+        return axis is self.axis and axis.limits == self.limits
+
+    def is_here(self, axis: AxisStream) -> bool:
+        """Whether the axis stands as expected, but for rounding."""
+        here, there = whole_way(axis), self.went_through
+        scale = ROUNDING * (1.0 + max(map(abs, there)))
+        return len(here) == len(there) and all(abs(a - b) <= scale for a, b in zip(here, there, strict=True))
 
 
 @dataclass(frozen=True)
@@ -76,12 +96,15 @@ class Plan:
         Where a displacement is out of reach: the axis waits at a voltage limit.
     slewed : ndarray of bool, shape (N, K)
         Where the axis is still on its way, at the slew limit.
+    origins : mapping of axis name to Origin
+        Of the axes that it reckons with; without those that follow known paths only.
     """
 
     trajectory: Trajectory
     voltages: FloatArray
     held: Mask
     slewed: Mask
+    origins: Mapping[str, Origin]
 
     @property
     def at_once(self) -> bool:
@@ -116,14 +139,19 @@ def prepare(
     """
     trajectory = trajectory.useful_at(now_ns)
     deadlines = trajectory.deadlines_ns(now_ns)
-    expected = {name: standing[name] for name in trajectory.names}
+    expected = {name: standing[name] for name in _reckoned_with(trajectory.names, standing)}
     for stretch in running.before(int(deadlines[0])) if running and trajectory.start_ns else []:
         still = slice(stretch.next, stretch.stop)
         for column, name in enumerate(stretch.points.trajectory.names):
             if name in expected:
                 voltages = stretch.points.voltages[still, column]
                 expected[name] = expected[name].after(voltages, stretch.deadlines_ns[still])
-    return _compensate(trajectory, deadlines, {**standing, **expected})
+    origins = {
+        name: Origin(live, live.limits, whole_way(there.axis))
+        for name, there in expected.items()
+        if isinstance(live := standing[name].axis, AxisStream) and isinstance(there.axis, AxisStream)
+    }
+    return Plan(trajectory, *_compensate(trajectory, deadlines, {**standing, **expected}), origins)
 
 
 def twin_of(memory: Memory) -> Memory:
@@ -138,7 +166,7 @@ def stream_twin_of(stream: AxisStream) -> AxisStream:
     return stream.twin()
 
 
-def _compensate(trajectory: Trajectory, deadlines: TimeArray, standing: Mapping[str, Standing]) -> Plan:
+def _compensate(trajectory: Trajectory, deadlines: TimeArray, standing: Mapping[str, Standing]) -> AxisPlan:
     shape = trajectory.positions.shape
     v, held, slewed = np.empty(shape, order="F"), np.empty(shape, np.bool_, "F"), np.empty(shape, np.bool_, "F")
     paths = {name: np.ascontiguousarray(trajectory.positions[:, i]) for i, name in enumerate(trajectory.names)}
@@ -152,29 +180,34 @@ def _compensate(trajectory: Trajectory, deadlines: TimeArray, standing: Mapping[
         here = standing[name]
         elapsed = seconds_between(deadlines, here.since_ns)
         try:
-            if isinstance(here.axis, Resting):
-                answer = _along_known_path(here.model, here.axis, y, elapsed)
-            else:
-                answer = _from_memory(here.model, here.axis, y, elapsed)
+            answer = _from_memory(here.model, here.axis, y, elapsed)
         except SlpiError as error:
             raise type(error)(f"axis '{name}': {error}") from None
         v[:, column], held[:, column], slewed[:, column] = answer
-    return Plan(trajectory, v, held, slewed)
+    return v, held, slewed
+
+
+def _move_along(names: Iterable[str], standing: Mapping[str, Standing]) -> bool:
+    """Whether axes may move along with each other."""
+    return any(not standing[name].axis.timeless for name in names)
+
+
+def _reckoned_with(names: Sequence[str], standing: Mapping[str, Standing]) -> Iterable[str]:
+    """Return the names of the axes on which a path of the named ones depends."""
+    return standing if _move_along(names, standing) else names
 
 
 def _with_effects(
     paths: Mapping[str, FloatArray], deadlines: TimeArray, standing: Mapping[str, Standing]
 ) -> dict[str, AxisPlan]:
-    """Return the plans of the causal axes if time matters to any of them; they may move along with each other."""
-    streams = {name: here.axis for name, here in standing.items() if isinstance(here.axis, AxisStream)}
-    if all(stream.timeless for name, stream in streams.items() if name in paths):
+    """Return the plans of the axes if time matters to any of them; they may move along with each other."""
+    if not _move_along(paths, standing):
         return {}
-    own = {name: path for name, path in paths.items() if name in streams}
     return follow_together(
-        {name: stream_twin_of(stream) for name, stream in streams.items()},
-        {name: standing[name].model for name in streams},
-        own,
-        {name: seconds_between(deadlines, standing[name].since_ns) for name in own},
+        {name: stream_twin_of(here.axis) for name, here in standing.items()},
+        {name: here.model for name, here in standing.items()},
+        paths,
+        {name: seconds_between(deadlines, standing[name].since_ns) for name in paths},
     )
 
 
@@ -185,19 +218,6 @@ def _from_memory(model: AxisModel, axis: AxisStream, y: FloatArray, elapsed: Flo
     rounding = ROUNDING * (high - low)
     held = (v <= axis.limits.lower) & (missing < -rounding) | (v >= axis.limits.upper) & (missing > rounding)
     return v, held, late & ~held
-
-
-def _along_known_path(model: AxisModel, axis: Resting, y: FloatArray, elapsed: FloatArray) -> AxisPlan:
-    start, (low, high) = model.start.voltage, model.voltage_range
-    if abs(axis.voltage - start) > ROUNDING * (high - low):
-        raise UsageError(
-            f"a path of kind '{model.kind}' begins at {start:g} V, where its model does, but the axis has "
-            f"{axis.voltage:g} V; bring it there first"
-        )
-    wanted, held = model.compensate(np.cumsum(elapsed), y, axis.limits)
-    v = keep_pace(axis.limits, axis.voltage, wanted, elapsed)
-    late = np.abs(v - wanted) > ROUNDING * (high - low)
-    return v, held & ~late, late
 
 
 def _check_reachable(name: str, model: AxisModel, y: FloatArray, cut: int) -> None:

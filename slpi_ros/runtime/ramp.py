@@ -5,7 +5,7 @@ from dataclasses import replace
 from math import inf
 
 from slpi_ros.errors import UsageError
-from slpi_ros.stream import LONGEST_STEP, Pace
+from slpi_ros.stream import Pace
 
 # So near a voltage counts as reached, volts: rounding, and the slow end of a gentle stop.
 NEAR = 1e-9
@@ -41,12 +41,33 @@ class Ramp:
         """Return the voltage (V) that follows `present` (V) after `dt` (s); a pause frees no longer way than usual."""
         if self.done:
             return present
-        limits = pace.limits
+        limits, dt = pace.limits, pace.counted(dt)
         goal = limits.clip(self._goals[-1])
-        own = Pace(replace(limits, slew=min(limits.slew, self._rate)))
-        own.rate = pace.rate
-        v = own.step(present, goal, min(dt, LONGEST_STEP))
-        pace.rate = own.rate
+        # Where it is too fast at first, it has to brake.
+        fastest = max(self._rate, abs(pace.rate) - limits.acceleration * dt) if dt else inf
+        own = Pace(replace(limits, slew=min(limits.slew, fastest)))
+        own.go_on(pace)
+        v = own.step(present, goal, dt)
+        pace.go_on(own)
         if abs(v - goal) <= NEAR:
             self._goals.pop()
+        return v
+
+
+class Brake:
+    """A way to rest, as short as the limit of acceleration allows.
+
+    Attributes
+    ----------
+    done : bool
+        Whether the voltage may stay.
+    """
+
+    def __init__(self) -> None:
+        self.done = False
+
+    def step(self, present: float, dt: float, pace: Pace) -> float:
+        """Return the voltage (V) that follows `present` (V) after `dt` (s)."""
+        v = pace.step(present, present, pace.counted(dt))
+        self.done = not pace.in_motion
         return v

@@ -1,6 +1,9 @@
 """Why a message is rejected."""
 
+from math import isfinite
+
 from slpi_ros.errors import SlpiError
+from slpi_ros.stream import refusal
 
 NO_MODEL = "no_model"
 INACTIVE = "inactive"
@@ -19,6 +22,8 @@ CAUSES = (
     NO_MODEL, INACTIVE, RESETTING, FOLLOWING, EMPTY, LENGTH, DUPLICATE_AXIS, UNKNOWN_AXIS, NOT_FINITE, DUPLICATE,
     TIME_BACKWARDS, STALE, OUT_OF_RANGE,
 )  # fmt: skip
+# Of measured displacements.
+MEASURED_CAUSES = (NOT_FINITE, OUT_OF_RANGE)
 
 
 class RejectedError(SlpiError):
@@ -27,3 +32,10 @@ class RejectedError(SlpiError):
     def __init__(self, cause: str, message: str) -> None:
         super().__init__(message)
         self.cause = cause
+
+
+def implausible(y: float, accepted: tuple[float, float], kind: str) -> RejectedError:
+    """Return why the displacement `y` (m), outside of those accepted (m), is none; `kind`: "desired" or "measured"."""
+    if isfinite(y):
+        return RejectedError(OUT_OF_RANGE, refusal(y, accepted, kind))
+    return RejectedError(NOT_FINITE, f"{kind} displacement is {y} m; send finite ones only")

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +12,15 @@ from slpi_ros.errors import ModelError
 from slpi_ros.files import all_or_nothing
 from slpi_ros.model import StageModel
 from slpi_ros.model_file import format_model
+from slpi_ros.runtime.last_voltages import LastVoltages, read_last_voltages
+from slpi_ros.runtime.memory_trust import RESTORED, MemoryTrust
 from slpi_ros.schemas import validate
 from slpi_ros.stream import Limits
 
 SCHEMA = "slpi_ros/saved_memory/1"
 # Characters; a memory of many axes has a few thousand.
 LONGEST = 1_000_000
+CRASHED = "restored from before a crash: the last voltage is right, turns just before may be missing; reset it"
 
 
 @dataclass(frozen=True)
@@ -28,11 +32,25 @@ class SavedAxis:
     went_through : tuple of float, volts
         Where the drive turned, oldest first, and last its voltage.
     certain : bool
-        Whether the memory was known, and nothing has moved since it was saved.
+        Whether the memory was known.
+    doubt : str
+        Why that may no longer be so; not saved.
     """
 
     went_through: tuple[float, ...]
     certain: bool
+    doubt: str = ""
+
+    def trust(self, identified: tuple[float, float]) -> MemoryTrust:
+        """Return what the memory is worth to the model that it was saved with, identified on these voltages (V)."""
+        if self.certain and not self.doubt:
+            return MemoryTrust(RESTORED, spanned=identified)
+        return MemoryTrust(doubt=self.doubt)
+
+    def after_crash(self, voltage: float) -> "SavedAxis":
+        """Return what is known of the axis if it was given this voltage (V) last, after it was saved."""
+        moved = () if voltage == self.went_through[-1] else (voltage,)
+        return SavedAxis((*self.went_through, *moved), self.certain, CRASHED)
 
 
 @dataclass(frozen=True)
@@ -44,7 +62,7 @@ class SavedMemory:
     model : str
         `model_id` of the model it belongs to.
     complete : bool
-        Whether the node ended in order after it was saved; if not, it may have moved on.
+        Whether the node ended in order after it was saved; if not, the drive may have turned since.
     axes : mapping of axis name to SavedAxis
     """
 
@@ -72,8 +90,8 @@ def model_id(model: StageModel) -> str:
     return hashlib.sha256(format_model(model).encode()).hexdigest()
 
 
-def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> None:
-    """Write a saved memory, all of it or nothing.
+def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
+    """Write a saved memory, all of it or nothing; return the mark for the voltages to come.
 
     Raises
     ------
@@ -89,12 +107,25 @@ def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> None:
             for name, axis in memory.axes.items()
         },
     }
+    text = json.dumps(document, allow_nan=False)
     with all_or_nothing(path, ModelError) as file:
-        json.dump(document, file, allow_nan=False)
+        file.write(text)
+    return _mark(text)
+
+
+def last_voltages(path: str | os.PathLike[str], mark: int) -> LastVoltages:
+    """Return what notes the voltages given after a memory was saved to `path`, in the order of its axes.
+
+    Raises
+    ------
+    ModelError
+        If the file beside it cannot be written.
+    """
+    return LastVoltages(_beside(path), mark)
 
 
 def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
-    """Read a saved memory; None where there is no such file yet.
+    """Read a saved memory, moved on to the voltages given last; None where there is no such file yet.
 
     Raises
     ------
@@ -118,7 +149,20 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
         name: SavedAxis(tuple(map(float, axis["went_through_V"])), axis["certain"])
         for name, axis in document["axes"].items()
     }
+    if not document["complete"]:
+        saved = tuple(axis.went_through[-1] for axis in axes.values())
+        last = read_last_voltages(_beside(path), _mark(text), len(axes)) or saved
+        axes = {name: axis.after_crash(v) for (name, axis), v in zip(axes.items(), last, strict=True)}
     return SavedMemory(document["model"], document["complete"], axes)
+
+
+def _mark(text: str) -> int:
+    """Return what tells which text of a memory noted voltages belong to."""
+    return zlib.crc32(text.encode())
+
+
+def _beside(path: str | os.PathLike[str]) -> str:
+    return f"{os.fspath(path)}.last"
 
 
 def _refuse(constant: str) -> float:

@@ -31,7 +31,8 @@ def take_over(axis: AxisModel, limits: Limits, went_through: Sequence[float] = (
     """
     if not axis.causal:
         raise UsageError(
-            f"kind '{axis.kind}' needs the whole path in advance and cannot follow commands; identify kind 'slpi'"
+            f"kind '{axis.kind}' needs whole paths from its start on, and the compensator follows commands and "
+            "trajectories from anywhere; identify kind 'slpi', or use 'slpi compensate'"
         )
     allowed = limits.within(axis.voltage_range)
     try_out(axis, allowed)
@@ -45,6 +46,16 @@ def take_over(axis: AxisModel, limits: Limits, went_through: Sequence[float] = (
     stream = axis.stream_from(memory, including(allowed, present))
     stream.limits = allowed
     return stream
+
+
+def go_on(axis: AxisModel, allowed: Limits, before: AxisStream) -> tuple[Limits, AxisStream]:
+    """Return a stream of a new model where another one has been, and `allowed`, wide enough for it."""
+    memory = axis.memory()
+    replay(memory, turning_voltages(before.memory))
+    limits = including(allowed, before.voltage)
+    stream = axis.stream_from(memory, including(limits, memory.voltage))
+    stream.resume(before)
+    return limits, stream
 
 
 def turning_voltages(memory: Memory) -> tuple[float, ...]:

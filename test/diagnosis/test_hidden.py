@@ -15,6 +15,8 @@ SAMPLES = 12_000
 FAST = ("lag", "creep", "resonance", "cross_coupling", "sensor_periodic", "hum")
 # Large enough that nobody should miss it; what is found of smaller ones is for the bench to say.
 LARGE = 10.0
+# A draw of a coercivity by a power law.
+COERCIVE = 3
 
 
 def diagnosed(hidden, folder):
@@ -104,3 +106,14 @@ def test_a_size_that_cannot_be(monkeypatch):
     monkeypatch.setattr("benchmarks.hidden.records.ATTEMPTS", 2)
     with pytest.raises(RuntimeError, match="no record"):
         hide(0, ["sensor_periodic"], size=1000.0, samples=2_000)
+
+
+def test_a_coercivity_that_grows_with_the_rate_is_found(tmp_path):
+    """Thresholds that move apart are another thing than friction: the voltage is seen through a play."""
+    hidden = hide(COERCIVE, ["rate_dependence"], size=LARGE, samples=SAMPLES)
+    (truth,) = hidden.truth
+    found = diagnosed(hidden, tmp_path).axes[truth.axis]
+    first = found.effects[0].effect
+    assert (first.name, first.side) == ("rate_dependence", "voltage"), found.summary
+    assert found.after_rms < 1.3 * hidden.floor[truth.axis]
+    assert first.exponent == pytest.approx(truth.parameters["exponent"], rel=0.2)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from effects.cases import EVERY
+from effects.cases import EVERY, coercivities
 from hypothesis import given
 
 from slpi_ros.diagnosis.parameters import FREE, bounded, free, moved, names, steps
@@ -32,6 +32,16 @@ def test_moving_by_nothing_keeps_what_makes_sense(effect):
 def test_a_step_is_never_lengthened(effect):
     change = free(effect) + 1.0
     assert np.all(np.abs(bounded(effect, change)) <= np.abs(change))
+
+
+@given(coercivities())
+def test_a_coercivity_has_parameters_of_its_own(effect):
+    """The others stay as they are, and gains may have either sign."""
+    assert not {"widening", "backlash", "transition"} & set(names(effect))
+    assert {"coercivity", "exponent", "onset", "settling"} <= set(names(effect))
+    values = free(effect)
+    values[-len(effect.reversible) or values.size :] = -1e-9
+    assert moved(effect, values).reversible == (-1e-9,) * len(effect.reversible)
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -56,6 +56,17 @@ def saturations(draw: st.DrawFn) -> Saturation:
     return Saturation(draw(st.sampled_from((-np.inf, limits[0]))), draw(st.sampled_from((np.inf, limits[1]))))
 
 
+@st.composite
+def coercivities(draw: st.DrawFn) -> RateDependence:
+    """Draw thresholds that grow with the rate; of what goes round the hysteresis each power has its share."""
+    gains = draw(st.lists(numbers(0, 1e-7), max_size=3))
+    return RateDependence(
+        *(0.0, 0.0, draw(numbers(0.2, 1)), draw(powers(30, 1e3)), 1.0, draw(powers(0.01, 3))),
+        *(draw(st.sampled_from((0.0, 5.0, 50.0))), draw(numbers(5e-4, 1e-2))),
+        tuple(gain / 100.0**power for power, gain in enumerate(gains)),
+    )
+
+
 BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "delay": st.builds(Delay, numbers(-0.2, 0.2)),
     "lag": st.builds(Lag, powers(1e-4, 1)),
@@ -70,7 +81,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "sensor_periodic": sensors(),
     "hum": st.builds(Hum, powers(1, 1000), powers(1e-10, 1e-7), numbers(-7, 7)),
 }
-EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__)
+EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__) | coercivities()
 # They change what moves, and leave what rests as it is.
 ABOUT_MOTION = ("delay", "lag", "rate_dependence", "creep", "resonance", "cross_coupling")
 

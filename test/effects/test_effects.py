@@ -13,6 +13,7 @@ from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.effect import Around, Effect
 from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS, from_document, in_order, to_document
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
@@ -30,7 +31,12 @@ def test_every_effect_has_its_place():
     assert set(BY_NAME) == set(EFFECTS)
     for name, kind in EFFECTS.items():
         assert kind.name == name
-        assert kind.side == ("voltage" if name in ("delay", "lag", "saturation") else "displacement")
+
+
+@given(EVERY)
+def test_every_effect_has_its_side(effect):
+    before = effect.name in ("delay", "lag", "saturation") or getattr(effect, "coercivity", 0.0) > 0
+    assert effect.side == ("voltage" if before else "displacement")
 
 
 @given(effects_and_records(EXACT))
@@ -245,6 +251,10 @@ def test_effects_stand_in_the_order_of_the_chain(effects):
     assert places == sorted(places)
 
 
+def test_what_has_a_default_may_be_left_out():
+    assert from_document({"name": "rate_dependence", "parameters": RATE}) == RateDependence(**RATE)
+
+
 def test_an_effect_comes_once():
     with pytest.raises(SlpiError, match="'lag' comes twice"):
         in_order([Lag(0.1), Lag(0.2)])
@@ -293,6 +303,9 @@ def test_hostile_documents_are_refused(effect, data):
         assert from_document(to_document(read)) == read
 
 
+RATE = {"widening": 0.0, "backlash": 0.0, "exponent": 0.5, "reference_rate": 100.0, "transition": 1.0}
+
+
 @pytest.mark.parametrize(
     ("name", "parameters"),
     [
@@ -319,6 +332,13 @@ def test_hostile_documents_are_refused(effect, data):
         ("sensor_periodic", {"period": 1e-7, "amplitude": 1e-7, "phase": 0.0}),
         ("hum", {"frequency": -50.0, "amplitude": 1e-9, "phase": 0.0}),
         ("rate_dependence", {"widening": 0.1, "backlash": 0, "exponent": 0, "reference_rate": 1, "transition": 1}),
+        ("rate_dependence", RATE | {"coercivity": -1.0}),
+        ("rate_dependence", RATE | {"coercivity": 1.0, "widening": 0.1}),
+        ("rate_dependence", RATE | {"coercivity": 1.0, "backlash": 1e-8}),
+        ("rate_dependence", RATE | {"coercivity": 1.0, "settling": -1e-3}),
+        ("rate_dependence", RATE | {"coercivity": 1.0, "onset": -1.0}),
+        ("rate_dependence", RATE | {"coercivity": 1.0, "reversible": [1e-8] * 7}),
+        ("rate_dependence", RATE | {"coercivity": 1.0, "reversible": [float("nan")]}),
         ("gremlins", {}),
         (None, {}),
         ([], {}),

@@ -86,6 +86,12 @@ class Client:
         return np.array(self.answers[before:])
 
 
+def last_at_full_pace(voltages: np.ndarray, step: float = 1.0) -> float:
+    """Return the last of voltages (V), shape (N,), that is whole steps (V) away from the first above 30 V."""
+    steps = (voltages - voltages[voltages > 30.0][0]) / step
+    return float(voltages[(voltages > 30.0) & (np.abs(steps - np.round(steps)) < 1e-6)][-1])
+
+
 def wish(names: Sequence[str], displacements: Sequence[float], stamp_ns: int = 0) -> JointState:
     """Return a desired message, metres."""
     message = JointState(name=list(names), position=list(displacements))

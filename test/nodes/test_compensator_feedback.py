@@ -102,5 +102,6 @@ def test_a_measurement_that_cannot_be_is_told_and_moves_nothing(x_file):
             "measurements_rejected.not_finite": 2, "measurements_rejected.out_of_range": 3, "rejected": 0,
         })  # fmt: skip
         assert "axis 'x': measured displacement 1000 um is far outside" in values["last_rejection"]
-        warned = [status for status in client.statuses() if "measurements rejected, the last: axis 'x'" in status.message]
+        statuses = client.graph.statuses(f"{client.name}: compensator")
+        warned = [status for status in statuses if "measurements rejected, the last: axis 'x'" in status.message]
         assert warned and warned[0].level == b"\1"

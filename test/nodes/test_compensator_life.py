@@ -14,9 +14,11 @@ from lifecycle_msgs.msg import State, Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
 from nodes.compensator_client import Client, compensator  # noqa: E402
 from nodes.ros_helpers import LATCHED, NodeProcess, on_graph, stage_model, started  # noqa: E402
-from rcl_interfaces.srv import DescribeParameters  # noqa: E402
+from rcl_interfaces.srv import DescribeParameters, GetParameters  # noqa: E402
+from runtime.test_trajectory import PATH_MODEL  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
+from slpi_ros.model import StageModel  # noqa: E402
 from slpi_ros.model_file import format_model, save_model  # noqa: E402
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -139,6 +141,18 @@ def test_a_wrong_model_file_ends_it_in_one_line(tmp_path, text):
         assert node.stderr.count("\n") == 1 and str(path) in node.stderr
 
 
+def test_a_model_that_needs_whole_paths_is_refused_either_way(tmp_path):
+    path, text = tmp_path / "smpi.json", format_model(StageModel({"x": PATH_MODEL}, "", ""))
+    path.write_text(text)
+    said = "axis 'x': kind 'smpi' needs whole paths from its start on, and the compensator follows commands and traj"
+    with started("compensator", {"model_file": str(path)}) as node, compensator() as client:
+        client.connect()
+        client.graph.publisher(String, "/stage_model", LATCHED).publish(String(data=text))
+        _, values = client.report(models_refused=1)
+        assert values["last_model_error"].startswith(f"/stage_model: {said}")
+        assert node.wait() == 1 and node.stderr.startswith(f"{path}: {said}") and node.stderr.count("\n") == 1
+
+
 def test_parameters_change_together_or_not_at_all(x_file):
     with compensator(model_file=x_file) as client:
         client.connect()
@@ -195,6 +209,19 @@ def test_config_files_start_a_compensator(config, namespace):
         models.publish(String(data=format_model(replace(stage_model(axes), hardware_id=""))))
         client.report("the model", **{"model.kind": ", ".join(["slpi"] * len(axes))})
         assert client.ask(axes, [0.0] * len(axes)) == [0.0] * len(axes)
+
+
+@pytest.mark.parametrize("namespace", ["", "/left"])
+@pytest.mark.parametrize("config", [*CONFIGS, "exciter"])
+def test_a_parameter_given_behind_a_config_file_has_the_last_word(config, namespace):
+    name = "exciter" if config == "exciter" else "compensator"
+    file = ["--params-file", str(CHECKOUT / "config" / f"{config}.yaml")]
+    arguments = [*file, "-p", "voltage_max:=60.0", "-p", "slew_limit:=700.0", "-r", f"__ns:={namespace or '/'}"]
+    with on_graph() as graph, started(name, {"slew_limit": 1.0}, *arguments) as node:
+        graph.tested = node
+        request = GetParameters.Request(names=["voltage_max", "slew_limit"])
+        values = graph.call(GetParameters, f"{namespace}/{name}/get_parameters", request).values
+        assert [value.double_value for value in values] == [60.0, 700.0]
 
 
 def test_topics_are_as_documented(x_file):

@@ -9,18 +9,21 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
+from builtin_interfaces.msg import Duration  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState  # noqa: E402
-from nodes.compensator_client import Client, compensator  # noqa: E402
+from nodes.compensator_client import Client, compensator, last_at_full_pace  # noqa: E402
 from nodes.ros_helpers import LATCHED, stage_model  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from slpi_ros.model_file import format_model, save_model  # noqa: E402
 from slpi_ros.nodes.compensator_driver import PERIOD  # noqa: E402
 from slpi_ros.stream import LONGEST_STEP  # noqa: E402
 
 SAFE = {"safe_voltage": 10, "ramp_rate": 200.0}
+MS = 1_000_000
 QUICK_RESET = {"reset_rate": 5000.0, "reset_cycles": 3}
 
 
@@ -93,6 +96,39 @@ def test_an_end_leads_to_the_safe_voltage_first(x_file, how):
             client.report(state="finalized" if how == "shutdown" else "inactive")
         way = np.array([before, *voltages(client, 1)])
         assert (np.diff(way) <= 0).all() and np.abs(np.diff(way)).max() <= 200.0 * LONGEST_STEP and len(way) > 20
+
+
+@pytest.mark.parametrize("how", ["deactivate", "signal"])
+def test_an_end_in_motion_brakes_where_acceleration_is_limited(x_file, how):
+    """What it takes to stop depends on the rate at the end, not on when the voltages come."""
+    with compensator(model_file=x_file, slew_limit=200.0, acceleration_limit=1000.0) as client:
+        client.connect()
+        points = [
+            JointTrajectoryPoint(positions=[8e-6], time_from_start=Duration(nanosec=5 * i * MS)) for i in range(190)
+        ]
+        message = JointTrajectory(joint_names=["x"], points=points)
+        client.graph.publisher(JointTrajectory, "/desired_trajectory").publish(message)
+        client.graph.spin_until(lambda: client.answers and client.answers[-1][0] > 30.0, "full pace")
+        if how == "signal":
+            assert client.node.stop(signal.SIGTERM) == 0
+            client.graph.tested = None
+        else:
+            request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+            assert client.graph.call(ChangeState, f"{client.name}/change_state", request).success
+            client.report(state="inactive")
+        # Voltages may come after the process has ended.
+        client.graph.spin_until(lambda: voltages(client)[-1] - last_at_full_pace(voltages(client)) > 5.0, "a way")
+        way = voltages(client)
+        assert way[-1] - last_at_full_pace(way) <= 200.0**2 / 2 / 1000.0 + 1e-6 and (np.diff(way) >= 0.0).all()
+
+
+def test_on_the_way_from_a_limit_nothing_is_out_of_reach(x_file):
+    with compensator(model_file=x_file, slew_limit=1000.0) as client:
+        client.connect()
+        client.follow(["x"], np.full((60, 1), 5e-6))
+        _, values = client.report(accepted=60)
+        assert values["held_at_limit"] == values["excursions"] == "0" and int(values["slew_limited"]) > 5
+        assert "out of reach" not in client.node.stderr
 
 
 def test_safe_voltages_lie_within_the_limits(x_file):

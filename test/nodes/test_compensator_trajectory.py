@@ -9,13 +9,14 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from builtin_interfaces.msg import Duration  # noqa: E402
-from nodes.compensator_client import SECOND_NS, Client, compensator  # noqa: E402
+from nodes.compensator_client import SECOND_NS, Client, compensator, last_at_full_pace  # noqa: E402
 from nodes.ros_helpers import LATCHED, RELIABLE, stage_model, voltage_path  # noqa: E402
 from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from slpi_ros.model import HeldAtLimitWarning  # noqa: E402
 from slpi_ros.model_file import format_model, save_model  # noqa: E402
+from slpi_ros.runtime.saved_memory import model_id  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings(f"ignore::{HeldAtLimitWarning.__module__}.{HeldAtLimitWarning.__name__}")
 MS = 1_000_000
@@ -148,3 +149,38 @@ def test_a_trajectory_keeps_to_the_slew_limit_and_survives_new_limits_and_a_new_
     assert v.min() >= 0.0 and v.max() <= 100.0
     # A step after skipped points may be as long as theirs together.
     assert np.abs(np.diff(v, axis=0)).max() <= 2000.0 * 2e-3 * (1 + int(values["points_skipped"])) + 1e-9
+
+
+def test_a_trajectory_that_waits_is_given_with_the_model_that_came_meanwhile(xy_file):
+    other = stage_model(("x", "y"), stroke=14e-6)
+    path = np.linspace(1e-6, 5e-6, 20)
+    with compensator(axes=["x", "y"], model_file=xy_file) as client:
+        client.connect()
+        models = client.graph.publisher(String, "/stage_model", LATCHED)
+        sender(client).publish(trajectory(["x"], SECOND_NS + np.arange(20) * 20 * MS, path[:, None]))
+        client.report(trajectories=1, points_remaining=20)
+        models.publish(String(data=format_model(other)))
+        client.report(**{"model.id": model_id(other)[:12], "points_remaining": 20})
+        settle(client, 20)
+        x = [answer[0] for answer in client.answers]
+        expected = other.compensate(np.arange(20), {"x": path, "y": np.zeros(20)})["x"]
+        # A busy machine may lose points, but the path has no turns.
+        assert all(np.abs(expected - v).min() < 1e-8 for v in x) and x[-1] == pytest.approx(expected[-1], abs=1e-8)
+        assert client.ask(["x"], [path[-1]])[0] == pytest.approx(x[-1], abs=1e-8)
+
+
+def test_a_cancelled_trajectory_brakes(xy_file):
+    """What it takes to stop depends on the rate at the end, not on when the voltages come."""
+    limits = {"slew_limit": 200.0, "acceleration_limit": 1000.0}
+    with compensator(axes=["x", "y"], model_file=xy_file, **limits) as client:
+        client.connect()
+        publisher = sender(client)
+        publisher.publish(trajectory(["x"], np.arange(2000) * 5 * MS, np.full((2000, 1), 8e-6)))
+        client.graph.spin_until(lambda: client.answers and client.answers[-1][0] > 30.0, "full pace")
+        publisher.publish(JointTrajectory())
+        client.report(points_remaining=0)
+        told = len(client.reports)
+        client.graph.spin_until(lambda: len(client.reports) > told + 5, "rest")
+        v = np.array(client.answers)[:, 0]
+        way = v[-1] - last_at_full_pace(v)
+        assert 5.0 < way <= 200.0**2 / 2 / 1000.0 + 1e-6 and (np.diff(v) >= 0.0).all()

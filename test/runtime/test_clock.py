@@ -61,6 +61,18 @@ def test_after_a_restart_no_time_has_passed_but_old_stamps_stay_late():
     assert verdict(stamps, NOW + 4 * SECOND_NS) == 1.0
 
 
+@pytest.mark.parametrize("earlier", [True, False])
+def test_a_restart_may_say_how_long_ago_the_voltage_was_given(earlier):
+    stamps = Stamps(JUMP)
+    if earlier:
+        verdict(stamps, NOW - SECOND_NS // 2)
+    stamps.restart(0.003)
+    assert [verdict(stamps, NOW), verdict(stamps, NOW + SECOND_NS)] == [0.003, 1.0]
+    stamps.restart(0.003)
+    assert verdict(stamps, NOW - 2 * SECOND_NS) == -3.0
+    assert verdict(stamps, NOW - SECOND_NS) == 1.0
+
+
 def test_a_restart_before_the_first_stamp_is_none():
     stamps = Stamps(JUMP)
     stamps.restart()

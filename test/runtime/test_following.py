@@ -1,6 +1,7 @@
 """Axes along trajectories: as planned while nothing comes in between, and as good as possible when something does."""
 
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.runtime.axis import Axis
 from slpi_ros.runtime.following import Following
 from slpi_ros.runtime.loop import LoopSettings
+from slpi_ros.runtime.plan import prepare
 from slpi_ros.runtime.trajectory import Trajectory
 from slpi_ros.stream import Limits
 
@@ -77,6 +79,86 @@ def test_a_model_limits_or_lateness_in_between_make_the_rest_sample_by_sample():
                 change(twin)
             expected.append(twin.move(1e-3, y))
         np.testing.assert_allclose(np.vstack(given)[:, 0], expected, rtol=0, atol=1e-7, err_msg=name)
+
+
+CURVES = MODEL.hysteresis
+STEEP = replace(MODEL, hysteresis=replace(CURVES, surface=1.2 * CURVES.surface, rise=1.2 * CURVES.rise))
+
+
+def swapped(axis):
+    axis.use(STEEP, axis.prepare(STEEP))
+
+
+def limited(axis):
+    axis.use_limits(Limits(0.0, 100.0, 1500.0))
+
+
+def shaken(axis):
+    """Leave the voltage, but not the memory."""
+    there = axis.voltage
+    for v in (80.0, 10.0, there):
+        axis.stream.drive(v)
+
+
+IN_BETWEEN = {"model": swapped, "limits": limited, "memory": shaken, "desired": lambda axis: axis.move(1e-3, 6e-6)}
+
+
+def kept_to(given, axis):
+    """Check the voltages: those of live wishes from where the axis was, each as soon as the slew limit allows."""
+    for (ahead, y), v in given:
+        assert v == pytest.approx(axis.move(ahead, y), abs=1e-7)
+
+
+@pytest.mark.parametrize("what", IN_BETWEEN)
+def test_a_plan_that_waits_for_its_time_is_worth_nothing_once_something_has_changed(what):
+    made, twin = axes(slew=2000.0), axes(slew=2000.0)["x"]
+    following = Following(made)
+    following.start(trajectory(start_ns=START + 100 * MS), lambda: START, START - 1000 * MS)
+    assert follow(following, made, START + 50 * MS).size == 0
+    for axis in (made["x"], twin):
+        IN_BETWEEN[what](axis)
+    given = follow(following, made, START + 500 * MS)[:, 0]
+    assert len(given) == 300
+    kept_to(zip([(0.1, PATH[0]), *((1e-3, y) for y in PATH[1:].tolist())], given, strict=True), twin)
+
+
+@pytest.mark.parametrize("accepted", [20, 80])
+@pytest.mark.parametrize("what", ["model", "limits", "late"])
+def test_nor_one_that_reckoned_with_a_path_that_became_another(what, accepted):
+    """Whether it was accepted before or after: what was planned for the path before it is no longer given."""
+    made, twin = axes(slew=2000.0), axes(slew=2000.0)["x"]
+    following = Following(made)
+    begin = START + 150 * MS
+    following.start(trajectory(), lambda: START, START - 1000 * MS)
+    given = []
+    for k in range(300):
+        now = START + k * MS
+        if k == accepted:
+            following.start(trajectory(start_ns=begin, path=PATH[150:]), lambda at=now: at, START)
+        if k == 50 and what != "late":
+            for axis in (made["x"], twin):
+                IN_BETWEEN[what](axis)
+        if what == "late" and 46 <= k < 55:
+            continue
+        assert following.step(now) is not None
+        ahead = 0.1 if k == 0 else 10e-3 if what == "late" and k == 55 else 1e-3
+        given.append(made["x"].voltage)
+        assert given[-1] == pytest.approx(twin.move(ahead, float(PATH[k])), abs=1e-7), k
+    assert not following.on
+
+
+@pytest.mark.parametrize("limits", [{}, {"slew": 2000.0}, {"slew": 3000.0, "acceleration": 2e5}])
+def test_what_comes_after_a_path_that_was_kept_to_is_given_as_planned(limits):
+    made = axes(**limits)
+    following, plans = Following(made), []
+    with mock.patch("slpi_ros.runtime.following.prepare", lambda *a: plans.append(prepare(*a)) or plans[-1]):
+        following.start(trajectory("xy"), lambda: START, START - 1000 * MS)
+        follow(following, made, START + 50 * MS)
+        following.start(trajectory("x", PATH[::-1], START + 150 * MS), lambda: START + 50 * MS, START)
+    with mock.patch.object(Axis, "move", None):
+        given = follow(following, made, START + 500 * MS)[:, 0]
+    expected = [*plans[0].voltages[50:150, 0], *plans[1].voltages[:, 0]]
+    np.testing.assert_allclose(given, expected, rtol=0, atol=1e-9)
 
 
 def test_points_that_are_late_are_skipped_and_the_memory_knows_what_was_given():

@@ -11,6 +11,7 @@ from slpi_ros.runtime.axis import Axis
 from slpi_ros.runtime.health import ENOUGH, WINDOW, ResidualWindow
 from slpi_ros.runtime.loop import LoopSettings
 from slpi_ros.runtime.ramp import Ramp
+from slpi_ros.runtime.rejection import RejectedError
 from slpi_ros.stream import Limits
 
 LIMITS = Limits(0.0, 100.0, 2000.0)
@@ -69,13 +70,16 @@ def test_a_measurement_is_held_against_the_wish_that_it_answers():
 
 
 @pytest.mark.parametrize("enabled", [True, False])
-def test_other_gains_after_a_measurement_beyond_reason(enabled):
-    silent = replace(ON, gains=PidGains(0.0, 1e-300), enabled=enabled)
+def test_other_gains_after_a_slope_beyond_reason(enabled):
+    silent = replace(ON, gains=PidGains(0.0, 0.0, 1e-300), enabled=enabled)
     bench = Bench(silent)
     bench.run(START)
-    bench.axis.measure(1e308)
-    bench.axis.move(DT, float(START[-1]))
+    for measured in (2e-6, 14e-6):
+        bench.axis.measure(measured)
+        bench.axis.move(1e-9, float(START[-1]))
     before = bench.axis.voltage
+    bench.axis.retune(replace(silent, gains=PidGains(0.0, 0.0, 1e306)))
+    assert bench.axis.move(DT, float(START[-1])) == pytest.approx(before, abs=1e-9)
     bench.axis.retune(replace(silent, gains=PidGains(1e2, 1e8)))
     assert bench.axis.move(DT, float(START[-1])) == pytest.approx(before, abs=1e-9)
     # Another takes over, and acts.
@@ -99,7 +103,8 @@ def test_stale_and_absurd_measurements_do_not_act_and_the_correction_stays():
     assert kept < -2.0
     for spoil in (None, np.nan, np.inf, 1e308):
         if spoil is not None:
-            bench.axis.measure(spoil)
+            with pytest.raises(RejectedError):
+                bench.axis.measure(spoil)
         bench.axis.move(DT, float(PATH[1000]))
         assert bench.axis.feedback == "holding"
         assert bench.axis.correction == pytest.approx(kept, abs=1e-9)
@@ -107,6 +112,36 @@ def test_stale_and_absurd_measurements_do_not_act_and_the_correction_stays():
     bench.now += 0.2
     bench.axis.move(DT, PATH[1000])
     assert bench.axis.feedback == "holding"
+
+
+@pytest.mark.parametrize("absurd", [17e-6, -1e-6, 1e-3, -1e300, 1e300, np.nan, np.inf])
+def test_a_measurement_that_cannot_be_acts_on_nothing(absurd):
+    """As far outside the identified displacements as no wish may be: a wrong unit, a sensor that fails."""
+    bench, undisturbed = Bench(ON, 3.0), Bench(ON, 3.0)
+    for each in (bench, undisturbed):
+        each.run(START)
+        each.run(PATH[:600])
+    for each in (bench, undisturbed):
+        for y in PATH[600:610].tolist():
+            if each is bench:
+                with pytest.raises(RejectedError, match="^measured displacement [^\n]+$") as caught:
+                    each.axis.measure(absurd)
+                assert caught.value.cause == ("out_of_range" if np.isfinite(absurd) else "not_finite")
+            each.run(np.array([y]), measuring=False)
+    assert bench.voltages == undisturbed.voltages
+    assert bench.axis.drift == undisturbed.axis.drift
+
+
+@pytest.mark.parametrize("first", [1e-3, np.nan])
+def test_a_measurement_that_cannot_be_does_not_hide_one_that_came_before(first):
+    bench, other = Bench(ON, 3.0), Bench(ON, 3.0)
+    for each in (bench, other):
+        each.run(START)
+        each.axis.measure(each.measured)
+    with pytest.raises(RejectedError):
+        bench.axis.measure(first)
+    assert bench.axis.move(DT, PATH[0]) == other.axis.move(DT, PATH[0])
+    assert bench.axis.feedback == "on"
 
 
 def test_switching_the_feedback_makes_no_jump():

@@ -1,12 +1,17 @@
 """Ramps, and the reset: after it the memory is the same whatever it was before."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import FAMILY_CASE, cases, fractions, paths, stream_forward
+from strategies import FAMILY_CASE, axis_model, cases, fractions, paths, stream_forward
 
 from slpi_ros.errors import UsageError
+from slpi_ros.model import StageModel
+from slpi_ros.nodes.compensation import Compensation
+from slpi_ros.runtime.memory_trust import ASSUMED, KNOWN, RESETTING, MemoryTrust
 from slpi_ros.runtime.ramp import Ramp
 from slpi_ros.runtime.reset import decaying_turns
 from slpi_ros.stream import Limits, Pace
@@ -99,3 +104,61 @@ def test_the_reset_of_a_family_visits_the_widest_loop_first():
     stream_forward(memory, np.array(decaying_turns(LIMITS, 50.0, 4)))
     turns = memory.snapshot().turn_voltages
     assert turns == (100.0, 0.0, 87.5, 12.5, 75.0, 25.0, 62.5, 37.5)
+
+
+# What the memory is worth then
+
+
+def stage(voltage: float = 100.0) -> StageModel:
+    """Return a model that was identified from 0 V to a voltage."""
+    return StageModel({"x": replace(axis_model(FAMILY_CASE), voltage_range=(0.0, voltage))}, "", "")
+
+
+def reset(limits: Limits, model: StageModel, swaps_to: StageModel | None = None, steps: int = 10**6) -> Compensation:
+    """Return a compensator whose memory has been reset, or driven for so many steps."""
+    made = Compensation(["x"], [limits])
+    made.use_model(model)
+    made.activate(True)
+    made.driving.reset(2, 1000.0, [30.0])
+    arrived = False
+    for _ in range(steps):
+        if arrived := made.drive(0.01):
+            break
+    if swaps_to:
+        made.use_model(swaps_to)
+    assert made.axes[0].memory_state == RESETTING
+    assert arrived or steps < 10**6
+    made.driving.stop()
+    return made
+
+
+@pytest.mark.parametrize(("limits", "state"), [
+    (LIMITS, KNOWN), (Limits(-5.0, 200.0), KNOWN), (Limits(0.5, 99.5), KNOWN), (Limits(0.0, 100.0, 300.0, 4e3), KNOWN),
+    (Limits(20.0, 40.0), ASSUMED), (Limits(0.0, 98.0), ASSUMED), (Limits(2.0, 100.0), ASSUMED),
+])  # fmt: skip
+def test_only_a_drive_through_all_that_was_identified_makes_the_memory_known(limits, state):
+    trust = reset(limits, stage()).axes[0].trust
+    assert trust.state == state
+    if state == ASSUMED:
+        assert f"wiped from {limits.lower:g} to {limits.upper:g} V only" in trust.doubt and "\n" not in trust.doubt
+        assert "0 to 100 V" in trust.doubt
+    else:
+        assert trust.doubt == ""
+
+
+def test_an_interrupted_reset_leaves_the_memory_assumed():
+    assert reset(LIMITS, stage(), steps=5).axes[0].trust == MemoryTrust(ASSUMED, "the reset was interrupted")
+
+
+def test_a_new_model_knows_the_memory_only_where_it_was_wiped():
+    wider, noisy, narrower = stage(120.0), stage(100.5), stage(90.0)
+    limits = Limits(0.0, 200.0)
+    for after, state in ((wider, ASSUMED), (noisy, KNOWN), (narrower, KNOWN)):
+        made = reset(limits, stage())
+        made.use_model(after)
+        assert made.axes[0].memory_state == state
+        assert reset(limits, stage(), swaps_to=after).axes[0].memory_state == state
+    # What was not known cannot become so by a model.
+    made = reset(Limits(0.0, 90.0), stage())
+    made.use_model(narrower)
+    assert made.axes[0].memory_state == ASSUMED

@@ -1,6 +1,7 @@
 """Axes whose models know effects, at run time: messages, trajectories, swaps, pauses, feedback, reset."""
 
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -98,6 +99,26 @@ def test_trajectories_are_followed_as_messages_are():
     assert made.following.points_held == made.following.points_slewing == 0
 
 
+def test_a_path_reckons_with_axes_that_another_path_brings_elsewhere():
+    """Until it takes over, x moves on; what y is then asked for is planned for where x will be."""
+    made, twin = compensation(), compensation()
+    begin = START + 300 * MS
+    first, second = (slice(0, 300), slice(300, 600))
+    x = Trajectory.of(["x"], np.arange(300) * MS, PATHS["x"][first, None], axes=["x", "y"])
+    y = Trajectory.of(["y"], np.arange(300) * MS, PATHS["y"][second, None], begin, axes=["x", "y"])
+    made.following.start(x, lambda: START, START)
+    made.following.start(y, lambda: START, START)
+    with mock.patch.object(Axis, "move", None):
+        given = []
+        for k in range(600):
+            made.follow(START + k * MS)
+            given.append(list(made.voltages))
+    # A pause of y before its path; a jump of x in both.
+    twin.axes[1].stamps.accept(START)
+    expected = np.array([move(twin, k, "x" if k < 300 else "y") for k in range(600)])
+    np.testing.assert_allclose(given, expected, rtol=0, atol=1e-5)
+
+
 def test_a_known_path_is_previewed_against_a_delay():
     model = StageModel(
         {name: replace(axis, effects=(Delay(0.02), *axis.effects)) for name, axis in COUPLED.axes.items()}
@@ -180,7 +201,7 @@ def test_feedback_with_effects():
 
 @pytest.mark.parametrize("effects", [(LAG,), (CREEP,), (LAG, CREEP, MODE)])
 def test_reset_and_ramps_move_the_effects_too(effects):
-    axis = with_effects(*effects)
+    axis = with_effects(*effects, limits=Limits(*X.voltage_range))
     stage, driving = axis.model.stream(), Driving([axis])
     driving.reset(3, 2000.0, [0.0])
     while not driving.step(DT):

@@ -11,13 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, PI_CASE, Case, axis_model, cases, fractions, paths
 
-from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.hysteresis.mpi import MultiSlope, thresholds_for
-from slpi_ros.hysteresis.smpi import AmplitudeScaled
-from slpi_ros.model import AxisModel, FitQuality, Start
+from slpi_ros.errors import SlpiError
+from slpi_ros.model import AxisModel
 from slpi_ros.runtime import deadlines, rejection
 from slpi_ros.runtime.deadlines import Streamer
-from slpi_ros.runtime.plan import Plan, Resting, Standing, prepare, stream_twin_of
+from slpi_ros.runtime.plan import Plan, Standing, prepare, stream_twin_of
 from slpi_ros.runtime.rejection import RejectedError
 from slpi_ros.runtime.trajectory import Trajectory
 from slpi_ros.stream import LONGEST_STEP, AxisStream, Limits, accepted_range
@@ -496,77 +494,6 @@ def test_an_axis_in_motion_brakes_first_where_acceleration_is_limited():
     )
     v, *_ = one_by_one(standing.axis, np.full(199, here), 10**18 + MS * np.arange(1, 200), 10**18)
     np.testing.assert_allclose(plan.voltages[:, 0], v, rtol=0, atol=1e-9)
-
-
-SPREAD = np.concatenate([[0.0], np.linspace(0.1, 1.0, 200), np.linspace(1.0, 0.3, 150), np.linspace(0.3, 0.0, 100)])
-SMPI = AmplitudeScaled(
-    MultiSlope(-10.0, 120.0, thresholds_for(120.0), 1e-7 * np.array([5, 0, 1, 2, 0, 0, 1, 0.5, 0, 0, 0, 0.2, 0])),
-    np.array([60.0, 120.0]),
-    np.array([40e-6, 90e-6]),
-)
-PATH_MODEL = AxisModel(
-    "smpi", SMPI, Start(-10.0, 1e-6), (-10.0, 110.0), (1e-6, 91e-6), FitQuality(0, 0, 0, 0, 1, 1, "")
-)
-
-
-def known_path(limits: Limits, voltage: float = -10.0, step: int = MS) -> Plan:
-    trajectory = Trajectory.of(["x"], step * np.arange(SPREAD.size), (1e-6 + 70e-6 * SPREAD)[:, None], axes=["x"])
-    return prepare(trajectory, {"x": Standing(PATH_MODEL, Resting(limits, voltage), 0)}, 10**18)
-
-
-def test_a_model_that_needs_the_whole_path_gets_it():
-    plan = known_path(Limits(-10.0, 110.0))
-    v, held = PATH_MODEL.compensate(np.arange(SPREAD.size), 1e-6 + 70e-6 * SPREAD)
-    assert plan.voltages[:, 0].tolist() == v.tolist()
-    assert np.ptp(v) > 80
-    assert plan.held[:, 0].tolist() == held.tolist() and not plan.slewed.any()
-
-
-def test_a_known_path_keeps_to_the_slew_limit():
-    plan, wanted = known_path(Limits(-10.0, 110.0, 900.0)), known_path(Limits(-10.0, 110.0)).voltages
-    steps = np.diff(plan.voltages[:, 0], prepend=-10.0)
-    assert np.abs(steps[1:]).max() == pytest.approx(0.9)
-    behind = np.abs(plan.voltages - wanted) > 1e-6
-    assert plan.slewed.tolist() == behind.tolist()
-    assert behind.any() and not behind.all()
-    assert not known_path(Limits(-10.0, 110.0, 900.0), step=200 * MS).slewed[2:].any()
-
-
-def test_a_known_path_keeps_to_the_acceleration_limit():
-    wanted = known_path(Limits(-10.0, 110.0)).voltages
-    gentle = known_path(Limits(-10.0, 110.0, inf, 1e5)).voltages
-    changes = np.diff(gentle[:, 0], n=2, prepend=[-10.0, -10.0]) / 1e-3**2
-    assert np.abs(changes[1:]).max() <= 1e5 * (1 + 1e-6) < np.abs(np.diff(wanted[:, 0], n=2)).max() / 1e-3**2
-    # The last step brakes before the voltage limit.
-    assert not known_path(Limits(-10.0, 110.0, inf, 1e9)).slewed[1:-1].any()
-    # Each after a pause: 100 V/s^2 over 0.1 s, from rest.
-    steps = np.diff(known_path(Limits(-10.0, 110.0, inf, 100.0), step=200 * MS).voltages[:, 0])
-    assert np.abs(steps).max() == pytest.approx(1.0)
-
-
-def test_a_known_path_that_is_held_says_so():
-    plan = known_path(Limits(-10.0, 60.0))
-    assert plan.voltages.max() == 60.0
-    assert plan.held.any() and not plan.slewed.any()
-    slow = known_path(Limits(-10.0, 60.0, 400.0))
-    assert slow.held.any() and slow.slewed.any() and not (slow.held & slow.slewed).any()
-
-
-def test_a_known_path_begins_where_its_model_does():
-    with pytest.raises(UsageError, match=r"^axis 'x': a path of kind 'smpi' begins at -10 V[^\n]*$"):
-        known_path(Limits(-10.0, 110.0), voltage=12.0)
-
-
-def test_a_known_path_may_follow_one_that_ends_at_its_start():
-    streamer: Streamer[Plan] = Streamer()
-    limits, times = Limits(-10.0, 110.0), MS * np.arange(SPREAD.size)
-    y = (1e-6 + 70e-6 * SPREAD)[:, None]
-    standing = {"x": Standing(PATH_MODEL, Resting(limits, -10.0), 0)}
-    streamer.start(prepare(Trajectory.of(["x"], times, y, 10**18, axes=["x"]), standing, 10**18), 10**18)
-    again = Trajectory.of(["x"], times, y, 10**18 + 1000 * MS, axes=["x"])
-    assert prepare(again, standing, 10**18, streamer).voltages.max() > 70
-    with pytest.raises(UsageError, match="bring it there first"):
-        prepare(replace(again, start_ns=10**18 + 200 * MS), standing, 10**18, streamer)
 
 
 # What makes no sense

@@ -1,0 +1,205 @@
+"""Rate dependence whose thresholds grow with the rate."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effects.cases import coercivities, records
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import FAMILY_CASE, axis_model
+
+from slpi_ros.effects.effect import Around
+from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.rate_dependence import RateDependence
+from slpi_ros.effects.registry import in_order
+from slpi_ros.model import StageModel
+from slpi_ros.model_file import format_model, parse_model
+from slpi_ros.stage.viscosity import RateLaw, Viscosity
+from slpi_ros.stream import Limits
+
+BARE = replace(axis_model(FAMILY_CASE), voltage_range=(-20.0, 120.0))
+SPAN, DT = 10e-6, 1e-3
+T = DT * np.arange(4000)
+CORNERS = np.interp(T, 0.3 + 0.25 * np.arange(16), [2e-6, *(10e-6, 4e-6, 8e-6, 5e-6, 9e-6) * 3])
+SMOOTH = 2e-6 + 4e-6 * (1 - np.cos(2 * np.pi * 0.5 * T)) * (1 - 0.4 * np.sin(2 * np.pi * 0.9 * T) ** 2)
+PATHS = pytest.mark.parametrize("wish", [SMOOTH, CORNERS], ids=["smooth", "corners"])
+EFFECTS = pytest.mark.parametrize(
+    "effect",
+    [
+        RateDependence(0.0, 0.0, 0.05, 200.0, 1.0, 2.0, 10.0, 2e-3, (5e-8,)),
+        RateDependence(0.0, 0.0, 0.5, 200.0, 1.0, 1.0, 0.0, 1e-3, (3e-8, 1e-10)),
+        RateDependence(0.0, 0.0, 0.1, 200.0, 1.0, 4.0, 5.0, 5e-3, (8e-8, -1e-10)),
+    ],
+    ids=["logarithm", "power", "large"],
+)
+
+
+def rms(error):
+    return float(np.sqrt(np.mean(error**2))) if error.size else 0.0
+
+
+def widest(effect, v, t):
+    rate = np.abs(np.diff(v) / np.diff(t)).max()
+    law = replace(effect, reversible=(), settling=0.0)
+    ramp = rate * np.array([0.0, 1.0, 2.0])
+    return float(np.ptp(law.apply(ramp, Around(np.arange(3.0))) - ramp))
+
+
+@given(coercivities(), records("voltage"))
+def test_what_is_seen_stays_within_the_coercivity(effect, record):
+    seen = effect.apply(record.signal, record.around)
+    assert np.abs(seen - record.signal).max() <= widest(effect, record.signal, record.around.t) * (1 + 1e-9) + 1e-9
+
+
+@given(coercivities(), records("voltage"))
+def test_more_coercivity_lets_less_through(effect, record):
+    """And none in the limit lets everything through."""
+    seen = [np.ptp(replace(effect, coercivity=c).apply(record.signal, record.around)) for c in (1e-12, 1.0, 3.0)]
+    assert seen[0] == pytest.approx(record.span, abs=1e-9)
+    assert seen[0] >= seen[1] - 1e-9 >= seen[2] - 2e-9
+
+
+@given(coercivities(), records("voltage"))
+def test_it_comes_back_from_its_inverse(effect, record):
+    """Nearly, for the rate of the command is not that of what comes out; away from turns it is closer."""
+    command = effect.invert(record.signal, record.around)
+    assert np.abs(command - record.signal).max() <= widest(effect, record.signal, record.around.t) * (1 + 1e-9) + 1e-9
+    error, ignored = (np.abs(effect.apply(v, record.around) - record.signal) for v in (command, record.signal))
+    slope = np.abs(np.gradient(record.signal, record.around.t))
+    fast = slope > 0.3 * slope.max(initial=0.0)
+    assert rms(error) <= rms(ignored) + 1e-5
+    assert rms(error[fast]) <= 0.9 * rms(ignored[fast]) + 1e-5
+
+
+@given(coercivities(), records("voltage"))
+def test_it_is_followed_nearly(effect, record):
+    """Backwards only, the rate comes half a sample late."""
+    follower, steps = effect.follower(), np.diff(record.around.t, prepend=0.0).tolist()
+    follower.start(float(record.signal[0]))
+    followed = [follower.forward(dt, v) for dt, v in zip(steps, record.signal.tolist(), strict=True)]
+    missed = effect.apply(record.signal, record.around) - followed
+    assert rms(missed) <= 0.2 * rms(effect.apply(record.signal, record.around) - record.signal) + 1e-12
+    assert follower.aside == pytest.approx(
+        float(effect.aside(record.signal[-1:], np.array(followed[-1:]))[0]), abs=1e-15
+    )
+
+
+@given(coercivities(), records("voltage"), st.integers(1, 600))
+def test_a_snapshot_is_the_whole_state(effect, record, at):
+    one, other = effect.follower(), effect.follower()
+    samples = list(zip(np.diff(record.around.t, prepend=0.0).tolist(), record.signal.tolist(), strict=True))
+    one.start(samples[0][1])
+    for dt, v in samples[:at]:
+        one.forward(dt, one.inverse(dt, v))
+    other.restore(tuple(json.loads(json.dumps(one.snapshot()))))
+    for dt, v in samples[at : at + 50]:
+        wanted = one.inverse(dt, v)
+        assert other.inverse(dt, v) == wanted
+        assert other.forward(dt, wanted) == one.forward(dt, wanted)
+
+
+@given(coercivities(), records("voltage"), st.sampled_from(("apply", "invert")))
+def test_at_rest_nothing_changes(effect, record, verb):
+    rest = np.full_like(record.signal, 50.0)
+    np.testing.assert_array_equal(getattr(effect, verb)(rest, record.around), rest)
+    assert not effect.aside(rest, rest).any()
+
+
+@given(records("voltage"), st.floats(0.1, 4.0), st.floats(0.2, 0.9), st.floats(5e-4, 5e-3))
+def test_against_the_simulated_stage(record, strength, exponent, settling):
+    """Of a power law."""
+    stage = Viscosity(RateLaw(strength, 100.0, exponent, settling=settling)).relay_voltage(
+        record.around.t, record.signal
+    )
+    effect = RateDependence(0.0, 0.0, exponent, 100.0, 1.0, strength, settling=settling)
+    np.testing.assert_allclose(effect.apply(record.signal, record.around), stage, rtol=0, atol=1e-3 * strength)
+
+
+@given(records("voltage"), st.floats(0.1, 4.0), st.floats(3.0, 30.0))
+def test_a_small_power_is_a_logarithm(record, strength, onset):
+    stage = Viscosity(RateLaw(strength, 100.0, 0.0, onset)).relay_voltage(record.around.t, record.signal)
+    effect = RateDependence(0.0, 0.0, 1e-3, 100.0, 1.0, strength, onset, 5e-3)
+    np.testing.assert_allclose(effect.apply(record.signal, record.around), stage, rtol=0, atol=5e-3 * strength)
+
+
+def test_a_ramp_back_and_forth():
+    """At one rate it is a play of one width, from where the coercivity has settled."""
+    t = np.arange(2000) * 1e-3
+    v = 50 * (1 - np.abs(1 - t))
+    u = RateDependence(0.0, 0.0, 0.5, 100.0, 1.0, 2.0, settling=1e-3).apply(v, Around(t))
+    half_width = 2.0 * np.sqrt(0.5)
+    np.testing.assert_allclose(u[100:900], v[100:900] - half_width, rtol=1e-12)
+    np.testing.assert_allclose(u[1100:1900], v[1100:1900] + half_width, rtol=1e-12)
+
+
+def test_no_samples_one_sample_and_no_time():
+    effect = RateDependence(0.0, 0.0, 0.5, 100.0, 1.0, 2.0)
+    for verb in (effect.apply, effect.invert):
+        assert verb(np.empty(0), Around(np.empty(0))).shape == (0,)
+        assert verb(np.array([3.0]), Around(np.array([7.0]))).tolist() == [3.0]
+        assert verb(np.array([3.0, 5.0, 4.0]), Around(np.zeros(3))).tolist() == [3.0, 5.0, 4.0]
+
+
+def test_it_is_the_last_before_the_hysteresis():
+    effect = RateDependence(0.0, 0.0, 0.5, 100.0, 1.0, 2.0)
+    axis = replace(BARE, effects=(effect, Lag(0.01)))
+    assert [each.name for each in in_order(axis.effects)] == ["lag", "rate_dependence"]
+    assert axis.chain.before == (Lag(0.01), effect) and not axis.chain.own
+    assert parse_model(format_model(StageModel({"x": axis})), "here").axes["x"].effects == axis.effects
+
+
+@EFFECTS
+@PATHS
+def test_compensation(effect, wish):
+    """A whole path, and sample by sample; the command does not run away."""
+    axis = replace(BARE, effects=(effect,))
+    batch, held = axis.compensate(T, wish)
+    stream = axis.stream()
+    streamed = [stream.step(now, y) for now, y in zip(T.tolist(), wish.tolist(), strict=True)]
+    np.testing.assert_allclose(batch, streamed, rtol=0, atol=1e-9)
+    bare = BARE.compensate(T, wish)[0]
+    error, ignored = (rms((axis.simulate(T, v) - wish)[20:]) for v in (batch, bare))
+    assert error < 2e-3 * SPAN and error < 0.4 * ignored
+    assert np.abs(batch - bare).max() < 2.5 * effect.coercivity
+    assert not held.any()
+
+
+@EFFECTS
+def test_beside_a_lag_and_limits(effect):
+    """What a stream says of its own displacement is what the model makes of its voltages."""
+    axis = replace(BARE, effects=(Lag(0.01), effect))
+    stream, twin = (axis.stream(Limits(10.0, 70.0, 400.0, 4e4)) for _ in range(2))
+    v, own = [], []
+    for now, y in zip(T.tolist(), (1.4 * CORNERS).tolist(), strict=True):
+        v.append(stream.step(now, y))
+        own.append(stream.own)
+    assert (min(v), max(v)) == (10.0, 70.0)
+    expected = [twin.drive(each, DT if k else 0.0) for k, each in enumerate(v)]
+    # At rest a power of the rate makes much of rounding.
+    np.testing.assert_allclose(own, expected, rtol=0, atol=1e-8 * SPAN)
+
+
+@EFFECTS
+def test_a_stream_goes_on_where_another_has_been(effect):
+    axis = replace(BARE, effects=(effect,))
+    one, other = axis.stream(), axis.stream()
+    for now, y in zip(T[:1500].tolist(), CORNERS.tolist(), strict=False):
+        one.step(now, y)
+    other.resume(one)
+    assert other.voltage == one.voltage
+    before = one.voltage
+    after = other.move(DT, float(CORNERS[1500]))
+    assert abs(after - before) < 1.0 + 2 * effect.coercivity
+
+
+@EFFECTS
+def test_twins_go_their_own_ways(effect):
+    stream = replace(BARE, effects=(effect,)).stream()
+    for now, y in zip(T[:700].tolist(), CORNERS.tolist(), strict=False):
+        stream.step(now, y)
+    twin, state = stream.twin(), stream.snapshot()
+    ahead = [twin.move(DT, float(y)) for y in CORNERS[700:800]]
+    assert stream.snapshot() == state
+    assert [stream.move(DT, float(y)) for y in CORNERS[700:800]] == ahead

@@ -6,6 +6,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
@@ -15,10 +16,11 @@ from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
 from nodes.compensator_client import Client, compensator  # noqa: E402
 from nodes.ros_helpers import LATCHED, NodeProcess, on_graph, stage_model, started  # noqa: E402
 from rcl_interfaces.srv import DescribeParameters, GetParameters  # noqa: E402
-from runtime.test_trajectory import PATH_MODEL  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from slpi_ros.model import StageModel  # noqa: E402
+from slpi_ros.hysteresis.mpi import MultiSlope, thresholds_for  # noqa: E402
+from slpi_ros.hysteresis.smpi import AmplitudeScaled  # noqa: E402
+from slpi_ros.model import AxisModel, FitQuality, StageModel, Start  # noqa: E402
 from slpi_ros.model_file import format_model, save_model  # noqa: E402
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -139,6 +141,16 @@ def test_a_wrong_model_file_ends_it_in_one_line(tmp_path, text):
     with started("compensator", {"model_file": str(path)}) as node:
         assert node.wait() == 1
         assert node.stderr.count("\n") == 1 and str(path) in node.stderr
+
+
+WEIGHTS = 1e-7 * np.array([5, 0, 1, 2, 0, 0, 1, 0.5, 0, 0, 0, 0.2, 0])
+SMPI = AmplitudeScaled(
+    MultiSlope(-10.0, 120.0, thresholds_for(120.0), WEIGHTS), np.array([60.0, 120.0]), np.array([40e-6, 90e-6])
+)
+# It needs whole paths.
+PATH_MODEL = AxisModel(
+    "smpi", SMPI, Start(-10.0, 1e-6), (-10.0, 110.0), (1e-6, 91e-6), FitQuality(0, 0, 0, 0, 1, 1, "")
+)
 
 
 def test_a_model_that_needs_whole_paths_is_refused_either_way(tmp_path):

@@ -51,7 +51,7 @@ $(BUILD_STAMP): $(VENV_STAMP) $(INSTALLED)
 test: build
 	$(VENV) -m ruff check .
 	$(VENV) -m mypy
-	$(IN_WORKSPACE) $(VENV) -m pytest
+	$(IN_WORKSPACE) $(VENV) -m pytest -n 2 --dist loadfile
 
 demo: build
 	$(IN_WORKSPACE) $(VENV) demo/run_demo.py

@@ -45,6 +45,7 @@ setup(
             "mcap-ros2-support>=0.5",
             "mypy>=1.9",
             "pytest>=7.4",
+            "pytest-xdist>=3.5",
             "ruff>=0.5",
             "types-jsonschema",
         ],

@@ -167,10 +167,13 @@ def test_a_publisher_killed_in_the_middle_of_a_move(model_file):
             planner.send_signal(signal.SIGKILL)
             planner.wait()
         # What it had sent is answered, nothing else comes: the voltage is held.
-        time.sleep(0.3)
-        _, values = client.report("the last one", accepted=client.answered, rate_hz="0.0")
-        sent = int(values["accepted"])
-        assert client.answered == sent < len(rows)
+        def at_rest() -> bool:
+            last = client.reports[-1]
+            return last["rate_hz"] == "0.0" and int(last["accepted"]) == client.answered
+
+        client.graph.spin_until(at_rest, "the last answer")
+        sent = client.answered
+        assert sent < len(rows)
         twin = Twin()
         for i, row in enumerate(rows[:sent]):
             twin.wish(row, START_NS + 2 * MS * i)

@@ -6,6 +6,7 @@ from time import monotonic_ns
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -40,6 +41,8 @@ LOG_PERIOD = 5.0
 WATCH_PERIOD = 0.05
 # History, depth and reliability, by parameters qos_overrides./TOPIC.{publisher,subscription}.POLICY.
 OVERRIDABLE = QoSOverridingOptions.with_default_policies()
+# How long an end waits until the last voltages have arrived.
+PATIENCE = Duration(seconds=1.0)
 
 
 class Compensator(LifecycleNode):
@@ -190,6 +193,8 @@ class Compensator(LifecycleNode):
             self._driver.ramp_now(safety.voltages, safety.rate)
         else:
             self._driver.stop_now()
+        # The process may end next, and with it what has not arrived.
+        self._publisher.wait_for_all_acked(PATIENCE)
         self._compensation.activate(False)
         self._keeper.save(complete=True)
 

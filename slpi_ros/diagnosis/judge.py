@@ -118,11 +118,15 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: float) ->
     return f"{sentence}; {gained}; {instead}"
 
 
+def _resolved(selection: Selection) -> float:
+    """Return the error (m) below which no hysteresis model comes."""
+    evidence = selection.now.evidence
+    return RESOLUTION * float(np.ptp(evidence.y[evidence.used]))
+
+
 def _left(selection: Selection, floor: Floor) -> bool:
     """Return whether more is left than noise and the model's resolution."""
-    now = selection.now
-    resolved = RESOLUTION * float(np.ptp(now.evidence.y[now.evidence.used]))
-    return now.held_out.rms > max(ABOVE_FLOOR * floor.rms, resolved)
+    return selection.now.held_out.rms > max(ABOVE_FLOOR * floor.rms, _resolved(selection))
 
 
 def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor) -> str:
@@ -134,8 +138,7 @@ def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floo
 
 def _stale(given: Given, selection: Selection, before_rms: float) -> bool:
     """Return whether the given model is wrong where one of its kind, fitted to the record, is not."""
-    resolved = RESOLUTION * float(np.ptp(selection.now.evidence.y[selection.now.evidence.used]))
-    return BIAS not in selection.structures and given.hysteresis_rms > max(STALE * before_rms, resolved)
+    return BIAS not in selection.structures and given.hysteresis_rms > max(STALE * before_rms, _resolved(selection))
 
 
 def _of_given(given: Given, selection: Selection, before_rms: float) -> str:

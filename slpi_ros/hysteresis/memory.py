@@ -177,7 +177,7 @@ class Memory(TurningPoints):
         """Answer samples of a run as long as they follow the present one on its branch, within voltage limits."""
         s, origin = self._direction, (self._v0, self._y0)
         reach = self._reach_f if coordinate else self._reach_u
-        drive, response, _ = (self._f, self._u, 0) if coordinate else (self._u, self._f, 0)
+        drive, response = (self._f, self._u) if coordinate else (self._u, self._f)
         d_origin, r_origin = origin[coordinate], origin[1 - coordinate]
         last = present = self._y if coordinate else self._v
         i = bisect_right(drive, s * (present - d_origin), 1)

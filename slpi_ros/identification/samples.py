@@ -161,10 +161,12 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     if count < fitted.size:
         y = np.where(fitted, y, 0.0)
     _require_motion(v, y, fitted, where)
-    known = slice(None) if count == fitted.size else np.flatnonzero(fitted)
     # A sensor that hangs says nothing, as one that is silent.
-    again = stuck(y[known], v[known])
-    fitted[again if count == fitted.size else np.flatnonzero(fitted)[again]] = False
+    if count == fitted.size:
+        fitted[stuck(y, v)] = False
+    else:
+        known = np.flatnonzero(fitted)
+        fitted[known[stuck(y[known], v[known])]] = False
     return Samples(without_noise(t if driven.all() else t[driven], v), y, fitted)
 
 

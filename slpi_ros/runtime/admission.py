@@ -4,24 +4,12 @@ from collections.abc import Mapping, Sequence
 
 from slpi_ros.runtime import rejection
 from slpi_ros.runtime.axis import Axis
-from slpi_ros.runtime.rejection import RejectedError
+from slpi_ros.runtime.rejection import RejectedError, require_names
 
 
 def match(names: Sequence[str], axes: Mapping[str, Axis]) -> list[Axis]:
-    """Return the named ones of all axes.
-
-    Raises
-    ------
-    RejectedError
-        If there is none, one is named twice, or one is unknown.
-    """
-    if not names:
-        raise RejectedError(rejection.EMPTY, "no axis is named; name the axes to move")
-    if len(set(names)) != len(names):
-        raise RejectedError(rejection.DUPLICATE_AXIS, f"{', '.join(names)}: an axis is named twice; name each once")
-    unknown = [name for name in names if name not in axes]
-    if unknown:
-        raise RejectedError(rejection.UNKNOWN_AXIS, f"no axis '{unknown[0]}'; this node moves {', '.join(axes)}")
+    """Return the named ones of all axes; RejectedError as `require_names`."""
+    require_names(names, axes)
     return [axes[name] for name in names]
 
 

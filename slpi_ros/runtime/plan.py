@@ -1,14 +1,12 @@
 """A plan: a trajectory in volts, compensated as one block from where the axes will be when it takes over."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import SlpiError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.model import AxisModel
 from slpi_ros.runtime import rejection
 from slpi_ros.runtime.deadlines import Streamer, follow, seconds_between
@@ -45,7 +43,7 @@ class Standing:
         """Return where the axis stands once given voltages, shape (M,), volts, at times, shape (M,), M >= 1."""
         last, at_ns = float(voltages[-1]), int(times_ns[-1])
         before = float(voltages[-2]) if voltages.size > 1 else self.axis.voltage
-        axis, elapsed = stream_twin_of(self.axis), seconds_between(times_ns, self.since_ns)
+        axis, elapsed = self.axis.twin(), seconds_between(times_ns, self.since_ns)
         if axis.timeless:
             axis.memory.forward_array(voltages)
             axis.drive(last)
@@ -97,7 +95,7 @@ class Plan:
     slewed : ndarray of bool, shape (N, K)
         Where the axis is still on its way, at the slew limit.
     origins : mapping of axis name to Origin
-        Of the axes that it reckons with; without those that follow known paths only.
+        Of the axes that it reckons with.
     """
 
     trajectory: Trajectory
@@ -147,23 +145,10 @@ def prepare(
                 voltages = stretch.points.voltages[still, column]
                 expected[name] = expected[name].after(voltages, stretch.deadlines_ns[still])
     origins = {
-        name: Origin(live, live.limits, whole_way(there.axis))
+        name: Origin(standing[name].axis, standing[name].axis.limits, whole_way(there.axis))
         for name, there in expected.items()
-        if isinstance(live := standing[name].axis, AxisStream) and isinstance(there.axis, AxisStream)
     }
     return Plan(trajectory, *_compensate(trajectory, deadlines, {**standing, **expected}), origins)
-
-
-def twin_of(memory: Memory) -> Memory:
-    """Return a memory in the same state, which moves on its own."""
-    twin = copy(memory)
-    twin.restore(memory.snapshot())
-    return twin
-
-
-def stream_twin_of(stream: AxisStream) -> AxisStream:
-    """Return a stream in the same state, which moves on its own."""
-    return stream.twin()
 
 
 def _compensate(trajectory: Trajectory, deadlines: TimeArray, standing: Mapping[str, Standing]) -> AxisPlan:
@@ -204,7 +189,7 @@ def _with_effects(
     if not _move_along(paths, standing):
         return {}
     return follow_together(
-        {name: stream_twin_of(here.axis) for name, here in standing.items()},
+        {name: here.axis.twin() for name, here in standing.items()},
         {name: here.model for name, here in standing.items()},
         paths,
         {name: seconds_between(deadlines, standing[name].since_ns) for name in paths},
@@ -212,7 +197,7 @@ def _with_effects(
 
 
 def _from_memory(model: AxisModel, axis: AxisStream, y: FloatArray, elapsed: FloatArray) -> AxisPlan:
-    v, late, reached = follow(stream_twin_of(axis), y, elapsed)
+    v, late, reached = follow(axis.twin(), y, elapsed)
     missing, (low, high) = y - reached, model.displacement_range
     # At a limit a wish may just be met, or lie on this side of it.
     rounding = ROUNDING * (high - low)

@@ -1,5 +1,6 @@
 """Why a message is rejected."""
 
+from collections.abc import Collection, Sequence
 from math import isfinite
 
 from slpi_ros.errors import SlpiError
@@ -32,6 +33,23 @@ class RejectedError(SlpiError):
     def __init__(self, cause: str, message: str) -> None:
         super().__init__(message)
         self.cause = cause
+
+
+def require_names(names: Sequence[str], axes: Collection[str]) -> None:
+    """Reject names that are none of the node's axes, or no list of them.
+
+    Raises
+    ------
+    RejectedError
+        If there is none, one is named twice, or one is unknown.
+    """
+    if not names:
+        raise RejectedError(EMPTY, "no axis is named; name the axes to move")
+    if len(set(names)) != len(names):
+        raise RejectedError(DUPLICATE_AXIS, f"{', '.join(names)}: an axis is named twice; name each once")
+    unknown = [name for name in names if name not in axes]
+    if unknown:
+        raise RejectedError(UNKNOWN_AXIS, f"no axis '{unknown[0]}'; this node moves {', '.join(axes)}")
 
 
 def implausible(y: float, accepted: tuple[float, float], kind: str) -> RejectedError:

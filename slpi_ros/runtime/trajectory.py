@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from slpi_ros.runtime import rejection
 from slpi_ros.runtime.clock import SECOND_NS
 from slpi_ros.runtime.deadlines import check_times
-from slpi_ros.runtime.rejection import RejectedError
+from slpi_ros.runtime.rejection import RejectedError, require_names
 
 FloatArray = NDArray[np.float64]
 TimeArray = NDArray[np.int64]
@@ -70,7 +70,7 @@ class Trajectory:
         RejectedError
             If names, shapes, times or positions make no sense; the first bad point is named.
         """
-        _check_names(names, axes)
+        require_names(names, axes)
         times, places = _as_array(time_from_start_ns), _as_array(positions, np.float64)
         if not times.size:
             raise RejectedError(rejection.EMPTY, "the trajectory has no points; give at least one")
@@ -109,16 +109,6 @@ class Trajectory:
     def deadlines_ns(self, now_ns: int) -> TimeArray:
         """Return when its points are due, shape (N,), nanoseconds, if it is accepted now."""
         return self.time_from_start_ns + (self.start_ns or now_ns)
-
-
-def _check_names(names: Sequence[str], axes: Sequence[str]) -> None:
-    if not names:
-        raise RejectedError(rejection.EMPTY, "no axis is named; name the axes to move")
-    if len(set(names)) != len(names):
-        raise RejectedError(rejection.DUPLICATE_AXIS, f"{', '.join(names)}: an axis is named twice; name each once")
-    unknown = [name for name in names if name not in axes]
-    if unknown:
-        raise RejectedError(rejection.UNKNOWN_AXIS, f"no axis '{unknown[0]}'; there are {', '.join(axes)}")
 
 
 def _as_array(values: ArrayLike, dtype: type | None = None) -> NDArray[Any]:

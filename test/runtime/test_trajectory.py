@@ -15,7 +15,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.model import AxisModel
 from slpi_ros.runtime import deadlines, rejection
 from slpi_ros.runtime.deadlines import Streamer
-from slpi_ros.runtime.plan import Plan, Standing, prepare, stream_twin_of
+from slpi_ros.runtime.plan import Plan, Standing, prepare
 from slpi_ros.runtime.rejection import RejectedError
 from slpi_ros.runtime.trajectory import Trajectory
 from slpi_ros.stream import LONGEST_STEP, AxisStream, Limits, accepted_range
@@ -192,7 +192,7 @@ def test_a_cancelled_trajectory_leaves_what_its_points_gave(drawn, share):
     # What comes next goes on from there.
     since = int(10**18 + drawn.times[done - 1]) if done else drawn.since
     now = since + 50 * MS
-    v, *_ = one_by_one(stream_twin_of(standing.axis), drawn.y, now + drawn.times, since)
+    v, *_ = one_by_one(standing.axis.twin(), drawn.y, now + drawn.times, since)
     again = prepared(drawn, replace(standing, since_ns=since), now=now)
     np.testing.assert_allclose(again.voltages[:, 0], v, rtol=0, atol=1e-8 * drawn.case.width)
 
@@ -488,7 +488,7 @@ def test_an_axis_in_motion_brakes_first_where_acceleration_is_limited():
     standing = Standing(model, model.stream(Limits(0.0, 100.0, 1000.0, 1e4)), 10**18)
     for _ in range(40):
         standing.axis.move(0.001, 10e-6)
-    here = stream_twin_of(standing.axis).memory.forward(standing.axis.voltage + 0.35)
+    here = standing.axis.twin().memory.forward(standing.axis.voltage + 0.35)
     plan = prepare(
         Trajectory.of(["x"], MS * np.arange(1, 200), np.full((199, 1), here), axes=["x"]), {"x": standing}, 10**18
     )

@@ -65,5 +65,5 @@ class Evidence:
 
     def problem(self, u: FloatArray) -> Problem:
         """Pose the problem of the hysteresis driven by `u`, shape (N,), volts."""
-        low, high = (self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf))
+        low, high = self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf)
         return Problem.pose([Samples(np.clip(u, low, high), self.y, self.used).after(self.history)], self.basis)

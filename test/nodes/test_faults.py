@@ -166,6 +166,7 @@ def test_a_publisher_killed_in_the_middle_of_a_move(model_file):
         finally:
             planner.send_signal(signal.SIGKILL)
             planner.wait()
+
         # What it had sent is answered, nothing else comes: the voltage is held.
         def at_rest() -> bool:
             last = client.reports[-1]

@@ -181,4 +181,3 @@ def test_parameters_of_which_no_stage_can_be_made(parameters, complaint):
     _, said = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert complaint in said and "Traceback" not in said and len(said.splitlines()) == 1
-

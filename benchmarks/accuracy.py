@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.stage.drive import scan_path
-from slpi_ros.stage.parameters import StageParameters
-from slpi_ros.stage.preisach import PreisachStage
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.paths import scan_path
+from slpi_ros.simulation.preisach import PreisachStage
 
 FloatArray = NDArray[np.float64]
 V_MAX = 100.0

@@ -7,10 +7,10 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from slpi_ros.io.joint_state_bytes import JointStates
+from slpi_ros.io.wire import before_numbers
+from slpi_ros.nodes.common import run
 from slpi_ros.nodes.qos import COMMANDS
-from slpi_ros.nodes.runner import run
-from slpi_ros.runtime.joint_state_bytes import JointStates
-from slpi_ros.runtime.wire import before_numbers
 
 
 class Echo(Node):

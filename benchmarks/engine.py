@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.family import LoopFamily
+from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.shape import Shape
 
 FloatArray = NDArray[np.float64]

@@ -12,7 +12,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 from round_trip import Client, Trip, compensator, echo, identified_stage
 
-from slpi_ros.model import StageModel
+from slpi_ros.model.stage_model import StageModel
 
 BLOCK_S = 0.25
 # Processes differ in their luck with memory and cores.

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 import slpi_ros
-from slpi_ros.experiments.measured import CASES, score
 from slpi_ros.identification.fit import KINDS
 from slpi_ros.identification.floor import floor_of
-from slpi_ros.identification.record import Record
-from slpi_ros.tables import import_table
+from slpi_ros.io.record import Record
+from slpi_ros.io.tables import import_table
+from slpi_ros.papers.measured import CASES, score
 
 # The triangles of this record end there, and sines begin (seconds).
 TRIANGLES_END = 2893.0

@@ -13,7 +13,7 @@ from accuracy import NOISE, V_MAX, FloatArray, fresh, record_of
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.stage.drive import scan_path
+from slpi_ros.simulation.paths import scan_path
 
 PATH_SECONDS = 40.0
 

@@ -22,10 +22,10 @@ from std_msgs.msg import Float64MultiArray
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.model import StageModel
-from slpi_ros.nodes.runner import make_executor
-from slpi_ros.stage.drive import scan_path
-from slpi_ros.stage.preisach import PreisachStage, StageParameters
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.nodes.common import make_executor
+from slpi_ros.simulation.paths import scan_path
+from slpi_ros.simulation.preisach import PreisachStage, StageParameters
 
 FloatArray = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from rclpy.signals import SignalHandlerOptions
 from round_trip import AXES, compensator, identified_stage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from slpi_ros.model import StageModel
-from slpi_ros.nodes.runner import make_executor
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.nodes.common import make_executor
 
 FloatArray = NDArray[np.float64]
 

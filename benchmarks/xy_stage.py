@@ -23,15 +23,15 @@ from std_msgs.msg import Float64MultiArray
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.experiments.compound_study import RATE, RECORD, RECORD_SAMPLES, WARM_UP, path, tune
-from slpi_ros.experiments.mpi_published import COMPOUND_MEAN, TABLE_6
-from slpi_ros.experiments.mpi_study import triangle_record
-from slpi_ros.experiments.paths import triangles
-from slpi_ros.model import StageModel, Start
-from slpi_ros.nodes.runner import make_executor
-from slpi_ros.stage.drive import scan_path
-from slpi_ros.stage.presets import p11_stage
-from slpi_ros.stage.stage import Stage
+from slpi_ros.model.stage_model import StageModel, Start
+from slpi_ros.nodes.common import make_executor
+from slpi_ros.papers.compound_study import RATE, RECORD, RECORD_SAMPLES, WARM_UP, path, tune
+from slpi_ros.papers.mpi_published import COMPOUND_MEAN, TABLE_6
+from slpi_ros.papers.mpi_study import triangle_record
+from slpi_ros.papers.paths import triangles
+from slpi_ros.simulation.paths import scan_path
+from slpi_ros.simulation.presets import p11_stage
+from slpi_ros.simulation.stage import Stage
 
 FloatArray = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from slpi_ros.excitation.drives import calibration_drive  # noqa: E402
 from slpi_ros.reports import plots  # noqa: E402
 from slpi_ros.reports.page import Page, png  # noqa: E402
 from slpi_ros.reports.text import describe_model  # noqa: E402
-from slpi_ros.stage.drive import scan_path  # noqa: E402
+from slpi_ros.simulation.paths import scan_path  # noqa: E402
 
 RATE = 250.0
 V_MIN, V_MAX = 0.0, 100.0

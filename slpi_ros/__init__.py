@@ -11,14 +11,14 @@ from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import SlpiError
 from slpi_ros.identification.findings import findings
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.quality import assess
-from slpi_ros.identification.record import Record
+from slpi_ros.identification.record_quality import assess
 from slpi_ros.identification.refit import refit
-from slpi_ros.model import AxisModel, HeldAtLimitWarning, StageModel
-from slpi_ros.model_file import load_model, save_model
+from slpi_ros.io.record import Record
+from slpi_ros.model.document import load_model, save_model
+from slpi_ros.model.stage_model import AxisModel, HeldAtLimitWarning, StageModel
 
 if TYPE_CHECKING:
-    from slpi_ros.bags import SeparateTopics
+    from slpi_ros.io.bag_reader import SeparateTopics
 
 __all__ = [
     "AxisModel",
@@ -46,7 +46,7 @@ def read_bag(
     ----------
     path : path-like
         A rosbag2 folder, or a lone mcap or sqlite3 file.
-    topic : str or slpi_ros.bags.SeparateTopics
+    topic : str or slpi_ros.io.bag_reader.SeparateTopics
         A topic of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts; or one topic of each.
     axes : sequence of str, optional
         The axes to read; all by default.
@@ -62,6 +62,6 @@ def read_bag(
         If the bag cannot be read; the message says what to do.
     """
     # Bags need rosbags, models do not: whoever only compensates does without it.
-    from slpi_ros.bags import read_bag as read
+    from slpi_ros.io.bag_reader import read_bag as read
 
     return read(path, topic, axes=axes)

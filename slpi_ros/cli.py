@@ -12,25 +12,26 @@ from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
 
-from slpi_ros import bags, tables
 from slpi_ros.cli_options import TOPIC, parser
-from slpi_ros.column_choice import Wishes
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import excite
-from slpi_ros.files import make_folder
+from slpi_ros.identification.cross_validation import held_out_truth
 from slpi_ros.identification.findings import Finding, findings, require_usable
 from slpi_ros.identification.fit import fit_of, identify
 from slpi_ros.identification.progress import shown_on
-from slpi_ros.identification.quality import assess
-from slpi_ros.identification.record import FloatArray, Record
+from slpi_ros.identification.record_quality import assess
 from slpi_ros.identification.refit import refit
-from slpi_ros.identification.truth import held_out_truth
 from slpi_ros.identification.uncertainty import curve_uncertainty, require_known_uncertainty
-from slpi_ros.model import StageModel, check_time, held_message
-from slpi_ros.model_file import load_model, save_model
+from slpi_ros.io import bag_reader as bags
+from slpi_ros.io import tables
+from slpi_ros.io.atomic_file import make_folder
+from slpi_ros.io.column_choice import Wishes
+from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.model.document import load_model, save_model
+from slpi_ros.model.stage_model import StageModel, check_time, held_message
+from slpi_ros.model.stream import Limits
 from slpi_ros.reports.text import describe_change, describe_model
-from slpi_ros.stream import Limits
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -247,7 +248,7 @@ def _known(columns: dict[str, FloatArray], model: StageModel, table: str) -> dic
 
 
 def _experiments(options: argparse.Namespace) -> None:
-    from slpi_ros.experiments.page import write_experiments
+    from slpi_ros.papers.page import write_experiments
 
     data = Path(options.data) if options.data else None
     if data and not data.is_dir():

@@ -12,11 +12,11 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.family import LoopFamily
 from slpi_ros.hysteresis.kinds import Hysteresis, to_document
+from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
-from slpi_ros.model import AxisModel, FitQuality, StageModel, Start
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
 
 FloatArray = NDArray[np.float64]
 

@@ -11,38 +11,26 @@ import pytest
 PACKAGE = "slpi_ros"
 ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
-# From top to bottom. A module may import its own layer and those below it.
+# From top to bottom. A module may import its own layer and those below it, of its own layer only its own folder.
 LAYERS = (
-    {"nodes", "cli", "cli_options"},
-    {"reports", "experiments"},
+    {"cli", "cli_options"},
+    {"papers", "nodes"},
+    {"reports"},
     {"diagnosis"},
-    {
-        *("alignment", "bag_files", "bag_watch", "bag_writer", "bags", "cdr", "column_choice", "column_names"),
-        *("csv_table", "joint_state", "mat_table", "mcap_file", "message_blocks", "message_types", "signals"),
-        *("sqlite_file", "tables"),
-    },
-    {"excitation", "identification"},
-    {
-        *("axis_model", "chain", "control", "coupling", "effect_stream", "model", "model_file", "pace", "runtime"),
-        *("schemas", "stage_stream", "stream"),
-    },
-    {"effects", "hysteresis"},
-    {"errors", "files", "metrics"},
+    {"identification", "compensator"},
+    {"model"},
+    {"effects"},
+    {"hysteresis", "io", "simulation", "excitation"},
+    {"errors"},
 )
-
-# The simulated stage stands beside the layers: it knows nothing of the compensator, and only these know it.
-BESIDE = "stage"
-MAY_IMPORT_BESIDE = {"nodes", "experiments"}
 
 # Modules outside the package that only one part of it may import.
 ONLY_NODES = {"ament_index_python", "launch", "launch_ros", "rclpy", "rosidl_runtime_py"}
 ONLY_NODES_ENDINGS = ("_msgs", "_srvs", "_interfaces")
-ONLY_BAGS = {"rosbags"}
+ONLY_IO = {"rosbags"}
 
 UNSAFE_MODULES = {"cloudpickle", "dill", "joblib", "marshal", "pickle", "shelve"}
 UNSAFE_CALLS = {"compile", "eval", "exec"}
-
-LONGEST_FILE = 320
 
 FILES = sorted(ROOT.rglob("*.py"))
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
@@ -77,7 +65,7 @@ def parts_imported_by(path: Path) -> set[str]:
     """Return the parts of the package that a file imports; "" where it imports the public API itself."""
     names = [name.split(".") for name in imports_of(path)]
     within = [name[1] if len(name) > 1 else "" for name in names if name[0] == PACKAGE]
-    return {part if part in LEVEL or part == BESIDE else "" for part in within}
+    return {part if part in LEVEL else "" for part in within}
 
 
 def outside_imported_by(path: Path) -> set[str]:
@@ -91,7 +79,7 @@ def needs_ros(module: str) -> bool:
 
 @every_file
 def test_every_part_has_a_layer(path: Path) -> None:
-    assert part_of(path) in LEVEL.keys() | {"", BESIDE}, f"add {part_of(path)!r} to LAYERS"
+    assert part_of(path) in LEVEL.keys() | {""}, f"add {part_of(path)!r} to LAYERS"
 
 
 @every_file
@@ -103,13 +91,10 @@ def test_folder_is_a_package(path: Path) -> None:
 def test_imports_point_down(path: Path) -> None:
     part, imported = part_of(path), parts_imported_by(path)
     if part == "":
-        allowed = LEVEL.keys() - LAYERS[0]
-    elif part == BESIDE:
-        allowed = {BESIDE, "errors"}
+        allowed = LEVEL.keys() - {"cli", "nodes", "papers"}
     else:
-        allowed = {below for below in LEVEL if LEVEL[below] >= LEVEL[part]}
-        allowed |= {BESIDE} if part in MAY_IMPORT_BESIDE else set()
-        allowed |= {""} if part in LAYERS[0] else set()
+        allowed = {below for below in LEVEL if LEVEL[below] > LEVEL[part]} | {part}
+        allowed |= {"", *LAYERS[0]} if part == "cli" else {""} if part in LAYERS[1] else set()
     assert imported <= allowed, f"{part or PACKAGE} may not import {sorted(imported - allowed)}"
 
 
@@ -120,8 +105,8 @@ def test_ros_stays_in_nodes(path: Path) -> None:
 
 
 @every_file
-def test_rosbags_stays_in_bags(path: Path) -> None:
-    assert path in (ROOT / "bags.py", ROOT / "bag_writer.py") or not outside_imported_by(path) & ONLY_BAGS
+def test_rosbags_stays_in_io(path: Path) -> None:
+    assert part_of(path) == "io" or not outside_imported_by(path) & ONLY_IO
 
 
 @every_file
@@ -133,15 +118,9 @@ def test_nothing_runs_what_it_reads(path: Path) -> None:
     assert not any(keyword.arg == "allow_pickle" for call in calls for keyword in call.keywords)
 
 
-@every_file
-def test_file_is_short(path: Path) -> None:
-    lines = len(path.read_text(encoding="utf-8").splitlines())
-    assert lines <= LONGEST_FILE, "a file holds one concept: split it"
-
-
 def test_public_api_loads_neither_ros_nor_rosbags() -> None:
     code = f"import sys, {PACKAGE}; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"
     command = [sys.executable, "-c", code]
     loaded = set(subprocess.run(command, cwd=ROOT.parent, stdout=subprocess.PIPE, text=True, check=True).stdout.split())
     assert PACKAGE in loaded
-    assert not {module for module in loaded if needs_ros(module)} | loaded & ONLY_BAGS
+    assert not {module for module in loaded if needs_ros(module)} | loaded & ONLY_IO

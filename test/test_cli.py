@@ -9,8 +9,8 @@ import pytest
 from identification.records import calibration, stage
 
 import slpi_ros
-from slpi_ros.bags import write_bag
-from slpi_ros.tables import read_table, write_table
+from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.tables import read_table, write_table
 
 
 def slpi(*arguments):

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.excitation.legs import Room
-from slpi_ros.stage.amplifier import Amplifier
-from slpi_ros.stage.bouc_wen import BoucWen
-from slpi_ros.stage.chain import Physics, own_motion, sensed
-from slpi_ros.stage.parameters import StageParameters
+from slpi_ros.simulation.amplifier import Amplifier
+from slpi_ros.simulation.bouc_wen import BoucWen
+from slpi_ros.simulation.chain import Physics, own_motion, sensed
+from slpi_ros.simulation.parameters import StageParameters
 
 from .drives import drive, log_uniform
 from .nature import DRAWS, NAMES, Nature, Setting

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.identification.record import Record
-from slpi_ros.stage.chain import Physics, own_motion
-from slpi_ros.stage.sensor import Sensor
+from slpi_ros.io.record import Record
+from slpi_ros.simulation.chain import Physics, own_motion
+from slpi_ros.simulation.sensor import Sensor
 
 from .attempt import BASES, CLOSE, NOISE, Base, Draw, together
 from .drives import log_uniform

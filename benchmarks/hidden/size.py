@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.record import Record
-from slpi_ros.stage.relays import RelayTriangle
+from slpi_ros.io.record import Record
+from slpi_ros.simulation.relays import RelayTriangle
 
 FloatArray = NDArray[np.float64]
 

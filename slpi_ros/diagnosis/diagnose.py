@@ -19,9 +19,9 @@ from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.floor import Floor, floor_of
 from slpi_ros.identification.progress import tell
-from slpi_ros.identification.record import Record
 from slpi_ros.identification.refit import require_own
-from slpi_ros.model import AxisModel, StageModel, Start
+from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import AxisModel, StageModel, Start
 
 FloatArray = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.identification.bases import Basis, SurfaceBasis
-from slpi_ros.identification.problem import Problem
+from slpi_ros.identification.least_squares import Problem
 from slpi_ros.identification.samples import Samples
 
 FloatArray = NDArray[np.float64]
@@ -28,7 +28,7 @@ class Evidence:
         Samples that are explained; the others (outliers, drop-outs, what came before the memory was known) only move
         the memory.
     history : tuple of float, volts
-        As in `slpi_ros.model.Start`.
+        As in `slpi_ros.model.stage_model.Start`.
     basis : Basis
         Of the hysteresis.
     smoothness : float

@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 from slpi_ros.diagnosis.evidence import Evidence
 from slpi_ros.diagnosis.explanation import Explanation
 from slpi_ros.errors import RecordError
-from slpi_ros.hysteresis.family import LoopFamily
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.hysteresis.loop_family import LoopFamily
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, SurfaceBasis
 from slpi_ros.identification.drive import Runs
+from slpi_ros.identification.initial_history import choose_start
+from slpi_ros.identification.least_squares import Problem
 from slpi_ros.identification.linear import SELECTION_SAMPLES, SMOOTHNESS
-from slpi_ros.identification.problem import Problem
-from slpi_ros.identification.record import Record
+from slpi_ros.identification.published_kinds import voltage_dead_band
 from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples
-from slpi_ros.identification.separated import voltage_dead_band
-from slpi_ros.identification.start import choose_start
-from slpi_ros.model import AxisModel
+from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import AxisModel
 
 FloatArray = NDArray[np.float64]
 

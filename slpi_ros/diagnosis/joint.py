@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from slpi_ros.identification.problem import Problem, blocked_folds
+from slpi_ros.identification.least_squares import Problem, blocked_folds
 
 FloatArray = NDArray[np.float64]
 Factor = tuple[FloatArray, bool]

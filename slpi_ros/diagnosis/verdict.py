@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.effects.effect import Effect
 from slpi_ros.effects.registry import to_document as effect_document
-from slpi_ros.model import StageModel
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 

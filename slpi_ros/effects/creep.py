@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from slpi_ros.effects.base import Form, Left, usual_step
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
-from slpi_ros.effects.form import Form, Left, usual_step
 from slpi_ros.effects.relaxation import Hold, hold
 from slpi_ros.effects.uniform import Uniform
 

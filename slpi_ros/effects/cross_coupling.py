@@ -7,9 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from slpi_ros.effects.base import Form, Left
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
-from slpi_ros.effects.form import Form, Left
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from slpi_ros.effects.form import Form, Left
+    from slpi_ros.effects.base import Form, Left
 
 FloatArray = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from typing import ClassVar, overload
 import numpy as np
 from scipy.signal import savgol_filter
 
+from slpi_ros.effects.base import Form, Left
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.coercivity import CoercivityFollower, play, reversible, settled_rate
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
-from slpi_ros.effects.form import Form, Left
 from slpi_ros.effects.rate_follower import RateFollower
 from slpi_ros.effects.uniform import Uniform
 from slpi_ros.errors import ModelError

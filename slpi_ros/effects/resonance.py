@@ -9,10 +9,10 @@ from typing import ClassVar
 import numpy as np
 from scipy.signal import lfilter
 
+from slpi_ros.effects.base import Form, Left, rhythms, usual_step
 from slpi_ros.effects.checks import require
 from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
-from slpi_ros.effects.form import Form, Left, rhythms, usual_step
-from slpi_ros.effects.mode import Mode
+from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.ringing import ResonanceFollower, Unringing
 from slpi_ros.effects.uniform import Uniform
 

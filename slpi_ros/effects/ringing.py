@@ -3,7 +3,7 @@
 from collections import deque
 from dataclasses import dataclass
 
-from slpi_ros.effects.mode import Mode
+from slpi_ros.effects.filters import Mode
 
 # Taps are so far apart at least, times 1 / w: nearer ones would only be larger.
 SPACING = 0.5

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.family import LoopFamily
+from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.mpi import MultiSlope
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
-from slpi_ros.hysteresis.slpi import SeparatedLoops, SingleLoop
-from slpi_ros.hysteresis.smpi import AmplitudeScaled
+from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
 
 # Shapes on the engine: causal. The others need the whole path in advance.
 CausalModel = LoopFamily | PrandtlIshlinskii | MultiSlope

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.mpi import MultiSlope
-from slpi_ros.hysteresis.smpi import BACK, AmplitudeScaled, cycles
+from slpi_ros.hysteresis.multi_slope import BACK, AmplitudeScaled, cycles
 from slpi_ros.identification.fitted import Fitted
+from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, held_out_errors
 from slpi_ros.identification.multi_slope import SAME_AMPLITUDE, MultiSlopeBasis, peak_line
-from slpi_ros.identification.problem import FIRST_SMOOTHNESS, Problem, held_out_errors
 from slpi_ros.identification.samples import FEWEST, Samples, only_one
-from slpi_ros.model import Start
+from slpi_ros.model.stage_model import Start
 
 FloatArray = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.family import LoopFamily
 from slpi_ros.hysteresis.kinds import Hysteresis
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
-from slpi_ros.identification.walk import Walk
+from slpi_ros.hysteresis.loop_family import LoopFamily
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.identification.design_matrix import Walk
 
 FloatArray = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from slpi_ros.errors import IdentificationError
-from slpi_ros.identification.quality import ClockQuality, DriveQuality, Quality, SignalQuality
+from slpi_ros.identification.record_quality import ClockQuality, DriveQuality, Quality, SignalQuality
 from slpi_ros.identification.samples import NEVER_TURNS
 
 Level = Literal["ok", "warn", "stop"]

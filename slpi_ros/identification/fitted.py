@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.kinds import Hysteresis
-from slpi_ros.model import Start
+from slpi_ros.model.stage_model import Start
 
 FloatArray = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError
-from slpi_ros.identification import readings
+from slpi_ros.identification import signal_statistics as readings
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn, turning_points
 
 FloatArray = NDArray[np.float64]

@@ -9,9 +9,9 @@ from scipy.optimize import least_squares
 
 from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.mpi import MultiSlope, falling_envelope, rising_envelope, thresholds_for
-from slpi_ros.hysteresis.smpi import BACK, cycles
+from slpi_ros.hysteresis.multi_slope import BACK, cycles
 from slpi_ros.identification.bases import OperatorWeights
-from slpi_ros.identification.walk import Walk
+from slpi_ros.identification.design_matrix import Walk
 
 FloatArray = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.runs import monotone_runs
-from slpi_ros.identification.readings import stuck
-from slpi_ros.identification.record import Record
+from slpi_ros.identification.signal_statistics import stuck
 from slpi_ros.identification.voltage import without_noise
+from slpi_ros.io.record import Record
 
 FloatArray = NDArray[np.float64]
 

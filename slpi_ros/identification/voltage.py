@@ -6,7 +6,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_filter
 
 from slpi_ros.hysteresis.runs import without_small_reversals
-from slpi_ros.identification import readings
+from slpi_ros.identification import signal_statistics as readings
 
 FloatArray = NDArray[np.float64]
 

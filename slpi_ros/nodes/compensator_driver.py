@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from slpi_ros.nodes.compensation import Compensation
-from slpi_ros.runtime.clock import SECOND_NS
-from slpi_ros.stream import LONGEST_STEP
+from slpi_ros.compensator.controller import Compensation
+from slpi_ros.io.joint_state import SECOND_NS
+from slpi_ros.model.stream import LONGEST_STEP
 
 # Seconds from one voltage to the next.
 PERIOD = 0.004

@@ -4,20 +4,13 @@ from collections.abc import Mapping, Sequence
 
 from rclpy.node import Node
 
+from slpi_ros.compensator.controller import Compensation
+from slpi_ros.compensator.last_voltages import LastVoltages
+from slpi_ros.compensator.memory_trust import KNOWN, RESTORED
+from slpi_ros.compensator.persistence import SavedAxis, SavedMemory, last_voltages, load_memory, model_id, save_memory
 from slpi_ros.errors import SlpiError
-from slpi_ros.model import StageModel
-from slpi_ros.nodes.compensation import Compensation
-from slpi_ros.runtime.last_voltages import LastVoltages
-from slpi_ros.runtime.memory_trust import KNOWN, RESTORED
-from slpi_ros.runtime.saved_memory import (
-    SavedAxis,
-    SavedMemory,
-    last_voltages,
-    load_memory,
-    model_id,
-    save_memory,
-)
-from slpi_ros.stream import Limits
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.model.stream import Limits
 
 LOG_PERIOD = 60.0
 

@@ -6,15 +6,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from slpi_ros.compensator.controller import Compensation
+from slpi_ros.compensator.persistence import model_id
 from slpi_ros.errors import ModelError, SlpiError
-from slpi_ros.model import StageModel
-from slpi_ros.model_file import load_model
-from slpi_ros.nodes.compensation import Compensation
+from slpi_ros.model.document import load_model
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_memory import MemoryKeeper
-from slpi_ros.nodes.compensator_report import Reporter
 from slpi_ros.nodes.compensator_settings import CompensatorSettings
-from slpi_ros.nodes.model_reading import Read, Reading
-from slpi_ros.runtime.saved_memory import model_id
+from slpi_ros.nodes.jobs import Read, Reading
 
 
 class Models:

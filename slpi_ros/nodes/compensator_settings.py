@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from math import inf
 
-from slpi_ros.control import PidGains
+from slpi_ros.compensator.feedback import PidGains
+from slpi_ros.compensator.loop import LoopSettings
+from slpi_ros.compensator.validation import TimeRules
 from slpi_ros.errors import UsageError
+from slpi_ros.model.stream import Limits
 from slpi_ros.nodes import compensator_parameters as ranges
 from slpi_ros.nodes.parameters import Values, choice, number, numbers, whole
-from slpi_ros.runtime.clock import TimeRules
-from slpi_ros.runtime.loop import LoopSettings
-from slpi_ros.stream import Limits
 
 Axes = tuple[str, ...]
 

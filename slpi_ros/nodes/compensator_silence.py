@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from time import monotonic_ns
 
-from slpi_ros.nodes.compensation import Compensation
+from slpi_ros.compensator.controller import Compensation
 from slpi_ros.nodes.compensator_driver import Driver
 from slpi_ros.nodes.compensator_settings import CompensatorSettings
 

@@ -9,14 +9,14 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory
 
-from slpi_ros.nodes.compensation import Compensation
+from slpi_ros.compensator.controller import Compensation
+from slpi_ros.compensator.rejection import EMPTY, INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
+from slpi_ros.compensator.timing import Timing
+from slpi_ros.compensator.trajectory import Trajectory
+from slpi_ros.io.joint_state import SECOND_NS
+from slpi_ros.io.messages import TrajectoryArrays, decode_trajectory
+from slpi_ros.model.stream import LONGEST_STEP
 from slpi_ros.nodes.compensator_driver import Driver
-from slpi_ros.runtime.clock import SECOND_NS
-from slpi_ros.runtime.rejection import EMPTY, INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
-from slpi_ros.runtime.timing import Timing
-from slpi_ros.runtime.trajectory import Trajectory
-from slpi_ros.runtime.trajectory_bytes import TrajectoryArrays, decode_trajectory
-from slpi_ros.stream import LONGEST_STEP
 
 # How often a simulated clock is looked at, seconds.
 SIMULATED_PERIOD = 0.001

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from slpi_ros.bags import read_bag
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import SlpiError
-from slpi_ros.model_file import parse_model
+from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.model.document import parse_model
 from slpi_ros.nodes.worker_process import WorkerProcess
 
 

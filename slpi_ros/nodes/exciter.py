@@ -17,12 +17,12 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from slpi_ros.errors import SlpiError
 from slpi_ros.excitation.playback import Playback
+from slpi_ros.io.joint_state import SECOND_NS
+from slpi_ros.nodes.common import request_stop, run
 from slpi_ros.nodes.exciter_settings import DECLARATIONS, LIVE, ExciterSettings
 from slpi_ros.nodes.parameters import Parameters
 from slpi_ros.nodes.qos import COMMANDS, LATCHED
-from slpi_ros.nodes.runner import request_stop, run
 
-SECOND_NS = 1_000_000_000
 POLL_PERIOD = 0.1
 LOG_PERIOD = 5.0
 # The last voltage must have arrived before the node goes.

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from slpi_ros.bags import read_bag
 from slpi_ros.errors import RecordError, SlpiError
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.record import Record
-from slpi_ros.model import StageModel
-from slpi_ros.model_file import format_model, save_model
+from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.record import Record
+from slpi_ros.model.document import format_model, save_model
+from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.worker_process import WorkerProcess
 
 

@@ -12,17 +12,17 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from slpi_ros.bag_watch import PATIENCE, BagWatch
 from slpi_ros.errors import SlpiError
-from slpi_ros.model import StageModel
-from slpi_ros.model_file import parse_model
+from slpi_ros.io.bag_watch import PATIENCE, BagWatch
+from slpi_ros.model.document import parse_model
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.nodes.common import run
 from slpi_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.fit_process import FitOutcome, FitProcess, FitRequest, StageIdentity
 from slpi_ros.nodes.identify_diagnosis import DiagnosisService, Identified
 from slpi_ros.nodes.identify_settings import DECLARATIONS, IdentifySettings
 from slpi_ros.nodes.parameters import Parameters
 from slpi_ros.nodes.qos import LATCHED
-from slpi_ros.nodes.runner import run
 
 POLL_PERIOD = 0.1
 WATCH_PERIOD = 0.5

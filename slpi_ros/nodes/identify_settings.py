@@ -4,9 +4,9 @@ import math
 import os
 from dataclasses import dataclass
 
-from slpi_ros.bag_watch import BagWatch
 from slpi_ros.errors import UsageError
 from slpi_ros.identification.fit import KINDS
+from slpi_ros.io.bag_watch import BagWatch
 from slpi_ros.nodes.fit_process import FitRequest
 from slpi_ros.nodes.parameters import Declaration, Values, choice, number
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from slpi_ros.runtime.clock import SECOND_NS
+from slpi_ros.io.joint_state import SECOND_NS
 
 
 def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:

@@ -12,9 +12,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from slpi_ros.bags import JOINT_STATE, BagWriter
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.nodes.runner import request_stop, run
+from slpi_ros.io.bag_reader import JOINT_STATE, BagWriter
+from slpi_ros.nodes.common import request_stop, run
 
 # a burst must fit while the disk is slow
 DEPTH = 10_000

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.verdict import AMBIGUOUS, NAMED, NOTHING_FOUND, AxisDiagnosis, Diagnosis, NamedEffect, Traces
 from slpi_ros.effects.registry import to_document
-from slpi_ros.reports import charts, residual_views
-from slpi_ros.reports.charts import Curve
+from slpi_ros.reports import residual_views
+from slpi_ros.reports import views as charts
 from slpi_ros.reports.colours import AFTER, BEFORE, CAUSES, NOISE
 from slpi_ros.reports.motion import Motion
 from slpi_ros.reports.page import Mood, Page, Share
+from slpi_ros.reports.views import Curve
 
 FloatArray = NDArray[np.float64]
 

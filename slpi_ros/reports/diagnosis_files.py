@@ -5,10 +5,10 @@ from pathlib import Path
 
 from slpi_ros.diagnosis.verdict import Diagnosis
 from slpi_ros.errors import SlpiError
-from slpi_ros.files import all_or_nothing, make_folder
-from slpi_ros.model_file import format_model
+from slpi_ros.io.atomic_file import all_or_nothing, make_folder
+from slpi_ros.io.schemas import validate
+from slpi_ros.model.document import format_model
 from slpi_ros.reports.diagnosis import write_diagnosis
-from slpi_ros.schemas import validate
 
 DOCUMENT, EXTENDED_MODEL, PAGE = "diagnosis.json", "extended_model.json", "report.html"
 

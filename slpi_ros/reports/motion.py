@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.identification import readings
+from slpi_ros.identification import signal_statistics as readings
+from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn, turning_points
-from slpi_ros.identification.walk import Walk
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from slpi_ros.reports.chart import ERROR, VOLTAGE, Chart, Panel, Quantity
-from slpi_ros.reports.charts import Curve, focus
 from slpi_ros.reports.colours import DESIRED
 from slpi_ros.reports.motion import Motion
 from slpi_ros.reports.thinning import thin_cloud
+from slpi_ros.reports.views import Curve, focus
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

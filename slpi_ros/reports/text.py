@@ -1,11 +1,11 @@
 """What a model holds, in words."""
 
-from slpi_ros.hysteresis.family import LoopFamily
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
-from slpi_ros.hysteresis.slpi import SeparatedLoops
-from slpi_ros.hysteresis.smpi import AmplitudeScaled
+from slpi_ros.hysteresis.loop_family import LoopFamily
+from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
+from slpi_ros.hysteresis.slpi_published import SeparatedLoops
 from slpi_ros.identification.refit import AxisChange
-from slpi_ros.model import AxisModel, StageModel
+from slpi_ros.model.stage_model import AxisModel, StageModel
 
 
 def describe_model(model: StageModel) -> list[str]:

@@ -5,7 +5,7 @@ import pytest
 
 from slpi_ros.diagnosis.joint import Joint
 from slpi_ros.identification.bases import SurfaceBasis
-from slpi_ros.identification.problem import Problem
+from slpi_ros.identification.least_squares import Problem
 from slpi_ros.identification.samples import Samples
 
 SMOOTHNESS = 0.1

@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import slpi_ros
-from slpi_ros.identification.record import Record
-from slpi_ros.tables import import_table
+from slpi_ros.io.record import Record
+from slpi_ros.io.tables import import_table
 
 
 def part(record, start, stop):

@@ -14,10 +14,10 @@ from slpi_ros.effects.effect import Around
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import in_order
-from slpi_ros.model import StageModel
-from slpi_ros.model_file import format_model, parse_model
-from slpi_ros.stage.viscosity import RateLaw, Viscosity
-from slpi_ros.stream import Limits
+from slpi_ros.model.document import format_model, parse_model
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.model.stream import Limits
+from slpi_ros.simulation.viscosity import RateLaw, Viscosity
 
 BARE = replace(axis_model(FAMILY_CASE), voltage_range=(-20.0, 120.0))
 SPAN, DT = 10e-6, 1e-3

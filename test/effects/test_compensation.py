@@ -16,11 +16,11 @@ from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.model import StageModel
-from slpi_ros.stage import creep as physics
-from slpi_ros.stage.drive import scan_path
-from slpi_ros.stage.parameters import StageParameters
-from slpi_ros.stage.preisach import PreisachStage
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.simulation import creep as physics
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.paths import scan_path
+from slpi_ros.simulation.preisach import PreisachStage
 
 AXES = ("x", "y")
 RATE, DURATION = 500.0, 12.0

@@ -6,9 +6,9 @@ from excitation.loops import fastest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slpi_ros import tables
 from slpi_ros.errors import UsageError
 from slpi_ros.excitation.drives import DRIVES, excite
+from slpi_ros.io import tables
 
 LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0}
 

@@ -7,7 +7,7 @@ from strategies import loop_families, prandtl_ishlinskii
 
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, from_document, to_document
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 
 FAMILY = {
     "grid_V": [0.0, 10.0, 30.0],

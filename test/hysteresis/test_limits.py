@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from strategies import Case, cases, fractions, paths, stream_forward, stream_inverse
 
 from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 
 FloatArray = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.hysteresis.family import LoopFamily
+from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.loops import SUSPECTED, TRUE_VERTEX, Separation, separate
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.runs import without_small_reversals

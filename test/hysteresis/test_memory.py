@@ -12,7 +12,7 @@ from strategies import FAMILY_CASE, Case, cases, cases_and_paths, paths, stream_
 
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.memory import Memory, MemoryState
-from slpi_ros.hysteresis.pi import play
+from slpi_ros.hysteresis.prandtl_ishlinskii import play
 
 NOT_FINITE = (float("nan"), float("inf"), -float("inf"))
 ABSURD = (1e6, -1e6, 1e300, -1e300)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.identification.record import Record
-from slpi_ros.stage.parameters import StageParameters
-from slpi_ros.stage.preisach import PreisachStage
+from slpi_ros.io.record import Record
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
 
 
 def record_of(t, v, y, axis="x"):

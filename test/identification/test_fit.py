@@ -11,9 +11,9 @@ from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS
 from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.fit import KINDS
-from slpi_ros.stage.drive import scan_path
+from slpi_ros.simulation.paths import scan_path
 
 
 @pytest.fixture(scope="module")

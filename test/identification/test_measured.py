@@ -5,8 +5,8 @@ import pytest
 from identification.records import rms
 
 import slpi_ros
-from slpi_ros.bags import write_bag
-from slpi_ros.tables import import_table
+from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.tables import import_table
 
 
 def through_a_bag(table, folder):

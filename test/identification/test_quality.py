@@ -11,10 +11,10 @@ from identification.records import record_of, stage
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.findings import Finding, findings, require_usable
-from slpi_ros.identification.quality import assess
-from slpi_ros.stage.parameters import StageParameters
-from slpi_ros.stage.preisach import PreisachStage
-from slpi_ros.tables import import_table
+from slpi_ros.identification.record_quality import assess
+from slpi_ros.io.tables import import_table
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
 
 NOISE = 8e-9
 seeds = pytest.mark.parametrize("seed", range(8))

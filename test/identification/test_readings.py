@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slpi_ros.identification import readings
+from slpi_ros.identification import signal_statistics as readings
 
 
 @given(st.floats(1e-12, 1e3), st.floats(-5, 5), st.integers(3, 12), st.integers(0, 2**32 - 1))

@@ -12,9 +12,9 @@ from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.refit import refit
-from slpi_ros.model_file import format_model, parse_model
-from slpi_ros.stage.drive import scan_path
-from slpi_ros.stage.preisach import PreisachStage
+from slpi_ros.model.document import format_model, parse_model
+from slpi_ros.simulation.paths import scan_path
+from slpi_ros.simulation.preisach import PreisachStage
 
 SEED = 1
 

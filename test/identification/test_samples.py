@@ -13,8 +13,8 @@ import slpi_ros
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.loops import separate
 from slpi_ros.identification import linear
+from slpi_ros.identification.initial_history import BeginningWarning
 from slpi_ros.identification.samples import Samples, select_samples
-from slpi_ros.identification.start import BeginningWarning
 
 paths = st.lists(st.integers(0, 8), min_size=1, max_size=80).map(lambda values: np.array(values, dtype=np.float64))
 

@@ -9,12 +9,12 @@ from identification.records import record_of, rms
 
 from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.hysteresis.loops import separate
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
-from slpi_ros.hysteresis.slpi import SeparatedLoops, SingleLoop
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.separated import default_thresholds, least_iterations
-from slpi_ros.model_file import format_model, parse_model
-from slpi_ros.stage.preisach import PreisachStage, StageParameters
+from slpi_ros.identification.published_kinds import default_thresholds, least_iterations
+from slpi_ros.model.document import format_model, parse_model
+from slpi_ros.simulation.preisach import PreisachStage, StageParameters
 
 
 def ramps(*turns):

@@ -20,8 +20,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from slpi_ros.hysteresis.family import LoopFamily
-from slpi_ros.model import AxisModel, FitQuality, StageModel, Start
+from slpi_ros.hysteresis.loop_family import LoopFamily
+from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
 
 RELIABLE = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -14,9 +14,9 @@ from nodes.compensator_client import PERIOD_NS, SECOND_NS, START_NS, compensator
 from nodes.ros_helpers import LATCHED, stage_model, voltage_path  # noqa: E402
 from std_msgs.msg import Float64, Float64MultiArray, String  # noqa: E402
 
-from slpi_ros.model import HeldAtLimitWarning  # noqa: E402
-from slpi_ros.model_file import format_model, save_model  # noqa: E402
-from slpi_ros.runtime.rejection import CAUSES  # noqa: E402
+from slpi_ros.compensator.rejection import CAUSES  # noqa: E402
+from slpi_ros.model.document import format_model, save_model  # noqa: E402
+from slpi_ros.model.stage_model import HeldAtLimitWarning  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings(f"ignore::{HeldAtLimitWarning.__module__}.{HeldAtLimitWarning.__name__}")
 

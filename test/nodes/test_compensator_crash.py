@@ -14,7 +14,7 @@ from nodes.test_compensator_trajectory import trajectory  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
-from slpi_ros.model_file import save_model  # noqa: E402
+from slpi_ros.model.document import save_model  # noqa: E402
 
 AXES = ["x", "y"]
 MS = 1_000_000

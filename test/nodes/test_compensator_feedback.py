@@ -12,7 +12,7 @@ from nodes.ros_helpers import stage_model  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
-from slpi_ros.model_file import save_model  # noqa: E402
+from slpi_ros.model.document import save_model  # noqa: E402
 
 GAINS = {"kp": 2e6, "ki": 1e9}
 

@@ -19,9 +19,9 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
 from slpi_ros.hysteresis.mpi import MultiSlope, thresholds_for  # noqa: E402
-from slpi_ros.hysteresis.smpi import AmplitudeScaled  # noqa: E402
-from slpi_ros.model import AxisModel, FitQuality, StageModel, Start  # noqa: E402
-from slpi_ros.model_file import format_model, save_model  # noqa: E402
+from slpi_ros.hysteresis.multi_slope import AmplitudeScaled  # noqa: E402
+from slpi_ros.model.document import format_model, save_model  # noqa: E402
+from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start  # noqa: E402
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP

@@ -14,9 +14,9 @@ from nodes.ros_helpers import LATCHED, RELIABLE, stage_model, voltage_path  # no
 from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
-from slpi_ros.model import HeldAtLimitWarning  # noqa: E402
-from slpi_ros.model_file import format_model, save_model  # noqa: E402
-from slpi_ros.runtime.saved_memory import model_id  # noqa: E402
+from slpi_ros.compensator.persistence import model_id  # noqa: E402
+from slpi_ros.model.document import format_model, save_model  # noqa: E402
+from slpi_ros.model.stage_model import HeldAtLimitWarning  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings(f"ignore::{HeldAtLimitWarning.__module__}.{HeldAtLimitWarning.__name__}")
 MS = 1_000_000

@@ -21,10 +21,10 @@ from nodes.ros_helpers import LATCHED, RELIABLE, stage_model, voltage_path  # no
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_msgs.msg import Float64, String  # noqa: E402
 
-from slpi_ros.model import StageModel  # noqa: E402
-from slpi_ros.model_file import format_model, save_model  # noqa: E402
-from slpi_ros.nodes.compensation import Compensation  # noqa: E402
-from slpi_ros.stream import LONGEST_STEP, Limits  # noqa: E402
+from slpi_ros.compensator.controller import Compensation  # noqa: E402
+from slpi_ros.model.document import format_model, save_model  # noqa: E402
+from slpi_ros.model.stage_model import StageModel  # noqa: E402
+from slpi_ros.model.stream import LONGEST_STEP, Limits  # noqa: E402
 
 AXES = ["x", "y"]
 MODEL = stage_model(AXES)

@@ -14,11 +14,11 @@ rclpy = pytest.importorskip("rclpy")
 
 from nodes.ros_helpers import stage_model  # noqa: E402
 
+from slpi_ros.compensator.controller import Compensation  # noqa: E402
+from slpi_ros.compensator.rejection import RejectedError  # noqa: E402
 from slpi_ros.errors import SlpiError  # noqa: E402
-from slpi_ros.model_file import format_model, parse_model  # noqa: E402
-from slpi_ros.nodes.compensation import Compensation  # noqa: E402
-from slpi_ros.runtime.rejection import RejectedError  # noqa: E402
-from slpi_ros.stream import Limits  # noqa: E402
+from slpi_ros.model.document import format_model, parse_model  # noqa: E402
+from slpi_ros.model.stream import Limits  # noqa: E402
 
 SLPI = json.loads(format_model(stage_model()))
 PI = copy.deepcopy(SLPI)

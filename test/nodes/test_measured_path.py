@@ -12,7 +12,7 @@ rclpy = pytest.importorskip("rclpy")
 from nodes.compensator_client import PERIOD_NS, START_NS, compensator  # noqa: E402
 
 import slpi_ros  # noqa: E402
-from slpi_ros.tables import import_table, read_table, write_table  # noqa: E402
+from slpi_ros.io.tables import import_table, read_table, write_table  # noqa: E402
 
 
 @pytest.fixture

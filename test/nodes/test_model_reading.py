@@ -13,13 +13,13 @@ from nodes.compensator_client import START_NS, compensator  # noqa: E402
 from nodes.ros_helpers import LATCHED, axis_model, stage_model  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
+from slpi_ros.compensator.persistence import model_id  # noqa: E402
 from slpi_ros.errors import ModelError  # noqa: E402
-from slpi_ros.hysteresis.family import LoopFamily  # noqa: E402
-from slpi_ros.model import StageModel  # noqa: E402
-from slpi_ros.model_file import format_model, parse_model  # noqa: E402
-from slpi_ros.nodes import model_reading  # noqa: E402
-from slpi_ros.nodes.model_reading import LARGEST, SMALL, Reading  # noqa: E402
-from slpi_ros.runtime.saved_memory import model_id  # noqa: E402
+from slpi_ros.hysteresis.loop_family import LoopFamily  # noqa: E402
+from slpi_ros.model.document import format_model, parse_model  # noqa: E402
+from slpi_ros.model.stage_model import StageModel  # noqa: E402
+from slpi_ros.nodes import jobs as model_reading  # noqa: E402
+from slpi_ros.nodes.jobs import LARGEST, SMALL, Reading  # noqa: E402
 
 
 def fine_model(vertices: int, axes: tuple[str, ...] = ("x",)) -> StageModel:

@@ -9,7 +9,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from slpi_ros.errors import UsageError  # noqa: E402
-from slpi_ros.nodes.runner import PATIENT_SIGNALS, make_executor  # noqa: E402
+from slpi_ros.nodes.common import PATIENT_SIGNALS, make_executor  # noqa: E402
 
 PATIENCE_S = 60.0
 
@@ -20,7 +20,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.nodes import runner
-from slpi_ros.nodes.runner import request_stop, run
+from slpi_ros.nodes.common import request_stop, run
 
 what, executor = sys.argv[1:3]
 

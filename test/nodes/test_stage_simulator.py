@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 
-from slpi_ros.stage.stage import Stage  # noqa: E402
+from slpi_ros.simulation.stage import Stage  # noqa: E402
 
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 PATIENCE_S = 30.0

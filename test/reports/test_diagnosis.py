@@ -19,7 +19,7 @@ from slpi_ros.diagnosis.verdict import (
 )
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.hum import Hum
-from slpi_ros.model import StageModel
+from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.diagnosis import write_diagnosis
 
 CHARTS = ("time", "motion", "rhythm", "loops")

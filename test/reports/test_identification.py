@@ -11,11 +11,11 @@ from reports.pages import parsed, trace, unpacked
 
 import slpi_ros
 from slpi_ros.errors import UsageError
-from slpi_ros.hysteresis.pi import PrandtlIshlinskii
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.identification.cross_validation import HeldOutTruth, Slice
 from slpi_ros.identification.floor import Floor
-from slpi_ros.identification.record import Record
-from slpi_ros.identification.truth import HeldOutTruth, Slice
-from slpi_ros.model import AxisModel, FitQuality, StageModel, Start
+from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
 from slpi_ros.reports.identification import write_report
 
 HOSTILE = """<script>alert(1)</script>"' onload=x &amp; <img src=http://x/y>"""

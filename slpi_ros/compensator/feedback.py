@@ -1,0 +1,262 @@
+"""Feedforward and PID feedback together (second paper, Fig. 12), sample by sample: what corrects an axis."""
+
+from dataclasses import dataclass, fields
+from math import exp, expm1, inf, isfinite
+
+from slpi_ros.errors import UsageError
+from slpi_ros.model.stream import Limits
+
+
+@dataclass(frozen=True)
+class PidGains:
+    """Gains of the feedback, for a stage whose displacement grows with its voltage.
+
+    Parameters
+    ----------
+    proportional : float, V/m
+    integral : float, V/(m s)
+    derivative : float, V s/m
+        Acts on the measured displacement, not on the desired one.
+    derivative_filter : float, seconds
+        Time constant of the low-pass on the derivative; 0: none.
+
+    Raises
+    ------
+    UsageError
+        If one is negative or not finite.
+    """
+
+    proportional: float
+    integral: float = 0.0
+    derivative: float = 0.0
+    derivative_filter: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse gains that make no controller."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (isfinite(value) and value >= 0.0):
+                raise UsageError(f"PID gain {field.name} is {value}; give a finite one that is not negative")
+
+
+class Feedback:
+    """Feedforward + PID of one axis: ``v = correct(t, desired, measured, feedforward)``; it starts disabled.
+
+    Enabling, disabling and retuning make no jump: what would jump becomes an offset, which fades with `release_time`.
+    So the error at the moment of enabling comes in softly, and at last in full.
+
+    The integral grows only as far as the voltage can follow (conditional integration): unlike back-calculation, this
+    forgets nothing it has learnt while the voltage is on its way, slew limited, to a distant feedforward.
+
+    Parameters
+    ----------
+    gains : PidGains
+    limits : Limits
+        Of the total voltage. They may be replaced at any time; a voltage outside new ones goes inside at once.
+    voltage : float, volts
+        What the axis has at the start; brought inside the limits.
+    release_time : float, seconds
+        inf: the offset, or the correction of a disabled feedback, stays.
+    longest_gap : float, seconds
+        A longer gap between samples counts as this long where time is integrated: integral and fading.
+
+    Raises
+    ------
+    UsageError
+        If `voltage` is not finite, or a time is not positive.
+    """
+
+    def __init__(
+        self,
+        gains: PidGains,
+        limits: Limits,
+        voltage: float = 0.0,
+        *,
+        release_time: float = 0.1,
+        longest_gap: float = 0.1,
+    ) -> None:
+        if not isfinite(voltage):
+            raise UsageError(f"voltage at the start is {voltage} V; give the present one")
+        if not release_time > 0.0:
+            raise UsageError(f"release_time is {release_time} s; give a positive one")
+        if not 0.0 < longest_gap < inf:
+            raise UsageError(f"longest_gap is {longest_gap} s; give a positive, finite one")
+        self.limits = limits
+        self._gains = gains
+        self._release_time = release_time
+        self._longest_gap = longest_gap
+        self._enabled = False
+        self._taking_over = False
+        self._t = -inf
+        self._voltage = min(max(voltage, limits.lower), limits.upper)
+        self._correction = 0.0
+        self._integral = 0.0
+        self._offset = 0.0
+        self._measured_at = -inf
+        self._measured = 0.0
+        self._error = 0.0
+        self._rate = 0.0
+
+    @property
+    def enabled(self) -> bool:
+        """Whether measurements act on the voltage."""
+        return self._enabled
+
+    @property
+    def gains(self) -> PidGains:
+        """Present gains."""
+        return self._gains
+
+    @property
+    def voltage(self) -> float:
+        """Present voltage, volts."""
+        return self._voltage
+
+    @property
+    def correction(self) -> float:
+        """What is added to the feedforward voltage, volts, as far as the voltage limits leave room for it."""
+        return self._correction
+
+    def enable(self) -> None:
+        """Let the next measurement take over from the present correction; without effect when enabled."""
+        if not self._enabled:
+            self._enabled = self._taking_over = True
+
+    def disable(self) -> None:
+        """Let the correction fade from here on."""
+        self._enabled = False
+
+    def forget(self) -> None:
+        """Forget the last measurement: the next one takes over from the present correction."""
+        self._error = self._rate = 0.0
+        self._measured_at = -inf
+        self._taking_over = self._enabled
+
+    def retune(self, gains: PidGains) -> None:
+        """Go on with other gains.
+
+        Raises
+        ------
+        UsageError
+            If they are beyond reason; the ones before stay.
+        """
+        before, after = (self._direct(each, self._error, self._rate) for each in (self._gains, gains))
+        offset = self._offset + (before - after)
+        if not isfinite(offset):
+            raise UsageError(f"{gains} give no finite voltage; check their units")
+        self._gains, self._offset = gains, offset
+
+    def correct(self, t: float, desired: float, measured: float, feedforward: float) -> float:
+        """Return the voltage for a sample with a measurement.
+
+        Parameters
+        ----------
+        t : float, seconds
+            Not before the last sample.
+        desired, measured : float, metres
+        feedforward : float, volts
+            What the inverse model gives for `desired`.
+
+        Returns
+        -------
+        float, volts
+            Within the limits, and within their slew of the last one.
+
+        Raises
+        ------
+        UsageError
+            If time runs backwards, or something is not finite. Nothing has moved then: `hold` may serve the sample.
+        """
+        self._check(t, feedforward)
+        elapsed = t - self._measured_at
+        error, rate = desired - measured, self._next_rate(elapsed, measured)
+        direct = self._direct(self._gains, error, rate)
+        if not isfinite(direct):
+            raise UsageError(f"desired {desired} m, measured {measured} m gives no finite voltage; hold the sample")
+        reach = self._reach(t)
+        if self._enabled:
+            integral, offset = self._next_integral_and_offset(elapsed, error, direct, feedforward, reach)
+            self._give(t, feedforward, direct + offset + integral, reach)
+            self._integral, self._offset, self._taking_over = integral, offset, False
+        else:
+            self._give(t, feedforward, self._without_measurement(t), reach)
+        self._error, self._rate = error, rate
+        if elapsed > 0.0:
+            self._measured_at, self._measured = t, measured
+        return self._voltage
+
+    def hold(self, t: float, feedforward: float) -> float:
+        """Return the voltage (V) for a sample without a measurement: the correction is kept, or fades when disabled.
+
+        Raises
+        ------
+        UsageError
+            If time (s) runs backwards, or something is not finite; nothing has moved then.
+        """
+        self._check(t, feedforward)
+        self._give(t, feedforward, self._without_measurement(t), self._reach(t))
+        return self._voltage
+
+    def _check(self, t: float, feedforward: float) -> None:
+        if not (isfinite(t) and isfinite(feedforward)):
+            raise UsageError(f"sample t = {t} s, feedforward = {feedforward} V is not finite; leave it out")
+        if t < self._t:
+            raise UsageError(f"time runs backwards: {t:.9g} s after {self._t:.9g} s; send samples in order")
+
+    def _next_rate(self, elapsed: float, measured: float) -> float:
+        """Low-pass the slope (m/s) of the line between two measurements: exact for whatever time is between them."""
+        if elapsed == 0.0:
+            return self._rate
+        # At the first measurement an endless time has elapsed: the slope is 0.
+        slope = (measured - self._measured) / elapsed
+        time_constant = self._gains.derivative_filter
+        if time_constant == 0.0:
+            return slope
+        return self._rate - (slope - self._rate) * expm1(-elapsed / time_constant)
+
+    def _next_integral_and_offset(
+        self, elapsed: float, error: float, direct: float, feedforward: float, reach: tuple[float, float]
+    ) -> tuple[float, float]:
+        """Return both (V); at the moment of taking over they leave the correction as it is."""
+        if self._taking_over:
+            return self._correction, -direct
+        dt = min(elapsed, self._longest_gap)
+        offset = self._offset * exp(-dt / self._release_time)
+        wanted = feedforward + direct + offset + self._integral
+        step = self._gains.integral * error * dt
+        return self._integral + part_within(step, reach[0] - wanted, reach[1] - wanted), offset
+
+    @staticmethod
+    def _direct(gains: PidGains, error: float, rate: float) -> float:
+        return gains.proportional * error - gains.derivative * rate
+
+    def _without_measurement(self, t: float) -> float:
+        """Return the correction that needs none."""
+        if self._enabled:
+            return self._correction
+        return self._correction * exp(-min(t - self._t, self._longest_gap) / self._release_time)
+
+    def _reach(self, t: float) -> tuple[float, float]:
+        """Return the lowest and highest voltage that may be given at `t`."""
+        lower, upper, slew = self.limits.lower, self.limits.upper, self.limits.slew
+        if slew == inf:
+            return lower, upper
+        # At the first sample no time has passed yet: the voltage stays and catches up from there.
+        way = slew * (t - self._t) if self._t > -inf else 0.0
+        # Outside the limits after they were replaced: inside at once, however far.
+        return min(max(self._voltage - way, lower), upper), max(min(self._voltage + way, upper), lower)
+
+    def _give(self, t: float, feedforward: float, correction: float, reach: tuple[float, float]) -> None:
+        """Move to the voltage nearest to `feedforward` and `correction` together."""
+        wanted = feedforward + correction
+        if not isfinite(wanted):
+            raise UsageError(f"feedforward {feedforward} V, correction {correction} V is not finite; check the gains")
+        self._t = t
+        self._voltage = min(max(wanted, reach[0]), reach[1])
+        # Else a correction that no voltage ever showed would have to fade before one that did.
+        self._correction = part_within(correction, self.limits.lower - feedforward, self.limits.upper - feedforward)
+
+
+def part_within(step: float, low: float, high: float) -> float:
+    """Return as much of `step` as leads no farther than `low` or `high`; none of it where it leads away from both."""
+    return min(max(step, min(low, 0.0)), max(high, 0.0))

@@ -1,0 +1,169 @@
+"""The memory of a stage, kept over a restart of the node: JSON, validated."""
+
+import hashlib
+import json
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from slpi_ros.compensator.last_voltages import LastVoltages, read_last_voltages
+from slpi_ros.compensator.memory_trust import RESTORED, MemoryTrust
+from slpi_ros.errors import ModelError
+from slpi_ros.io.atomic_file import all_or_nothing
+from slpi_ros.io.schemas import validate
+from slpi_ros.model.document import format_model
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.model.stream import Limits
+
+SCHEMA = "slpi_ros/saved_memory/1"
+# Characters; a memory of many axes has a few thousand.
+LONGEST = 1_000_000
+CRASHED = "restored from before a crash: the last voltage is right, turns just before may be missing; reset it"
+
+
+@dataclass(frozen=True)
+class SavedAxis:
+    """Where one axis was.
+
+    Parameters
+    ----------
+    went_through : tuple of float, volts
+        Where the drive turned, oldest first, and last its voltage.
+    certain : bool
+        Whether the memory was known.
+    doubt : str
+        Why that may no longer be so; not saved.
+    """
+
+    went_through: tuple[float, ...]
+    certain: bool
+    doubt: str = ""
+
+    def trust(self, identified: tuple[float, float]) -> MemoryTrust:
+        """Return what the memory is worth to the model that it was saved with, identified on these voltages (V)."""
+        if self.certain and not self.doubt:
+            return MemoryTrust(RESTORED, spanned=identified)
+        return MemoryTrust(doubt=self.doubt)
+
+    def after_crash(self, voltage: float) -> "SavedAxis":
+        """Return what is known of the axis if it was given this voltage (V) last, after it was saved."""
+        moved = () if voltage == self.went_through[-1] else (voltage,)
+        return SavedAxis((*self.went_through, *moved), self.certain, CRASHED)
+
+
+@dataclass(frozen=True)
+class SavedMemory:
+    """Where a stage was.
+
+    Parameters
+    ----------
+    model : str
+        `model_id` of the model it belongs to.
+    complete : bool
+        Whether the node ended in order after it was saved; if not, the drive may have turned since.
+    axes : mapping of axis name to SavedAxis
+    """
+
+    model: str
+    complete: bool
+    axes: Mapping[str, SavedAxis]
+
+    def require_fit(self, model: StageModel, names: Sequence[str], limits: Sequence[Limits]) -> None:
+        """Raise ModelError unless it belongs to this model and has a voltage within the limits for every axis."""
+        if self.model != model_id(model):
+            raise ModelError("the saved memory belongs to another model; it is left out")
+        for name, allowed in zip(names, limits, strict=True):
+            if name not in self.axes:
+                raise ModelError(f"the saved memory has no axis '{name}'; it is left out")
+            voltage = self.axes[name].went_through[-1]
+            if not allowed.lower <= voltage <= allowed.upper:
+                raise ModelError(
+                    f"the saved memory has {voltage:g} V for axis '{name}', outside {allowed.lower:g}.."
+                    f"{allowed.upper:g} V; it is left out"
+                )
+
+
+def model_id(model: StageModel) -> str:
+    """Return a fingerprint of a model's document, 64 hexadecimal digits."""
+    return hashlib.sha256(format_model(model).encode()).hexdigest()
+
+
+def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
+    """Write a saved memory, all of it or nothing; return the mark for the voltages to come.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be written.
+    """
+    document = {
+        "schema": SCHEMA,
+        "model": memory.model,
+        "complete": memory.complete,
+        "axes": {
+            name: {"went_through_V": list(axis.went_through), "certain": axis.certain}
+            for name, axis in memory.axes.items()
+        },
+    }
+    text = json.dumps(document, allow_nan=False)
+    with all_or_nothing(path, ModelError) as file:
+        file.write(text)
+    return _mark(text)
+
+
+def last_voltages(path: str | os.PathLike[str], mark: int) -> LastVoltages:
+    """Return what notes the voltages given after a memory was saved to `path`, in the order of its axes.
+
+    Raises
+    ------
+    ModelError
+        If the file beside it cannot be written.
+    """
+    return LastVoltages(_beside(path), mark)
+
+
+def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
+    """Read a saved memory, moved on to the voltages given last; None where there is no such file yet.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be read or holds something else.
+    """
+    try:
+        with Path(path).open(encoding="utf-8") as file:
+            text = file.read(LONGEST + 1)
+        document = json.loads(text, parse_constant=_refuse)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ModelError(f"{path}: no saved memory: {reason}; it is left out") from None
+    try:
+        validate(document, "saved_memory", str(path))
+    except RecursionError:
+        raise ModelError(f"{path}: no saved memory: nested too deeply; it is left out") from None
+    axes = {
+        name: SavedAxis(tuple(map(float, axis["went_through_V"])), axis["certain"])
+        for name, axis in document["axes"].items()
+    }
+    if not document["complete"]:
+        saved = tuple(axis.went_through[-1] for axis in axes.values())
+        last = read_last_voltages(_beside(path), _mark(text), len(axes)) or saved
+        axes = {name: axis.after_crash(v) for (name, axis), v in zip(axes.items(), last, strict=True)}
+    return SavedMemory(document["model"], document["complete"], axes)
+
+
+def _mark(text: str) -> int:
+    """Return what tells which text of a memory noted voltages belong to."""
+    return zlib.crc32(text.encode())
+
+
+def _beside(path: str | os.PathLike[str]) -> str:
+    return f"{os.fspath(path)}.last"
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(f"{constant} is no voltage")

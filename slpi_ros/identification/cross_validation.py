@@ -1,0 +1,247 @@
+"""How wrong a model is where it was not fitted: on blocks left out, by loop level, by region and by speed.
+
+The same blocks are predicted by the classical PI model, fitted to the same others; and there is a floor, below which
+no model can come.
+"""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from slpi_ros.errors import SlpiError
+from slpi_ros.hysteresis.loops import separate
+from slpi_ros.identification.drive import smallest_turn
+from slpi_ros.identification.fit import FITS, fit_of
+from slpi_ros.identification.floor import Floor, floor_of
+from slpi_ros.identification.initial_history import BeginningWarning
+from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.signal_statistics import noise
+from slpi_ros.io.record import Record
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+CLASSICAL = "pi"
+# A record is thinned to about so many samples: more of them tell the same errors later.
+SAMPLES = 40_000
+# Loops as deep as that or deeper are one class; the voltage range is cut into so many regions.
+DEEPEST, REGIONS = 3, 5
+# Slower than this share of the fast moves counts as rest; speeds that differ by less than this factor, as one.
+_REST, _ONE_SPEED = 0.02, 1.5
+_SPEED_CLASSES = 3
+# Samples on each side between which a speed is measured.
+_SPEED_REACH = 2
+
+
+@dataclass(frozen=True)
+class Slice:
+    """Errors of a part of the samples left out.
+
+    Parameters
+    ----------
+    name : str
+        Which part.
+    samples : int
+    rms, maximum : float, metres
+    classical_rms : float, metres
+        That of the classical PI model; NaN where it could not be fitted.
+    """
+
+    name: str
+    samples: int
+    rms: float
+    maximum: float
+    classical_rms: float
+
+    def line(self) -> str:
+        """Return a line of the table, nm."""
+        classical = f"{self.classical_rms * 1e9:.1f}" if np.isfinite(self.classical_rms) else "-"
+        return f"{self.name:<24}{self.samples:9}{self.rms * 1e9:9.1f}{self.maximum * 1e9:10.1f}{classical:>14}"
+
+
+@dataclass(frozen=True)
+class HeldOutTruth:
+    """Errors on blocks left out of the fit, free-run.
+
+    Parameters
+    ----------
+    axis, kind : str
+    floor : Floor
+        How well the record repeats itself; of several the middle one.
+    overall : Slice
+    by_level : tuple of Slice
+        How deep the loop lies in others: 0 for the outer one.
+    by_region : tuple of Slice
+        By voltage, from the lowest on.
+    by_speed : tuple of Slice
+        By the size of dv/dt, from rest on.
+    t, v, error, classical : ndarray, shape (M,), seconds, volts and metres
+        The samples left out themselves: model minus measurement. Times count from each record's first stamp.
+    """
+
+    axis: str
+    kind: str
+    floor: Floor
+    overall: Slice
+    by_level: tuple[Slice, ...]
+    by_region: tuple[Slice, ...]
+    by_speed: tuple[Slice, ...]
+    t: FloatArray
+    v: FloatArray
+    error: FloatArray
+    classical: FloatArray
+
+    def lines(self) -> list[str]:
+        """Return a table in words and nm."""
+        head = f"{'on blocks left out, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}{'classical PI':>14}"
+        parts = (self.overall, *self.by_level, *self.by_region, *self.by_speed)
+        floor = f"{'floor':<33}{self.floor.rms * 1e9:9.1f}   from {self.floor.source}"
+        return [head, *(part.line() for part in parts), floor]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One thinned record: its samples, and when each was taken (s)."""
+
+    samples: Samples
+    t: FloatArray
+
+    @classmethod
+    def of(cls, record: Record, axis: str, start: float | None, stop: float | None, most: int) -> "_Part":
+        samples = select_samples(record, axis, start, stop)
+        # Samples without a voltage are left out, and those after the stop.
+        t = record.t[np.isfinite(record.voltage[axis])][: samples.v.size]
+        kept = samples.thinning(most)
+        return cls(samples.at(kept), t[kept])
+
+
+def held_out_truth(
+    record: Record | Sequence[Record],
+    axis: str,
+    kind: str = "slpi",
+    *,
+    start: float | None = None,
+    stop: float | None = None,
+    loops_at_rest: bool = False,
+) -> HeldOutTruth:
+    """Fit a kind of model to a thinned record, block after block left out, and judge it there.
+
+    Parameters
+    ----------
+    record : Record or sequence of Record
+    axis : str
+    kind, start, stop, loops_at_rest
+        As for `slpi_ros.identify`.
+
+    Returns
+    -------
+    HeldOutTruth
+
+    Raises
+    ------
+    SlpiError
+        If the record does not allow a fit.
+    """
+    records = [record] if isinstance(record, Record) else list(record)
+    fit = fit_of(kind, loops_at_rest=loops_at_rest)
+    parts = [_Part.of(one, axis, start, stop, SAMPLES // len(records)) for one in records]
+    samples = [part.samples for part in parts]
+    with threadpool_limits(1), warnings.catch_warnings():
+        # What the fit of the whole record leaves aside has been said.
+        warnings.simplefilter("ignore", BeginningWarning)
+        error = fit(samples).held_out
+        classical = error if kind == CLASSICAL else _classical(samples)
+    left_out = np.isfinite(error)
+    error, classical = error[left_out], classical[left_out]
+    level = np.concatenate([_levels(part.t, part.samples.v) for part in parts])[left_out]
+    speed = np.concatenate([_speeds(part.t, part.samples.v) for part in parts])[left_out]
+    t = np.concatenate([part.t for part in parts])[left_out]
+    v = np.concatenate([part.samples.v for part in parts])[left_out]
+
+    ends = np.cumsum([part.t.size for part in parts])[:-1]
+    floors = sorted(map(_floor, parts, np.split(left_out, ends)), key=lambda floor: floor.rms)
+
+    def cut(classes: Iterator[tuple[str, Mask]]) -> tuple[Slice, ...]:
+        return tuple(_slice(name, error[chosen], classical[chosen]) for name, chosen in classes if chosen.any())
+
+    return HeldOutTruth(
+        axis=axis,
+        kind=kind,
+        floor=floors[len(floors) // 2],
+        overall=_slice("all", error, classical),
+        by_level=cut(_level_classes(level)),
+        by_region=cut(_region_classes(v)),
+        by_speed=cut(_speed_classes(speed)),
+        t=t,
+        v=v,
+        error=error,
+        classical=classical,
+    )
+
+
+def _classical(samples: Sequence[Samples]) -> FloatArray:
+    try:
+        return FITS[CLASSICAL](samples).held_out
+    except SlpiError:
+        # A record that suits one kind may not suit the other.
+        return np.full(sum(part.v.size for part in samples), np.nan)
+
+
+def _floor(part: _Part, judged: Mask) -> Floor:
+    return floor_of(part.t, part.samples.v, np.where(judged, part.samples.y, np.nan))
+
+
+def _slice(name: str, error: FloatArray, classical: FloatArray) -> Slice:
+    known = np.isfinite(classical)
+    classical_rms = float(np.sqrt(np.mean(classical[known] ** 2))) if known.any() else np.nan
+    return Slice(name, error.size, float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error))), classical_rms)
+
+
+def _levels(t: FloatArray, v: FloatArray) -> IntArray:
+    """Return how deep the loop of each sample lies in others, shape (N,)."""
+    level = np.zeros(v.size, np.int64)
+    for loop in separate(v, dead_band=smallest_turn(v, noise(v, t))).loops:
+        level[loop.samples] = loop.level
+    return level
+
+
+def _speeds(t: FloatArray, v: FloatArray) -> FloatArray:
+    """Return the size of dv/dt (V/s), shape (N,), over some samples on each side."""
+    at = np.arange(v.size)
+    before, after = np.maximum(at - _SPEED_REACH, 0), np.minimum(at + _SPEED_REACH, v.size - 1)
+    seconds = t[after] - t[before]
+    return np.divide(np.abs(v[after] - v[before]), seconds, out=np.zeros(v.size), where=seconds > 0.0)
+
+
+def _level_classes(level: IntArray) -> Iterator[tuple[str, Mask]]:
+    yield "outer loop", level == 0
+    for depth in range(1, DEEPEST):
+        yield f"loops of level {depth}", level == depth
+    yield f"level {DEEPEST} and deeper", level >= DEEPEST
+
+
+def _region_classes(v: FloatArray) -> Iterator[tuple[str, Mask]]:
+    edges = np.linspace(v.min(), v.max(), REGIONS + 1)
+    region = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, REGIONS - 1)
+    for number, (low, high) in enumerate(pairwise(edges.tolist())):
+        yield f"{low:.4g} to {high:.4g} V", region == number
+
+
+def _speed_classes(speed: FloatArray) -> Iterator[tuple[str, Mask]]:
+    rest = speed <= _REST * float(np.quantile(speed, 0.95))
+    yield "at rest", rest
+    moving = speed[~rest]
+    if not moving.size:
+        return
+    slow, fast = np.quantile(moving, (0.1, 0.9)).tolist()
+    classes = _SPEED_CLASSES if fast > _ONE_SPEED * slow else 1
+    edges = np.quantile(moving, np.linspace(0.0, 1.0, classes + 1))
+    number = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, classes - 1)
+    for k, (low, high) in enumerate(pairwise(edges.tolist())):
+        yield f"{low:.3g} to {high:.3g} V/s", ~rest & (number == k)

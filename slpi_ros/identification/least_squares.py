@@ -1,0 +1,178 @@
+"""One basis on one record: the convex problem, its solution, and how well it predicts blocks left out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from slpi_ros.identification.bases import Basis
+from slpi_ros.identification.design_matrix import Design, Walk
+from slpi_ros.identification.progress import tell
+from slpi_ros.identification.qp import solve_free, solve_qp
+from slpi_ros.identification.samples import Samples
+
+FloatArray = NDArray[np.float64]
+
+# The weight with which outliers are found and starts are compared.
+FIRST_SMOOTHNESS = 0.1
+FOLDS, BLOCKS_OF_FOLD = 5, 8
+# Errors beyond this many (robust) standard deviations count linearly, not squared (Huber).
+HUBER = 1.5
+REWEIGHTINGS = 3
+# Keeps the equations definite where neither record nor roughness says anything.
+RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One basis on one record or several.
+
+    Displacement is in units of `scale`; weights are zero where a sample is not fitted; `judged` are those that others
+    can predict; `rough` is the matrix of the basis's roughness.
+    """
+
+    basis: Basis
+    design: Design
+    y: FloatArray
+    weights: FloatArray
+    judged: NDArray[np.bool_]
+    rough: FloatArray
+    scale: float
+    gain: float
+
+    @classmethod
+    def pose(cls, samples: Sequence[Samples], basis: Basis) -> "Problem":
+        """Pose the problem of fitting `basis` to the samples of one record or several."""
+        walk = Walk.joined(
+            [Walk.along(part.v, symmetric_rest=basis.symmetric_rest, primed=part.primed) for part in samples]
+        )
+        design = Design.of(walk, basis.branch_part(walk))
+        volts, metres = np.max([part.spread for part in samples], axis=0).tolist()
+        rough = np.zeros((design.local.shape[1],) * 2)
+        own = basis.roughness()
+        rough[: own.shape[1], : own.shape[1]] = (own.T @ own).toarray()
+        return cls(
+            basis=basis,
+            design=design,
+            y=np.concatenate([part.y for part in samples]) / metres,
+            weights=np.concatenate([part.fitted for part in samples]).astype(np.float64),
+            judged=np.concatenate([part.judged for part in samples]),
+            rough=rough,
+            scale=metres,
+            gain=metres / volts,
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of samples fitted."""
+        return int(np.count_nonzero(self.weights))
+
+    def errors(self, x: FloatArray) -> FloatArray:
+        """Return the errors of the fitted samples, metres."""
+        fitted = self.weights > 0
+        return (self.design.predict(x) - self.y)[fitted] * self.scale
+
+    def penalty(self, smoothness: float, count: float) -> FloatArray:
+        """Return the matrix of the roughness penalty on `count` samples, shape (p, p)."""
+        matrix = self.rough * (smoothness * count / 1000)
+        matrix[np.diag_indices_from(matrix)] += RIDGE * count
+        return matrix
+
+    def solve(self, smoothness: float) -> FloatArray:
+        """Fit all samples, with every branch rising."""
+        matrix, vector = self.design.normal_equations(self.y, self.weights)
+        return self.constrained(matrix + self.penalty(smoothness, self.count), vector)
+
+    def constrained(self, matrix: FloatArray, vector: FloatArray) -> FloatArray:
+        """Minimise ``x' M x / 2 - b' x`` with every branch rising."""
+        constraints, bound = self.basis.monotone(self.gain / self.scale)
+        # The displacement at rest is free, that of every record.
+        shape = (bound.size, matrix.shape[0])
+        constraints = sp.csr_array((constraints.data, constraints.indices, constraints.indptr), shape)
+        return solve_qp(matrix, vector, constraints, bound)
+
+    def residual(self) -> FloatArray:
+        """Return the errors, shape (N,), in units of `scale`, of a rough fit whose branches may fall."""
+        matrix, vector = self.design.normal_equations(self.y, self.weights)
+        x = solve_free(matrix + self.penalty(FIRST_SMOOTHNESS, self.count), vector)
+        return self.design.predict(x) - self.y
+
+    def reweighted(self) -> "Problem":
+        """Return the problem with outliers weighed down."""
+        allowed = (self.weights > 0).astype(np.float64)
+        problem = self
+        for _ in range(REWEIGHTINGS):
+            size = np.abs(problem.residual())
+            spread = 1.4826 * np.median(size[allowed > 0])
+            weights = allowed * np.minimum(1.0, HUBER * spread / np.maximum(size, 1e-300))
+            problem = replace(self, weights=weights)
+        return problem
+
+    def folds(self) -> list[NDArray[np.int64]]:
+        """Return the samples that are left out together.
+
+        The first rise is never left out: a record shows it once, and no other part can predict it.
+        """
+        return blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise)
+
+    def held_out_errors(self, smoothness: float) -> FloatArray:
+        """Return the error (m) of each sample, shape (N,), when it is left out of the fit; NaN where it never is."""
+        errors = np.full(self.y.size, np.nan)
+        for fold, chosen in enumerate(self.folds(), 1):
+            tell(f"fits with blocks left out, {fold} of {FOLDS}")
+            weights = self.weights.copy()
+            weights[chosen] = 0.0
+            part = replace(self, weights=weights)
+            errors[chosen] = (self.design.predict(part.solve(smoothness)) - self.y)[chosen] * self.scale
+        return errors
+
+    def scores(self, smoothness: Sequence[float]) -> FloatArray:
+        """Return the robust rms error (m) on blocks left out, one for each smoothness; quick, so branches may fall."""
+        matrix, vector = self.design.normal_equations(self.y, self.weights)
+        squares, total = np.zeros(len(smoothness)), 0.0
+        for chosen in self.folds():
+            left_out = np.zeros_like(self.weights)
+            left_out[chosen] = self.weights[chosen]
+            fold_matrix, fold_vector = self.design.normal_equations(self.y, left_out)
+            energy, total = float(left_out @ self.y**2), total + float(left_out.sum())
+            for k, weight in enumerate(smoothness):
+                rest = self.penalty(weight, self.count - chosen.size)
+                x = solve_free(matrix - fold_matrix + rest, vector - fold_vector)
+                squares[k] += x @ fold_matrix @ x - 2.0 * (x @ fold_vector) + energy
+        rms: FloatArray = np.sqrt(np.maximum(squares, 0.0) / total) * self.scale
+        return rms
+
+
+def blocked_folds(allowed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Return the samples, of those `allowed`, that are left out together: blocks spread over the record."""
+    blocks = np.array_split(np.flatnonzero(allowed), FOLDS * BLOCKS_OF_FOLD)
+    return [np.concatenate(blocks[fold::FOLDS]) for fold in range(FOLDS)]
+
+
+def held_out_errors(
+    samples: Samples, allowed: NDArray[np.bool_], predict: Callable[[NDArray[np.bool_]], FloatArray]
+) -> FloatArray:
+    """Return the error (m) of each sample, shape (N,), when it is left out of a fit; NaN where it never is.
+
+    Parameters
+    ----------
+    samples : Samples
+    allowed : ndarray of bool, shape (N,)
+        Samples that may be left out.
+    predict : callable
+        Given the samples to be fitted, bool of shape (N,), returns the displacement of all, shape (N,), metres.
+    """
+    errors = np.full(samples.v.size, np.nan)
+    for fold, chosen in enumerate(blocked_folds(allowed), 1):
+        tell(f"fits with blocks left out, {fold} of {FOLDS}")
+        kept = samples.fitted.copy()
+        kept[chosen] = False
+        errors[chosen] = (predict(kept) - samples.y)[chosen]
+    return errors
+
+
+def noise_rms(errors: FloatArray) -> float:
+    """Return the rms of what changes from sample to sample in `errors`, outliers apart."""
+    return float(1.4826 * np.median(np.abs(np.diff(errors))) / np.sqrt(2))

@@ -1,0 +1,238 @@
+"""Voltage and displacement from topics of their own, brought onto one clock."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.errors import RecordError
+from slpi_ros.io.joint_state import SECOND_NS
+from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.io.signals import Signals
+
+TimeArray = NDArray[np.int64]
+
+# Where neighbours are this many periods apart, nothing is known between them.
+_GAP = 10.0
+# Names for columns that no message names.
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class SeparateTopics:
+    """Two topics that hold together what ``stage_state`` holds alone.
+
+    Either may be of type ``sensor_msgs/JointState``, ``std_msgs/Float64``, ``std_msgs/Float64MultiArray`` or
+    ``geometry_msgs/Vector3Stamped``, in volts and metres. Of a JointState, displacement is ``position``, and voltage
+    is ``effort`` unless that is empty or zero: then ``position`` too. Axes are matched by name where both topics name
+    them; columns without names are taken in the order of the axes, and a single voltage drives all axes.
+
+    Time is that of the header stamps where both topics have them and they overlap, else of recording, for both.
+    Outside the time that both topics cover there are no samples.
+
+    Parameters
+    ----------
+    voltage, displacement : str
+        Names, as for a single topic.
+    clock : {"displacement", "voltage"}
+        Whose messages become samples. With "displacement", nothing measured is changed: its messages get the voltage
+        of their time, and a voltage that turns unseen between two of them becomes a sample of its own, whose
+        displacement is NaN. With "voltage", displacement is interpolated linearly.
+    held : bool
+        A commanded voltage stays as it is until the next message. With the clock "voltage", a sample then lies in the
+        middle between its message and the next. False for a measured voltage, which is interpolated linearly.
+        Nothing is interpolated across gaps of more than ten periods: NaN is what is known there.
+    """
+
+    voltage: str
+    displacement: str
+    clock: Literal["displacement", "voltage"] = "displacement"
+    held: bool = True
+
+
+@dataclass(frozen=True)
+class _Series:
+    """The columns of one signal, each of shape (n,), and their times."""
+
+    time: TimeArray
+    columns: Mapping[str, FloatArray]
+
+
+def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axes: Sequence[str], path: Path) -> Record:
+    """Make a record of two topics.
+
+    Parameters
+    ----------
+    voltage, displacement : Signals
+        What the topics hold.
+    topics : SeparateTopics
+        How to bring them together.
+    axes : sequence of str
+        Those to take, by name and in the order of columns without names; empty for all.
+    path : Path
+        Where they came from.
+
+    Returns
+    -------
+    Record
+
+    Raises
+    ------
+    RecordError
+        If they hold no signal, do not overlap, or their axes do not match.
+    """
+    where = f"{path}: voltage on '{topics.voltage}', displacement on '{topics.displacement}'"
+    v_columns = _filled(voltage, ("effort", "position", "data", "vector"), where)
+    d_columns = _filled(displacement, ("position", "data", "vector"), where)
+    wanted = tuple(axes) or _common_axes(voltage, displacement)
+    moved = _assign(d_columns, displacement.named, wanted, f"{where}: displacement", alone=False)
+    driven = _assign(v_columns, voltage.named, wanted, f"{where}: voltage", alone=True)
+    v_time, d_time, notes = _times(voltage, displacement, topics, where)
+    resample = _on_displacement if topics.clock == "displacement" else _on_voltage
+    time, v, y = resample(_Series(v_time, driven), _Series(d_time, moved), topics.held)
+    if not time.size:
+        raise RecordError(f"{where}: no message of one lies within the time of the other; record them together")
+    return Record(
+        time_ns=time,
+        voltage=v,
+        displacement=y,
+        source=str(path),
+        hardware_id=displacement.frame_id or voltage.frame_id,
+        notes=(*notes, *_naming(voltage, topics.voltage, wanted), *_naming(displacement, topics.displacement, wanted)),
+    )
+
+
+def _filled(signals: Signals, fields: Sequence[str], where: str) -> Mapping[str, FloatArray]:
+    """Return the columns of the first field that is not empty or zero."""
+    for field in fields:
+        columns = signals.fields.get(field, {})
+        if any(np.nan_to_num(column).any() for column in columns.values()):
+            return columns
+    raise RecordError(f"{where}: one of them has no value other than zero; choose other topics")
+
+
+def _common_axes(voltage: Signals, displacement: Signals) -> tuple[str, ...]:
+    """Return the axes that the messages name, in the order of the displacement."""
+    if displacement.named:
+        common = tuple(name for name in displacement.names if name in voltage.names)
+        return common if voltage.named and common else displacement.names
+    return voltage.names if voltage.named else _AXES[: len(displacement.names)]
+
+
+def _assign(
+    columns: Mapping[str, FloatArray], named: bool, axes: Sequence[str], what: str, *, alone: bool
+) -> dict[str, FloatArray]:
+    """Return one column for each axis; a single one may serve all if that makes sense for it `alone`."""
+    if named and all(axis in columns for axis in axes):
+        return {axis: columns[axis] for axis in axes}
+    if len(columns) == 1 and (alone or (len(axes) == 1 and not named)):
+        return dict.fromkeys(axes, next(iter(columns.values())))
+    if not named and len(columns) == len(axes):
+        return dict(zip(axes, columns.values(), strict=True))
+    held = f"axes {', '.join(columns)}" if named else f"{len(columns)} columns without names"
+    raise RecordError(f"{what} has {held} for the axes {', '.join(axes)}; name those to read, in order (axes)")
+
+
+def _naming(signals: Signals, topic: str, axes: Sequence[str]) -> list[str]:
+    if signals.named or len(signals.names) == 1:
+        return []
+    return [f"'{topic}' names no axes: its columns were taken for {', '.join(axes)}, in this order"]
+
+
+def _times(
+    voltage: Signals, displacement: Signals, topics: SeparateTopics, where: str
+) -> tuple[TimeArray, TimeArray, list[str]]:
+    """Return the times of both topics on one clock, and what to note about it."""
+    if voltage.stamp is not None and displacement.stamp is not None:
+        if _overlap(voltage.stamp, displacement.stamp):
+            for topic, stamp in ((topics.voltage, voltage.stamp), (topics.displacement, displacement.stamp)):
+                _require_order(stamp, f"{where}: stamps of '{topic}'")
+            return voltage.stamp, displacement.stamp, []
+        reason = "their header stamps are of different clocks"
+    else:
+        unstamped = [
+            f"'{topic}'"
+            for topic, signals in ((topics.voltage, voltage), (topics.displacement, displacement))
+            if signals.stamp is None
+        ]
+        reason = f"{' and '.join(unstamped)} without header stamps"
+    if not _overlap(voltage.logged, displacement.logged):
+        raise RecordError(f"{where}: at no time were both recorded; record them together")
+    note = f"aligned by the time of recording ({reason}): late messages are paired with the wrong voltage"
+    return voltage.logged, displacement.logged, [note]
+
+
+def _overlap(one: TimeArray, other: TimeArray) -> bool:
+    return bool(max(one.min(), other.min()) < min(one.max(), other.max()))
+
+
+def _require_order(time: TimeArray, what: str) -> None:
+    back = np.flatnonzero(np.diff(time) < 0)
+    if back.size:
+        seconds = (time[back[0]] - time[back[0] + 1]) / SECOND_NS
+        raise RecordError(f"{what} run backwards by {seconds:.6g} s at message {back[0] + 1}; record anew")
+
+
+_Aligned = tuple[TimeArray, dict[str, FloatArray], dict[str, FloatArray]]
+
+
+def _on_displacement(voltage: _Series, displacement: _Series, held: bool) -> _Aligned:
+    """Give every displacement the voltage of its time."""
+    known = (displacement.time >= voltage.time[0]) & (displacement.time <= voltage.time[-1])
+    time = displacement.time[known]
+    y = {axis: column[known] for axis, column in displacement.columns.items()}
+    if not held:
+        return time, {axis: _between(time, voltage.time, column) for axis, column in voltage.columns.items()}, y
+    current = np.searchsorted(voltage.time, time, side="right") - 1
+    unseen = _unseen_turns(voltage, current)
+    # The displacement that follows a command in time stands behind it.
+    places = np.searchsorted(time, voltage.time[unseen], side="left")
+    current = np.insert(current, places, unseen)
+    return (
+        np.insert(time, places, voltage.time[unseen]),
+        {axis: column[current] for axis, column in voltage.columns.items()},
+        {axis: np.insert(column, places, np.nan) for axis, column in y.items()},
+    )
+
+
+def _unseen_turns(voltage: _Series, current: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the messages at which a voltage turns and which are `current` at no displacement."""
+    unseen = np.zeros(voltage.time.size, dtype=bool)
+    unseen[current.min(initial=voltage.time.size) : current.max(initial=0)] = True
+    unseen[current] = False
+    turn = np.zeros(voltage.time.size, dtype=bool)
+    for column in voltage.columns.values():
+        step = np.sign(np.diff(column))
+        # A level stretch goes on as the last move before it.
+        step = step[np.maximum.accumulate(np.where(step != 0.0, np.arange(step.size), 0))]
+        turn[1:-1] |= step[:-1] * step[1:] < 0
+    return np.flatnonzero(unseen & turn)
+
+
+def _on_voltage(voltage: _Series, displacement: _Series, held: bool) -> _Aligned:
+    """Give every voltage the displacement of its time."""
+    time, v = voltage.time, dict(voltage.columns)
+    if held:
+        time = time[:-1] + np.diff(time) // 2
+        v = {axis: column[:-1] for axis, column in v.items()}
+    known = (time >= displacement.time[0]) & (time <= displacement.time[-1])
+    time = time[known]
+    return (
+        time,
+        {axis: column[known] for axis, column in v.items()},
+        {axis: _between(time, displacement.time, column) for axis, column in displacement.columns.items()},
+    )
+
+
+def _between(time: TimeArray, known_at: TimeArray, values: FloatArray) -> FloatArray:
+    """Interpolate linearly; NaN within gaps."""
+    start = known_at[0]
+    result = np.interp((time - start).astype(np.float64), (known_at - start).astype(np.float64), values)
+    steps = np.diff(known_at)
+    before = np.clip(np.searchsorted(known_at, time, side="left") - 1, 0, max(steps.size - 1, 0))
+    within = (time > known_at[before]) & (time < known_at[before + 1])
+    result[within & (steps[before] > _GAP * np.median(steps))] = np.nan
+    return np.asarray(result)

@@ -1,0 +1,173 @@
+"""Finding a recording: the bag on disk, the topic in the bag, and what to say when it is not there."""
+
+import errno
+import os
+import re
+import shutil
+import struct
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from slpi_ros.errors import RecordError, SlpiError
+from slpi_ros.io.message_blocks import zstd
+
+_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+# The parts of a split bag end in their number.
+_PART = re.compile(r"(.*)_(\d+)(\.(?:mcap|db3)(?:\.zstd)?)")
+_WANTED = "give a rosbag2 folder or an .mcap or .db3 file"
+
+
+def partial_path(path: str | os.PathLike[str]) -> Path:
+    """Return the folder that holds the bag of this path until it is complete."""
+    path = Path(path)
+    return path.with_name(f".{path.name}.partial")
+
+
+def locate(path: Path) -> list[Path]:
+    """Return what a bag reader can open: a folder with metadata, or bag files, in order if there are several.
+
+    Raises
+    ------
+    RecordError
+        If there is none at this path.
+    """
+    if not path.exists():
+        hint = _WANTED
+        if path.name and partial_path(path).exists():
+            hint = f"its recording is unfinished, in {partial_path(path)}: wait for the recorder to end"
+        raise RecordError(f"{path}: no such bag; {hint}")
+    if path.is_file():
+        if path.name.endswith(_SUFFIXES):
+            return [path]
+        hint = {
+            ".csv": "import the table first with `slpi import`",
+            ".mat": "import the table first with `slpi import`",
+            ".bag": "convert a ROS 1 bag first with `rosbags-convert`",
+        }.get(path.suffix, _WANTED)
+        raise RecordError(f"{path}: not a bag of ROS 2; {hint}")
+    if (path / "metadata.yaml").exists():
+        return [path]
+    files = [file for file in path.iterdir() if file.name.endswith(_SUFFIXES)]
+    if not files:
+        raise RecordError(f"{path}: a folder without metadata.yaml and without .mcap or .db3 file; not a bag")
+    return files if len(files) == 1 else _parts(files, path)
+
+
+def _parts(files: list[Path], folder: Path) -> list[Path]:
+    """Return the files of a split bag in order; only of such a one, as there may be several bags in a folder."""
+    names = [_PART.fullmatch(file.name) for file in files]
+    order = sorted(int(name[2]) if name else -1 for name in names)
+    if order != list(range(len(files))) or len({(name[1], name[3]) for name in names if name}) > 1:
+        raise RecordError(
+            f"{folder}: {len(files)} bag files but no metadata.yaml, and they are not parts 0 to {len(files) - 1} of "
+            f"one bag; make one with `ros2 bag reindex {folder}`, or give one of the files"
+        )
+    return sorted(files, key=lambda file: int(file.name.rpartition("_")[2].partition(".")[0]))
+
+
+@contextmanager
+def unpacked(file: Path) -> Iterator[Path]:
+    """Provide a lone bag file that its recorder compressed as a whole; any other is provided as it is."""
+    if file.suffix != ".zstd":
+        yield file
+        return
+    with TemporaryDirectory() as folder:
+        plain = Path(folder) / file.stem
+        with zstd().open(file) as packed, plain.open("wb") as target:
+            shutil.copyfileobj(packed, target)
+        yield plain
+
+
+@contextmanager
+def translated(source: Path) -> Iterator[None]:
+    """Turn whatever a damaged bag makes its reader raise into a RecordError of one line."""
+    try:
+        _require_whole(source)
+        yield
+    except SlpiError:
+        raise
+    except PermissionError as error:
+        raise RecordError(f"{source}: cannot be read ({one_line(error)}); check the permissions") from error
+    except MemoryError as error:
+        raise RecordError(f"{source}: not enough memory to read it; split it into shorter bags") from error
+    except Exception as error:
+        if getattr(error, "errno", None) == errno.ENOSPC:
+            raise RecordError(f"{source}: no room to unpack it; free some, or set TMPDIR to another place") from error
+        # struct, zstd, yaml, sqlite, unicode...: a damaged file fails in any way
+        reason = one_line(error)
+        raise RecordError(f"{source}: damaged or unfinished ({reason}); {_remedy(source)}") from error
+
+
+def _require_whole(source: Path) -> None:
+    """Raise EOFError for an SQLite file that lacks its end: SQLite itself would read zeros there."""
+    files = sorted(source.iterdir()) if source.is_dir() else [source]
+    for file in (file for file in files if file.suffix == ".db3"):
+        journal = file.with_name(f"{file.name}-wal")
+        if journal.exists() and journal.stat().st_size:
+            raise EOFError(f"messages still in {journal.name}: `sqlite3 {file} 'PRAGMA wal_checkpoint'` moves them")
+        with file.open("rb") as stream:
+            header = stream.read(100)
+        # https://sqlite.org/fileformat.html: the size in the header counts if both change counters agree
+        if len(header) < 100 or header[24:28] != header[92:96]:
+            continue
+        page, pages = struct.unpack_from(">H", header, 16)[0], struct.unpack_from(">I", header, 28)[0]
+        size, wanted = file.stat().st_size, pages * (65536 if page == 1 else page)
+        if size < wanted:
+            raise EOFError(f"{size} bytes of {wanted} in {file.name}")
+
+
+def _remedy(source: Path) -> str:
+    """Say what can be tried with a bag that does not open."""
+    if source.is_dir():
+        return "rebuild metadata.yaml with `ros2 bag reindex`, or give its .mcap or .db3 file alone"
+    if source.suffix == ".zstd":
+        return f"test it with `zstd -t {source}`, and copy it anew"
+    if source.suffix == ".mcap":
+        return f"if its recorder was killed, recover with `mcap recover {source} -o NEW.mcap`"
+    return f"try `sqlite3 {source} .recover | sqlite3 NEW.db3`"
+
+
+def one_line(error: Exception) -> str:
+    """Return what the error says, short and without line breaks."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str], source: Path) -> str:
+    """Return the full name of the topic that is meant.
+
+    Parameters
+    ----------
+    topics : mapping of str to str
+        Full name to type of what the bag holds.
+    topic : str
+        Full name, or its last parts where they leave no doubt.
+    msgtypes : collection of str
+        The types it may have.
+    source : Path
+        The bag, for messages.
+
+    Raises
+    ------
+    RecordError
+        If there is none, more than one, or it is of another type.
+    """
+    contents = ", ".join(f"{name} ({topics[name]})" for name in sorted(topics)) or "no topics"
+    wanted = absolute_name(topic)
+    found = [name for name in topics if absolute_name(name) == wanted]
+    found = found or sorted(name for name in topics if name.endswith(wanted))
+    if not found:
+        raise RecordError(f"{source}: no topic '{topic}'; the bag holds {contents}")
+    if len(found) > 1:
+        raise RecordError(f"{source}: topic '{topic}' may be {' or '.join(found)}; give the full name")
+    if topics[found[0]] not in msgtypes:
+        raise RecordError(
+            f"{source}: topic '{found[0]}' is {topics[found[0]]}, not {' or '.join(msgtypes)}; the bag holds {contents}"
+        )
+    return found[0]
+
+
+def absolute_name(topic: str) -> str:
+    """Return the topic with exactly one leading slash."""
+    return f"/{topic.strip('/')}"

@@ -1,0 +1,198 @@
+"""Messages of one topic from an MCAP file, a chunk at a time and without touching each of them.
+
+The format: https://mcap.dev/spec. A file is a row of records; most are chunks, which hold records in turn, and behind
+each chunk stand indexes of its messages. Chunks without the wanted topic are passed over.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.io.cdr import ByteArray
+from slpi_ros.io.message_blocks import BLOCK, MessageBlock, decompressed, is_compressed
+
+_CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _DATA_END = 0x04, 0x05, 0x06, 0x07, 0x0F
+_MAGIC_SIZE, _FOOTER_SIZE = 8, 37
+_RECORD = struct.Struct("<BQ")
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_INDEX_HEAD = struct.Struct("<HI")
+
+# What comes before the data of a message.
+_MESSAGE_HEAD = np.dtype(
+    [("op", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
+)
+# Of a message's length, what is not data.
+_HEAD_IN_LENGTH = _MESSAGE_HEAD.itemsize - _RECORD.size
+
+
+def read_mcap(path: Path, topic: str) -> Iterator[MessageBlock]:
+    """Yield the messages of a topic, in the order in which they were written.
+
+    Parameters
+    ----------
+    path : Path
+        A complete file.
+    topic : str
+        Full name.
+
+    Raises
+    ------
+    Exception
+        Of any kind where the file is damaged.
+    """
+    with path.open("rb") as file:
+        yield from _McapFile(file, topic).blocks()
+
+
+class _McapFile:
+    """One pass through the records of a file."""
+
+    def __init__(self, file: BinaryIO, topic: str) -> None:
+        self._file = file
+        self._topic = topic.encode()
+        self._channels: set[int] = set()
+        self._end = file.seek(-_FOOTER_SIZE, 2)
+        self._summary = int.from_bytes(self._read(self._end + _RECORD.size, 8), "little")
+        if self._summary:
+            for op, start, length in self._records(self._summary):
+                if op == _CHANNEL:
+                    self._learn(self._read(start, length))
+        # Without a summary a channel may be announced within any chunk.
+        self._all_known = bool(self._channels)
+
+    def blocks(self) -> Iterator[MessageBlock]:
+        """Yield the messages, chunk by chunk."""
+        chunk: tuple[int, int] | None = None
+        indexes: list[bytes] = []
+        bare: list[tuple[int, bytes]] = []
+        for op, start, length in self._records(_MAGIC_SIZE):
+            if op == _MESSAGE_INDEX:
+                indexes.append(self._read(start, length))
+                continue
+            if chunk:
+                yield from self._chunk(*chunk, indexes)
+                chunk, indexes = None, []
+            if op == _CHUNK:
+                chunk = start, length
+            elif op == _CHANNEL:
+                self._learn(self._read(start, length))
+            elif op == _MESSAGE and int.from_bytes(self._read(start, 2), "little") in self._channels:
+                data = self._read(start, length)
+                bare.append((int.from_bytes(data[6:14], "little"), data[_HEAD_IN_LENGTH:]))
+            if len(bare) == BLOCK or (bare and op == _DATA_END):
+                yield MessageBlock.of(*zip(*bare, strict=True))
+                bare = []
+            if op == _DATA_END:
+                return
+        raise EOFError("no end of the data section")
+
+    def _records(self, position: int) -> Iterator[tuple[int, int, int]]:
+        """Yield type, place and length of the records from `position` on, to the footer."""
+        while position < self._end:
+            op, length = _RECORD.unpack(self._read(position, _RECORD.size))
+            position += _RECORD.size
+            if position + length > self._end:
+                raise EOFError(f"record of {length} bytes at {position} reaches beyond the end")
+            yield op, position, length
+            position += length
+
+    def _read(self, position: int, size: int) -> bytes:
+        self._file.seek(position)
+        data = self._file.read(size)
+        if len(data) < size:
+            raise EOFError(f"{len(data)} of {size} bytes at {position}")
+        return data
+
+    def _learn(self, channel: bytes) -> None:
+        """Remember a channel if it is one of the topic's."""
+        size = int.from_bytes(channel[4:8], "little")
+        if channel[8 : 8 + size] == self._topic:
+            self._channels.add(int.from_bytes(channel[:2], "little"))
+
+    def _chunk(self, start: int, length: int, indexes: list[bytes]) -> Iterator[MessageBlock]:
+        """Yield the messages of a chunk, if it holds any."""
+        if indexes and self._all_known:
+            offsets = _indexed(indexes, self._channels)
+            if not offsets.size:
+                return
+            records = _records_of_chunk(self._read(start, length))
+        else:
+            records = _records_of_chunk(self._read(start, length))
+            offsets = self._walk(records)
+        if offsets.size:
+            yield _gather(np.frombuffer(records, np.uint8), offsets, self._channels)
+
+    def _walk(self, records: bytes) -> NDArray[np.int64]:
+        """Return where the wanted messages of a chunk without index are."""
+        offsets, position = [], 0
+        while position < len(records):
+            op, length = _RECORD.unpack_from(records, position)
+            start = position + _RECORD.size
+            if op == _CHANNEL:
+                self._learn(records[start : start + length])
+            elif op == _MESSAGE and int.from_bytes(records[start : start + 2], "little") in self._channels:
+                offsets.append(position)
+            position = start + length
+        return np.array(offsets, np.int64)
+
+
+def _indexed(indexes: list[bytes], channels: set[int]) -> NDArray[np.int64]:
+    """Return the offsets of the wanted messages, in ascending order."""
+    offsets = [np.empty(0, np.int64)]
+    for index in indexes:
+        channel, size = _INDEX_HEAD.unpack_from(index)
+        if channel in channels:
+            entries = np.frombuffer(index, "<i8", size // 8, _INDEX_HEAD.size)
+            offsets.append(entries[1::2])
+    return np.sort(np.concatenate(offsets))
+
+
+def _records_of_chunk(chunk: bytes) -> bytes:
+    """Return the records in a chunk, decompressed and checked."""
+    _, _, size, checksum, name = _CHUNK_HEAD.unpack_from(chunk)
+    start = _CHUNK_HEAD.size + name
+    compression = chunk[_CHUNK_HEAD.size : start].decode()
+    stored = int.from_bytes(chunk[start : start + 8], "little")
+    records = decompressed(chunk[start + 8 : start + 8 + stored], compression)
+    if len(records) != size:
+        raise EOFError(f"chunk of {len(records)} bytes, not {size}")
+    if checksum and zlib.crc32(records) != checksum:
+        raise ValueError("checksum of a chunk does not agree")
+    return records
+
+
+def _gather(records: ByteArray, offsets: NDArray[np.int64], channels: set[int]) -> MessageBlock:
+    """Cut the messages at the `offsets`, shape (n,), out of a chunk's records."""
+    heads = _rows(records, offsets, _MESSAGE_HEAD.itemsize).view(_MESSAGE_HEAD)[:, 0]
+    if (heads["op"] != _MESSAGE).any() or not np.isin(heads["channel"], list(channels)).all():
+        raise ValueError("an index of messages points elsewhere")
+    logged = heads["log"].astype(np.int64)
+    starts = offsets + _MESSAGE_HEAD.itemsize
+    sizes = heads["length"].astype(np.int64) - _HEAD_IN_LENGTH
+    if (sizes == sizes[0]).all() and sizes[0] > 0:
+        rows = _rows(records, starts, int(sizes[0]))
+        if not is_compressed(rows):
+            return MessageBlock(logged, rows)
+    ends = (starts + sizes).tolist()
+    if min(sizes) < 0 or max(ends) > records.size:
+        raise EOFError("a message reaches beyond its chunk")
+    return MessageBlock.of(
+        logged.tolist(), [records[a:b].tobytes() for a, b in zip(starts.tolist(), ends, strict=True)]
+    )
+
+
+def _rows(data: ByteArray, starts: NDArray[np.int64], length: int) -> ByteArray:
+    """Return the `length` bytes from each of the ascending `starts` on, shape (n, length)."""
+    if starts[0] < 0 or starts[-1] + length > data.size:
+        raise EOFError("a message reaches beyond its chunk")
+    steps = np.diff(starts)
+    if steps.size and (steps == steps[0]).all():
+        view = np.lib.stride_tricks.as_strided
+        return view(data[starts[0] :], (starts.size, length), (int(steps[0]), 1), writeable=False)
+    rows: ByteArray = data[starts[:, None] + np.arange(length)]
+    return rows

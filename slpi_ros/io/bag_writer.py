@@ -1,0 +1,215 @@
+"""Bags out: a rosbag2 folder, mcap or sqlite3, that is there as a whole or not at all.
+
+No rosbags exception leaves this module.
+"""
+
+import os
+import shutil
+import sqlite3
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.typesys import Stores, TypesysError, get_typestore
+
+from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.io.bag_files import absolute_name, one_line, partial_path
+from slpi_ros.io.joint_state import JointStateBlock, encode_joint_states
+from slpi_ros.io.message_types import JOINT_STATE
+
+STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+
+_BAG_VERSION: Literal[9] = 9  # what ROS 2 Jazzy writes
+_WRITE_ERRORS = (OSError, sqlite3.Error, WriterError)
+
+
+class BagWriter:
+    """A bag being written; a context manager.
+
+    Until it is complete the bag is in ``.NAME.partial`` beside its place, so a folder of that name is always
+    a whole bag. An exception inside ``with`` discards it; without ``with``, call ``close`` or ``discard``.
+
+    Parameters
+    ----------
+    path : path
+        The rosbag2 folder to make; parent folders are made too.
+    storage : {"mcap", "sqlite3"}
+        File format.
+    topic : str, optional
+        Topic of type ``sensor_msgs/JointState`` that ``write`` and ``write_raw`` go to; None to announce
+        all topics by ``add_topic``.
+    hardware_id : str
+        The stage, for messages made by ``write``.
+
+    Attributes
+    ----------
+    path : Path
+        Where the bag will be.
+    partial : Path
+        Where it is until then.
+    message_count : int
+        Messages written so far.
+
+    Raises
+    ------
+    RecordError
+        If the path or an unfinished bag of that name exists, or cannot be written.
+    UsageError
+        If there is no such storage.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        storage: str = "mcap",
+        topic: str | None = "/stage_state",
+        hardware_id: str = "",
+    ) -> None:
+        if storage not in STORAGES:
+            raise UsageError(f"no bag storage '{storage}'; choose {' or '.join(STORAGES)}")
+        self.path = Path(path).absolute()
+        self.partial = partial_path(self.path)
+        self.message_count = 0
+        self._hardware_id = hardware_id
+        self._topic = topic
+        self._connections: dict[str, Any] = {}
+        if os.path.lexists(self.path):
+            raise RecordError(f"{path}: exists already; choose another name, or remove it first")
+        if self.partial.exists():
+            raise RecordError(
+                f"{self.partial}: an unfinished bag of the same name; wait for its recorder, or, if that was "
+                "killed, move the folder away (mcap files can be saved with `mcap recover`)"
+            )
+        try:
+            self._writer = Writer(self.partial / self.path.name, version=_BAG_VERSION, storage_plugin=STORAGES[storage])
+            self._writer.open()
+        except _WRITE_ERRORS as error:
+            shutil.rmtree(self.partial, ignore_errors=True)
+            raise RecordError(f"{path}: cannot be made ({one_line(error)}); choose another place") from error
+        if topic is not None:
+            self.add_topic(topic)
+
+    def add_topic(self, topic: str, msgtype: str = JOINT_STATE) -> None:
+        """Announce a topic.
+
+        Parameters
+        ----------
+        topic : str
+            Name; a missing leading slash is added.
+        msgtype : str
+            As in ``sensor_msgs/msg/JointState``; any type of ROS 2 Jazzy's own packages.
+
+        Raises
+        ------
+        RecordError
+            If the definition of the type is not known here.
+        """
+        name = absolute_name(topic)
+        try:
+            self._connections[name] = self._writer.add_connection(name, msgtype, typestore=typestore())
+        except (KeyError, TypesysError) as error:
+            raise RecordError(
+                f"{name}: no definition of type {msgtype}, only of ROS 2 Jazzy's own; leave this topic out"
+            ) from error
+        except _WRITE_ERRORS as error:
+            raise self._failure(error) from error
+
+    def write(self, stamp_ns: int, names: Sequence[str], displacement: ArrayLike, voltage: ArrayLike) -> None:
+        """Write one sample of all axes.
+
+        Parameters
+        ----------
+        stamp_ns : int, nanoseconds
+            Stamp of the header and time of the log.
+        names : sequence of str, length K
+            Axes.
+        displacement : array_like, shape (K,), metres
+            Measured displacement.
+        voltage : array_like, shape (K,), volts
+            Applied voltage.
+        """
+        row = (1, len(names))
+        block = JointStateBlock(
+            np.array([stamp_ns], np.int64),
+            np.asarray(displacement, float).reshape(row),
+            np.asarray(voltage, float).reshape(row),
+        )
+        self.write_raw(stamp_ns, encode_joint_states(block, tuple(names), self._hardware_id)[0])
+
+    def write_raw(self, stamp_ns: int, message: bytes, topic: str | None = None) -> None:
+        """Write a message that is serialised already.
+
+        Parameters
+        ----------
+        stamp_ns : int, nanoseconds
+            Time of the log.
+        message : bytes
+            CDR with its encapsulation header.
+        topic : str, optional
+            One that was announced; by default the writer's own.
+        """
+        name = absolute_name(topic or self._topic or "")
+        if name not in self._connections:
+            raise UsageError(f"{self.path}: topic '{name}' was not announced; call add_topic first")
+        try:
+            self._writer.write(self._connections[name], stamp_ns, message)
+        except _WRITE_ERRORS as error:
+            raise self._failure(error) from error
+        self.message_count += 1
+
+    def close(self) -> None:
+        """Complete the bag and put it in its place.
+
+        Raises
+        ------
+        RecordError
+            If the disk does not take it; what is there stays in the partial folder.
+        """
+        try:
+            self._writer.close()
+            (self.partial / self.path.name).rename(self.path)
+            self.partial.rmdir()
+        except _WRITE_ERRORS as error:
+            raise self._failure(error) from error
+
+    def discard(self) -> None:
+        """Give up: remove everything written so far."""
+        # a full disk lets even this fail; there is nothing left to lose
+        with suppress(*_WRITE_ERRORS):
+            self._writer.abort()
+        shutil.rmtree(self.partial, ignore_errors=True)
+
+    def __enter__(self) -> Self:
+        """Return the open writer."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete the bag, or discard it after an exception."""
+        if error is not None:
+            self.discard()
+            return
+        try:
+            self.close()
+        except RecordError:
+            self.discard()
+            raise
+
+    def _failure(self, error: Exception) -> RecordError:
+        return RecordError(
+            f"{self.path}: cannot be written ({one_line(error)}); free some space or choose another place"
+        )
+
+
+@cache
+def typestore() -> Any:
+    """Return the message types that are known here: those of ROS 2 Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)

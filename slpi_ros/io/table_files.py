@@ -1,0 +1,281 @@
+"""A text file with columns of numbers: fast where it is clean, precise about where it is not."""
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.errors import RecordError
+from slpi_ros.io.columns import is_unit
+from slpi_ros.io.record import FloatArray
+
+# the comma last: in tables with another separator it may be the decimal mark
+_SEPARATORS = (";", "\t", ",")
+_LINES_TO_SEARCH = 100
+_UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+_NO_TEXT = re.compile(r"[\0-\x08\x0e-\x19\x7f]")
+_ENOUGH = 10_000
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """The text of a table.
+
+    Parameters
+    ----------
+    path : Path
+        Where it came from, for messages.
+    columns : tuple of str
+        Their names.
+    body : str
+        The lines below the names.
+    separator : str
+        What stands between cells. Where it is no comma, numbers may have a decimal comma.
+    header_line : int
+        Number of the line of names.
+    """
+
+    path: Path
+    columns: tuple[str, ...]
+    body: str
+    separator: str = ","
+    header_line: int = 1
+
+    def listing(self) -> str:
+        """Return the names of the columns for a message."""
+        return listed(self.columns)
+
+    def read(self, wanted: Sequence[str]) -> dict[str, FloatArray]:
+        """Return the wanted columns as numbers, each of shape (N,), N >= 2; an empty cell is NaN.
+
+        Raises
+        ------
+        RecordError
+            If there is no such column, a cell holds something else, or there are fewer than two rows.
+        """
+        for column in wanted:
+            if self.columns.count(column) != 1:
+                problem = "two columns" if column in self.columns else "no column"
+                raise RecordError(f"{self.path}: {problem} '{column}'; there is {self.listing()}")
+        places = [self.columns.index(column) for column in wanted]
+        rows = self._read_fast(places)
+        if rows is None:
+            rows = self._read_carefully(places)
+        if len(rows) < 2:
+            raise RecordError(f"{self.path}: {len(rows)} rows of data; at least two are needed")
+        return dict(zip(wanted, rows.T.copy(), strict=True))
+
+    def _read_fast(self, places: Sequence[int]) -> FloatArray | None:
+        """Let NumPy read a table of nothing but numbers; None where it is not one."""
+        if not self.body.strip():
+            return np.empty((0, len(places)))
+        body = self.body
+        if self.separator != "," and "," in body:
+            if "." in body:
+                return None
+            body = body.replace(",", ".")
+        try:
+            rows = np.loadtxt(io.StringIO(body), delimiter=self.separator, quotechar='"', comments=None, ndmin=2)
+        except ValueError:
+            return None
+        # a decimal comma makes a regular table too, but one that is wider than its header
+        return rows[:, places] if rows.shape[1] == len(self.columns) else None
+
+    def _read_carefully(self, places: Sequence[int]) -> FloatArray:
+        """Read cell by cell: finds empty cells, and the line that is wrong."""
+        rows = []
+        marks = set[str]()
+        for line, cells in self._lines():
+            if len(cells) != len(self.columns):
+                raise RecordError(
+                    f"{self.path}: line {line} has {len(cells)} cells, the header {len(self.columns)}; write one cell "
+                    "for each column, and numbers with a decimal point unless the separator is a semicolon or tab"
+                )
+            rows.append([self._number(cells[place], line, self.columns[place]) for place in places])
+            if self.separator != ",":
+                marks |= {",", "."} & set("".join(cells[place] for place in places))
+            if len(marks) > 1:
+                raise RecordError(
+                    f"{self.path}: line {line}: decimal commas and points in one table; write all numbers alike"
+                )
+        return np.array(rows, float).reshape(-1, len(places))
+
+    def _number(self, cell: str, line: int, column: str) -> float:
+        text = cell if self.separator == "," else cell.replace(",", ".")
+        try:
+            return float(text) if text.strip() else np.nan
+        except ValueError:
+            raise RecordError(
+                f"{self.path}: line {line}, column '{column}': {cell[:40]!r} is not a number; "
+                "correct it or leave the cell empty"
+            ) from None
+
+    def _lines(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield number in the file and cells of every line that is not blank."""
+        reader = csv.reader(io.StringIO(self.body), delimiter=self.separator)
+        try:
+            for cells in reader:
+                if any(map(str.strip, cells)):
+                    yield reader.line_num + self.header_line, cells
+        except csv.Error as error:
+            raise RecordError(
+                f"{self.path}: line {reader.line_num + self.header_line}: not a table ({error})"
+            ) from error
+
+    def require(self, good: NDArray[np.bool_], column: str, values: FloatArray, rule: str) -> None:
+        """Raise RecordError for the first value that is not good.
+
+        Parameters
+        ----------
+        good : ndarray of bool, shape (N,)
+            What holds of the values.
+        column : str
+            Their column.
+        values : ndarray, shape (N,)
+            The values, one for each row.
+        rule : str
+            What the message says that must hold.
+        """
+        if not good.all():
+            row = int(np.argmin(good))
+            line, _ = next(islice(self._lines(), row, None))
+            raise RecordError(f"{self.path}: line {line}, column '{column}': {values[row]:.12g}; {rule}")
+
+
+def load_csv(path: Path) -> CsvTable:
+    """Read the text and the names of the columns; encoding, separator and the line of names show in the file.
+
+    Raises
+    ------
+    RecordError
+        If the file cannot be read, or is not a table with names of columns above its numbers.
+    """
+    text = _text(path)
+    lines = _first_lines(text)
+    header = next(filter(None, (_header(lines, separator) for separator in _SEPARATORS)), None)
+    header = header or _first_line(lines, path)
+    if len(header.columns) < 2:
+        raise RecordError(
+            f"{path}: no line with the names of columns above lines of as many numbers, separated by comma, semicolon "
+            "or tab; begin with a line such as time_s,x_V"
+        )
+    if all(_is_number(name) for name in header.columns):
+        raise RecordError(f"{path}: numbers in the first line; put the names of the columns above them")
+    columns = tuple(_without_control_characters(name) for name in header.columns)
+    return CsvTable(path, columns, text[header.end :], header.separator, header.line)
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line that is not blank: its number, its text, and where in the whole text it ends."""
+
+    number: int
+    text: str
+    end: int
+
+
+@dataclass(frozen=True)
+class _Header:
+    columns: tuple[str, ...]
+    separator: str
+    line: int
+    end: int
+
+
+def _text(path: Path) -> str:
+    """Return the text of a file, with lines that end in a line feed."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise RecordError(f"{path}: no such file; give a table with comma-separated values") from None
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read ({error.strerror}); give a CSV file") from error
+    encodings = ("utf-16",) if content[:2] in _UTF_16_MARKS else ("utf-8-sig", "latin-1")
+    for encoding in encodings:
+        with suppress(UnicodeError):
+            text = io.TextIOWrapper(io.BytesIO(content), encoding).read()
+            if not _NO_TEXT.search(text, 0, _ENOUGH) and "\0" not in text:
+                return text
+    raise RecordError(f"{path}: not a text file; give a table with comma-separated values in UTF-8")
+
+
+def _first_lines(text: str) -> list[_Line]:
+    """Return the lines among which the names of the columns are looked for."""
+    lines: list[_Line] = []
+    end = 0
+    for number in range(1, _LINES_TO_SEARCH + 1):
+        begin, end = end, (text.find("\n", end) + 1 or len(text))
+        if text[begin:end].strip():
+            lines.append(_Line(number, text[begin:end], end))
+    return lines
+
+
+def _header(lines: Sequence[_Line], separator: str) -> _Header | None:
+    """Return the names that stand above as many numbers: of such lines the first of the widest."""
+    rows = [_cells(line.text, separator) for line in lines]
+    tops = [at for at in range(len(rows) - 1) if _are_names(rows[at]) and _are_numbers(rows[at + 1], rows[at])]
+    if not tops:
+        return None
+    at = max(tops, key=lambda at: len(rows[at]))
+    columns, above = rows[at], rows[at - 1] if at else []
+    units = [name.strip("()[] ") for name in columns]
+    if len(above) == len(columns) and _are_names(above) and all(is_unit(unit) for unit in units if unit):
+        columns = [f"{name} [{unit}]" if unit else name for name, unit in zip(above, units, strict=True)]
+    return _Header(tuple(columns), separator, lines[at].number, lines[at].end)
+
+
+def _first_line(lines: Sequence[_Line], path: Path) -> _Header:
+    """Return the first line as names, where none stands above numbers."""
+    if not lines:
+        raise RecordError(f"{path}: no names in the first line; begin with a line such as time_s,x_V")
+    columns, separator = max(((_cells(lines[0].text, s), s) for s in _SEPARATORS), key=lambda split: len(split[0]))
+    return _Header(tuple(columns), separator, lines[0].number, lines[0].end)
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    """Return the cells of a line without the space around them; none if it is no line of a table."""
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+    except csv.Error:
+        return []
+
+
+def _are_names(cells: Sequence[str]) -> bool:
+    return sum(map(bool, cells)) > 1 and not any(_is_number(cell) for cell in cells)
+
+
+def _are_numbers(cells: Sequence[str], names: Sequence[str]) -> bool:
+    """Return whether cells below names are numbers, or at least two of them are."""
+    numbers = sum(map(_is_number, cells))
+    return len(cells) == len(names) and (numbers > 1 or numbers == sum(map(bool, cells)) > 0)
+
+
+def called(name: str, columns: Sequence[str]) -> str:
+    """Return the column of a name, else the only one of that name in other case, else the name itself."""
+    alike = [column for column in columns if column.casefold() == name.casefold()]
+    return alike[0] if len(alike) == 1 and name not in columns else name
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names for a message, not too many and without what would spoil a terminal."""
+    text = ", ".join(names)
+    return _without_control_characters(text[:200]) + ("..." if len(text) > 200 else "")
+
+
+def _without_control_characters(text: str) -> str:
+    return "".join(c if c.isprintable() or c == "\N{NO-BREAK SPACE}" else "?" for c in text)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,213 @@
+"""Tables in and out: measured data to import, and the command tables of the command line."""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.errors import RecordError
+from slpi_ros.io.atomic_file import all_or_nothing
+from slpi_ros.io.column_choice import Choice, Wishes, choose
+from slpi_ros.io.columns import Column
+from slpi_ros.io.mat_table import MatTable, load_mat
+from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.io.table_files import CsvTable, called, load_csv
+
+# message stamps count seconds in int32
+_TIME_END = 2.0**31
+
+
+def import_table(
+    path: str | os.PathLike[str],
+    *,
+    time: str | None = None,
+    voltage: Sequence[str] = (),
+    displacement: Sequence[str] = (),
+    displacement_unit: str | None = None,
+    axes: Sequence[str] = (),
+) -> Record:
+    """Read measured data from any source; the names of the columns say what they are.
+
+    A unit in a name is honoured, as in ``time_ms``, ``Voltage (mV)``, ``x [nm]`` or ``displacement in nm``; case
+    counts only where it decides. Without one, values are seconds, volts and micrometres.
+
+    Parameters
+    ----------
+    path : path
+        A text file of columns separated by comma, semicolon or tab, the latter two also with decimal commas, whose
+        names stand above the numbers; or a MATLAB file of numeric arrays, up to version 7, whose name ends in
+        ``.mat``: its vectors are the columns.
+    time : str, optional
+        Column of time; by default ``time_s``, else the first that begins with "time" (or is ``t``) and says its
+        unit, else the first that begins so.
+    voltage : sequence of str
+        Columns of voltage, one for all axes or one for each displacement; by default those that begin with
+        "voltage" or say a unit of voltage.
+    displacement : sequence of str
+        Columns of displacement, one for each axis; by default those that begin with "displacement", else with
+        "position", else ``<axis>_m`` (or another unit) where there is ``<axis>_V``, else x, y and z with a unit.
+    displacement_unit : {"um", "m", "mm", "nm", "pm"}, optional
+        Unit of displacement columns whose names do not say one; by default "um".
+    axes : sequence of str
+        Names of the axes; by default those in the displacement columns' names, and ``x`` where there is none.
+
+    Returns
+    -------
+    Record
+        In volts and metres. Empty cells and ``nan`` become NaN. A time axis that begins before zero is
+        shifted to begin there.
+
+    Raises
+    ------
+    RecordError
+        If the file, a column, its unit or a value is not what it should be.
+    UsageError
+        If an option is wrong, contradicts the name of a column, or gives one column two roles.
+    """
+    wishes = Wishes(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
+    return import_told(path, wishes)[0]
+
+
+def import_told(path: str | os.PathLike[str], wishes: Wishes) -> tuple[Record, tuple[str, ...]]:
+    """Do as `import_table`, and tell what was taken for what.
+
+    Parameters
+    ----------
+    path : path
+        As of `import_table`.
+    wishes : Wishes
+        The other parameters of `import_table`.
+
+    Returns
+    -------
+    record : Record
+        In volts and metres.
+    lines : tuple of str
+        Columns, units and ranges, a line for each axis; before them one about time if its unit was assumed.
+    """
+    record, choice = _imported(Path(path), wishes)
+    return record, tuple(_told(record, choice))
+
+
+def _imported(path: Path, wishes: Wishes) -> tuple[Record, Choice]:
+    table = load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
+    choice = choose(table, wishes)
+    values = table.read([column.name for column in choice.columns()])
+    record = Record(
+        time_ns=_nanoseconds(_si(values, choice.time), choice.time.name, table),
+        voltage={axis: _si(values, column) for axis, column in choice.voltage.items()},
+        displacement={axis: _si(values, column) for axis, column in choice.displacement.items()},
+        source=str(path),
+    )
+    return record, choice
+
+
+def _si(values: Mapping[str, FloatArray], column: Column) -> FloatArray:
+    return values[column.name] * column.scale
+
+
+def _told(record: Record, choice: Choice) -> Iterable[str]:
+    """Yield lines that say what was taken for what."""
+    if choice.time.assumed:
+        yield f"time: column '{choice.time.name}' taken as {choice.time.unit}"
+    for axis in record.axes:
+        voltage = _told_column(choice.voltage[axis], record.voltage[axis], "V")
+        displacement = _told_column(choice.displacement[axis], record.displacement[axis] * 1e6, "um")
+        yield f"axis {axis}: {voltage}, {displacement}"
+
+
+def _told_column(column: Column, values: FloatArray, unit: str) -> str:
+    """Return name and range of a column, and whether its unit was assumed."""
+    known = values[np.isfinite(values)]
+    assumed = " (unit assumed)" if column.assumed else ""
+    if not known.size:
+        return f"{column.name} without a value"
+    return f"{column.name} {known.min():.5g} to {known.max():.5g} {unit}{assumed}"
+
+
+def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Read a command table, in which every value counts.
+
+    Parameters
+    ----------
+    path : path
+        Columns ``time_s`` and ``<axis>_<suffix>`` in any order; others are ignored.
+    suffix : {"V", "m"}
+        Unit of the wanted columns.
+
+    Returns
+    -------
+    t : ndarray, shape (N,), seconds
+        Never decreasing.
+    values : dict of axis name to ndarray, shape (N,), volts or metres
+        In the order of the columns.
+
+    Raises
+    ------
+    RecordError
+        If a value is missing or not finite, or time runs backwards; with line, column and value.
+    """
+    table = load_csv(Path(path))
+    ending = _ending(suffix)
+    columns = {n.removesuffix(ending): n for n in table.columns if n.endswith(ending) and n != ending}
+    if not columns:
+        raise RecordError(f"{path}: no column <axis>{ending}; there is {table.listing()}")
+    time = called("time_s", table.columns)
+    values = table.read((time, *columns.values()))
+    for column, samples in values.items():
+        table.require(np.isfinite(samples), column, samples, "every cell needs a finite number")
+    _require_order(values[time], time, table)
+    return values[time], {axis: values[column] for axis, column in columns.items()}
+
+
+def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[str, FloatArray], suffix: str) -> None:
+    """Write a table that ``read_table`` reads back: time to the nanosecond, values to the last bit.
+
+    The file appears complete or not at all; one of the same name is replaced.
+
+    Parameters
+    ----------
+    path : path
+        Where to write.
+    t : ndarray, shape (N,), seconds
+        Time.
+    columns : mapping of axis name to ndarray, shape (N,), volts or metres
+        One column for each axis.
+    suffix : {"V", "m"}
+        Unit of the columns.
+
+    Raises
+    ------
+    RecordError
+        If the lengths differ or the file cannot be written.
+    """
+    path = Path(path)
+    for axis, values in columns.items():
+        if len(values) != len(t):
+            raise RecordError(f"{path}: {len(values)} values of axis '{axis}' but {len(t)} times")
+    header = ",".join(["time_s", *(f"{axis}{_ending(suffix)}" for axis in columns)])
+    texts: list[Iterable[str]] = [(f"{second:.9f}" for second in np.asarray(t, float).tolist())]
+    texts += [map(repr, np.asarray(values, float).tolist()) for values in columns.values()]
+    with all_or_nothing(path, RecordError) as file:
+        file.write(f"{header}\n")
+        file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
+
+
+def _ending(suffix: str) -> str:
+    return f"_{suffix.strip('_')}"
+
+
+def _nanoseconds(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> NDArray[np.int64]:
+    """Return stamps; times before zero move all stamps up, as messages cannot hold them."""
+    table.require(np.isfinite(seconds), column, seconds, "every row needs a time")
+    table.require(np.abs(seconds) < _TIME_END, column, seconds, "more than 2^31 s; is the unit right?")
+    _require_order(seconds, column, table)
+    stamps: NDArray[np.int64] = np.rint((seconds - min(seconds[0], 0.0)) * 1e9).astype(np.int64)
+    return stamps
+
+
+def _require_order(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> None:
+    forward = np.concatenate([[True], np.diff(seconds) >= 0])
+    table.require(forward, column, seconds, "time runs backwards here; sort or cut the table")

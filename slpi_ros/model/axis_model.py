@@ -1,0 +1,282 @@
+"""The model of one axis: a hysteresis model, the effects around it, where its memory starts, what it comes from."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.effects.chain import Chain, Middle, backward, forward, loop_middle, reaching
+from slpi_ros.effects.effect import Around, Effect
+from slpi_ros.effects.registry import in_order
+from slpi_ros.errors import UnreachableError, UsageError
+from slpi_ros.hysteresis import multi_slope as smpi
+from slpi_ros.hysteresis import slpi_published as slpi
+from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
+from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.runs import require_finite
+from slpi_ros.model.stream import ROUNDING, AxisStream, Limits, accepted_range, refusal
+from slpi_ros.model.streaming import EffectStream
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the memory starts: at `voltage` (V) and `displacement` (m).
+
+    `history` holds the voltages (V) at which the drive is taken to have turned before, oldest first: a long fall to
+    the first of them wiped the memory. Empty: the stage has never been moved.
+    """
+
+    voltage: float
+    displacement: float
+    history: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class FitQuality:
+    """How well the model describes the record it comes from, free-run, metres.
+
+    Parameters
+    ----------
+    rms, maximum : float, metres
+        Error over the samples fitted.
+    held_out_rms : float, metres
+        Error over blocks left out of the fit, from cross-validation.
+    floor_rms : float, metres
+        Noise of the sensor, estimated from the record.
+    samples : int
+        Samples fitted.
+    covered : float
+        Share of the surface's cells that the record visited, 0..1.
+    source : str
+        The record.
+    """
+
+    rms: float
+    maximum: float
+    held_out_rms: float
+    floor_rms: float
+    samples: int
+    covered: float
+    source: str
+
+
+@dataclass(frozen=True)
+class AxisModel:
+    """One axis.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the hysteresis model.
+    hysteresis : Hysteresis
+    start : Start
+    voltage_range : (float, float), volts
+    displacement_range : (float, float), metres
+        What the record covered. `compensate` keeps to these voltages.
+    quality : FitQuality
+    effects : tuple of Effect
+        What the stage does beside its hysteresis, in the order in which it acts.
+
+    Raises
+    ------
+    ModelError
+        If an effect comes twice.
+    """
+
+    kind: str
+    hysteresis: Hysteresis
+    start: Start
+    voltage_range: tuple[float, float]
+    displacement_range: tuple[float, float]
+    quality: FitQuality
+    effects: tuple[Effect, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Put the effects in order."""
+        object.__setattr__(self, "effects", in_order(self.effects))
+
+    @property
+    def causal(self) -> bool:
+        """Whether the model can follow a path that is not known in advance."""
+        return not isinstance(self.hysteresis, PathModel)
+
+    def memory(self) -> Memory:
+        """Return a fresh memory at the start.
+
+        Raises
+        ------
+        UsageError
+            If the model is not causal.
+        """
+        start = self.start
+        if isinstance(self.hysteresis, PathModel):
+            raise UsageError(
+                f"kind '{self.kind}' needs the whole path in advance and cannot follow it sample by sample; "
+                "give it a whole path, or identify kind 'slpi'"
+            )
+        if not start.history:
+            return Memory(self.hysteresis, start.voltage, start.displacement)
+        first, *turns = (*start.history, start.voltage)
+        # Displacement is known at the end of the history: walk it once to learn how far it leads.
+        way = Memory(self.hysteresis, first, 0.0, primed=True).forward_array(np.array([first, *turns]))[-1]
+        memory = Memory(self.hysteresis, first, start.displacement - float(way), primed=True)
+        for v in turns:
+            memory.forward(v)
+        return memory
+
+    def stream(self, limits: Limits | None = None) -> AxisStream:
+        """Return a fresh stream within `limits` and the identified voltages."""
+        return self.stream_from(self.memory(), self._allowed(limits))
+
+    def stream_from(self, memory: Memory, allowed: Limits) -> AxisStream:
+        """Return a stream that goes on from a memory of this axis; its effects are at rest there."""
+        if not self.effects:
+            return AxisStream(memory, self.displacement_range, allowed)
+        middle = self._middle if self.chain.rate_dependence else None
+        return EffectStream(memory, self.displacement_range, allowed, self.chain, middle)
+
+    def simulate(self, t: FloatArray, v: FloatArray) -> FloatArray:
+        """Return the displacement, shape (N,), metres, for the voltage `v`, shape (N,), volts, at times `t` (s).
+
+        Other axes rest. Time does not matter to a model without effects.
+        """
+        return self.seen(t, self.own(t, v), {})
+
+    def own(self, t: FloatArray, v: FloatArray) -> FloatArray:
+        """Return the displacement, shape (N,), metres, that the voltage alone gives: before other axes come in."""
+        if not self.effects:
+            return self._forward_array(v)
+        around = Around(t - t[:1])
+        u, aside = reaching(self.chain.before, v, around)
+        middle = self._middle if self.chain.rate_dependence else None
+        return forward(self.chain.own, self._forward_array(u) + aside, replace(around, u=u, middle=middle))
+
+    def seen(self, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the displacement that a sensor sees, shape (N,), metres.
+
+        Parameters
+        ----------
+        t : ndarray, shape (N,), seconds
+        own : ndarray, shape (N,), metres
+            What `own` gives.
+        others : mapping of axis name to ndarray, shape (N,), metres
+            Own motions of the other axes from their start.
+        """
+        return forward(self.chain.shared, own, Around(t - t[:1], others=others)) if self.effects else own
+
+    def compensate(self, t: FloatArray, y: FloatArray, limits: Limits | None = None) -> tuple[FloatArray, Mask]:
+        """Return the voltage for a desired displacement `y`, shape (N,), metres, and where it waits at a limit.
+
+        Other axes rest. Time `t`, shape (N,), seconds, does not matter to a model without effects.
+
+        Raises
+        ------
+        UnreachableError
+            If a displacement lies far outside the identified ones.
+        UsageError
+            If a displacement is not finite.
+        """
+        return self.command(t, self.unseen(t, y), limits)
+
+    def unseen(self, t: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the own displacement, shape (N,), metres, for a desired one, shape (N,), metres; other axes rest.
+
+        Raises
+        ------
+        SlpiError
+            As `compensate`.
+        """
+        require_finite(y)
+        accepted = accepted_range(self.displacement_range)
+        far = (y < accepted[0]) | (y > accepted[1])
+        if far.any():
+            at = int(np.argmax(far))
+            raise UnreachableError(f"sample {at}: {refusal(float(y[at]), accepted)}")
+        return backward(self.chain.shared, y, Around(t - t[:1])) if self.effects else y
+
+    def command(self, t: FloatArray, own: FloatArray, limits: Limits | None = None) -> tuple[FloatArray, Mask]:
+        """Return the voltage for an own displacement, shape (N,), metres, and where it waits at a limit."""
+        allowed = self._allowed(limits)
+        if not self.effects:
+            return self._invert_hysteresis(own, allowed)
+        chain, (lowest, highest) = self.chain, self.chain.clipped
+        between = replace(allowed, lower=max(allowed.lower, lowest), upper=max(min(allowed.upper, highest), lowest))
+        around = Around(t - t[:1], middle=self._middle if chain.rate_dependence else None)
+        if chain.coercivity and self.causal:
+            return self._through_play(around, own, allowed, between)
+        h, u = chain.hysteresis_for(own, around, lambda h: self._invert_hysteresis(h, between)[0])
+        held = self._missed(h, u, between)
+        return self._kept(backward(chain.before, u, around), held, allowed)
+
+    def _through_play(
+        self, around: Around, own: FloatArray, allowed: Limits, between: Limits
+    ) -> tuple[FloatArray, Mask]:
+        """Return what `command` does where the hysteresis sees the voltage through a play: one sample after another."""
+        chain = self.chain
+        h = backward(chain.own, own, around)
+        stream = EffectStream(
+            self.memory(), self.displacement_range, between, replace(chain, before=chain.before[-1:], own=(), shared=())
+        )
+        u, held = np.empty_like(h), np.zeros(h.size, dtype=np.bool_)
+        for place, (dt, wish) in enumerate(
+            zip(np.diff(around.t, prepend=around.t[:1]).tolist(), h.tolist(), strict=True)
+        ):
+            u[place] = stream.move(dt, wish)
+            held[place] = stream.held
+        return self._kept(backward(chain.before[:-1], u, around), held, allowed)
+
+    def _kept(self, wanted: FloatArray, held: Mask, allowed: Limits) -> tuple[FloatArray, Mask]:
+        v = np.clip(wanted, allowed.lower, allowed.upper)
+        width = self.voltage_range[1] - self.voltage_range[0]
+        return v, held | (np.abs(v - wanted) > ROUNDING * width)
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The effects in their places."""
+        return Chain.of(self.effects)
+
+    @cached_property
+    def _middle(self) -> Middle:
+        """The middle of the largest loop (m), at voltages (V)."""
+        voltages, middle = loop_middle(self._forward_array, *self.voltage_range)
+        return lambda u: np.interp(u, voltages, middle)
+
+    def _allowed(self, limits: Limits | None) -> Limits:
+        return (limits or Limits(-inf, inf)).within(self.voltage_range)
+
+    def _forward_array(self, v: FloatArray) -> FloatArray:
+        return (self._known_path() or self.memory()).forward_array(v)
+
+    def _known_path(self) -> slpi.KnownPath | smpi.KnownPath | None:
+        """Return what moves a model that is not causal along whole paths."""
+        if isinstance(self.hysteresis, PathModel):
+            return self.hysteresis.along(self.start.voltage, self.start.displacement)
+        return None
+
+    def _invert_hysteresis(self, h: FloatArray, allowed: Limits) -> tuple[FloatArray, Mask]:
+        """Return the voltage for a displacement without effects, shape (N,), metres, and where it waits at a limit."""
+        # The axis may rest outside its limits; the first voltage it is given is inside.
+        path = self._known_path() or AxisStream(self.memory(), self.displacement_range, allowed).memory
+        u = path.inverse_array(h, allowed.lower, allowed.upper)
+        return u, self._missed(h, u, allowed)
+
+    def _missed(self, h: FloatArray, u: FloatArray, allowed: Limits) -> Mask:
+        """Return where a voltage at a limit does not give the wanted displacement."""
+        held = (u <= allowed.lower) | (u >= allowed.upper)
+        if held.any():
+            # At a limit a wish may just be met.
+            with warnings.catch_warnings():
+                # What stands in for loops that were never identified has been said.
+                warnings.simplefilter("ignore", slpi.UnidentifiedLoopWarning)
+                path = self._known_path() or AxisStream(self.memory(), self.displacement_range, allowed).memory
+                missed = path.forward_array(u) - h
+            low, high = self.displacement_range
+            held &= np.abs(missed) > ROUNDING * (high - low)
+        return held

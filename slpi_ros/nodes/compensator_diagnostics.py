@@ -1,0 +1,227 @@
+"""What the compensator says of its health."""
+
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+
+from rclpy.node import Node
+
+from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.controller import Compensation
+from slpi_ros.compensator.timing import Timing, TimingReport
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.compensator_silence import Silence
+from slpi_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Health
+
+Problem = tuple[bool, bytes, str]
+
+
+class Reporter:
+    """Makes and publishes the compensator's health.
+
+    Parameters
+    ----------
+    node : Node
+    compensation : Compensation
+    settings : callable
+        Returns the present ones.
+    silence : Silence
+
+    Attributes
+    ----------
+    state : str
+        Of the lifecycle.
+    timing : Timing
+        Of the messages.
+    lateness : Timing
+        Of the points of trajectories.
+    last_rejection : str
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        compensation: Compensation,
+        settings: Callable[[], CompensatorSettings],
+        silence: Silence,
+    ) -> None:
+        self.state = "unconfigured"
+        self.timing = self.lateness = Timing()
+        self.last_rejection = ""
+        self._compensation, self._settings, self._silence = compensation, settings, silence
+        self._models_refused, self._model_error, self._model_id = 0, "", ""
+        self._diagnostics = Diagnostics(node, "compensator")
+        self._start_window()
+
+    def enter(self, state: str) -> None:
+        """Report a new state of the lifecycle."""
+        self.state = state
+        self.report()
+
+    def model_taken(self, fingerprint: str) -> None:
+        """Report the model in use."""
+        self._model_id, self._model_error = fingerprint, ""
+        self.report()
+
+    def model_refused(self, reason: str) -> None:
+        """Report why a model was refused."""
+        self._models_refused += 1
+        self._model_error = reason
+        self.report()
+
+    def on_period(self) -> None:
+        """Report what was since the last time."""
+        self.report()
+        self._start_window()
+
+    def report_at_least(self, level: bytes) -> None:
+        """Report now if the last report was better than this."""
+        if self._diagnostics.level < level:
+            self.report()
+
+    def report(self) -> None:
+        """Publish the health."""
+        settings, model = self._settings(), self._compensation.model
+        values = self._counters() | self._pace() | self._model_values(model)
+        if model:
+            for axis in self._compensation.axes:
+                values |= _axis_values(axis)
+        problems = tuple((level, text) for wrong, level, text in self._problems(settings) if wrong)
+        hardware_id = settings.hardware_id or (model.hardware_id if model else "")
+        self._diagnostics.report(Health(problems, self._summary(), values, hardware_id))
+
+    def _start_window(self) -> None:
+        self._window, self._window_start = self._compensation.counts.copy(), time.perf_counter()
+        self.timing.restart()
+        self.lateness.restart()
+
+    def _summary(self) -> str:
+        if self.state != "active":
+            return self.state
+        if self._compensation.driving.resetting:
+            return "resetting the memory"
+        doing = self._compensation.following.doing or "compensating"
+        doubts = [f" (axis '{axis.name}': {axis.trust.doubt})" for axis in self._compensation.axes if axis.trust.doubt]
+        return f"{doing}; memory {self._memory()}{''.join(doubts)}"
+
+    def _memory(self) -> str:
+        return ", ".join(dict.fromkeys(axis.memory_state for axis in self._compensation.axes))
+
+    def _counters(self) -> dict[str, object]:
+        counts = self._compensation.counts
+        return {
+            "state": self.state,
+            "received": counts.received,
+            "accepted": counts.accepted,
+            "rejected": counts.rejected,
+            **{f"rejected.{cause}": count for cause, count in counts.by_cause.items()},
+            "measurements_rejected": counts.measurements_rejected,
+            **{f"measurements_rejected.{cause}": count for cause, count in counts.measured_by_cause.items()},
+            "last_rejection": self.last_rejection,
+            "held_at_limit": counts.held_at_limit,
+            "excursions": counts.excursions,
+            "slew_limited": counts.slew_limited,
+            "trajectories": counts.trajectories,
+            "trajectories_rejected": counts.trajectories_rejected,
+            "points_remaining": self._compensation.following.remaining,
+            "points_skipped": self._compensation.following.skipped,
+            "points_held_at_limit": self._compensation.following.points_held,
+            "points_slew_limited": self._compensation.following.points_slewing,
+            "gaps": counts.gaps,
+            "time_jumps": counts.time_jumps,
+            "memory": self._memory(),
+        }
+
+    def _pace(self) -> dict[str, object]:
+        elapsed = max(time.perf_counter() - self._window_start, 1e-3)
+        timing = self.timing.report()
+        p50, p99, longest = _microseconds(timing)
+        late_p50, late_p99, latest = _microseconds(self.lateness.report())
+        return {
+            "rate_hz": f"{(self._compensation.counts.received - self._window.received) / elapsed:.1f}",
+            "jitter_ms": f"{timing.jitter * 1e3:.3f}" if timing else "",
+            "latency_p50_us": p50,
+            "latency_p99_us": p99,
+            "latency_max_us": longest,
+            "deadline_error_p50_us": late_p50,
+            "deadline_error_p99_us": late_p99,
+            "deadline_error_max_us": latest,
+        }
+
+    def _model_values(self, model: StageModel | None) -> dict[str, object]:
+        kinds = [model.axis(axis.name).kind for axis in self._compensation.axes] if model else []
+        return {
+            "model.id": self._model_id[:12] if model else "",
+            "model.created": model.created if model else "",
+            "model.age_h": _hours_since(model.created) if model else "",
+            "model.hardware_id": model.hardware_id if model else "",
+            "model.kind": ", ".join(kinds),
+            "models_refused": self._models_refused,
+            "last_model_error": self._model_error,
+        }
+
+    def _problems(self, settings: CompensatorSettings) -> Iterator[Problem]:
+        """Say what is wrong, or was since the last periodic report."""
+        counts, window = self._compensation.counts, self._window
+        ready, active = self._compensation.model is not None, self.state == "active"
+        yield self._model_error != "", WARN if ready else ERROR, f"model refused: {self._model_error}"
+        yield active and not ready, WARN, "waiting for a model"
+        rejected = counts.rejected - window.rejected
+        yield rejected > 0, WARN, f"{rejected} messages rejected, the last: {self.last_rejection}"
+        refused = counts.trajectories_rejected - window.trajectories_rejected
+        yield refused > 0, WARN, f"{refused} trajectories rejected, the last: {self.last_rejection}"
+        unused = counts.measurements_rejected - window.measurements_rejected
+        yield unused > 0, WARN, f"{unused} measurements rejected, the last: {self.last_rejection}"
+        held = counts.held_at_limit - window.held_at_limit
+        yield held > 0, WARN, f"{held} times held at a voltage limit"
+        jumps = counts.time_jumps - window.time_jumps
+        yield jumps > 0, WARN, f"the clock of the stamps was set back {jumps} times"
+        yield self._silence.said != "", WARN, self._silence.said
+        if ready:
+            for axis in self._compensation.axes:
+                yield from _axis_problems(axis, settings.drift_alarm, counts.accepted > window.accepted)
+
+
+def _microseconds(report: TimingReport | None) -> tuple[str, str, str]:
+    """Write median, 99th percentile and longest."""
+    p50, p99, longest = (f"{each * 1e6:.0f}" for each in report.latency) if report else ("", "", "")
+    return p50, p99, longest
+
+
+def _axis_values(axis: Axis) -> dict[str, object]:
+    drift, quality = axis.drift, axis.model.quality if axis.model else None
+    values = {
+        "voltage_V": f"{axis.voltage:.4f}",
+        "memory": axis.memory_state,
+        "memory_doubt": axis.trust.doubt,
+        "covered": f"{quality.covered:.3f}" if quality else "",
+        "held_out_rms_nm": f"{quality.held_out_rms * 1e9:.2f}" if quality else "",
+        "feedback": axis.feedback,
+        "correction_V": f"{axis.correction:.4f}",
+        "residual_rms_nm": f"{drift.rms * 1e9:.2f}" if drift else "",
+        "residual_mean_nm": f"{drift.mean * 1e9:.2f}" if drift else "",
+    }
+    return {f"{axis.name}.{key}": value for key, value in values.items()}
+
+
+def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]:
+    yield moving and axis.feedback == "holding", WARN, f"axis '{axis.name}': feedback holds, no fresh measurement"
+    drift, quality = axis.drift, axis.model.quality if axis.model else None
+    if drift and quality:
+        usual = max(quality.held_out_rms, quality.floor_rms)
+        text = (
+            f"axis '{axis.name}' is off its model by {drift.rms * 1e9:.1f} nm rms, mean {drift.mean * 1e9:.1f} nm, in "
+            f"{drift.samples} measurements; identified with {usual * 1e9:.1f} nm: reset the memory, or identify again"
+        )
+        yield 0.0 < factor * usual < drift.rms, WARN, text
+
+
+def _hours_since(created: str) -> str:
+    """Return how long ago an ISO 8601 time was; "" if it is none."""
+    try:
+        then = datetime.fromisoformat(created)
+    except ValueError:
+        return ""
+    age = datetime.now(UTC) - (then if then.tzinfo else then.replace(tzinfo=UTC))
+    return f"{age.total_seconds() / 3600:.2f}"

@@ -1,0 +1,293 @@
+"""The MPI paper's measurements on a simulated stage like its own, and the models fitted to them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.mpi import MultiSlope
+from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
+from slpi_ros.identification.fit import identify
+from slpi_ros.identification.metrics import ErrorMetrics, error_metrics
+from slpi_ros.identification.multi_slope import PeakFrequency, fit_peak_frequency
+from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import AxisModel
+from slpi_ros.papers.paths import triangles
+from slpi_ros.simulation.preisach import PreisachStage
+
+FloatArray = NDArray[np.float64]
+
+# Volts and hertz of Fig. 4. Models are those of the highest frequency.
+AMPLITUDES = (20, 40, 60, 80, 100, 120)
+FREQUENCIES = (0.1, 0.5, 1, 2, 5, 10, 20)
+# Of each drive from rest: two cycles to settle, one that is shown and fitted, and the one after it.
+CYCLES, SETTLED, NEXT = 4, 2, 3
+# Volts of the record that the loop family is fitted to; its first cycle wipes the memory and is not fitted.
+FALLING = (120, 120, 120, 100, 80, 60, 40, 20)
+# Volts, hertz and cycles of Fig. 8.
+VARIABLE = ((120, 20, 2), (80, 20, 2), (40, 20, 2), (120, 2, 2))
+
+MPI, SMPI, PI, FAMILY = "MPI", "SMPI", "classical PI", "loop family"
+KINDS = {MPI: "mpi", PI: "pi", FAMILY: "slpi"}
+ONE_MPI, OWN_MPI, SCALED_MPI = "MPI of 120 V", "MPI of each amplitude", "and of each frequency, by Eq. 1"
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Equal triangles from rest, and what the sensor read.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,), seconds
+    v : ndarray, shape (N,), volts
+    y : ndarray, shape (N,), metres
+    """
+
+    t: FloatArray
+    v: FloatArray
+    y: FloatArray
+
+    def cycle(self, number: int) -> slice:
+        """Return the samples of a cycle; the first one is number 0."""
+        samples = self.t.size // CYCLES
+        return slice(number * samples, (number + 1) * samples)
+
+    @property
+    def settled(self) -> tuple[FloatArray, FloatArray]:
+        """Voltage (V) and displacement (m) of the cycle that is shown and fitted."""
+        return self.v[self.cycle(SETTLED)], self.y[self.cycle(SETTLED)]
+
+    @property
+    def first_peak(self) -> float:
+        """Largest displacement of the first cycle, metres."""
+        return float(self.y[self.cycle(0)].max())
+
+    @property
+    def settled_peak(self) -> float:
+        """Largest displacement of the settled cycle, above that at its start, metres."""
+        y = self.settled[1]
+        return float(y.max() - y[0])
+
+    @property
+    def bows(self) -> tuple[float, float, float]:
+        """Mean width of the settled loop, and how far rise and fall leave its chord, as shares of the stroke."""
+        share = (self.settled[1] - self.settled[1][0]) / self.settled_peak
+        top = share.size // 2
+        chord, rise, fall = np.linspace(0.0, 1.0, top + 1), share[: top + 1], np.append(0.0, share[top:][::-1])
+        return float(np.mean(fall - rise)), float(np.abs(rise - chord).max()), float(np.abs(fall - chord).max())
+
+
+@dataclass(frozen=True)
+class CycleFit:
+    """A model fitted to the settled cycle of a drive.
+
+    Parameters
+    ----------
+    model : AxisModel
+    simulated : ndarray, shape (n,), metres
+        On the cycle fitted.
+    fitted, following : ErrorMetrics
+        On the cycle fitted, and on the next one.
+    """
+
+    model: AxisModel
+    simulated: FloatArray
+    fitted: ErrorMetrics
+    following: ErrorMetrics
+
+
+@dataclass(frozen=True)
+class ScaledFit:
+    """The SMPI model on the settled cycle of a drive: simulated (m), shape (n,), and its errors."""
+
+    simulated: FloatArray
+    errors: ErrorMetrics
+
+
+@dataclass(frozen=True)
+class VariablePath:
+    """The path of Fig. 8.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,), seconds
+    y : ndarray, shape (N,), metres
+        What the sensor read.
+    parts : tuple of slice
+        The samples of each amplitude and frequency, as in `VARIABLE`.
+    models : mapping of name to ndarray, shape (N,), metres
+        What the models say; their zero is such that their mean error in the first part is 0.
+    """
+
+    t: FloatArray
+    y: FloatArray
+    parts: tuple[slice, ...]
+    models: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Everything measured and fitted.
+
+    Parameters
+    ----------
+    drives : mapping of (amplitude (V), frequency (Hz)) to Drive
+    peaks : mapping of amplitude (V) to PeakFrequency
+        Eq. 1, fitted to the peaks of the first cycles.
+    ringing : mapping of frequency (Hz) to float, metres
+        By how much the flexure's mode moves the stage at the highest amplitude, at most.
+    fits : mapping of kind's name to mapping of amplitude (V) to CycleFit
+        Each at the highest frequency.
+    scaled : mapping of amplitude (V) to ScaledFit
+    variable : VariablePath
+    """
+
+    drives: Mapping[tuple[float, float], Drive]
+    peaks: Mapping[float, PeakFrequency]
+    ringing: Mapping[float, float]
+    fits: Mapping[str, Mapping[float, CycleFit]]
+    scaled: Mapping[float, ScaledFit]
+    variable: VariablePath
+
+    @property
+    def fastest(self) -> dict[float, Drive]:
+        """The drives at the highest frequency, by amplitude (V)."""
+        highest = max(frequency for _, frequency in self.drives)
+        return {amplitude: drive for (amplitude, f), drive in self.drives.items() if f == highest}
+
+
+def run_study(
+    axis: PreisachStage,
+    amplitudes: Sequence[float] = AMPLITUDES,
+    frequencies: Sequence[float] = FREQUENCIES,
+    samples: int = 1000,
+) -> Study:
+    """Measure an axis and fit the models.
+
+    Parameters
+    ----------
+    axis : PreisachStage
+    amplitudes : sequence of float, volts
+        Rising; the last one is that of the SMPI model.
+    frequencies : sequence of float, hertz
+        Rising.
+    samples : int
+        In one cycle; even.
+    """
+    drives = {(a, f): _drive(axis, a, f, samples) for f in frequencies for a in amplitudes}
+    fastest = {a: drives[a, frequencies[-1]] for a in amplitudes}
+    peaks = {a: fit_peak_frequency(frequencies, [drives[a, f].first_peak for f in frequencies]) for a in amplitudes}
+    fits = {
+        name: {amplitude: _fit(drive, kind) for amplitude, drive in fastest.items()} for name, kind in KINDS.items()
+    }
+    return Study(
+        drives=drives,
+        peaks=peaks,
+        ringing={f: _ringing(axis, amplitudes[-1], f, samples) for f in frequencies},
+        fits=fits,
+        scaled=_scale(fastest, _shape(fits[MPI][amplitudes[-1]])),
+        variable=_variable_path(axis, fits[MPI], peaks, samples),
+    )
+
+
+def triangle_record(
+    axis: PreisachStage, name: str, amplitudes: Sequence[float], frequency: float, samples: int
+) -> Record:
+    """Drive one triangle of each amplitude (V) from rest and return the record of the axis `name`."""
+    axis.rest()
+    v = np.append(np.concatenate([triangles(a, frequency, 1, samples)[1] for a in amplitudes]), 0.0)
+    t = np.arange(v.size) / (samples * frequency)
+    return _record(t, v, axis.run(t, v)[1], name)
+
+
+def _record(t: FloatArray, v: FloatArray, y: FloatArray, name: str = "x") -> Record:
+    return Record(np.round(t * 1e9).astype(np.int64), {name: v}, {name: y})
+
+
+def _drive(axis: PreisachStage, amplitude: float, frequency: float, samples: int) -> Drive:
+    axis.rest()
+    t, v = triangles(amplitude, frequency, CYCLES, samples)
+    return Drive(t, v, axis.run(t, v)[1])
+
+
+def _ringing(axis: PreisachStage, amplitude: float, frequency: float, samples: int) -> float:
+    """Compare a settled cycle (m) with that of the same axis without its mode."""
+    stiff = PreisachStage(replace(axis.parameters, resonance_frequency=0.0))
+    t, v = triangles(amplitude, frequency, SETTLED + 1, samples)
+    axis.rest()
+    apart = (axis.run(t, v)[0] - stiff.run(t, v)[0])[-samples:]
+    return float(np.abs(apart).max())
+
+
+def _fit(drive: Drive, kind: str) -> CycleFit:
+    """Fit the settled cycle; the voltage before it moves the memory."""
+    fitted, following = drive.cycle(SETTLED), drive.cycle(NEXT)
+    start, stop = drive.t[fitted.start] - 1e-9, drive.t[fitted.stop] - 1e-9
+    model = identify(_record(drive.t, drive.v, drive.y), kind, start=start, stop=stop).axis("x")
+    y = model.simulate(drive.t, drive.v)
+    errors = (error_metrics(drive.y[part], y[part]) for part in (fitted, following))
+    return CycleFit(model, y[fitted], *errors)
+
+
+def _shape(fit: CycleFit) -> MultiSlope:
+    assert isinstance(fit.model.hysteresis, MultiSlope)
+    return fit.model.hysteresis
+
+
+def _scale(drives: Mapping[float, Drive], base: MultiSlope) -> dict[float, ScaledFit]:
+    """Scale the model of one amplitude to that of each drive; only the displacement at the start is fitted."""
+    peaks = np.array([drive.settled_peak for drive in drives.values()])
+    path = AmplitudeScaled(base, np.array(list(drives), dtype=np.float64), peaks).along(0.0, 0.0)
+    fits = {}
+    for amplitude, drive in drives.items():
+        v, y = drive.settled
+        relative = path.forward_array(v)
+        simulated = relative + np.median(y - relative)
+        fits[amplitude] = ScaledFit(simulated, error_metrics(y, simulated))
+    return fits
+
+
+def _variable_path(
+    axis: PreisachStage, fits: Mapping[float, CycleFit], peaks: Mapping[float, PeakFrequency], samples: int
+) -> VariablePath:
+    """Drive the path of Fig. 8, its first part twice, and let models follow it; the first time is left out."""
+    path = (VARIABLE[0], *VARIABLE)
+    waves = [triangles(amplitude, frequency, cycles, samples) for amplitude, frequency, cycles in path]
+    starts = np.cumsum([0.0, *(cycles / frequency for _, frequency, cycles in path)])
+    t = np.concatenate([start + wave[0] for start, wave in zip(starts, waves, strict=False)])
+    v = np.concatenate([wave[1] for wave in waves])
+    axis.rest()
+    y = axis.run(t, v)[1]
+
+    def own(exponent: float) -> FloatArray:
+        """Follow each cycle by the model of its amplitude, its displacement scaled by a power of its frequency."""
+        parts, present = [], 0.0
+        for amplitude, frequency, cycles in path:
+            scale = (frequency / VARIABLE[0][1]) ** exponent
+            shape, cycle = _shape(fits[amplitude]), np.append(triangles(amplitude, frequency, 1, samples)[1], 0.0)
+            for _ in range(cycles):
+                part = present + scale * Memory(shape).forward_array(cycle)
+                parts.append(part[:-1])
+                present = float(part[-1])
+        return np.concatenate(parts)
+
+    highest = VARIABLE[0][0]
+    record = triangle_record(axis, "x", FALLING, VARIABLE[0][1], samples)
+    family = identify(record, "slpi", start=1.0 / VARIABLE[0][1]).axis("x")
+    models = {
+        ONE_MPI: fits[highest].model.simulate(t, v),
+        OWN_MPI: own(0.0),
+        SCALED_MPI: own(peaks[highest].b),
+        FAMILY: family.simulate(t, v),
+    }
+    bounds = np.cumsum([0, *(cycles * samples for _, _, cycles in path)]).tolist()
+    shown, first = slice(bounds[1], None), slice(bounds[1], bounds[2])
+    return VariablePath(
+        t=t[shown] - t[bounds[1]],
+        y=y[shown],
+        parts=tuple(slice(a - bounds[1], b - bounds[1]) for a, b in pairwise(bounds[1:])),
+        models={name: (x - np.mean(x[first] - y[first]))[shown] for name, x in models.items()},
+    )

@@ -1,0 +1,59 @@
+"""What the SLPI paper prints: the parameters of Tables 2 to 5, as models, and its headline percentages.
+
+The tables give no unit for the weights; they are taken for micrometres per volt.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
+
+FloatArray = NDArray[np.float64]
+
+THRESHOLDS = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0)
+# Micrometres per volt, one for each threshold.
+TABLE_2 = (0.02943, 0.01351, 0.00040, 0.00206, 0.00230, 0.00265, 0.00249, 0.00550, 0.02802, 0.09411)
+TABLE_3 = (0.03151, 0.01298, 0.01092, 0.00445, 0.00648, 0.00000, 0.00148, 0.00016, 0.00051, 0.00100)
+TABLE_4 = (0.04045, 0.00000, 0.00893, 0.00537, 0.00456, 0.01136, 0.00000, 0.00000, 0.00000, 0.00000)
+TABLE_5 = (0.03040, 0.01116, 0.01516, 0.00478, 0.00000, 0.00000, 0.00823, 0.00057, 0.00000, 0.00000)
+TABLES = {2: TABLE_2, 3: TABLE_3, 4: TABLE_4, 5: TABLE_5}
+
+# By how much SLPI is better than classical PI, in per cent (section 4.1).
+OUTER_MAXIMUM, HIGHEST_MEAN, SPREAD, OVERALL_MEAN = 10.0, 97.5, 53.7, 50.3
+
+
+def table_model(number: int) -> PrandtlIshlinskii:
+    """Return the PI model of Table 2 (level II), 3 (level I), 4 (level 0) or 5 (classical PI), volts to metres."""
+    return PrandtlIshlinskii(np.array(THRESHOLDS), 1e-6 * np.array(TABLES[number]))
+
+
+def table_loops(vertices: tuple[float, float], spans: tuple[float, float, float], *, at_rest: bool) -> SeparatedLoops:
+    """Return the three loops of Tables 4, 3 and 2, each on the loop before it.
+
+    Parameters
+    ----------
+    vertices : (float, float), volts
+        Of the loops of level I and II; the paper does not print them.
+    spans : (float, float, float), volts
+        Of the loops of level 0, I and II.
+    at_rest : bool
+        As published; else the inner loops close.
+    """
+    outer = _loop(4, 0, 1, (0.0, 0.0), spans[0], None)
+    run_in = None if at_rest else 0.0
+    first_vertex = vertices[0], outer.memory().forward(vertices[0])
+    first = _loop(3, 1, -1, first_vertex, spans[1], run_in)
+    way_back = first.memory()
+    # Down to the turn, and up again to the next vertex.
+    way_back.forward(spans[1])
+    second_vertex = vertices[1], first_vertex[1] - way_back.forward(vertices[0] - vertices[1])
+    return SeparatedLoops((outer, first, _loop(2, 2, -1, second_vertex, spans[2], run_in)))
+
+
+def _loop(
+    table: int, level: int, direction: int, vertex: tuple[float, float], span: float, run_in: float | None
+) -> SingleLoop:
+    model = table_model(table)
+    height = SingleLoop(level, direction, vertex, (span, 1.0), (0.0, 0.0), model, run_in).memory().forward(span)
+    return SingleLoop(level, direction, vertex, (span, height), (0.0, 0.0), model, run_in)

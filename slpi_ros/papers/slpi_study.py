@@ -1,0 +1,256 @@
+"""The SLPI paper's experiment on a simulated stage: one path, four models, the errors of each loop."""
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.hysteresis.loops import Loop, Separation, separate
+from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.slpi_published import KnownPath, SeparatedLoops, UnidentifiedLoopWarning
+from slpi_ros.identification.fit import identify
+from slpi_ros.identification.linear import PLAY_OPERATORS
+from slpi_ros.identification.published_kinds import default_thresholds, fit_plays, least_iterations
+from slpi_ros.io.record import Record
+from slpi_ros.papers.paths import ramps, straight_between_turns
+from slpi_ros.simulation.presets import flexure_stage
+
+FloatArray = NDArray[np.float64]
+
+# Like the random path of Fig. 4: up to level II; a sample every 4 V and 0.8 s, and at every turn (2.2).
+RANDOM_PATH = (0.0, 80.0, 12.0, 68.0, 20.0, 80.0, 100.0, 0.0)
+# Fig. 16: a second inner loop, whose vertex lies on the back branch. Fig. 18: inner and outer loop share their rise.
+DOUBLE_INNER_LOOP = (0.0, 64.0, 24.0, 100.0, 40.0, 76.0, 0.0)
+OVERLAPPED = (0.0, 60.0, 0.0, 100.0, 0.0)
+STEP_V, STEP_S = 4.0, 0.8
+VOLTAGE_RANGE = (0.0, 100.0)
+# As many passes are averaged (2.2, step 4).
+PASSES = 2
+UNSEEN = 6
+
+CLASSICAL, MORE_PLAYS = "classical PI", f"classical PI, {PLAY_OPERATORS} operators"
+AT_REST, CLOSING, FAMILY = "SLPI, at rest", "SLPI, closing", "loop family"
+MODELS = (CLASSICAL, MORE_PLAYS, AT_REST, CLOSING, FAMILY)
+DRAWN = (CLASSICAL, AT_REST, CLOSING, FAMILY)
+
+Drive = Memory | KnownPath
+
+
+@dataclass(frozen=True)
+class LoopErrors:
+    """Errors of one model along a path, metres.
+
+    Parameters
+    ----------
+    error : ndarray, shape (N,)
+    means, maxima : tuple of float
+        Mean and largest size on each loop, the outer one first.
+    """
+
+    error: FloatArray
+    means: tuple[float, ...]
+    maxima: tuple[float, ...]
+
+    @classmethod
+    def of(cls, error: FloatArray, loops: tuple[Loop, ...]) -> "LoopErrors":
+        """Return the errors, shape (N,), metres, loop by loop (Eq. 13 and 14)."""
+        size = np.abs(error)
+        return cls(
+            error,
+            tuple(float(size[loop.samples].mean()) for loop in loops),
+            tuple(float(size[loop.samples].max()) for loop in loops),
+        )
+
+    @property
+    def overall(self) -> float:
+        """Mean size over the whole path."""
+        return float(np.mean(np.abs(self.error)))
+
+    @property
+    def spread(self) -> float:
+        """Difference between the worst and the best loop's mean."""
+        return max(self.means) - min(self.means)
+
+
+@dataclass(frozen=True)
+class Study:
+    """One path on the stage, and what the models make of it.
+
+    Parameters
+    ----------
+    turns : tuple of float, volts
+    separation : Separation
+        Voltage and displacement, and their loops.
+    classical : PrandtlIshlinskii
+    at_rest, closing : SeparatedLoops
+    modelled : dict of model name to LoopErrors
+        Model less measured.
+    compensated : dict of model name to LoopErrors
+        What the stage did less what was desired: straight lines between the displacements at the turns.
+    straight : dict of model name to LoopErrors
+        The same for the straight line through zero and the largest displacement (4.1), which turns elsewhere.
+    desired : ndarray, shape (N,), metres
+        Of `compensated`.
+    voltages : dict of model name to ndarray, shape (N,), volts
+        Of `compensated`.
+    drives : dict of model name to callable
+        Makes the model's memory, at the start.
+    """
+
+    turns: tuple[float, ...]
+    separation: Separation
+    classical: PrandtlIshlinskii
+    at_rest: SeparatedLoops
+    closing: SeparatedLoops
+    modelled: Mapping[str, LoopErrors]
+    compensated: Mapping[str, LoopErrors]
+    straight: Mapping[str, LoopErrors]
+    desired: FloatArray
+    voltages: Mapping[str, FloatArray]
+    drives: Mapping[str, Callable[[], Drive]]
+
+
+def study(turns: tuple[float, ...]) -> Study:
+    """Drive the stage through `turns` (V), identify every model on it, and let each compensate."""
+    v = ramps(turns, STEP_V)
+    t = _times(v)
+    y = np.mean([measure(v, seed) for seed in range(PASSES)], axis=0)
+    record = Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y}, "random path")
+    separation = separate(v, y)
+    published = {
+        at_rest: identify(record, "slpi-published", loops_at_rest=at_rest).axis("x").hysteresis
+        for at_rest in (True, False)
+    }
+    at_rest, closing = published[True], published[False]
+    assert isinstance(at_rest, SeparatedLoops)
+    assert isinstance(closing, SeparatedLoops)
+    classical = classical_model(v, y)
+    family = identify(record).axis("x")
+    drives: dict[str, Callable[[], Drive]] = {
+        CLASSICAL: lambda: Memory(classical, 0.0, float(y[0])),
+        MORE_PLAYS: identify(record, "pi").axis("x").memory,
+        AT_REST: lambda: at_rest.along(0.0, float(y[0])),
+        CLOSING: lambda: closing.along(0.0, float(y[0])),
+        FAMILY: family.memory,
+    }
+    desired = straight_between_turns(y, v)
+    straight = y[0] + (y.max() - y[0]) * v / v.max()
+    voltages = {name: voltage_for(drive(), desired) for name, drive in drives.items()}
+    loops = separation.loops
+    return Study(
+        turns=turns,
+        separation=separation,
+        classical=classical,
+        at_rest=at_rest,
+        closing=closing,
+        modelled={name: LoopErrors.of(forward(drive(), v) - y, loops) for name, drive in drives.items()},
+        compensated={name: LoopErrors.of(reached(u) - desired, loops) for name, u in voltages.items()},
+        straight={
+            name: LoopErrors.of(reached(voltage_for(drive(), straight)) - straight, loops)
+            for name, drive in drives.items()
+        },
+        desired=desired,
+        voltages=voltages,
+        drives=drives,
+    )
+
+
+@dataclass(frozen=True)
+class UnseenPaths:
+    """What the models of one study make of other paths.
+
+    Parameters
+    ----------
+    turns : tuple of tuple of float, volts
+        The paths.
+    mean_errors : dict of model name to tuple of float, metres
+        Model less stage, free-run, for each path.
+    loops, replaced : int
+        Inner loops of all paths, and how many of them were never identified.
+    """
+
+    turns: tuple[tuple[float, ...], ...]
+    mean_errors: Mapping[str, tuple[float, ...]]
+    loops: int
+    replaced: int
+
+
+def unseen_paths(known: Study, seed: int = 1) -> UnseenPaths:
+    """Draw other paths within the same range, and let the models of a study predict them."""
+    rng = np.random.default_rng(seed)
+    paths = tuple(_draw(rng) for _ in range(UNSEEN))
+    errors: dict[str, list[float]] = {name: [] for name in MODELS}
+    loops = replaced = 0
+    for turns in paths:
+        v = ramps(turns, STEP_V)
+        true = reached(v)
+        for name, drive in known.drives.items():
+            errors[name].append(float(np.mean(np.abs(forward(drive(), v) - true))))
+        inner = separate(v).loops[1:]
+        loops += len(inner)
+        for loop in inner:
+            span = float(np.ptp(v[loop.path]))
+            place = loop.level, loop.direction, float(v[loop.vertex]), span
+            replaced += not known.closing.holds(known.closing.nearest(*place, 0), *place, 0)
+    return UnseenPaths(paths, {name: tuple(e) for name, e in errors.items()}, loops, replaced)
+
+
+def _draw(rng: np.random.Generator) -> tuple[float, ...]:
+    """Return turns of a path from 0 V with five inner turns and the highest voltage somewhere among them."""
+    levels = STEP_V * rng.choice(np.arange(2, 24), 6, replace=False)
+    low, high = np.sort(levels[:3]), np.sort(levels[3:])
+    inner = np.column_stack([np.maximum(low, high), np.minimum(low, high)])[rng.permutation(3)]
+    turns = [0.0, *inner.ravel().tolist(), 100.0, 0.0]
+    return tuple(float(turn) for turn in turns)
+
+
+def classical_model(v: FloatArray, y: FloatArray) -> PrandtlIshlinskii:
+    """Fit the classical PI model as Table 5 does: its thresholds, at rest and zero where the record starts."""
+    thresholds = default_thresholds(float(np.ptp(v)))
+    everything = np.ones(v.size, dtype=bool)
+    fit = fit_plays(
+        v - v[0],
+        y - y[0],
+        everything,
+        thresholds,
+        None,
+        through_zero=True,
+        iterations=least_iterations(v.size, v.size),
+    )
+    return PrandtlIshlinskii(thresholds, fit.weights)
+
+
+def _times(v: FloatArray) -> FloatArray:
+    return STEP_S * np.arange(v.size, dtype=np.float64)
+
+
+def measure(v: FloatArray, seed: int) -> FloatArray:
+    """Drive a fresh stage through `v`, shape (N,), volts; return what the interferometer reads, shape (N,), metres."""
+    return flexure_stage(seed).run(_times(v), v)[1]
+
+
+def reached(v: FloatArray) -> FloatArray:
+    """Drive a fresh stage through `v`, shape (N,), volts; return where it is, shape (N,), metres."""
+    return flexure_stage().run(_times(v), v)[0]
+
+
+def forward(drive: Drive, v: FloatArray) -> FloatArray:
+    """Return the model's displacement, shape (N,), metres; that nearest loops stand in is told elsewhere."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnidentifiedLoopWarning)
+        return drive.forward_array(v)
+
+
+def voltage_for(drive: Drive, y: FloatArray) -> FloatArray:
+    """Return the model's voltage within what was identified, shape (N,), volts, for displacements (m)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnidentifiedLoopWarning)
+        return drive.inverse_array(y, *VOLTAGE_RANGE)
+
+
+def gain(before: float, after: float) -> float:
+    """Return by how much an error has fallen, in per cent."""
+    return 100.0 * (1.0 - after / before)

@@ -1,0 +1,243 @@
+"""The compensator's heart without ROS: all or nothing, always within the limits."""
+
+import math
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+rclpy = pytest.importorskip("rclpy")
+
+from nodes.ros_helpers import axis_model, stage_model, voltage_path  # noqa: E402
+
+from slpi_ros.compensator.controller import Compensation  # noqa: E402
+from slpi_ros.compensator.rejection import CAUSES, RejectedError  # noqa: E402
+from slpi_ros.errors import SlpiError, UsageError  # noqa: E402
+from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel, Start  # noqa: E402
+from slpi_ros.model.stream import LONGEST_STEP, Limits  # noqa: E402
+
+MS = 1_000_000
+START_NS = 1_700_000_000_123_456_789
+
+
+def compensation(axes=("x",), model=None, **limits):
+    made = Compensation(axes, [Limits(**{"lower": 0.0, "upper": 100.0, **limits})] * len(axes))
+    made.active = True
+    made.use_model(model or stage_model(axes))
+    return made
+
+
+def snapshots(made):
+    return [axis.stream.memory.snapshot() for axis in made.axes]
+
+
+def test_answers_are_the_library_s():
+    model = stage_model(("x", "y"))
+    made = compensation(("x", "y"))
+    wanted = {
+        axis: model.axis(axis).simulate(np.arange(3000) * 5e-3, voltage_path(3000, seed))
+        for seed, axis in enumerate("xy")
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", HeldAtLimitWarning)
+        expected = model.compensate(np.arange(3000) * 5e-3, wanted)
+    for i, (x, y) in enumerate(zip(wanted["x"], wanted["y"], strict=True)):
+        order = (["x", "y"], [x, y]) if i % 3 else (["y", "x"], [y, x])
+        made.move(START_NS + 5 * MS * i, *order)
+        assert made.voltages[0] == pytest.approx(expected["x"][i], abs=1e-9)
+        assert made.voltages[1] == pytest.approx(expected["y"][i], abs=1e-9)
+    assert made.counts.accepted == 3000 and made.counts.rejected == 0
+
+
+def test_axes_that_are_not_named_keep_their_voltage():
+    made = compensation(("x", "y"))
+    made.move(START_NS, ["y"], [5e-6])
+    voltage = made.voltages[1]
+    for i in range(1, 10):
+        made.move(START_NS + i * MS, ["x"], [i * 1e-6])
+        assert made.voltages[1] == voltage
+
+
+REJECTIONS = {
+    "empty": ([], []),
+    "length": (["x", "y"], [1e-6]),
+    "duplicate_axis": (["x", "x"], [1e-6, 2e-6]),
+    "unknown_axis": (["x", "z"], [1e-6, 2e-6]),
+    "not_finite": (["x", "y"], [1e-6, math.nan]),
+    "out_of_range": (["x", "y"], [1e-6, 1.0]),
+}
+
+
+@pytest.mark.parametrize("cause", REJECTIONS)
+def test_a_rejected_message_moves_nothing(cause):
+    made = compensation(("x", "y"))
+    made.move(START_NS, ["x", "y"], [3e-6, 4e-6])
+    before, voltages = snapshots(made), list(made.voltages)
+    with pytest.raises(RejectedError) as caught:
+        made.move(START_NS + MS, *REJECTIONS[cause])
+    assert caught.value.cause == cause
+    assert made.counts.by_cause == {**dict.fromkeys(CAUSES, 0), cause: 1}
+    assert (made.counts.received, made.counts.accepted, made.counts.rejected) == (2, 1, 1)
+    assert snapshots(made) == before and list(made.voltages) == voltages
+
+
+def test_nothing_moves_before_a_model_or_activation():
+    made = Compensation(["x"], [Limits(0.0, 100.0)])
+    causes = []
+    for _ in range(2):
+        with pytest.raises(RejectedError) as caught:
+            made.move(START_NS, ["x"], [1e-6])
+        causes.append(caught.value.cause)
+        made.active = True
+    assert causes == ["inactive", "no_model"]
+
+
+def test_time_is_compared_in_nanoseconds_and_for_each_axis():
+    made = compensation(("x", "y"))
+    made.move(START_NS, ["x"], [2e-6])
+    made.move(START_NS - 50 * MS, ["y"], [1e-6])
+    with pytest.raises(RejectedError) as caught:
+        made.move(START_NS - 1, ["y", "x"], [2e-6, 2e-6])
+    assert caught.value.cause == "time_backwards"
+    made.use_model(stage_model(("x", "y"), stroke=9e-6))
+    with pytest.raises(RejectedError):
+        made.move(START_NS - 1, ["x"], [2e-6])
+
+
+def test_what_is_just_out_of_reach_is_held_and_the_path_after_it_is_as_before():
+    made = compensation()
+    top = stage_model().axis("x").displacement_range[1]
+    made.move(START_NS, ["x"], [0.0])
+    assert made.counts.held_at_limit == 0
+    assert made.move(START_NS + 1, ["x"], [1.1 * top])
+    assert made.voltages[0] == 100.0 and made.counts.held_at_limit == 1
+    assert not made.move(START_NS + 2, ["x"], [0.5 * top])
+    clean = compensation()
+    for i, y in enumerate((top, 0.5 * top)):
+        clean.move(START_NS + i, ["x"], [y])
+    assert made.voltages[0] == pytest.approx(clean.voltages[0], abs=1e-9)
+
+
+def test_slew_is_respected_from_the_first_sample_on():
+    made = compensation(slew=500.0)
+    path = stage_model().axis("x").simulate(np.arange(2000) * 5e-3, voltage_path(2000, 3))
+    last = made.voltages[0]
+    reached = 0
+    for i, y in enumerate(path):
+        made.move(START_NS + i * MS, ["x"], [y])
+        assert abs(made.voltages[0] - last) <= (0.5 if i else 0.0) + 1e-9
+        reached += abs(made.axes[0].stream.memory.displacement - y) < 1e-12
+        last = made.voltages[0]
+    assert reached > 0
+
+
+@pytest.mark.parametrize("slew", [math.inf, 200.0])
+def test_a_new_model_takes_over_where_the_voltage_is(slew):
+    made = compensation(slew=slew)
+    path = stage_model().axis("x").simulate(np.arange(400) * 5e-3, voltage_path(400, 5))
+    rng = np.random.default_rng(7)
+    for i, y in enumerate(path):
+        if i % 3 == 0:
+            before = made.voltages[0]
+            narrow = axis_model(stroke=10e-6 * rng.uniform(0.9, 1.1), voltage=rng.uniform(85.0, 120.0))
+            made.use_model(StageModel({"x": narrow}))
+            assert made.voltages[0] == before
+        last = made.voltages[0]
+        made.move(START_NS + i * MS, ["x"], [min(y, narrow.displacement_range[1])])
+        assert 0.0 <= made.voltages[0] <= 100.0
+        assert abs(made.voltages[0] - last) <= slew * 1e-3 + 1e-9
+
+
+def refused_models():
+    good = axis_model()
+    yield "has no axis 'x'", {"y": good}
+    yield "outside the voltage +limits", {"x": replace(good, voltage_range=(200.0, 300.0))}
+    yield "none that a stage can take", {"x": replace(good, displacement_range=(0.0, 1e6))}
+    yield "none that a stage can be given", {"x": replace(good, start=Start(5e6, 0.0))}
+
+
+@pytest.mark.parametrize(("why", "axes"), list(refused_models()))
+def test_a_refused_model_leaves_the_old_one_working(why, axes):
+    made = compensation()
+    made.move(START_NS, ["x"], [4e-6])
+    before, model = snapshots(made), made.model
+    with pytest.raises(SlpiError, match=why):
+        made.use_model(StageModel(axes))
+    assert snapshots(made) == before and made.model is model
+    made.move(START_NS + MS, ["x"], [5e-6])
+
+
+def test_limits_change_while_it_runs_unless_they_leave_the_stage_outside():
+    made = compensation()
+    made.move(START_NS, ["x"], [5e-6])
+    before = snapshots(made)
+    made.use_limits([Limits(0.0, 70.0, 1000.0)])
+    assert snapshots(made) == before
+    made.move(START_NS + 10**9, ["x"], [9e-6])
+    assert made.voltages[0] == 70.0
+    with pytest.raises(UsageError, match="move it inside first"):
+        made.use_limits([Limits(0.0, 60.0)])
+    made.forget_model()
+    with pytest.raises(UsageError, match="move it inside first"):
+        made.use_limits([Limits(0.0, 60.0)])
+
+
+NUMBER = st.one_of(
+    st.floats(-3e-6, 13e-6), st.sampled_from([0.0, math.nan, math.inf, -math.inf, 1e300, -1e-300, 5e-324, 10e-6])
+)
+MESSAGE = st.tuples(
+    st.sampled_from([-5 * MS, 0, 1, MS, 20 * MS, 10**12]),
+    st.lists(st.sampled_from(["x", "y", "x", "y", "z"]), max_size=3),
+    st.lists(NUMBER, max_size=3),
+)
+LIMITS = st.tuples(st.floats(-50.0, 40.0), st.floats(1.0, 120.0), st.sampled_from([math.inf, 1.0, 1e3, 1e6]))
+
+
+@settings(max_examples=150)
+@given(st.lists(st.one_of(MESSAGE, st.tuples(st.floats(5e-6, 2e-5), st.floats(60.0, 150.0))), max_size=60), LIMITS)
+def test_no_flood_brings_a_voltage_outside(events, bounds):
+    lower, width, slew = bounds
+    limits = Limits(lower, lower + width, slew)
+    made = Compensation(("x", "y"), [limits] * 2)
+    made.active = True
+    try:
+        made.use_model(stage_model(("x", "y")))
+    except UsageError:
+        return
+    clean = Compensation(("x", "y"), [limits] * 2)
+    clean.active = True
+    clean.use_model(stage_model(("x", "y")))
+    now, last = START_NS, list(made.voltages)
+    latest: dict[str, int] = {}
+    for event in events:
+        if len(event) == 2:
+            model = stage_model(("x", "y"), stroke=event[0], voltage=event[1])
+            try:
+                made.use_model(model)
+            except UsageError:
+                # It has another voltage now than this model is good for.
+                assert max(last) > event[1]
+            else:
+                clean.use_model(model)
+            assert list(made.voltages) == last
+            continue
+        step, names, displacements = event
+        now += step
+        try:
+            made.move(now, names, displacements)
+        except RejectedError:
+            assert list(made.voltages) == last
+        else:
+            clean.move(now, names, displacements)
+            for name, before, after in zip("xy", last, made.voltages, strict=True):
+                assert limits.lower <= after <= limits.upper
+                elapsed = min(max(now - latest.get(name, now), 0) * 1e-9, LONGEST_STEP)
+                assert slew == math.inf or abs(after - before) <= slew * elapsed + 1e-9
+                assert name in names or after == before
+            latest |= dict.fromkeys(names, now)
+        last = list(made.voltages)
+        now = max([now, *latest.values()])
+    assert snapshots(made) == snapshots(clean)

@@ -1,0 +1,235 @@
+"""The closed loop of an axis, and what its measurements say of the model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from strategies import FAMILY_CASE, PI_CASE, axis_model
+
+from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.feedback import PidGains
+from slpi_ros.compensator.health import ENOUGH, WINDOW, ResidualWindow
+from slpi_ros.compensator.loop import LoopSettings
+from slpi_ros.compensator.ramp import Ramp
+from slpi_ros.compensator.rejection import RejectedError
+from slpi_ros.model.stream import Limits
+
+LIMITS = Limits(0.0, 100.0, 2000.0)
+MODEL = replace(axis_model(FAMILY_CASE), displacement_range=(2e-6, 14e-6))
+OFF = LoopSettings(False, PidGains(2e6, 1e8, 0.0), 0.1)
+ON = replace(OFF, enabled=True)
+DT = 1e-3
+
+
+class Bench:
+    """An axis whose stage is the model, but for an offset of its voltage: a stage that has drifted."""
+
+    def __init__(self, settings: LoopSettings, offset: float = 0.0, limits: Limits = LIMITS) -> None:
+        self.now = 0.0
+        self.axis = Axis("x", 0, limits, settings, lambda: self.now)
+        self.axis.use(MODEL, self.axis.prepare(MODEL))
+        self.stage, self.offset = FAMILY_CASE.memory(), offset
+        self.measured = self.stage.forward(offset)
+        self.voltages: list[float] = []
+
+    def run(self, path: np.ndarray, measuring: bool = True) -> np.ndarray:
+        """Return the errors, shape (N,), metres, along a path, shape (N,), metres."""
+        errors = []
+        for y in path.tolist():
+            self.now += DT
+            if measuring:
+                self.axis.measure(self.measured)
+            v = self.axis.move(DT, y)
+            self.voltages.append(v)
+            self.measured = self.stage.forward(v + self.offset)
+            errors.append(self.measured - y)
+        return np.array(errors)
+
+
+PATH = 8e-6 - 4e-6 * np.cos(np.linspace(0.0, 12.0, 3000))
+START = np.linspace(2e-6, PATH[0], 400)
+
+
+def test_feedback_takes_away_what_the_model_does_not_know():
+    alone, corrected = Bench(OFF, 3.0), Bench(ON, 3.0)
+    for bench in (alone, corrected):
+        bench.run(START)
+    late = slice(1000, None)
+    without, with_feedback = (np.abs(bench.run(PATH)[late]).mean() for bench in (alone, corrected))
+    assert without > 2e-7 and with_feedback < without / 20
+    assert alone.axis.feedback == "off" and corrected.axis.feedback == "on"
+    assert corrected.axis.correction == pytest.approx(-3.0, abs=0.3)
+
+
+def test_a_measurement_is_held_against_the_wish_that_it_answers():
+    """On a ramp a stage that does what the model says leaves nothing to correct."""
+    bench = Bench(ON)
+    bench.run(START)
+    bench.run(np.linspace(PATH[0], 11e-6, 1000))
+    assert abs(bench.axis.correction) < 1e-6
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_other_gains_after_a_slope_beyond_reason(enabled):
+    silent = replace(ON, gains=PidGains(0.0, 0.0, 1e-300), enabled=enabled)
+    bench = Bench(silent)
+    bench.run(START)
+    for measured in (2e-6, 14e-6):
+        bench.axis.measure(measured)
+        bench.axis.move(1e-9, float(START[-1]))
+    before = bench.axis.voltage
+    bench.axis.retune(replace(silent, gains=PidGains(0.0, 0.0, 1e306)))
+    assert bench.axis.move(DT, float(START[-1])) == pytest.approx(before, abs=1e-9)
+    bench.axis.retune(replace(silent, gains=PidGains(1e2, 1e8)))
+    assert bench.axis.move(DT, float(START[-1])) == pytest.approx(before, abs=1e-9)
+    # Another takes over, and acts.
+    bench.run(PATH[:500])
+    assert bench.axis.feedback == ("on" if enabled else "off")
+
+
+def test_without_feedback_measurements_change_no_voltage():
+    heard, deaf = Bench(OFF, 3.0), Bench(OFF, 3.0)
+    heard.run(PATH)
+    deaf.run(PATH, measuring=False)
+    assert heard.voltages == pytest.approx(deaf.voltages, abs=1e-12)
+    assert deaf.axis.drift is None and heard.axis.drift.samples == WINDOW
+
+
+def test_stale_and_absurd_measurements_do_not_act_and_the_correction_stays():
+    bench = Bench(ON, 3.0)
+    bench.run(START)
+    bench.run(PATH[:1000])
+    kept = bench.axis.correction
+    assert kept < -2.0
+    for spoil in (None, np.nan, np.inf, 1e308):
+        if spoil is not None:
+            with pytest.raises(RejectedError):
+                bench.axis.measure(spoil)
+        bench.axis.move(DT, float(PATH[1000]))
+        assert bench.axis.feedback == "holding"
+        assert bench.axis.correction == pytest.approx(kept, abs=1e-9)
+    bench.axis.measure(9e-6)
+    bench.now += 0.2
+    bench.axis.move(DT, PATH[1000])
+    assert bench.axis.feedback == "holding"
+
+
+@pytest.mark.parametrize("absurd", [17e-6, -1e-6, 1e-3, -1e300, 1e300, np.nan, np.inf])
+def test_a_measurement_that_cannot_be_acts_on_nothing(absurd):
+    """As far outside the identified displacements as no wish may be: a wrong unit, a sensor that fails."""
+    bench, undisturbed = Bench(ON, 3.0), Bench(ON, 3.0)
+    for each in (bench, undisturbed):
+        each.run(START)
+        each.run(PATH[:600])
+    for each in (bench, undisturbed):
+        for y in PATH[600:610].tolist():
+            if each is bench:
+                with pytest.raises(RejectedError, match="^measured displacement [^\n]+$") as caught:
+                    each.axis.measure(absurd)
+                assert caught.value.cause == ("out_of_range" if np.isfinite(absurd) else "not_finite")
+            each.run(np.array([y]), measuring=False)
+    assert bench.voltages == undisturbed.voltages
+    assert bench.axis.drift == undisturbed.axis.drift
+
+
+@pytest.mark.parametrize("first", [1e-3, np.nan])
+def test_a_measurement_that_cannot_be_does_not_hide_one_that_came_before(first):
+    bench, other = Bench(ON, 3.0), Bench(ON, 3.0)
+    for each in (bench, other):
+        each.run(START)
+        each.axis.measure(each.measured)
+    with pytest.raises(RejectedError):
+        bench.axis.measure(first)
+    assert bench.axis.move(DT, PATH[0]) == other.axis.move(DT, PATH[0])
+    assert bench.axis.feedback == "on"
+
+
+def test_switching_the_feedback_makes_no_jump():
+    bench = Bench(OFF, 3.0)
+    bench.run(START)
+    for settings in (ON, OFF, replace(ON, gains=PidGains(1e6, 3e8)), ON, OFF):
+        bench.axis.retune(settings)
+        bench.run(np.full(300, PATH[0]))
+    steps = np.abs(np.diff(bench.voltages))[len(START) :]
+    assert 0.0 < steps.max() < 0.1
+
+
+@pytest.mark.parametrize("acceleration", [np.inf, 2e5])
+def test_voltages_in_total_keep_to_all_limits(acceleration):
+    limits = Limits(0.0, 60.0, 500.0, acceleration)
+    bench = Bench(ON, 8.0, limits)
+    rng = np.random.default_rng(3)
+    bench.run(np.repeat(rng.uniform(2e-6, 12e-6, 60), 40))
+    v = np.array([0.0, *bench.voltages])
+    assert v.min() >= 0.0 and v.max() <= 60.0 and v.max() > 59.0
+    assert np.abs(np.diff(v)).max() <= 500.0 * DT + 1e-9
+    if acceleration < np.inf:
+        assert np.abs(np.diff(v, 2)).max() <= acceleration * DT**2 + 1e-9
+
+
+def test_a_new_model_takes_over_without_a_jump_and_keeps_the_correction():
+    bench = Bench(ON, 3.0)
+    bench.run(START)
+    bench.run(PATH[:1000])
+    voltage, correction = bench.axis.voltage, bench.axis.correction
+    other = replace(MODEL, quality=replace(MODEL.quality, rms=1e-9))
+    bench.axis.use(other, bench.axis.prepare(other))
+    assert (bench.axis.voltage, bench.axis.correction) == (voltage, correction)
+    bench.run(PATH[1000:1010])
+    assert abs(bench.voltages[-10] - voltage) <= 2.0
+
+
+def test_a_drive_starts_at_the_voltage_in_total_and_the_path_goes_on_from_its_end():
+    bench = Bench(ON, 3.0)
+    bench.run(START)
+    bench.run(PATH[:1000])
+    before = bench.axis.voltage
+    bench.axis.start_drive(Ramp([20.0], 1000.0))
+    way = []
+    while not bench.axis.drive(DT):
+        way.append(bench.axis.voltage)
+    assert abs(way[0] - before) <= 1.0 + 1e-9 and np.abs(np.diff(way)).max() <= 1.0 + 1e-9
+    bench.axis.stop_drive()
+    assert bench.axis.voltage == 20.0 and bench.axis.correction == 0.0
+    assert bench.axis.move(0.0, PATH[1000]) == 20.0
+    assert bench.axis.went_through[-1] == 20.0
+
+
+def test_the_health_of_a_stage_as_identified_is_its_noise_and_of_another_more():
+    """Moving or not, as long as the answer comes before the sample after the next."""
+    rng = np.random.default_rng(1)
+    for offset, low, high in ((0.0, 7e-9, 9e-9), (3.0, 2e-7, 1e-6)):
+        bench = Bench(OFF, offset)
+        bench.run(START)
+        for y in [PATH[0]] * WINDOW:
+            bench.axis.measure(bench.measured + rng.normal(0.0, 8e-9))
+            bench.run(np.array([y]), measuring=False)
+        assert low < bench.axis.drift.rms < high
+        bench.run(PATH[:WINDOW])
+        assert bench.axis.drift.rms <= high
+
+
+def test_residuals_are_counted_in_a_window_and_only_outside_of_what_was_expected():
+    window = ResidualWindow(0.0)
+    for _ in range(ENOUGH - 1):
+        window.measure(1.0)
+    assert window.drift() is None
+    window.measure(1.0)
+    assert (window.drift().rms, window.drift().mean) == (1.0, 1.0)
+    window.expect(10.0)
+    for i in range(WINDOW):
+        window.measure((0.0, 10.0, 5.0, -1.0, 11.0)[i % 5])
+    drift = window.drift()
+    assert drift.samples == WINDOW
+    assert (drift.rms, drift.mean) == (pytest.approx(0.4**0.5), pytest.approx(0.0))
+    window.forget(3.0)
+    assert window.drift() is None
+
+
+def test_an_axis_without_a_model_takes_no_measurement():
+    axis = Axis("x", 0, LIMITS, ON)
+    axis.measure(1e-6)
+    assert axis.drift is None
+    model = axis_model(PI_CASE)
+    axis.use(model, axis.prepare(model))
+    assert axis.feedback == "holding"

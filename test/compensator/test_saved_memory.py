@@ -1,0 +1,158 @@
+"""The memory in a file: back as it was, or refused in one line."""
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from strategies import two_axes
+
+from slpi_ros.compensator.last_voltages import LastVoltages, read_last_voltages
+from slpi_ros.compensator.memory_trust import ASSUMED, RESTORED, MemoryTrust
+from slpi_ros.compensator.persistence import (
+    CRASHED,
+    SavedAxis,
+    SavedMemory,
+    last_voltages,
+    load_memory,
+    model_id,
+    save_memory,
+)
+from slpi_ros.errors import ModelError
+from slpi_ros.model.stream import Limits
+
+MODEL = two_axes()
+SAVED = SavedMemory(
+    model_id(MODEL), True, {"x": SavedAxis((0.0, 60.0, 20.0, 1 / 3), True), "y": SavedAxis((-0.1,), False)}
+)
+LIMITS = [Limits(-1.0, 100.0)] * 2
+
+
+def test_it_comes_back_to_the_last_bit(tmp_path):
+    path = tmp_path / "memory.json"
+    assert load_memory(path) is None
+    save_memory(SAVED, path)
+    assert load_memory(path) == SAVED
+    SAVED.require_fit(MODEL, ["y", "x"], LIMITS)
+
+
+def test_it_belongs_to_one_model_its_axes_and_its_limits():
+    other = replace(MODEL, created="2030-01-01T00:00:00Z")
+    with pytest.raises(ModelError, match="another model"):
+        SAVED.require_fit(other, ["x"], LIMITS[:1])
+    with pytest.raises(ModelError, match="no axis 'z'"):
+        SAVED.require_fit(MODEL, ["x", "z"], LIMITS)
+    with pytest.raises(ModelError, match=r"-0\.1 V for axis 'y', outside 0\.\.1 V"):
+        SAVED.require_fit(MODEL, ["x", "y"], [Limits(0.0, 1.0)] * 2)
+
+
+def as_given(*voltages: float) -> bytes:
+    return struct.pack(f"{len(voltages)}d", *voltages)
+
+
+def crashed(path: Path, *commands: tuple[float, float]) -> SavedMemory:
+    """Return what is found after a life that saved its memory, gave these voltages and was killed."""
+    last = last_voltages(path, save_memory(replace(SAVED, complete=False), path))
+    for voltages in commands:
+        last.note(as_given(*voltages))
+    found = load_memory(path)
+    assert found
+    return found
+
+
+def test_after_a_crash_it_is_where_the_last_command_led(tmp_path):
+    path = tmp_path / "memory.json"
+    found = crashed(path, (1.0, 2.0), (3.0, -0.1), (0.1, 0.2))
+    assert found.axes["x"].went_through == (0.0, 60.0, 20.0, 1 / 3, 0.1)
+    assert found.axes["y"].went_through == (-0.1, 0.2)
+    # The mark is the memory's: what was noted for another one is not believed, nor what an orderly end makes old.
+    save_memory(replace(SAVED, complete=False, model="0" * 64), path)
+    assert load_memory(path).axes["x"].went_through == SAVED.axes["x"].went_through
+    save_memory(SAVED, path)
+    assert load_memory(path) == SAVED
+
+
+def test_after_a_crash_nothing_is_certain(tmp_path):
+    found = crashed(tmp_path / "memory.json")
+    assert found.axes["x"] == SavedAxis(SAVED.axes["x"].went_through, True, CRASHED)
+    assert found.axes["x"].trust((0.0, 50.0)) == MemoryTrust(ASSUMED, CRASHED)
+    assert SAVED.axes["x"].trust((0.0, 50.0)) == MemoryTrust(RESTORED, "", (0.0, 50.0))
+    assert SAVED.axes["y"].trust((0.0, 50.0)) == MemoryTrust()
+
+
+@given(st.integers(1, 5), st.integers(0, 100), st.integers(0, 300), st.binary(max_size=8))
+def test_a_torn_record_is_never_believed(tmp_path_factory, commands, mark, at, noise):
+    """Whatever a crash makes of the record under way, the one before it counts."""
+    path = tmp_path_factory.mktemp("torn") / "last"
+    last, contents = LastVoltages(path, mark), [b""]
+    for i in range(commands):
+        last.note(as_given(i, 10 * i))
+        contents.append(path.read_bytes())
+    before, after = contents[-2:]
+    torn = [i for i in range(len(after)) if i >= len(before) or before[i] != after[i]]
+    kept = torn[: at % (len(torn) + 1)]
+    mixed = bytearray(before.ljust(len(after), b"\0"))
+    for i in kept:
+        mixed[i] = after[i]
+    path.write_bytes(bytes(mixed))
+    whole = commands - 1 if bytes(mixed) == after else commands - 2
+    assert read_last_voltages(path, mark, 2) == ((whole, 10.0 * whole) if whole >= 0 else None)
+    assert read_last_voltages(path, mark + 1, 2) is None
+    path.write_bytes(noise * 20)
+    assert read_last_voltages(path, mark, 2) is None
+
+
+def test_last_voltages_of_other_axes_or_nowhere(tmp_path):
+    path = tmp_path / "last"
+    assert read_last_voltages(path, 1, 1) is None
+    last = LastVoltages(path, 1)
+    last.note(as_given(5.0))
+    assert read_last_voltages(path, 1, 1) == (5.0,) and read_last_voltages(path, 1, 2) is None
+    assert LastVoltages(path, 1) and read_last_voltages(path, 1, 1) is None, "a new life starts without"
+    last.discard()
+    assert not path.exists()
+    with pytest.raises(ModelError, match="^[^\n]+cannot be written[^\n]+$"):
+        LastVoltages(tmp_path, 1)
+
+
+def texts() -> list[str]:
+    save = {"schema": "slpi_ros/saved_memory/1", "model": "0" * 64, "complete": True}
+    good = save | {"axes": {"x": {"went_through_V": [1.0], "certain": True}}}
+    wrong_axes = [
+        {}, None, {"x": {}}, {"x": {"went_through_V": [], "certain": True}},
+        {"x": {"went_through_V": [1e9], "certain": True}}, {"x": {"went_through_V": ["1"], "certain": True}},
+        {"x": {"went_through_V": [10**400], "certain": True}}, {"x": {"went_through_V": [1.0], "certain": 1}},
+    ]  # fmt: skip
+    return [
+        "", "garbage", "[" * 100_000, "null", json.dumps(good)[:-9], json.dumps(good).replace("1.0", "NaN"),
+        json.dumps(good).replace("1.0", "1e400"), json.dumps(good | {"schema": "slpi_ros/model/1"}),
+        json.dumps(good | {"model": "abc"}), json.dumps(good | {"more": 1}),
+        *(json.dumps(save | {"axes": axes}) for axes in wrong_axes),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", texts(), ids=range(len(texts())))
+def test_what_is_no_saved_memory_is_refused_in_one_line(tmp_path, text):
+    path = tmp_path / "memory.json"
+    path.write_text(text)
+    with pytest.raises(ModelError, match="^[^\n]+$"):
+        load_memory(path)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.binary(max_size=60))
+def test_noise_is_refused_in_one_line(tmp_path, noise):
+    path = tmp_path / "memory.json"
+    path.write_bytes(noise)
+    with pytest.raises(ModelError, match="^[^\n]+$"):
+        load_memory(path)
+
+
+def test_a_place_that_cannot_be_written_is_said(tmp_path):
+    with pytest.raises(ModelError, match="cannot be written"):
+        save_memory(SAVED, tmp_path / "no folder" / "memory.json")
+    with pytest.raises(ModelError, match="no saved memory"):
+        load_memory(tmp_path)

@@ -1,0 +1,92 @@
+"""A model takes over from another: bumpless, and with the memory of what the axis went through."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import FAMILY_CASE, axis_model, axis_models, cases_and_paths, stream_forward
+
+from slpi_ros.compensator.model_swap import take_over, turning_voltages
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.hysteresis.shape import FAR
+from slpi_ros.model.stream import Limits
+
+OPEN = Limits(-1e4, 1e4)
+
+
+@given(cases_and_paths(), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=20))
+def test_a_replayed_memory_goes_on_as_the_one_that_was_there(drawn, shares):
+    """The new model being the old one, nothing must be lost: neither where it is nor where it will go."""
+    case, path = drawn
+    axis = replace(axis_model(case), voltage_range=(-1e4, 1e4))
+    memory = axis.memory()
+    stream_forward(memory, path)
+    turns = turning_voltages(memory)
+    assert max(map(abs, turns)) < FAR / 2
+    stream = take_over(axis, OPEN, turns)
+    assert stream.voltage == memory.voltage
+    further = np.array([case.span[0] + share * case.width for share in shares])
+    scale = 1e-9 * case.width * case.slopes[1]
+    assert stream.memory.displacement == pytest.approx(memory.displacement, abs=scale)
+    np.testing.assert_allclose(stream_forward(stream.memory, further), stream_forward(memory, further), atol=scale)
+
+
+@given(axis_models(), axis_models(), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12))
+def test_another_model_stands_where_it_would_had_it_always_been_there(old, new, shares):
+    """Within the range both know; what the old one was assumed to have gone through before counts too."""
+    low, high = max(old.voltage_range[0], new.voltage_range[0]), min(old.voltage_range[1], new.voltage_range[1])
+    if low >= high:
+        return
+    old, new = (replace(each, voltage_range=(-1e4, 1e4)) for each in (old, new))
+    memory, twin = old.memory(), new.memory()
+    for v in turning_voltages(memory):
+        twin.forward(v)
+    for share in shares:
+        for each in (memory, twin):
+            each.forward(low + share * (high - low))
+    stream = take_over(new, OPEN, turning_voltages(memory))
+    assert stream.voltage == memory.voltage == twin.voltage
+    # Turning points that the old memory has wiped are gone from the new one's, too, wherever loops close alike.
+    beyond = (min(low, *turning_voltages(memory)) - 200.0, max(high, *turning_voltages(memory)) + 200.0)
+    for v in (*beyond, 0.5 * (low + high)):
+        for each in (stream.memory, twin):
+            each.forward(v)
+    scale = 1e-6 * max(abs(twin.displacement), 1e-6)
+    assert stream.memory.displacement == pytest.approx(twin.displacement, abs=scale)
+
+
+AXIS = axis_model(FAMILY_CASE)
+
+
+@pytest.mark.parametrize(("present", "taken"), [(119.0, True), (121.0, False), (-19.0, True), (-21.0, False)])
+def test_a_voltage_just_outside_goes_inside_and_one_far_outside_is_a_reason_to_refuse(present, taken):
+    limits = Limits(-500.0, 500.0, 100.0)
+    if not taken:
+        with pytest.raises(UsageError, match="it has .* V, but the model is good for 0..100 V"):
+            take_over(AXIS, limits, (0.0, present))
+        return
+    stream = take_over(AXIS, limits, (0.0, present))
+    assert stream.voltage == present
+    assert stream.limits == Limits(0.0, 100.0, 100.0)
+    wish = 20e-6 if present > 0 else -15e-6
+    way = [stream.step(i * 0.05, wish) for i in range(6)]
+    assert way[0] == present
+    assert np.abs(np.diff([present, *way])).max() <= 5.0 + 1e-9
+    assert way[-1] == (100.0 if present > 0 else 0.0)
+
+
+def test_without_a_past_the_model_starts_where_it_says():
+    stream = take_over(AXIS, Limits(5.0, 100.0))
+    assert stream.voltage == 5.0 and stream.limits == Limits(5.0, 100.0)
+
+
+@pytest.mark.parametrize(("change", "limits"), [
+    ({"voltage_range": (600.0, 700.0)}, Limits(0.0, 100.0)),
+    ({"displacement_range": (0.0, 1e6)}, Limits(0.0, 100.0)),
+    ({}, Limits(-9.0, -1.0)),
+])  # fmt: skip
+def test_models_that_cannot_serve(change, limits):
+    with pytest.raises(SlpiError, match="^[^\n]+$"):
+        take_over(replace(AXIS, **change), limits)

@@ -1,0 +1,80 @@
+"""The linear prediction of identification is the engine's own, for every basis and start."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.identification.bases import PlayBasis, SurfaceBasis
+from slpi_ros.identification.design_matrix import Design, Walk
+
+
+def surface_parameters(basis, rng):
+    n = basis.grid.size
+    density = rng.uniform(0.1, 1.0, (n, n))
+    surface = np.zeros((n, n))
+    for i in range(1, n):
+        for j in range(i - 1, -1, -1):
+            surface[i, j] = surface[i - 1, j] + surface[i, j + 1] - surface[i - 1, j + 1] * (i - 1 > j) + density[i, j]
+    rise = np.cumsum(rng.uniform(0.5, 1.5, n))
+    return np.concatenate([surface[np.tril_indices(n, -1)], rise, [rng.normal()]])
+
+
+def play_parameters(basis, rng):
+    return np.concatenate([rng.uniform(0.1, 1.0, basis.size), [rng.normal()]])
+
+
+BASES = {
+    "slpi": (SurfaceBasis(np.linspace(-3.0, 9.0, 8)), surface_parameters),
+    "pi": (PlayBasis(np.array([0.0, 0.7, 1.1, 4.0])), play_parameters),
+}
+
+
+@pytest.mark.parametrize("kind", BASES)
+@pytest.mark.parametrize("primed", [False, True])
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), corners=st.integers(2, 30), between=st.integers(1, 40))
+def test_prediction_is_what_the_engine_simulates(kind, primed, seed, corners, between):
+    rng = np.random.default_rng(seed)
+    basis, draw = BASES[kind]
+    x = draw(basis, rng)
+    v = np.interp(np.linspace(0, corners - 1, corners * between), np.arange(corners), rng.uniform(-3, 9, corners))
+    walk = Walk.along(v, symmetric_rest=basis.symmetric_rest, primed=primed)
+    predicted = Design.of(walk, basis.branch_part(walk)).predict(x)
+    memory = Memory(basis.shape(x, 1.0), float(v[0]), float(x[-1]), primed=primed)
+    np.testing.assert_allclose(predicted, memory.forward_array(v), atol=1e-8)
+
+
+def test_normal_equations_are_those_of_the_full_matrix():
+    rng = np.random.default_rng(3)
+    basis, _ = BASES["slpi"]
+    v = np.interp(np.linspace(0, 19, 300), np.arange(20), rng.uniform(-3, 9, 20))
+    walk = Walk.along(v, symmetric_rest=False, primed=False)
+    design = Design.of(walk, basis.branch_part(walk))
+    full = np.column_stack([design.predict(unit) for unit in np.eye(basis.size + 1)])
+    y, weights = rng.normal(size=v.size), rng.uniform(0, 1, v.size)
+    matrix, vector = design.normal_equations(y, weights)
+    np.testing.assert_allclose(matrix, full.T * weights @ full, atol=1e-9)
+    np.testing.assert_allclose(vector, full.T @ (weights * y), atol=1e-9)
+
+
+def test_roughness_vanishes_for_a_classical_pi_surface_with_smooth_branches():
+    grid = np.linspace(0.0, 10.0, 9)
+    basis = SurfaceBasis(grid)
+    alpha, beta = np.meshgrid(grid, grid, indexing="ij")
+    surface = 0.3 * (alpha - beta) + 0.02 * (alpha - beta) ** 2
+    rise = surface[:, 0]
+    x = np.concatenate([surface[np.tril_indices(9, -1)], rise, [5.0]])
+    rough = basis.roughness() @ x
+    bend = 2 * 0.02 * (grid[1] - grid[0]) ** 2 * 9 / 41
+    assert np.all((np.abs(rough) < 1e-12) | (np.abs(rough - bend) < 1e-12)), "only the first rise may bend"
+
+
+def test_monotone_rows_hold_for_a_rising_surface_and_not_for_a_falling_one():
+    basis, draw = BASES["slpi"]
+    x = draw(basis, np.random.default_rng(0))
+    rows, bound = basis.monotone(0.0)
+    assert np.all(rows @ x >= bound - 1e-12)
+    x[5] = -1.0
+    assert not np.all(rows @ x >= bound - 1e-12)

@@ -1,0 +1,144 @@
+"""The byte layout of JointState streams, against rosbags and rclpy, which know nothing of it."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from slpi_ros.errors import RecordError
+from slpi_ros.io.joint_state import JointStateBlock, encode_joint_states, joint_state_layout
+from slpi_ros.io.message_blocks import MessageBlock
+from slpi_ros.io.message_types import JOINT_STATE
+from slpi_ros.io.signals import decode_signals
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=9)
+numbers = st.floats(allow_nan=True, width=64)
+stamps = st.integers(0, 2**31 * 10**9 - 1)
+
+
+def message(stamp_ns, names, position, effort, frame_id="", velocity=()):
+    time = STORE.types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    header = STORE.types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
+    arrays = {"position": position, "velocity": velocity, "effort": effort}
+    arrays = {name: np.array(values, float) for name, values in arrays.items()}
+    return STORE.types[JOINT_STATE](header=header, name=list(names), **arrays)
+
+
+def serialised(*args, little_endian=True, **kwargs) -> bytes:
+    return bytes(STORE.serialize_cdr(message(*args, **kwargs), JOINT_STATE, little_endian=little_endian))
+
+
+def rows(*messages):
+    return np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
+
+
+def decode(*messages, blocks=1):
+    parts = np.array_split(np.arange(len(messages)), blocks)
+    return decode_signals(
+        [MessageBlock.of(part.tolist(), [messages[row] for row in part]) for part in parts],
+        JOINT_STATE,
+        lambda data: STORE.deserialize_cdr(data, JOINT_STATE),
+    )
+
+
+@given(st.lists(texts, min_size=1, max_size=4), texts, stamps, st.data())
+def test_encoded_as_rosbags_does(names, frame_id, stamp, data):
+    position, effort = (data.draw(st.lists(numbers, min_size=len(names), max_size=len(names))) for _ in "pe")
+    block = JointStateBlock(np.array([stamp]), np.array([position]), np.array([effort]))
+    encoded = encode_joint_states(block, tuple(names), frame_id)
+    assert encoded == [serialised(stamp, names, position, effort, frame_id)]
+
+
+@given(st.lists(texts, min_size=1, max_size=4, unique=True), texts, st.integers(0, 3), st.data())
+def test_all_at_once_agrees_with_one_by_one(names, frame_id, velocities, data):
+    given_rows = st.lists(numbers, min_size=len(names), max_size=len(names))
+    drawn = data.draw(st.lists(st.tuples(stamps, given_rows, given_rows), min_size=1, max_size=5))
+    messages = [serialised(t, names, p, e, frame_id, [1.0] * velocities) for t, p, e in drawn]
+    assert joint_state_layout(tuple(names), frame_id, velocities).decode(rows(*messages)) is not None
+    alike = decode(*messages)
+    # one more message of another length leaves only the slow way
+    each = decode(*messages, serialised(1, [*names, "one more"], [], []))
+    assert alike.frame_id == frame_id
+    stamp = np.zeros(len(drawn)) if alike.stamp is None else alike.stamp
+    assert stamp.tolist() == each.stamp[:-1].tolist() == [stamp for stamp, _, _ in drawn]
+    for name in names:
+        for field in ("position", "effort"):
+            np.testing.assert_array_equal(alike.fields[field][name], each.fields[field][name][:-1])
+
+
+def test_names_of_one_length_are_not_mixed_up():
+    messages = [serialised(1, ["a", "b"], [1, 2], [3, 4]), serialised(2, ["b", "a"], [5, 6], [7, 8])]
+    for blocks in (1, 2):
+        fields = decode(*messages, blocks=blocks).fields
+        assert fields["position"]["a"].tolist() == [1, 6]
+        assert fields["effort"]["b"].tolist() == [4, 7]
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 3])
+def test_short_arrays_and_absent_joints_are_nan(blocks):
+    signals = decode(
+        serialised(1, ["a", "b"], [1, 2], [3, 4]),
+        serialised(2, ["b", "c"], [5], []),
+        serialised(3, [], [], []),
+        blocks=blocks,
+    )
+    position, effort = signals.fields["position"], signals.fields["effort"]
+    assert signals.names == ("a", "b", "c")
+    np.testing.assert_array_equal(position["a"], [1, np.nan, np.nan])
+    np.testing.assert_array_equal(position["b"], [2, 5, np.nan])
+    np.testing.assert_array_equal(effort["b"], [4, np.nan, np.nan])
+    assert np.isnan(position["c"]).all()
+
+
+def test_blocks_in_the_order_of_the_log():
+    messages = [serialised(t, ["a"], [t], [-t]) for t in (1, 2, 3, 4)]
+    blocks = [MessageBlock.of([30, 40], messages[2:]), MessageBlock.of([10, 30], messages[:2])]
+    signals = decode_signals(blocks, JOINT_STATE, lambda data: STORE.deserialize_cdr(data, JOINT_STATE))
+    assert signals.logged.tolist() == [10, 30, 30, 40]
+    assert signals.fields["position"]["a"].tolist() == signals.stamp.tolist() == [1, 3, 2, 4]
+
+
+def test_big_endian_messages():
+    signals = decode(*[serialised(t, ["a"], [t], [-t], little_endian=False) for t in (1, 2, 3)])
+    assert signals.stamp.tolist() == signals.fields["position"]["a"].tolist() == [1, 2, 3]
+
+
+def test_garbage_in_padding_and_at_the_end():
+    clean = serialised(7, ["x", "long"], [1, 2], [3, 4], "id")
+    layout = joint_state_layout(("x", "long"), "id")
+    dirty = bytearray(clean)
+    for place in np.flatnonzero(~layout.fixed):
+        if not any(first <= place < first + 16 for _, first in layout.fields.values()):
+            dirty[place] = 0xFB
+    assert dirty != clean
+    fields = layout.decode(rows(clean + b"garbage", bytes(dirty) + b"\xff" * 7))
+    assert fields is not None
+    assert fields["position"].tolist() == [[1, 2]] * 2
+    assert fields["effort"].tolist() == [[3, 4]] * 2
+    assert layout.decode(rows(clean[:-1])) is None
+
+
+def test_rclpy_both_ways():
+    serialization = pytest.importorskip("rclpy.serialization")
+    joint_state = pytest.importorskip("sensor_msgs.msg").JointState
+    block = JointStateBlock(np.array([12_000_000_034]), np.array([[1.5, 2.5]]), np.array([[3.5, 4.5]]))
+    names = ("x", "another")
+    read = serialization.deserialize_message(encode_joint_states(block, names, "stage")[0], joint_state)
+    assert (read.header.stamp.sec, read.header.stamp.nanosec) == (12, 34)
+    assert (read.header.frame_id, list(read.name)) == ("stage", ["x", "another"])
+    assert (list(read.position), list(read.effort)) == ([1.5, 2.5], [3.5, 4.5])
+    again = joint_state_layout(names, "stage").decode(rows(*[serialization.serialize_message(read)] * 3))
+    assert again is not None
+    assert again["sec"].tolist() == [12] * 3
+    assert again["nanosec"].tolist() == [34] * 3
+    assert again["position"].tolist() == [[1.5, 2.5]] * 3
+
+
+@pytest.mark.parametrize("stamp", [-1, 2**31 * 10**9])
+def test_stamp_that_no_header_can_hold(stamp):
+    block = JointStateBlock(np.array([0, stamp]), np.zeros((2, 1)), np.zeros((2, 1)))
+    with pytest.raises(RecordError, match="sample 1: time .* does not fit"):
+        encode_joint_states(block, ("x",))

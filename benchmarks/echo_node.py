@@ -7,10 +7,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from slpi_ros.io.joint_state_bytes import JointStates
-from slpi_ros.io.wire import before_numbers
-from slpi_ros.nodes.common import run
-from slpi_ros.nodes.qos import COMMANDS
+from slpi_ros.io.cdr import before_numbers
+from slpi_ros.io.messages import JointStates
+from slpi_ros.nodes.common import COMMANDS, run
 
 
 class Echo(Node):

@@ -25,13 +25,11 @@ import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.model.stage_model import StageModel, Start
 from slpi_ros.nodes.common import make_executor
-from slpi_ros.papers.compound_study import RATE, RECORD, RECORD_SAMPLES, WARM_UP, path, tune
-from slpi_ros.papers.mpi_published import COMPOUND_MEAN, TABLE_6
-from slpi_ros.papers.mpi_study import triangle_record
-from slpi_ros.papers.paths import triangles
+from slpi_ros.papers.compound import RATE, RECORD, RECORD_SAMPLES, WARM_UP, path, tune
+from slpi_ros.papers.mpi_study import COMPOUND_MEAN, TABLE_6, triangle_record
+from slpi_ros.papers.published import triangles
 from slpi_ros.simulation.paths import scan_path
-from slpi_ros.simulation.presets import p11_stage
-from slpi_ros.simulation.stage import Stage
+from slpi_ros.simulation.stage import Stage, p11_stage
 
 FloatArray = NDArray[np.float64]
 

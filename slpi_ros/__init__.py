@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import SlpiError
-from slpi_ros.identification.findings import findings
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.record_quality import assess
+from slpi_ros.identification.record_quality import assess, findings
 from slpi_ros.identification.refit import refit
 from slpi_ros.io.record import Record
 from slpi_ros.model.document import load_model, save_model

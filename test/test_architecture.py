@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
 # From top to bottom. A module may import its own layer and those below it, of its own layer only its own folder.
 LAYERS = (
-    {"cli", "cli_options"},
+    {"cli"},
     {"papers", "nodes"},
     {"reports"},
     {"diagnosis"},

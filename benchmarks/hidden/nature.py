@@ -6,11 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.simulation.amplifier import Amplifier
 from slpi_ros.simulation.chain import Flexure, Physics, SlowDomains
-from slpi_ros.simulation.creep import Creep
-from slpi_ros.simulation.surroundings import Hum, Interferometer, Temperature
-from slpi_ros.simulation.viscosity import RateLaw, Viscosity
+from slpi_ros.simulation.dynamics import Amplifier, Creep, RateLaw, Viscosity
+from slpi_ros.simulation.sensor import Hum, Interferometer, Temperature
 
 from .drives import log_uniform
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.identification.fit import identify
 from slpi_ros.io.record import Record
-from slpi_ros.simulation.relays import RelayTriangle
+from slpi_ros.simulation.preisach import RelayTriangle
 
 FloatArray = NDArray[np.float64]
 

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
-from slpi_ros.compensator import rejection
+from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.rejection import RejectedError, require_names
+from slpi_ros.compensator.validation import RejectedError, require_names
 
 
 def match(names: Sequence[str], axes: Mapping[str, Axis]) -> list[Axis]:

@@ -3,16 +3,14 @@
 from collections.abc import Callable, Sequence
 from time import monotonic
 
-from slpi_ros.compensator.health import Drift
-from slpi_ros.compensator.loop import ClosedLoop, LoopSettings
-from slpi_ros.compensator.memory_trust import MemoryTrust
+from slpi_ros.compensator.feedback import ClosedLoop, Drift, LoopSettings
 from slpi_ros.compensator.model_swap import go_on, including, take_over, turning_voltages, whole_way
-from slpi_ros.compensator.ramp import Brake, Ramp
-from slpi_ros.compensator.rejection import implausible
-from slpi_ros.compensator.validation import Stamps
+from slpi_ros.compensator.persistence import MemoryTrust
+from slpi_ros.compensator.ramps import Brake, Ramp
+from slpi_ros.compensator.validation import Stamps, implausible
 from slpi_ros.errors import UsageError
 from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.stream import AxisStream, Limits
+from slpi_ros.model.streaming import AxisStream, Limits
 
 
 class Axis:

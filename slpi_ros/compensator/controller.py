@@ -4,23 +4,20 @@ from array import array
 from collections.abc import Callable, Collection, Mapping, Sequence
 from time import monotonic
 
-from slpi_ros.compensator import rejection
+from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.admission import check, match
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.feedback import PidGains
-from slpi_ros.compensator.following import Following
-from slpi_ros.compensator.loop import LoopSettings
+from slpi_ros.compensator.driving import Driving
+from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.persistence import SavedAxis
-from slpi_ros.compensator.ramps import Driving
-from slpi_ros.compensator.rejection import RejectedError
 from slpi_ros.compensator.statistics import Counts
-from slpi_ros.compensator.validation import TimeRules
-from slpi_ros.effects.coupling import Coupling
+from slpi_ros.compensator.trajectory import Following
+from slpi_ros.compensator.validation import RejectedError, TimeRules
+from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.io.joint_state import SECOND_NS
+from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.stage_stream import StageStream
-from slpi_ros.model.stream import Limits
+from slpi_ros.model.streaming import Limits, StageStream
 
 OPEN_LOOP = LoopSettings(False, PidGains(0.0), 0.1)
 

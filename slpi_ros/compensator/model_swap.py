@@ -8,7 +8,7 @@ from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.shape import FAR
 from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.stream import TOLERATED_SHARE, AxisStream, Limits
+from slpi_ros.model.streaming import TOLERATED_SHARE, AxisStream, Limits
 
 
 def take_over(axis: AxisModel, limits: Limits, went_through: Sequence[float] = ()) -> AxisStream:

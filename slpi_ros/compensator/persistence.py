@@ -3,19 +3,130 @@
 import hashlib
 import json
 import os
+import struct
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from slpi_ros.compensator.last_voltages import LastVoltages, read_last_voltages
-from slpi_ros.compensator.memory_trust import RESTORED, MemoryTrust
 from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.stream import Limits
+from slpi_ros.model.streaming import Limits
+
+# Nobody knows where the stage has been; being wiped; wiped since; kept over a restart.
+ASSUMED, RESETTING, KNOWN, RESTORED = "assumed", "resetting", "known", "restored"
+# A drive may miss either end of the identified voltages by this share of their span: measured ends are noisy.
+TOLERATED_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class MemoryTrust:
+    """How far a memory is to be trusted.
+
+    Parameters
+    ----------
+    state : str
+        `ASSUMED`, `RESETTING`, `KNOWN` or `RESTORED`.
+    doubt : str
+        Why it is assumed, where there is more to say than that nobody knows.
+    spanned : (float, float), volts
+        Lowest and highest voltage of the drive that made it known.
+    """
+
+    state: str = ASSUMED
+    doubt: str = ""
+    spanned: tuple[float, float] = (0.0, 0.0)
+
+    def over(self, identified: tuple[float, float]) -> "MemoryTrust":
+        """Return what it is worth for a model identified on these voltages (V).
+
+        Loops wider than the drive are not wiped by it: what the stage did there before still counts.
+        """
+        (low, high), (lowest, highest) = self.spanned, identified
+        margin = TOLERATED_SHARE * (highest - lowest)
+        if self.state not in (KNOWN, RESTORED) or (low <= lowest + margin and highest - margin <= high):
+            return self
+        doubt = (
+            f"wiped from {low:.6g} to {high:.6g} V only, while the model was identified from {lowest:.6g} to "
+            f"{highest:.6g} V; reset it within wider voltage limits, or identify within these"
+        )
+        return replace(self, state=ASSUMED, doubt=doubt)
+
+
+# What a record begins with: a mark of what it belongs to, and its number.
+HEAD = struct.Struct("<IQ")
+VOLTAGE_BYTES, CHECKSUM_BYTES = 8, 4
+
+
+class LastVoltages:
+    """Notes every command in two microseconds.
+
+    Two records are written in turn, each with a checksum: whenever the process dies, one of them is whole. The system
+    keeps what has been written, so nothing waits for the disk; only when the machine itself fails may it be lost.
+
+    Parameters
+    ----------
+    path : path-like
+        A file of that name is emptied.
+    mark : int
+        Of what the records belong to, 32 bits; it may be changed at any time.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], mark: int) -> None:
+        self._path, self.mark, self._number = path, mark, 0
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        except (OSError, ValueError) as error:
+            raise ModelError(f"{path}: cannot be written: {error}; choose another place") from None
+
+    def note(self, voltages: bytes) -> None:
+        """Note the voltages (V) of all axes, each 8 bytes as the machine has them.
+
+        Raises
+        ------
+        ModelError
+            If the file cannot be written.
+        """
+        self._number = number = self._number + 1
+        record = HEAD.pack(self.mark, number) + voltages
+        try:
+            os.pwrite(self._file, record + zlib.crc32(record).to_bytes(4, "little"), (number & 1) * (len(record) + 4))
+        except OSError as error:
+            raise ModelError(f"{self._path}: cannot be written: {error.strerror}; make room") from None
+
+    def discard(self) -> None:
+        """Remove the file: nothing will be given any more."""
+        os.close(self._file)
+        with suppress(OSError):
+            os.unlink(self._path)
+
+
+def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tuple[float, ...] | None:
+    """Return the voltages (V) noted last for so many axes; None where no whole record bears the mark."""
+    size = HEAD.size + VOLTAGE_BYTES * axes + CHECKSUM_BYTES
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(2 * size)
+    except (OSError, ValueError):
+        return None
+    found = []
+    for record in (data[:size], data[size:]):
+        body, checksum = record[:-CHECKSUM_BYTES], record[-CHECKSUM_BYTES:]
+        if len(record) == size and zlib.crc32(body) == int.from_bytes(checksum, "little"):
+            belongs_to, number = HEAD.unpack_from(body)
+            if belongs_to == mark:
+                found.append((number, struct.unpack_from(f"{axes}d", body, HEAD.size)))
+    return max(found)[1] if found else None
+
 
 SCHEMA = "slpi_ros/saved_memory/1"
 # Characters; a memory of many axes has a few thousand.

@@ -1,98 +1,107 @@
 """All axes driven on their own: to a safe voltage, or to a known memory."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Iterable
+from dataclasses import replace
+from math import inf
 
-from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.memory_trust import KNOWN, RESETTING, MemoryTrust
-from slpi_ros.compensator.ramp import Ramp
-from slpi_ros.compensator.reset import decaying_turns
+from slpi_ros.errors import UsageError
+from slpi_ros.model.streaming import Limits, Pace
 
 
-class Driving:
-    """What moves axes on their own.
+def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:
+    """Return the voltages (V) at which a decaying oscillation turns, the final one last.
+
+    The first cycle reaches both limits and closes every loop between them. The amplitude then falls by the same
+    amount each cycle, on either side of the final voltage by as much as there is room.
 
     Parameters
     ----------
-    axes : sequence of Axis
-        Each with a model before anything starts.
+    limits : Limits
+    final : float, volts
+        Within the limits.
+    cycles : int
+        At least 1.
+
+    Raises
+    ------
+    UsageError
+        If there is no cycle, or the final voltage is outside.
+    """
+    if cycles < 1 or not limits.lower <= final <= limits.upper:
+        raise UsageError(
+            f"a reset of {cycles} cycles to {final:g} V within {limits.lower:g}..{limits.upper:g} V; "
+            "give at least one cycle and a final voltage within the limits"
+        )
+    above, below = limits.upper - final, limits.lower - final
+    # Which limit came first must not matter: the upper one is visited once more.
+    turns = [limits.upper, limits.lower]
+    for left in range(cycles, 0, -1):
+        share = left / cycles
+        turns += [final + share * above, final + share * below]
+    return [*(limits.clip(v) for v in turns), final]
+
+
+# So near a voltage counts as reached, volts: rounding, and the slow end of a gentle stop.
+NEAR = 1e-9
+
+
+class Ramp:
+    """A way through voltages, each reached before the next one.
+
+    Parameters
+    ----------
+    goals : iterable of float, volts
+    rate : float, V/s
+        Fastest change; the slew limit may be lower.
+
+    Raises
+    ------
+    UsageError
+        If the rate is not positive, or a goal not finite.
+    """
+
+    def __init__(self, goals: Iterable[float], rate: float) -> None:
+        self._goals = list(goals)[::-1]
+        self._rate = rate
+        if not rate > 0.0 or not all(-inf < goal < inf for goal in self._goals):
+            raise UsageError(f"a ramp at {rate} V/s through {self._goals[::-1]} V leads nowhere; give a positive rate")
+
+    @property
+    def done(self) -> bool:
+        """Whether the last goal is reached."""
+        return not self._goals
+
+    def step(self, present: float, dt: float, pace: Pace) -> float:
+        """Return the voltage (V) that follows `present` (V) after `dt` (s); a pause frees no longer way than usual."""
+        if self.done:
+            return present
+        limits, dt = pace.limits, pace.counted(dt)
+        goal = limits.clip(self._goals[-1])
+        # Where it is too fast at first, it has to brake.
+        fastest = max(self._rate, abs(pace.rate) - limits.acceleration * dt) if dt else inf
+        own = Pace(replace(limits, slew=min(limits.slew, fastest)))
+        own.go_on(pace)
+        v = own.step(present, goal, dt)
+        pace.go_on(own)
+        if abs(v - goal) <= NEAR:
+            self._goals.pop()
+        return v
+
+
+class Brake:
+    """A way to rest, as short as the limit of acceleration allows.
 
     Attributes
     ----------
-    on : bool
-        Whether something has been started and not been stopped.
-    resetting : bool
-        Whether that is a reset of the memory.
+    done : bool
+        Whether the voltage may stay.
     """
 
-    def __init__(self, axes: Sequence[Axis]) -> None:
-        self._axes = axes
-        self._spans: list[tuple[float, float]] = []
-        self.on = self.resetting = False
+    def __init__(self) -> None:
+        self.done = False
 
-    def reset(self, cycles: int, rate: float, finals: Sequence[float]) -> None:
-        """Start the decaying oscillation that wipes the memory.
-
-        Parameters
-        ----------
-        cycles : int
-        rate : float, V/s
-        finals : sequence of float, volts
-            Where the axes end, or as near as their limits allow.
-        """
-        self.stop()
-        for axis, final in zip(self._axes, finals, strict=True):
-            limits = axis.stream.limits
-            axis.start_drive(Ramp(decaying_turns(limits, limits.clip(final), cycles), rate))
-            axis.trust = MemoryTrust(RESETTING)
-        self._spans = [(axis.stream.voltage,) * 2 for axis in self._axes]
-        self.on = self.resetting = True
-
-    def ramp(self, goals: Sequence[float], rate: float) -> None:
-        """Start to go to the voltages `goals` (V), or as near as limits allow, at `rate` (V/s)."""
-        self.stop()
-        for axis, goal in zip(self._axes, goals, strict=True):
-            axis.start_drive(Ramp([goal], rate))
-        self.on = True
-
-    def hold(self, but: Collection[Axis] = ()) -> None:
-        """Let the axes `but` go, and leave the others where they are: at rest, or where they come to rest."""
-        if self.resetting:
-            self.stop()
-        for axis in self._axes:
-            if axis not in but and axis.in_motion:
-                axis.brake()
-                continue
-            axis.stop_drive()
-            if axis not in but:
-                axis.rest()
-        self.on = any(axis.on_ramp for axis in self._axes)
-
-    def rest(self) -> None:
-        """Know that the axes have been at rest for a while."""
-        for axis in self._axes:
-            axis.rest()
-
-    def step(self, dt: float) -> bool:
-        """Move all axes on, `dt` (s) later; return whether all have arrived."""
-        arrived = [axis.drive(dt) for axis in self._axes]
-        if self.resetting:
-            reached = [axis.stream.voltage for axis in self._axes]
-            self._spans = [(min(low, v), max(high, v)) for (low, high), v in zip(self._spans, reached, strict=True)]
-        return all(arrived)
-
-    def stop(self) -> None:
-        """Take up desired displacements again, from where the axes are; without effect when off.
-
-        A reset that has not come to its end, or has not spanned what the model was identified on, leaves the memory
-        assumed.
-        """
-        if not self.on:
-            return
-        for axis in self._axes:
-            axis.stop_drive()
-        if self.resetting:
-            for axis, span in zip(self._axes, self._spans, strict=True):
-                axis.trust = MemoryTrust(doubt="the reset was interrupted")
-                if axis.arrived and axis.model:
-                    axis.trust = MemoryTrust(KNOWN, spanned=span).over(axis.model.voltage_range)
-        self.on = self.resetting = False
+    def step(self, present: float, dt: float, pace: Pace) -> float:
+        """Return the voltage (V) that follows `present` (V) after `dt` (s)."""
+        v = pace.step(present, present, pace.counted(dt))
+        self.done = not pace.in_motion
+        return v

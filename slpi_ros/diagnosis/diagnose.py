@@ -17,9 +17,9 @@ from slpi_ros.diagnosis.structure import BIAS
 from slpi_ros.diagnosis.verdict import AxisDiagnosis, Diagnosis
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
-from slpi_ros.identification.floor import Floor, floor_of
 from slpi_ros.identification.progress import tell
 from slpi_ros.identification.refit import require_own
+from slpi_ros.identification.signal_statistics import Floor, floor_of
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import AxisModel, StageModel, Start
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from slpi_ros.diagnosis.evidence import Evidence
 from slpi_ros.diagnosis.joint import Joint, Score
 from slpi_ros.diagnosis.parameters import bounded, free, moved, names, steps
+from slpi_ros.effects.base import Around, Effect
 from slpi_ros.effects.chain import reaching
 from slpi_ros.effects.creep import Creep, settling
-from slpi_ros.effects.effect import Around, Effect
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import Hysteresis
+from slpi_ros.identification.convex_fit import SMOOTHNESS
 from slpi_ros.identification.least_squares import Problem
-from slpi_ros.identification.linear import SMOOTHNESS
 from slpi_ros.identification.samples import Samples
 
 FloatArray = NDArray[np.float64]

@@ -11,8 +11,8 @@ from slpi_ros.diagnosis.explanation import Explanation
 from slpi_ros.diagnosis.selection import Named, Selection, chance_of_gain, gain
 from slpi_ros.diagnosis.structure import BIAS
 from slpi_ros.diagnosis.verdict import AMBIGUOUS, NAMED, NOTHING_FOUND, UNEXPLAINED, AxisDiagnosis, NamedEffect, Traces
-from slpi_ros.effects.effect import Effect
-from slpi_ros.identification.floor import Floor
+from slpi_ros.effects.base import Effect
+from slpi_ros.identification.signal_statistics import Floor
 
 FloatArray = NDArray[np.float64]
 

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import usual_step
+from slpi_ros.effects.base import Effect, usual_step
 from slpi_ros.effects.creep import FASTEST, Creep, plausible
-from slpi_ros.effects.effect import Effect
 from slpi_ros.effects.rate_dependence import RateDependence
 
 FloatArray = NDArray[np.float64]

@@ -12,9 +12,8 @@ from slpi_ros.diagnosis.gather import one_speed
 from slpi_ros.diagnosis.joint import Score
 from slpi_ros.diagnosis.parameters import free
 from slpi_ros.diagnosis.structure import BIAS, STRUCTURES
-from slpi_ros.effects.base import Form, usual_step
+from slpi_ros.effects.base import Effect, Form, usual_step
 from slpi_ros.effects.delay import Delay
-from slpi_ros.effects.effect import Effect
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError

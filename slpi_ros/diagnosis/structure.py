@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.explanation import Explanation
-from slpi_ros.hysteresis.runs import monotone_runs
+from slpi_ros.hysteresis.reversals import monotone_runs
 
 FloatArray = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.effect import Effect
+from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
 from slpi_ros.model.stage_model import StageModel
 

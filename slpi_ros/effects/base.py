@@ -1,14 +1,104 @@
 """How an effect looks for itself in what a model leaves: forms of it, linear in a few gains, for a fit to judge."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from math import isfinite
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from slpi_ros.effects.effect import Around, Effect, FloatArray
+from slpi_ros.errors import ModelError
+
+FloatArray = NDArray[np.float64]
+
+Side = Literal["voltage", "displacement"]
+# When an effect can be undone: sample by sample; where the whole path is known; on the record's clock only; never.
+Removable = Literal["always", "path", "record", "never"]
+
+
+@dataclass(frozen=True)
+class Around:
+    """What an effect may look at besides the signal it changes.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,), seconds
+        From the first stamp, not decreasing.
+    u : ndarray, shape (N,), volts, optional
+        Voltage that drives the hysteresis.
+    middle : callable, optional
+        Displacement (m) half-way between the two branches of the largest loop, at voltages (V).
+    others : mapping of axis name to ndarray, shape (N,), metres
+        Motion of the other axes from their start, before coupling.
+    """
+
+    t: FloatArray
+    u: FloatArray | None = None
+    middle: Callable[[FloatArray], FloatArray] | None = None
+    others: Mapping[str, FloatArray] = field(default_factory=dict)
+
+
+class Follower(Protocol):
+    """An effect sample by sample; it remembers what it needs of the past."""
+
+    def start(self, x: float) -> None:
+        """Be at rest at the input `x` (V or m), as after a long time."""
+
+    def forward(self, dt: float, x: float) -> float:
+        """Move to the input `x`, `dt` (s) later; return the output."""
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the input that gives the wanted output `dt` (s) from now, or as near as is stable; nothing moves."""
+
+    def snapshot(self) -> Any:
+        """Return the whole state, JSON-like: numbers and tuples of them."""
+
+    def restore(self, state: Any) -> None:
+        """Take over a state from `snapshot`."""
+
+
+class DrivenFollower(Follower, Protocol):
+    """A follower that also looks at the voltage that drives the hysteresis."""
+
+    def attach(self, middle: Callable[[float], float]) -> None:
+        """Tell where the middle of the largest loop is: displacement (m) at a voltage (V)."""
+
+    def drive(self, dt: float, u: float) -> None:
+        """Note the voltage `u` (V), `dt` (s) after the last one."""
+
+
+class Effect(Protocol):
+    """One effect: a frozen dataclass whose fields are its parameters, SI units, and their `uncertainty`."""
+
+    name: ClassVar[str]
+    removable: ClassVar[Removable]
+
+    @property
+    def side(self) -> Side:
+        """What it acts on."""
+
+    @property
+    def uncertainty(self) -> Mapping[str, float]:
+        """Standard deviation by parameter, in the parameter's unit."""
+
+    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return what becomes of a signal, shape (N,), volts or metres; it begins at rest."""
+
+    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+        """Return the signal that becomes the given one, shape (N,), volts or metres; the whole path is known."""
+
+    @classmethod
+    def fit(cls, left: "Left") -> "Iterator[Form | Effect]":
+        """Yield what it may be in a record: forms for a fit to judge, linear in their gains, or effects as they are."""
+
+    def describe(self) -> str:
+        """Say in one sentence what it is, with numbers."""
+
+    def follower(self) -> Follower | None:
+        """Return what follows it sample by sample; None: nothing can be done so."""
+
 
 # Neighbours of a spectrum's peak that belong to it, on either side.
 LINE_WIDTH = 12
@@ -110,3 +200,61 @@ def rhythms(left: Left, count: int, lowest: float) -> list[float]:
     frequency = np.fft.rfftfreq(size, dt)
     power = np.where(frequency >= lowest, np.abs(np.fft.rfft(even, size)) ** 2, 0.0)
     return strongest_lines(power, frequency, count)
+
+
+Rule = tuple[str, bool, str]
+
+
+def require(effect: Any, *rules: Rule) -> None:
+    """Refuse parameters that make no sense.
+
+    Parameters
+    ----------
+    effect : Effect
+        A frozen dataclass; every number in it has to be finite.
+    rules : (str, bool, str)
+        Name of a parameter, whether it holds, and what is needed.
+
+    Raises
+    ------
+    ModelError
+        It names the first bad one.
+    """
+    require_finite(effect)
+    require_rules(effect, *rules)
+
+
+def require_finite(effect: Any) -> None:
+    """Refuse numbers that are not finite; ModelError."""
+    for name, value in parameters_of(effect).items():
+        if not all(isfinite(number) for number in numbers_in(value)):
+            raise ModelError(f"effect '{effect.name}': {name} is {value}; give finite numbers")
+
+
+def require_rules(effect: Any, *rules: Rule) -> None:
+    """Refuse parameters for which a rule does not hold, and uncertainties of no parameter; ModelError."""
+    for name, holds, need in rules:
+        if not holds:
+            raise ModelError(f"effect '{effect.name}': {name} is {getattr(effect, name)}; it must be {need}")
+    names = parameters_of(effect)
+    for name, deviation in effect.uncertainty.items():
+        if name.split(".")[0] not in names or not (isfinite(deviation) and deviation >= 0):
+            raise ModelError(
+                f"effect '{effect.name}': uncertainty of {name[:40]!r} is {deviation}; give 0 or more for one of "
+                f"{', '.join(names)}"
+            )
+
+
+def parameters_of(effect: Any) -> dict[str, Any]:
+    """Return the parameters of an effect by name."""
+    return {item.name: getattr(effect, item.name) for item in fields(effect) if item.name != "uncertainty"}
+
+
+def numbers_in(value: Any) -> Iterator[float]:
+    """Yield the numbers of a parameter: itself, those of a tuple, or those of a mapping."""
+    if isinstance(value, Mapping):
+        yield from value.values()
+    elif isinstance(value, tuple):
+        yield from value
+    else:
+        yield value

@@ -9,11 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from slpi_ros.effects.base import Form, Left, usual_step
-from slpi_ros.effects.checks import require
-from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
-from slpi_ros.effects.relaxation import Hold, hold
-from slpi_ros.effects.uniform import Uniform
+from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require, usual_step
+from slpi_ros.effects.filters import Hold, Uniform, hold
 
 # What settles sooner (s) is called a lag.
 FASTEST = 0.1

@@ -7,9 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Form, Left, usual_step
-from slpi_ros.effects.checks import require
-from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require, usual_step
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,31 @@
 """A lightly damped second-order mode, exact where its input is linear between samples (first-order hold)."""
 
 from dataclasses import dataclass
-from math import cos, exp, sin, sqrt
+from math import cos, exp, expm1, sin, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+# Below this ratio of step to time constant, series keep the digits that differences lose.
+_SMALL = 1e-3
+
+
+class Hold(NamedTuple):
+    """``z1 = now u1 + before u0 + kept z0`` over one step; the three add up to 1."""
+
+    now: float
+    before: float
+    kept: float
+
+
+def hold(dt: float, time_constant: float) -> Hold:
+    """Return how a lag goes on over a step `dt` (s); where no time passes, its output stays."""
+    x = dt / time_constant
+    moved = -expm1(-x)
+    now = x / 2 - x**2 / 6 + x**3 / 24 - x**4 / 120 if x < _SMALL else 1 - moved / x
+    return Hold(now, moved - now, exp(-x))
+
 
 FloatArray = NDArray[np.float64]
 
@@ -54,3 +75,50 @@ class Mode:
         denominator = np.array([1.0, -total, product])
         # Rounding must not change what the mode makes of a rest.
         return numerator * (denominator.sum() / numerator.sum()), denominator
+
+
+# Stamps that stray by less than this share of a step are even.
+EVEN = 0.01
+# The grid has at most so many points for each sample.
+FINEST = 4
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """An even grid over some stamps.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,), seconds
+        The stamps, not decreasing.
+    grid : ndarray, shape (M,), seconds
+        The same as `t` where that is even.
+    dt : float, seconds
+        Step of the grid; 0 where no time passes.
+    """
+
+    t: FloatArray
+    grid: FloatArray
+    dt: float
+
+    @classmethod
+    def over(cls, t: FloatArray) -> "Uniform":
+        """Return the grid over stamps `t`, shape (N,), seconds: at their median step, and not too fine."""
+        span = float(t[-1] - t[0]) if t.size else 0.0
+        if span <= 0.0:
+            return cls(t, t, 0.0)
+        dt = span / (t.size - 1)
+        even = t[0] + dt * np.arange(t.size)
+        if np.abs(t - even).max() <= EVEN * dt:
+            return cls(t, t, dt)
+        step = max(float(np.median(np.diff(t))), span / (FINEST * t.size))
+        points = int(np.ceil(span / step)) + 1
+        return cls(t, np.linspace(t[0], t[-1], points), span / (points - 1))
+
+    def on(self, signal: FloatArray) -> FloatArray:
+        """Return a signal, shape (N,), on the grid, shape (M,)."""
+        return signal if self.grid is self.t else np.interp(self.grid, self.t, signal)
+
+    def off(self, signal: FloatArray) -> FloatArray:
+        """Return a signal on the grid, shape (M,), at the stamps, shape (N,)."""
+        return signal if self.grid is self.t else np.interp(self.t, self.grid, signal)

@@ -8,9 +8,18 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Form, Left, amplitude_and_phase, rhythms, wave
-from slpi_ros.effects.checks import require
-from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.base import (
+    Around,
+    FloatArray,
+    Form,
+    Left,
+    Removable,
+    Side,
+    amplitude_and_phase,
+    require,
+    rhythms,
+    wave,
+)
 
 # So many lines of a spectrum are tried, from this frequency (Hz) on: slower is drift or creep.
 LINES, SLOWEST = 4, 2.0

@@ -8,11 +8,8 @@ from typing import ClassVar
 import numpy as np
 from scipy.signal import lfilter
 
-from slpi_ros.effects.base import Form, Left, usual_step
-from slpi_ros.effects.checks import require
-from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
-from slpi_ros.effects.relaxation import Hold, hold
-from slpi_ros.effects.uniform import Uniform
+from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require, usual_step
+from slpi_ros.effects.filters import Hold, Uniform, hold
 
 # The exact inverse of the first-order hold lets the command alternate from sample to sample after every turn. Taking
 # this share of the old input's weight for the new one's damps that to a third with each sample; ramps stay exact.

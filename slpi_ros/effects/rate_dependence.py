@@ -4,22 +4,242 @@ It has two forms. What is lost to friction shows on the displacement: loops wide
 Where the thresholds themselves grow, the hysteresis sees the voltage through a play (see `coercivity`).
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import copysign, exp
 from typing import ClassVar, overload
 
 import numpy as np
 from scipy.signal import savgol_filter
 
-from slpi_ros.effects.base import Form, Left
-from slpi_ros.effects.checks import require
-from slpi_ros.effects.coercivity import CoercivityFollower, play, reversible, settled_rate
-from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
-from slpi_ros.effects.rate_follower import RateFollower
-from slpi_ros.effects.uniform import Uniform
+from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require
+from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.runs import monotone_runs
+from slpi_ros.hysteresis.reversals import monotone_runs
+
+CoercivityState = tuple[float, float, float, float]
+
+# The reversible part is nearly linear over a coercivity: so many chords lead to where it has a value.
+CHORDS = 8
+# A command at the end of the play, to rounding, is not inside.
+INSIDE = 1 - 1e-9
+
+
+def reversible(v: FloatArray, gains: Sequence[float]) -> FloatArray:
+    """Return the reversible part, shape (N,), metres, at voltages, shape (N,), volts."""
+    return np.asarray(np.polynomial.polynomial.polyval(v, [0.0, *gains]), dtype=np.float64)
+
+
+def settled_rate(t: FloatArray, v: FloatArray, settling: float) -> FloatArray:
+    """Return the rate (V/s) that a path, shape (N,), volts, has of late, from rest, at times `t`, shape (N,), s."""
+    if v.size < 2:
+        return np.zeros_like(v)
+    # From the sample before to the one after; a follower knows only the one before.
+    dt, way = (np.append(x[1:], x[-1]) - np.insert(x[:-1], 0, x[0]) for x in (t, v))
+    rate = np.abs(np.divide(way, dt, out=np.zeros_like(v), where=dt > 0.0))
+    kept = np.exp(-np.diff(t, prepend=t[:1]) / settling) if settling else np.zeros_like(v)
+    settled, now = [], 0.0
+    for value, share in zip(rate.tolist(), kept.tolist(), strict=True):
+        now = value + (now - value) * share
+        settled.append(now)
+    return np.array(settled)
+
+
+def play(v: FloatArray, half_width: FloatArray) -> FloatArray:
+    """Return what is seen of a path, shape (N,), through a play of changing half-width, shape (N,), volts."""
+    seen, now = np.empty_like(v), float(v[0]) if v.size else 0.0
+    for place, (low, high) in enumerate(zip((v - half_width).tolist(), (v + half_width).tolist(), strict=True)):
+        now = min(max(now, low), high)
+        seen[place] = now
+    return seen
+
+
+class CoercivityFollower:
+    """The play sample by sample.
+
+    The command that a wish asks for depends on its own rate: taken from the commands, that would run away. The inverse
+    takes the rate from the voltage that comes out; where that rests, from a command inside the play.
+
+    Parameters
+    ----------
+    half_width : callable
+        Of the play, volts, at a rate, V/s.
+    settling, reversible
+        As in `RateDependence`.
+    """
+
+    def __init__(self, half_width: Callable[[float], float], settling: float, reversible: Sequence[float]) -> None:
+        self._half_width, self._settling, self._reversible = half_width, settling, tuple(reversible)
+        self.start(0.0)
+
+    def start(self, x: float) -> None:
+        """Be at rest at `x` (V)."""
+        self._v = self._u = x
+        self._rate = self._rate_out = 0.0
+
+    def forward(self, dt: float, x: float) -> float:
+        """Move to the command `x` (V), `dt` (s) later; return the voltage (V) that the hysteresis sees."""
+        way, before = x - self._v, self._u
+        self._rate = self._settled(dt, self._rate, way)
+        half_width = self._half_width(self._rate)
+        self._v, self._u = x, min(max(before, x - half_width), x + half_width)
+        moved = self._u - before
+        if moved or abs(x - before) < INSIDE * self._half_width(self._rate_out):
+            self._rate_out = self._settled(dt, self._rate_out, moved or way)
+        return self._u
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the command (V) for a voltage (V) at the hysteresis."""
+        way = wanted - self._u
+        return self.ahead(wanted, copysign(1.0, way)) if way else self._v
+
+    def ahead(self, u: float, direction: float) -> float:
+        """Return the command (V) that moves the hysteresis on at `u` (V), in a direction, -1 or 1."""
+        return u + direction * self._half_width(self._rate_out)
+
+    def within(self, aside: float) -> tuple[float | None, float]:
+        """Return the command (V) that leads a displacement (m) round the resting hysteresis; None: that must move.
+
+        The other number is the direction of the command from the middle of the play, -1 or 1.
+        """
+        low, high = (self.between(self.ahead(self._u, side), self._u) for side in (-1.0, 1.0))
+        direction = 1.0 if aside > 0.5 * (low + high) else -1.0
+        if not low < aside < high:
+            return None, direction
+        v, slope = self._u, 0.5 * (high - low) / self._half_width(self._rate_out)
+        for _ in range(CHORDS):
+            v += (aside - self.between(v, self._u)) / slope
+        return v, direction
+
+    @property
+    def aside(self) -> float:
+        """Displacement (m) that goes round the hysteresis."""
+        return self.between(self._v, self._u)
+
+    def between(self, v: float, u: float) -> float:
+        """Return what goes round the hysteresis (m) at a command `v` (V) where that sees `u` (V)."""
+        return sum(gain * (v**power - u**power) for power, gain in enumerate(self._reversible, start=1))
+
+    def snapshot(self) -> CoercivityState:
+        """Return both voltages and their rates."""
+        return self._v, self._u, self._rate, self._rate_out
+
+    def restore(self, state: CoercivityState) -> None:
+        """Take over a state from `snapshot`."""
+        self._v, self._u, self._rate, self._rate_out = state
+
+    def _settled(self, dt: float, before: float, way: float) -> float:
+        if dt <= 0.0:
+            return before
+        rate = abs(way) / dt
+        return rate + (before - rate) * (exp(-dt / self._settling) if self._settling else 0.0)
+
+
+# Share of the latest rate in the smoothed one.
+SMOOTHING = 0.5
+# Time over which rates of voltage and displacement are compared, seconds.
+COMPARISON = 0.02
+
+RateState = tuple[float | None, float, float, float | None, float, float, float]
+
+
+class RateFollower:
+    """Rate dependence sample by sample; it looks at the voltage too.
+
+    The voltage that a wish asks for depends on its own rate: taken from the voltages, that would run away. The inverse
+    therefore takes the rate from the wishes, and only slowly learns how the two compare.
+
+    Parameters
+    ----------
+    widening, backlash, exponent, reference_rate, transition : float
+        As in `RateDependence`.
+    """
+
+    def __init__(
+        self, widening: float, backlash: float, exponent: float, reference_rate: float, transition: float
+    ) -> None:
+        self._widening, self._backlash = widening, backlash
+        self._exponent, self._reference_rate, self._transition = exponent, reference_rate, transition
+        self._middle: Callable[[float], float] = float
+        self.start(0.0)
+
+    def attach(self, middle: Callable[[float], float]) -> None:
+        """Tell where the middle of the largest loop is: displacement (m) at a voltage (V)."""
+        self._middle = middle
+
+    def start(self, x: float) -> None:
+        """Be at rest at `x` (m); the next voltage is the one it rests at."""
+        self._u: float | None = None
+        self._rate = self._direction = self._wish_rate = self._volts = self._metres = 0.0
+        self._wish: float | None = x
+        self._asked: float | None = None
+
+    def drive(self, dt: float, u: float) -> None:
+        """Note the voltage `u` (V), `dt` (s) after the last one."""
+        way = 0.0 if self._u is None else u - self._u
+        if dt > 0.0:
+            self._rate += SMOOTHING * (way / dt - self._rate)
+            self._compare(dt, way)
+        if self._asked is not None or dt > 0.0:
+            self._wish, self._asked = self._asked, None
+        self._direction = self._turned(way)
+        self._u = u
+
+    def forward(self, dt: float, x: float) -> float:
+        """Return the displacement (m) of the wider loops for one of the loops at rest (m)."""
+        if self._u is None or not self._rate:
+            return x
+        behind = self._backlash * self._direction
+        return x + self._speed(self._rate) * (self._widening * (x - self._middle(self._u)) - behind)
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the displacement (m) of the loops at rest for one of the wider loops (m)."""
+        self._asked = wanted
+        if self._u is None or self._wish is None or dt <= 0.0:
+            return wanted
+        rate = (self._wish_rate + SMOOTHING * ((wanted - self._wish) / dt - self._wish_rate)) * self._volts_per_metre()
+        speed, middle = self._speed(rate), self._middle(self._u + rate * dt)
+        back = wanted + speed * (self._widening * middle + self._backlash * self._turned(rate * dt))
+        return back / (1 + speed * self._widening)
+
+    def snapshot(self) -> RateState:
+        """Return voltage, rate, direction, and what is known of the wishes."""
+        return self._u, self._rate, self._direction, self._wish, self._wish_rate, self._volts, self._metres
+
+    def restore(self, state: RateState) -> None:
+        """Take over a state from `snapshot`."""
+        self._u, self._rate, self._direction, self._wish, self._wish_rate, self._volts, self._metres = state
+        self._asked = None
+
+    def _turned(self, way: float) -> float:
+        """Return the direction after a way (V)."""
+        if not way:
+            return self._direction
+        toward = copysign(1.0, way)
+        return toward + (self._direction - toward) * exp(-abs(way) / self._transition)
+
+    def _speed(self, rate: float) -> float:
+        return float((abs(rate) / self._reference_rate) ** self._exponent)
+
+    def _compare(self, dt: float, way: float) -> None:
+        """Note the last wish, and how its rate compares with that of the voltage."""
+        if self._asked is None or self._wish is None:
+            self._wish_rate = 0.0
+            return
+        went = self._asked - self._wish
+        self._wish_rate += SMOOTHING * (went / dt - self._wish_rate)
+        kept = exp(-dt / COMPARISON)
+        self._volts = kept * self._volts + abs(way)
+        self._metres = kept * self._metres + abs(went)
+
+    def _volts_per_metre(self) -> float:
+        """Return by how many volts the voltage goes on for each metre: as in the middle of the loop, and as of late."""
+        u = self._u or 0.0
+        slope = 1 / max((self._middle(u + 1.0) - self._middle(u - 1.0)) / 2, 1e-15)
+        seen = self._volts / self._metres if self._metres > 0.0 else slope
+        return min(max(seen, slope / 3), 3 * slope)
+
 
 # Powers, and ways as shares of the voltage range, that are looked for.
 EXPONENTS, TRANSITIONS = (0.2, 0.5, 0.8), (0.01, 0.04, 0.12)

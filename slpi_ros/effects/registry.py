@@ -5,11 +5,10 @@ from dataclasses import MISSING, fields
 from math import isinf
 from typing import Any, get_origin
 
-from slpi_ros.effects.checks import parameters_of
+from slpi_ros.effects.base import Effect, parameters_of
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
-from slpi_ros.effects.effect import Effect
 from slpi_ros.effects.hum import Hum
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence

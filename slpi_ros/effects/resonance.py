@@ -1,5 +1,6 @@
 """Resonance: a lightly damped flexure mode that rings after every turn."""
 
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -9,12 +10,126 @@ from typing import ClassVar
 import numpy as np
 from scipy.signal import lfilter
 
-from slpi_ros.effects.base import Form, Left, rhythms, usual_step
-from slpi_ros.effects.checks import require
-from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
-from slpi_ros.effects.filters import Mode
-from slpi_ros.effects.ringing import ResonanceFollower, Unringing
-from slpi_ros.effects.uniform import Uniform
+from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require, rhythms, usual_step
+from slpi_ros.effects.filters import Mode, Uniform
+
+# Taps are so far apart at least, times 1 / w: nearer ones would only be larger.
+SPACING = 0.5
+# Farther apart than this, times 1 / w, they would no longer see the ringing.
+WIDEST = 3.0
+
+
+@dataclass(frozen=True)
+class Unringing:
+    """The input that a mode needs is ``sum_k taps[k] y(t + preview - k spacing)``.
+
+    Parameters
+    ----------
+    taps : tuple of float
+        Their sum is 1. Zeros on the mode's poles, and one more that takes the remaining delay away.
+    spacing : float, seconds
+    """
+
+    taps: tuple[float, ...]
+    spacing: float
+
+    @staticmethod
+    def shortest(mode: Mode) -> float:
+        """Return the smallest useful spacing, seconds."""
+        return SPACING / mode.omega
+
+    @classmethod
+    def of(cls, mode: Mode, spacing: float, preview: float = 0.0) -> "Unringing":
+        """Return the taps for a spacing (s), where the wish is known a `preview` (s) ahead."""
+        zeros = (1.0, 0.0, 0.0)
+        if spacing * mode.omega < WIDEST:
+            total, product = mode.ringing(spacing)
+            zeros = (1 / (1 - total + product), -total / (1 - total + product), product / (1 - total + product))
+        delay = mode.lag / spacing + zeros[1] + 2 * zeros[2] - preview / spacing
+        a, b, c = zeros
+        return cls(
+            (a * (1 + delay), b * (1 + delay) - a * delay, c * (1 + delay) - b * delay, -c * delay),
+            spacing,
+        )
+
+
+class ResonanceFollower:
+    """A mode sample by sample."""
+
+    def __init__(self, mode: Mode) -> None:
+        self._mode = mode
+        self._dt, self._free = 0.0, mode.free(0.0)
+        self._shortest = self._unringing = Unringing.of(mode, Unringing.shortest(mode))
+        self.start(0.0)
+
+    def start(self, x: float) -> None:
+        """Be at rest at `x` (m)."""
+        self._input = self._position = x
+        self._velocity = 0.0
+        self._asked: float | None = None
+        # Age (s) and value (m) of the wishes so far, the latest last; before the oldest the wish was at rest.
+        self._wishes: deque[tuple[float, float]] = deque([(0.0, x)])
+        self._now = 0.0
+
+    def forward(self, dt: float, x: float) -> float:
+        """Move to the input `x` (m), `dt` (s) later; return where the stage is (m)."""
+        if dt > 0.0:
+            if dt != self._dt:
+                self._dt, self._free = dt, self._mode.free(dt)
+            m11, m12, m21, m22 = self._free
+            slope = (x - self._input) / dt
+            behind = self._mode.lag * slope
+            position, velocity = self._position - self._input + behind, self._velocity - slope
+            self._position = x - behind + m11 * position + m12 * velocity
+            self._velocity = slope + m21 * position + m22 * velocity
+        self._input = x
+        self._remember(dt)
+        return self._position
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the input (m) for a wanted place (m)."""
+        self._asked = wanted
+        if max(dt, self._shortest.spacing) != self._unringing.spacing:
+            self._unringing = Unringing.of(self._mode, dt) if dt > self._shortest.spacing else self._shortest
+        taps, spacing = self._unringing.taps, self._unringing.spacing
+        later, value, at = self._now + dt, wanted, self._now + dt - spacing
+        needed, k = taps[0] * wanted, 1
+        # From the latest wish to the oldest; between them they are taken as linear.
+        for earlier, before in reversed(self._wishes):
+            while at >= earlier:
+                share = (at - earlier) / (later - earlier) if later > earlier else 0.0
+                needed += taps[k] * (before + (value - before) * share)
+                k += 1
+                if k == len(taps):
+                    return needed
+                at -= spacing
+            later, value = earlier, before
+        return needed + sum(taps[k:]) * value
+
+    def snapshot(self) -> tuple[float | tuple[float, ...], ...]:
+        """Return input, position, velocity, and the wishes by age."""
+        ages = tuple(self._now - t for t, _ in self._wishes)
+        return self._input, self._position, self._velocity, ages, tuple(y for _, y in self._wishes)
+
+    def restore(self, state: tuple[float | tuple[float, ...], ...]) -> None:
+        """Take over a state from `snapshot`."""
+        self._input, self._position, self._velocity, ages, wishes = state  # type: ignore[assignment]
+        self._now = 0.0
+        self._wishes = deque((-age, y) for age, y in zip(ages, wishes, strict=True))  # type: ignore[arg-type]
+        self._asked = None
+
+    def _remember(self, dt: float) -> None:
+        """Keep the last wish, as long as a tap may ask for it; where there was none, the place counts."""
+        self._now += dt
+        wishes = self._wishes
+        if dt <= 0.0:
+            wishes.pop()
+        wishes.append((self._now, self._position if self._asked is None else self._asked))
+        self._asked = None
+        oldest = self._now - 4 * max(self._shortest.spacing, dt)
+        while len(wishes) > 2 and wishes[1][0] <= oldest:
+            wishes.popleft()
+
 
 # Modes that are looked for: from this frequency (Hz) to this share of the sampling rate, at so many lines.
 LOWEST, HIGHEST, LINES = 10.0, 0.45, 4

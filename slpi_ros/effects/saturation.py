@@ -7,9 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Left
-from slpi_ros.effects.checks import require_rules
-from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.base import Around, FloatArray, Left, Removable, Side, require_rules
 
 # Voltages are sorted into so many bins; the stage stands still where it moves by less than this share of the usual.
 BINS, STILL = 200, 0.35

@@ -8,9 +8,18 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Form, Left, amplitude_and_phase, strongest_lines, wave
-from slpi_ros.effects.checks import require
-from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.base import (
+    Around,
+    FloatArray,
+    Form,
+    Left,
+    Removable,
+    Side,
+    amplitude_and_phase,
+    require,
+    strongest_lines,
+    wave,
+)
 
 # Periods (m) that are looked for, so many of them, in so many bins of displacement.
 SHORTEST, LONGEST, LINES, BINS = 50e-9, 2e-6, 4, 2**14

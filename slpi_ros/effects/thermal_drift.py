@@ -7,9 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Form, Left
-from slpi_ros.effects.checks import require
-from slpi_ros.effects.effect import Around, FloatArray, Removable, Side
+from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require
 
 # Knots of the lines that may fit a record.
 KNOTS = (2, 3, 5, 8, 13)

@@ -7,8 +7,7 @@ import numpy as np
 
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.loop_family import LoopFamily
-from slpi_ros.hysteresis.mpi import MultiSlope
-from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
+from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import UsageError
-from slpi_ros.hysteresis.runs import monotone_runs, require_finite
+from slpi_ros.hysteresis.reversals import monotone_runs, require_finite
 from slpi_ros.hysteresis.stack import MemoryState, TurningPoints
 
 __all__ = ["Memory", "MemoryState"]

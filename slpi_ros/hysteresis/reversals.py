@@ -1,77 +1,76 @@
-"""On which branch does each sample of a voltage lie? The stack moves alike for all models; this tells how."""
+"""Monotone runs of a signal: between two of its reversals a hysteresis model is one monotone function."""
 
-from typing import NamedTuple
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.runs import monotone_runs
-from slpi_ros.hysteresis.shape import END, Curve
-from slpi_ros.hysteresis.stack import TurningPoints
+from slpi_ros.errors import UsageError
 
 FloatArray = NDArray[np.float64]
 
 
-# What `Piece.origin` says of branches that started before the first sample.
-AT_REST, LONG_FALL = -1, -2
+def monotone_runs(x: FloatArray) -> list[tuple[int, int]]:
+    """Cut `x`, shape (N,), into stretches ``start:stop`` that go one way.
 
-
-class Piece(NamedTuple):
-    """Samples ``start:stop`` on the branch that started at sample `origin`, or `AT_REST`, or is the `LONG_FALL`."""
-
-    start: int
-    stop: int
-    direction: int
-    origin: int
-
-
-_IDENTITY = Curve.of(np.array([[0.0, END], [0.0, END]]))
-
-
-class _Straight:
-    """A shape without hysteresis: enough to move the stack."""
-
-    def __init__(self, symmetric_rest: bool) -> None:
-        self.symmetric_rest = symmetric_rest
-
-    def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return the identity."""
-        return _IDENTITY
-
-    def first_rise(self, v_rest: float) -> Curve:
-        """Return the identity."""
-        return self.branch(1, v_rest)
-
-
-def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> list[Piece]:
-    """Cut a voltage into the branches that its samples lie on.
-
-    Parameters
-    ----------
-    v : ndarray, shape (N,), volts
-        The axis rests at the first value, which may be repeated.
-    symmetric_rest : bool
-        As in `slpi_ros.hysteresis.shape.Shape`.
-    primed : bool
-        As in `slpi_ros.hysteresis.stack.TurningPoints`.
-
-    Returns
-    -------
-    list of Piece
-        In order; together they hold every sample but those still at rest.
+    The first sample, with those equal to it that follow at once, is a stretch of its own; later equal neighbours belong
+    to the stretch before them.
     """
-    if not v.size:
+    if not x.size:
         return []
-    memory = TurningPoints(_Straight(symmetric_rest), float(v[0]), float(v[0]), primed=primed)
-    origins = [LONG_FALL] if primed else []
-    pieces: list[Piece] = []
-    for start, stop in monotone_runs(v):
-        if not start:
-            continue
-        for begin, end in memory.pieces(v, start, stop, 0):
-            if memory.depth > len(origins):
-                origins.append(start - 1)
-            del origins[memory.depth :]
-            pieces.append(Piece(begin, end, memory.direction, origins[-1] if origins else AT_REST))
-            memory.arrive(float(v[end - 1]), float(v[end - 1]))
-    return pieces
+    rising, level = x[1:] > x[:-1], x[1:] == x[:-1]
+    first = 1
+    if level.any():
+        first += int(np.argmin(level)) if not level.all() else level.size
+        # A level stretch inherits the direction of the last move before it.
+        rising = rising[np.maximum.accumulate(np.where(level, 0, np.arange(level.size)))]
+    bounds = np.flatnonzero(rising[first:] != rising[first - 1 : -1]) + first + 1
+    edges = [0, first, *bounds.tolist(), x.size]
+    return [(start, stop) for start, stop in pairwise(edges) if start < stop]
+
+
+def require_finite(x: FloatArray) -> None:
+    """Raise UsageError, which names the first one, when samples are not finite."""
+    finite = np.isfinite(x)
+    if not finite.all():
+        at = int(np.argmin(finite))
+        raise UsageError(f"sample {at} is {x[at]}; leave samples that are not finite out")
+
+
+def count_before(x: FloatArray, direction: int, bound: float) -> int:
+    """Count the samples of a run `x`, monotone in `direction` (+1 or -1), that come strictly before `bound`."""
+    if direction > 0:
+        return int(np.searchsorted(x, bound, side="left"))
+    return x.size - int(np.searchsorted(x[::-1], bound, side="right"))
+
+
+def without_small_reversals(x: FloatArray, dead_band: float) -> FloatArray:
+    """Return `x`, shape (N,), with every reversal of at most `dead_band` flattened; larger turns keep their values."""
+    if not dead_band > 0.0:
+        return x
+    extremes = _large_turns(x, dead_band)
+    flattened = np.full_like(x, x[extremes[0]])
+    for start, stop in pairwise(extremes):
+        accumulate = np.maximum.accumulate if x[stop] >= x[start] else np.minimum.accumulate
+        flattened[start : stop + 1] = accumulate(x[start : stop + 1])
+    flattened[extremes[-1] :] = x[extremes[-1]]
+    return flattened
+
+
+def _large_turns(x: FloatArray, dead_band: float) -> list[int]:
+    """Return the samples between which `x` moves by more than `dead_band`, alternately up and down."""
+    lowest = highest = 0
+    extremes: list[int] = []
+    way = 0
+    for turn in [0, *(stop - 1 for _, stop in monotone_runs(x))]:
+        if x[turn] < x[lowest]:
+            lowest = turn
+        if x[turn] > x[highest]:
+            highest = turn
+        if way <= 0 and x[turn] - x[lowest] > dead_band:
+            extremes.append(lowest)
+            way, highest = 1, turn
+        elif way >= 0 and x[highest] - x[turn] > dead_band:
+            extremes.append(highest)
+            way, lowest = -1, turn
+    return [*extremes, highest if way > 0 else lowest if way < 0 else 0]

@@ -14,7 +14,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.runs import count_before
+from slpi_ros.hysteresis.reversals import count_before
 from slpi_ros.hysteresis.shape import FAR, Curve, Shape
 
 FloatArray = NDArray[np.float64]

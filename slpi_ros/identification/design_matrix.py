@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.reversals import AT_REST, LONG_FALL, trace
+from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, trace
 
 FloatArray = NDArray[np.float64]
 

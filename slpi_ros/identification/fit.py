@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
-from slpi_ros.identification import linear
+from slpi_ros.identification import convex_fit as linear
 from slpi_ros.identification import published_kinds as separated
-from slpi_ros.identification.amplitude_scaled import fit_amplitude_scaled
-from slpi_ros.identification.fitted import Fitted
-from slpi_ros.identification.least_squares import noise_rms
+from slpi_ros.identification.least_squares import Fitted, noise_rms
 from slpi_ros.identification.progress import tell
+from slpi_ros.identification.published_kinds import fit_amplitude_scaled
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel

@@ -2,21 +2,36 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
 
 from slpi_ros.errors import IdentificationError, UsageError
-from slpi_ros.hysteresis.loops import Loop, separate
+from slpi_ros.hysteresis.multi_slope import (
+    BACK,
+    AmplitudeScaled,
+    MultiSlope,
+    cycles,
+    falling_envelope,
+    rising_envelope,
+    thresholds_for,
+)
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii, play
-from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, UnidentifiedLoopWarning, at_vertex
-from slpi_ros.identification.bases import LEAST_GAIN
-from slpi_ros.identification.fitted import Fitted
-from slpi_ros.identification.least_squares import RIDGE, held_out_errors
-from slpi_ros.identification.qp import solve_qp
+from slpi_ros.hysteresis.slpi_published import (
+    Loop,
+    SeparatedLoops,
+    SingleLoop,
+    UnidentifiedLoopWarning,
+    at_vertex,
+    separate,
+)
+from slpi_ros.identification.bases import LEAST_GAIN, OperatorWeights
+from slpi_ros.identification.design_matrix import Walk
+from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, RIDGE, Fitted, Problem, held_out_errors, solve_qp
 from slpi_ros.identification.samples import FEWEST, NEVER_TURNS, Samples, only_one
 from slpi_ros.model.stage_model import Start
 
@@ -273,3 +288,229 @@ def _offset(vertex: tuple[float, float], direction: int, below: SingleLoop) -> t
         by_displacement.inverse(below.span[1])
     missed = v - by_displacement.inverse(y), y - by_voltage.forward(v)
     return below.direction * missed[0], below.direction * missed[1]
+
+
+# Cycles count as of one amplitude when theirs differ by less than this share of the largest.
+SAME_AMPLITUDE = 0.02
+
+
+@dataclass(frozen=True)
+class MultiSlopeBasis(OperatorWeights):
+    """The MPI model: one weight for each operator; parameters as those of `MultiSlope`."""
+
+    origin: float
+    amplitude: float
+    thresholds: FloatArray
+    symmetric_rest: bool = False
+
+    @classmethod
+    def over(cls, low: float, high: float) -> "MultiSlopeBasis":
+        """Return the basis with the paper's thresholds for the voltages from `low` to `high` (V)."""
+        return cls(low, high - low, thresholds_for(high - low))
+
+    def branch_part(self, walk: Walk) -> sp.csr_array:
+        """Return how far each operator has moved along the branch."""
+        upper, lower = np.maximum(walk.v, walk.v_origin), np.minimum(walk.v, walk.v_origin)
+        waits = rising_envelope(upper[:, None] - self.origin, self.thresholds) - self._falling(lower)
+        moved = np.maximum(0.0, waits) * walk.direction[:, None]
+        if walk.long_fall.any():
+            fallen, rest = walk.v[walk.long_fall], walk.v_rest[walk.long_fall]
+            moved[walk.long_fall] = self._falling(fallen) - self._falling(rest)
+        return sp.csr_array(moved)
+
+    def _falling(self, v: FloatArray) -> FloatArray:
+        """Return the falling envelopes, shape (N, size)."""
+        return falling_envelope(v[:, None] - self.origin, self.thresholds, self.amplitude)
+
+    def shape(self, x: FloatArray, gain: float) -> MultiSlope:
+        """Return the MPI model."""
+        return MultiSlope(self.origin, self.amplitude, self.thresholds, np.maximum(x[:-1], 0.0))
+
+
+def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the amplitude and the peak displacement of each cycle of a record, in its order.
+
+    A cycle starts within 1 % of the voltage range of the lowest voltage, and goes beyond that. It is left out if its
+    displacement is not known there, or within 1 % of its highest voltage.
+
+    Parameters
+    ----------
+    v : ndarray, shape (N,), volts
+    y : ndarray, shape (N,), metres
+        Not finite where it is not known.
+
+    Returns
+    -------
+    amplitudes : ndarray, shape (c,), volts
+        Largest voltage of each cycle, above the lowest one of the record.
+    peaks : ndarray, shape (c,), metres
+        Largest displacement of each cycle, above that at its start.
+    """
+    if not v.size:
+        return np.empty(0), np.empty(0)
+    origin, near = v.min(), BACK * np.ptp(v)
+    found = []
+    for first, last in cycles(v, origin + near):
+        top, known = v[first : last + 1].max(), first + np.flatnonzero(np.isfinite(y[first : last + 1]))
+        v_known, y_known = v[known], y[known]
+        if known.size and v_known[0] <= origin + near < top and v_known.max() >= top - near:
+            found.append((v_known.max() - origin, y_known.max() - y_known[0]))
+    amplitudes, peaks = np.array(found, dtype=np.float64).reshape(-1, 2).T
+    return amplitudes, peaks
+
+
+def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the knots of ``X_p`` over amplitude for the SMPI model: cycles of nearly equal amplitude are averaged.
+
+    Parameters
+    ----------
+    v : ndarray, shape (N,), volts
+    y : ndarray, shape (N,), metres
+
+    Returns
+    -------
+    voltages : ndarray, shape (m,), volts
+    displacements : ndarray, shape (m,), metres
+
+    Raises
+    ------
+    IdentificationError
+        If the record holds no cycle, or the peaks do not rise with the amplitude.
+    """
+    amplitudes, peaks = cycle_peaks(v, y)
+    if not amplitudes.size:
+        raise IdentificationError("no cycle starts at the lowest voltage; drive from there up and back, per amplitude")
+    order = np.argsort(amplitudes)
+    amplitudes, peaks = amplitudes[order], peaks[order]
+    group = np.zeros(amplitudes.size, dtype=np.int64)
+    first = 0
+    for i in range(1, amplitudes.size):
+        apart = amplitudes[i] - amplitudes[first] > SAME_AMPLITUDE * amplitudes[-1]
+        group[i] = group[i - 1] + apart
+        first = i if apart else first
+    count = np.bincount(group)
+    voltages, displacements = (np.bincount(group, x) / count for x in (amplitudes, peaks))
+    down = np.flatnonzero(np.diff(displacements, prepend=0.0) <= 0.0)
+    if down.size:
+        raise IdentificationError(
+            f"the peak displacement {displacements[down[0]]:.4g} m at the amplitude {voltages[down[0]]:.4g} V is not "
+            "above that of smaller amplitudes; check the record for drift and outliers"
+        )
+    return voltages, displacements
+
+
+@dataclass(frozen=True)
+class PeakFrequency:
+    """Peak displacement over drive frequency, ``X_p = a f^b`` (MPI paper, Eq. 1).
+
+    Parameters
+    ----------
+    a : float, metres
+        Peak displacement at 1 Hz.
+    b : float
+        Negative when the peak sinks with the frequency.
+    """
+
+    a: float
+    b: float
+
+    def __call__(self, frequency: ArrayLike) -> FloatArray:
+        """Return the peak displacement (m) at `frequency` (Hz), of its shape."""
+        return self.a * np.asarray(frequency, dtype=np.float64) ** self.b
+
+
+def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
+    """Fit ``X_p = a f^b`` with the least sum of squared errors of the peaks.
+
+    Parameters
+    ----------
+    frequency : array_like, shape (n,), Hz
+    peak : array_like, shape (n,), metres
+
+    Raises
+    ------
+    IdentificationError
+        If there are not two frequencies, or a value is not positive and finite.
+    """
+    f, x = np.asarray(frequency, dtype=np.float64), np.asarray(peak, dtype=np.float64)
+    if f.ndim != 1 or f.shape != x.shape or np.unique(f).size < 2:
+        raise IdentificationError(
+            f"X_p = a f^b: frequencies {f.shape}, peaks {x.shape}; give a peak of each of two frequencies or more"
+        )
+    for name, unit, values in (("frequency", "Hz", f), ("peak", "m", x)):
+        bad = ~(np.isfinite(values) & (values > 0))
+        if bad.any():
+            raise IdentificationError(f"X_p = a f^b: {name} {values[bad][0]:g} {unit} is not positive; leave it out")
+    # In logarithms the fit is linear, but weighs errors of small peaks more: a start only. In units of the mean peak.
+    mean = x.mean()
+    slope, level = np.polyfit(np.log(f), np.log(x / mean), 1)
+    best = least_squares(
+        lambda p: np.exp(p[0] + p[1] * np.log(f)) - x / mean, (level, slope), ftol=1e-15, xtol=1e-15, gtol=1e-15
+    )
+    return PeakFrequency(float(mean * np.exp(best.x[0])), float(best.x[1]))
+
+
+def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
+    """Fit the SMPI model to one record.
+
+    Raises
+    ------
+    UsageError
+        If there are several records.
+    IdentificationError
+        If too few samples belong to cycles of the largest amplitude.
+    """
+    samples = only_one(records, "smpi")
+    largest = in_largest_cycles(samples.v)
+    count = int(np.count_nonzero(samples.fitted & largest))
+    if count < FEWEST:
+        raise IdentificationError(
+            f"{count} samples in cycles up to the highest voltage; at least {FEWEST} are needed: "
+            "drive from the lowest voltage to the highest and back"
+        )
+
+    def predict(kept: NDArray[np.bool_]) -> FloatArray:
+        model, offset = _fit_scaled(samples, kept, largest)
+        return model.along(float(samples.v[0]), offset).forward_array(samples.v)
+
+    model, offset = _fit_scaled(samples, samples.fitted, largest)
+    y = model.along(float(samples.v[0]), offset).forward_array(samples.v)
+    problem = Problem.pose([samples.only(largest)], MultiSlopeBasis.over(*_ends(samples)))
+    return Fitted(
+        hysteresis=model,
+        start=Start(float(samples.v[0]), offset),
+        y=samples.y[samples.fitted],
+        voltage_range=samples.voltage_range,
+        errors=(y - samples.y)[samples.fitted],
+        held_out=held_out_errors(samples, samples.fitted, predict),
+        covered=problem.basis.covered(problem.design.local[problem.weights > 0]),
+    )
+
+
+def in_largest_cycles(v: FloatArray) -> NDArray[np.bool_]:
+    """Return which samples belong to a cycle that reaches the highest voltage of a record, shape (N,)."""
+    low, high = float(v.min()), float(v.max())
+    chosen = np.zeros(v.size, dtype=bool)
+    for first, last in cycles(v, low + BACK * (high - low)):
+        chosen[first : last + 1] |= v[first : last + 1].max() >= high - SAME_AMPLITUDE * (high - low)
+    return chosen
+
+
+def _ends(samples: Samples) -> tuple[float, float]:
+    return float(samples.v.min()), float(samples.v.max())
+
+
+def _fit_scaled(samples: Samples, kept: NDArray[np.bool_], largest: NDArray[np.bool_]) -> tuple[AmplitudeScaled, float]:
+    """Return the model fitted to the samples `kept`, and the displacement at the start (m)."""
+    part = replace(samples, fitted=kept & largest)
+    problem = Problem.pose([part], MultiSlopeBasis.over(*_ends(samples)))
+    x = problem.solve(FIRST_SMOOTHNESS) * problem.scale
+    base = problem.basis.shape(x, problem.gain)
+    assert isinstance(base, MultiSlope)
+    # Of all fitted samples: a few peaks say nothing of the samples between them.
+    model = AmplitudeScaled(base, *peak_line(samples.v, np.where(samples.fitted, samples.y, np.nan)))
+    # Displacement at the start: at the low end, where all cycles begin, the model must be right.
+    relative = model.along(float(samples.v[0]), 0.0).forward_array(samples.v)
+    low, high = _ends(samples)
+    at_low_end = kept & (samples.v <= low + BACK * (high - low))
+    return model, float(np.median((samples.y - relative)[at_low_end if at_low_end.any() else kept]))

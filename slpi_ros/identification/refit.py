@@ -14,16 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from slpi_ros.effects.base import Around
 from slpi_ros.effects.chain import forward
-from slpi_ros.effects.effect import Around
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
+from slpi_ros.identification.convex_fit import FIT_SAMPLES
 from slpi_ros.identification.initial_history import choose_start
-from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms
-from slpi_ros.identification.linear import FIT_SAMPLES
-from slpi_ros.identification.qp import solve_free
+from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import AxisModel, StageModel, Start

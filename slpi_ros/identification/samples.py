@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
-from slpi_ros.hysteresis.runs import monotone_runs
-from slpi_ros.identification.signal_statistics import stuck
-from slpi_ros.identification.voltage import without_noise
+from slpi_ros.hysteresis.reversals import monotone_runs
+from slpi_ros.identification.signal_statistics import stuck, without_noise
 from slpi_ros.io.record import Record
 
 FloatArray = NDArray[np.float64]

@@ -3,12 +3,83 @@
 All tests know the voltage: a displacement may rest while the voltage rests, and turn where the voltage turns.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.signal import savgol_filter
 from scipy.special import ndtri
+
+from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.hysteresis.reversals import without_small_reversals
+from slpi_ros.identification.drive import hold_band, resting, smallest_turn, turning_points
+
+
+@dataclass(frozen=True)
+class ErrorMetrics:
+    """How far a model, or a stage, is from what it should be.
+
+    The MPI paper's "mean square error" is `root_mean_square` in all places: Tables 2 and 4, 0.1201 µm (feedforward) and
+    0.2949 µm (feedforward and PID). Its unit is µm, and it exceeds the mean absolute error as a root must. A mean
+    square cannot exceed the product of maximum and mean absolute error; Table 2 from 20 to 100 V, Table 4 at 20 and
+    40 V and the 0.1201 do. Of the others, R² of 0.9996 at 120 V (Table 3) goes with the root only.
+
+    Parameters
+    ----------
+    maximum : float, metres
+        Maximum absolute error.
+    mean : float, metres
+        Mean absolute error.
+    root_mean_square : float, metres
+        What the paper calls mean square error.
+    mean_square : float, square metres
+        Mean square error proper.
+    r_squared : float
+        ``R² = 1 - SSE / SST``, MPI paper, Eq. 3.
+    """
+
+    maximum: float
+    mean: float
+    root_mean_square: float
+    mean_square: float
+    r_squared: float
+
+
+def error_metrics(measured: ArrayLike, model: ArrayLike) -> ErrorMetrics:
+    """Compare a model with what was measured, or what was measured with what was desired.
+
+    Parameters
+    ----------
+    measured : array_like, shape (N,), metres
+        The reference; R² is relative to its variation.
+    model : array_like, shape (N,), metres
+
+    Raises
+    ------
+    UsageError
+        If the two are not equally long, not finite, or `measured` does not vary.
+    """
+    y, y_model = np.asarray(measured, dtype=np.float64), np.asarray(model, dtype=np.float64)
+    if y.ndim != 1 or y.shape != y_model.shape or y.size == 0:
+        raise UsageError(f"error metrics: {y.shape} measured and {y_model.shape} modelled values; give as many of each")
+    if not (np.isfinite(y).all() and np.isfinite(y_model).all()):
+        raise UsageError("error metrics: values that are not finite; leave such samples out")
+    total = np.sum((y - y.mean()) ** 2)
+    if not total > 0.0:
+        raise UsageError(f"error metrics: all measured values are {y[0]:g} m; R² needs some variation")
+    error = np.abs(y - y_model)
+    mean_square = float(np.mean(error**2))
+    return ErrorMetrics(
+        maximum=float(error.max()),
+        mean=float(error.mean()),
+        root_mean_square=float(np.sqrt(mean_square)),
+        mean_square=mean_square,
+        r_squared=float(1.0 - np.sum(error**2) / total),
+    )
+
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -253,3 +324,252 @@ def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArr
     )
     by_chance = np.count_nonzero(earlier) < 2 * np.count_nonzero(later)
     return outliers[:0] if by_chance else outliers[earlier]
+
+
+_FEWEST_READINGS = 5
+# Fewer differences than this do not tell their rms to 10 %.
+FEWEST = 100
+# Enough moves and holds of a long record, taken evenly from all of it, and how far back a move is looked for.
+_ENOUGH_PIECES, _LOOK_BACK = 1000, 1000
+# Turns this close to each other (share of the voltage range) are the same; so are voltages along a move, in rms.
+_SAME_TURN, _SAME_VOLTAGE = 0.005, 0.003
+_FEWEST_OF_MOVE, _FEWEST_OF_HOLD = 10, 20
+# A longer hold is cut, so that what is slow in it is nearly a parabola.
+_LONGEST_PIECE = 2.0
+# What lies farther out, in standard deviations, is an outlier; the rms of a Gaussian cut off there; how often to cut.
+_OUTLIER, _CUT_GAUSSIAN, _CUTS = 2.5, 0.95460, 5
+_ROBUST_FITS = 3
+
+
+# Smaller than this share of the range it is the rounding of numbers.
+NO_NOISE = 1e-9
+
+
+@dataclass(frozen=True)
+class Floor:
+    """How well a record repeats itself.
+
+    Parameters
+    ----------
+    rms : float, metres
+    source : str
+        What it was seen in, with numbers.
+    """
+
+    rms: float
+    source: str
+
+
+def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray | None = None) -> Floor:
+    """Find how well a record repeats itself, outliers apart.
+
+    From moves that are made again between the same turns, where there are enough of them; else from holds; else from
+    what changes from sample to sample. What differs slowly and evenly (drift, creep) does not count.
+
+    Parameters
+    ----------
+    t, v : ndarray, shape (N,), seconds and volts
+        Time and voltage.
+    y : ndarray, shape (N,), metres
+        Displacement; NaN where there is none.
+    residual : ndarray, shape (N,), metres, optional
+        What a model leaves of it. It is looked at instead of `y`, so that what the model says about time (drift, hum)
+        does not count.
+
+    Returns
+    -------
+    Floor
+
+    Raises
+    ------
+    RecordError
+        If there are fewer than 5 samples.
+    """
+    signal = y if residual is None else residual
+    usable = np.isfinite(v) & np.isfinite(signal)
+    t, v, y, signal = t[usable], v[usable], y[usable], signal[usable]
+    if t.size < _FEWEST_READINGS:
+        raise RecordError(f"{t.size} samples have no noise floor; give at least {_FEWEST_READINGS}")
+    found = _seen(t, v, signal, alone=residual is not None)
+    step = digit(y)
+    if found.rms < step / np.sqrt(12.0):
+        return Floor(step / np.sqrt(12.0), f"digits: {step * 1e9:.3g} nm from one reading to the next")
+    if found.rms < NO_NOISE * np.ptp(y):
+        return Floor(0.0, f"no noise in {found.source}")
+    return found
+
+
+def _seen(t: FloatArray, v: FloatArray, signal: FloatArray, *, alone: bool) -> Floor:
+    for name, seen in (("repeats", _repeats(t, v, signal)), ("holds", _holds(t, v, signal))):
+        parts = list(seen)
+        pooled = np.concatenate([np.empty(0), *parts])
+        if pooled.size >= FEWEST:
+            what = {"repeats": "moves made again", "holds": "pieces of holds"}[name]
+            return Floor(robust_rms(pooled), f"{name}: {len(parts)} {what}, {pooled.size} samples")
+    level = noise(signal, t) if alone else noise(signal, t, v)
+    return Floor(level, f"high frequencies: {signal.size} samples, each beside its neighbours; slow noise is not seen")
+
+
+def robust_rms(x: FloatArray) -> float:
+    """Return the rms of `x`, shape (N,), outliers apart; that of a Gaussian is not changed."""
+    size = np.abs(x)
+    spread = 1.4826 * float(np.median(size))
+    for _ in range(_CUTS):
+        spread = float(np.sqrt(np.mean(size[size <= _OUTLIER * spread] ** 2))) / _CUT_GAUSSIAN
+    # Where most are equal (coarse digits), nothing is an outlier.
+    return spread or float(np.sqrt(np.mean(x**2)))
+
+
+def _repeats(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatArray]:
+    """Yield, for each move that was made before, how it differs, in units of one reading's noise.
+
+    On a move from one turn to the next the stage follows a branch of its own, up to where the loop around it closes:
+    what it has done before the turn before does not matter.
+    """
+    span = float(np.ptp(v))
+    ends = turning_points(v, smallest_turn(v, noise(v, t)))
+    # Each move: the turn before it, its own, and where it goes.
+    turns = np.column_stack([v[ends[:-2]], v[ends[1:-1]], v[ends[2:]]])
+    for move in range(1, len(turns), max(1, len(turns) // _ENOUGH_PIECES)):
+        earliest = max(0, move - _LOOK_BACK)
+        alike = np.flatnonzero(np.abs(turns[earliest:move] - turns[move]).max(axis=1) < _SAME_TURN * span)
+        if not alike.size:
+            continue
+        own, other = (
+            Move(t[part] - t[part.start], v[part], signal[part])
+            for part in (slice(ends[k + 1], ends[k + 2] + 1) for k in (move, earliest + int(alike[-1])))
+        )
+        direction = np.sign(turns[move, 2] - turns[move, 1])
+        within = direction * (own.v - turns[move, 0]) <= 0.0
+        difference = _difference(own, other, within, _SAME_VOLTAGE * span)
+        if difference.size:
+            yield difference
+
+
+class Move(NamedTuple):
+    """Time (s) since the turn, voltage (V) and signal (m) from one turn to the next."""
+
+    t: FloatArray
+    v: FloatArray
+    signal: FloatArray
+
+
+def _difference(own: Move, other: Move, within: NDArray[np.bool_], same: float) -> FloatArray:
+    """Return how `own` differs from `other` where it is `within`; empty where their voltages are not the `same` (V)."""
+    t, v, signal = (x[within] for x in own)
+    if min(t.size, other.t.size) < _FEWEST_OF_MOVE:
+        return np.empty(0)
+    shift = _shift(t, v, other.t, other.v)
+    inside = (t + shift >= other.t[0]) & (t + shift <= other.t[-1])
+    t, v, signal = t[inside], v[inside], signal[inside]
+    if t.size < _FEWEST_OF_MOVE:
+        return np.empty(0)
+    after = np.clip(np.searchsorted(other.t, t + shift), 1, other.t.size - 1)
+    before = after - 1
+    step = other.t[after] - other.t[before]
+    share = np.divide(t + shift - other.t[before], step, out=np.zeros_like(t), where=step > 0.0)
+    v_other, signal_other = ((1.0 - share) * x[before] + share * x[after] for x in (other.v, other.signal))
+    if np.sqrt(np.mean((v - v_other) ** 2)) > same:
+        return np.empty(0)
+    # A reading between two others is less noisy than they are.
+    weight = 1.0 / np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
+    # Where the voltages differ a little, the displacements do by a gain, which changes along the move.
+    beside = v - v_other
+    return _without(weight * (signal - signal_other), *(weight * x for x in (np.ones_like(t), t, beside, beside * t)))
+
+
+def _shift(t: FloatArray, v: FloatArray, t_other: FloatArray, v_other: FloatArray) -> float:
+    """Return by how much later (s) the other move passes the voltages of this one."""
+    rate = np.gradient(v, np.maximum.accumulate(t) + 1e-12 * np.arange(t.size))
+    shift = 0.0
+    for _ in range(3):
+        behind = v - np.interp(t + shift, t_other, v_other)
+        shift += float(behind @ rate / max(rate @ rate, 1e-300))
+    return shift
+
+
+def _holds(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatArray]:
+    """Yield, for each piece of a hold, what is left when a parabola is taken out."""
+    starts, stops = resting(t, v, hold_band(v, noise(v, t), digit(v)))
+    every = max(1, starts.size // _ENOUGH_PIECES)
+    for start, stop in zip(starts[::every].tolist(), stops[::every].tolist(), strict=True):
+        # At first the stage still follows the move before.
+        first = (start + stop) // 2
+        pieces = max(1, round((t[stop - 1] - t[first]) / _LONGEST_PIECE))
+        for piece in np.array_split(np.arange(first, stop), pieces):
+            if piece.size >= _FEWEST_OF_HOLD:
+                since = t[piece] - t[piece[0]]
+                yield _without(signal[piece], np.ones(piece.size), since, since**2)
+
+
+def _without(x: FloatArray, *columns: FloatArray) -> FloatArray:
+    """Return what is left of `x`, shape (n,), when a sum of columns is taken out; as large as it was before."""
+    design = np.column_stack(columns)
+    size = np.sqrt((design**2).sum(axis=0))
+    design = design[:, size > 0.0] / size[size > 0.0]
+    left = x
+    for _ in range(_ROBUST_FITS):
+        kept = np.abs(left) <= _OUTLIER * 1.4826 * np.median(np.abs(left)) if left is not x else slice(None)
+        left = x - design @ np.linalg.lstsq(design[kept], x[kept], rcond=1e-9)[0]
+    return np.asarray(left * np.sqrt(x.size / (x.size - design.shape[1])))
+
+
+# A commanded voltage has less noise than the first share of its range; what looks like more than the other one is none.
+LEAST_NOISE, MOST_NOISE = 1e-4, 5e-3
+# Orders of the differences in which noise is all that is left, and readings that are enough to tell it from.
+_ORDERS = (3, 4, 5, 6)
+_ENOUGH_VOLTAGES = 100_000
+# Samples over which a parabola may take the place of the readings: as many as it fits.
+_WINDOWS = (5, 9, 17, 33, 65, 129)
+# Reversals up to so many standard deviations are still noise.
+_DEAD_BAND = 2.0
+
+
+def voltage_noise(t: FloatArray, v: FloatArray) -> float:
+    """Return the noise (V rms) of a measured voltage, shape (N,), volts; 0 for a commanded one, which has next to none.
+
+    Noise changes from sample to sample; differences of a high order pass over what does so smoothly.
+    """
+    if v.size <= max(_ORDERS):
+        return 0.0
+    part = v[:_ENOUGH_VOLTAGES]
+    estimates = [noise(v, t)]
+    for order in _ORDERS:
+        # The squares of the binomial coefficients of a difference add up to another one.
+        size = np.sqrt(_central_binomial(order))
+        estimates.append(float(1.4826 * np.median(np.abs(np.diff(part, order)))) / size)
+    level = min(estimates)
+    span = float(np.ptp(v))
+    return level if LEAST_NOISE * span < level < MOST_NOISE * span else 0.0
+
+
+def _central_binomial(order: int) -> float:
+    k = np.arange(1, order + 1)
+    return float(np.prod((order + k) / k))
+
+
+def without_noise(t: FloatArray, v: FloatArray) -> FloatArray:
+    """Return a voltage, shape (N,), without the noise of its measurement; a commanded one as it is.
+
+    Each reading gives way to a parabola through those around it, as many as lie on it but for their noise. What still
+    turns back by no more than the noise is flattened.
+    """
+    noise = voltage_noise(t, v)
+    if not noise:
+        return v
+    smooth = v
+    for window in _WINDOWS:
+        if window > v.size:
+            break
+        parabola = savgol_filter(v, window, 2)
+        off = uniform_filter1d((v - parabola) ** 2, window, mode="nearest")
+        # Of so few readings the parabola takes three, and chance some.
+        explained = noise**2 * (1.0 - _weight_of_own(window)) * (1.0 + np.sqrt(2.0 / window)) ** 2
+        smooth = np.where(off < explained, parabola, smooth)
+    return without_small_reversals(smooth, _DEAD_BAND * noise)
+
+
+def _weight_of_own(window: int) -> float:
+    """Return the weight of the middle reading in the parabola's value there."""
+    n = window // 2
+    return 3.0 * (3.0 * n * (n + 1) - 1.0) / ((2 * n + 3) * (2 * n + 1) * (2 * n - 1))

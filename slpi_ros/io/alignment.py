@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError
-from slpi_ros.io.joint_state import SECOND_NS
+from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.io.record import FloatArray, Record
 from slpi_ros.io.signals import Signals
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slpi_ros.errors import RecordError, SlpiError
-from slpi_ros.io.message_blocks import zstd
+from slpi_ros.io.bag_storage import zstd
 
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 # The parts of a split bag end in their number.

@@ -17,14 +17,16 @@ from rosbags.rosbag2 import Reader
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.alignment import SeparateTopics, combine
 from slpi_ros.io.bag_files import locate, match_topic, translated, unpacked
-from slpi_ros.io.bag_storage import read_mcap
+from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.bag_writer import STORAGES, BagWriter, typestore
-from slpi_ros.io.joint_state import JointStateBlock, encode_joint_states
-from slpi_ros.io.message_blocks import MessageBlock
-from slpi_ros.io.message_types import JOINT_STATE, MESSAGE_TYPES
+from slpi_ros.io.messages import (
+    JOINT_STATE,
+    MESSAGE_TYPES,
+    JointStateBlock,
+    encode_joint_states,
+)
 from slpi_ros.io.record import Record
 from slpi_ros.io.signals import Signals, decode_signals
-from slpi_ros.io.sqlite_file import read_sqlite
 
 __all__ = ["JOINT_STATE", "STORAGES", "BagWriter", "SeparateTopics", "read_bag", "read_bags", "write_bag"]
 

@@ -4,17 +4,100 @@ The format: https://mcap.dev/spec. A file is a row of records; most are chunks, 
 each chunk stand indexes of its messages. Chunks without the wanted topic are passed over.
 """
 
+import sqlite3
 import struct
+import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.io.cdr import ByteArray
-from slpi_ros.io.message_blocks import BLOCK, MessageBlock, decompressed, is_compressed
+
+# Messages taken together where the file does not group them itself.
+BLOCK = 4_000
+
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+
+@dataclass(frozen=True)
+class MessageBlock:
+    """Some messages of a topic.
+
+    Parameters
+    ----------
+    logged : ndarray of int64, shape (n,), nanoseconds
+        When each was recorded.
+    messages : ndarray of uint8, shape (n, L), or list of bytes, length n
+        The former where all have the same length L.
+    """
+
+    logged: NDArray[np.int64]
+    messages: ByteArray | list[bytes]
+
+    @classmethod
+    def of(cls, logged: Sequence[int], messages: Sequence[bytes]) -> "MessageBlock":
+        """Make a block of single messages, decompressed where the recorder compressed each of them."""
+        times = np.array(logged, np.int64)
+        if len(set(map(len, messages))) == 1 and messages[0]:
+            rows = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
+            if not is_compressed(rows):
+                return cls(times, rows)
+        if any(message[:4] == _ZSTD_MAGIC for message in messages):
+            return cls.of(logged, [_unpacked(message) for message in messages])
+        return cls(times, list(messages))
+
+    def each(self) -> list[bytes]:
+        """Return the messages one by one."""
+        if isinstance(self.messages, list):
+            return self.messages
+        return [row.tobytes() for row in self.messages]
+
+
+def is_compressed(rows: ByteArray) -> bool:
+    """Say whether any of the messages, shape (n, L), was compressed by the recorder: CDR begins otherwise."""
+    magic = np.frombuffer(_ZSTD_MAGIC, np.uint8)
+    return rows.shape[1] >= magic.size and bool((rows[:, : magic.size] == magic).all(axis=1).any())
+
+
+def _unpacked(message: bytes) -> bytes:
+    return decompressed(message, "zstd") if message[:4] == _ZSTD_MAGIC else message
+
+
+def decompressed(data: bytes, compression: str) -> bytes:
+    """Return what was compressed, by one of the compressions of MCAP and rosbag2.
+
+    Raises
+    ------
+    ValueError
+        If there is no such compression.
+    """
+    match compression:
+        case "":
+            return data
+        case "zstd":
+            return bytes(zstd().decompress(data))
+        case "lz4":
+            # Rarely needed; rosbags brings it, as it does zstd.
+            from lz4.frame import decompress  # type: ignore[import-untyped]
+
+            return bytes(decompress(data))
+    raise ValueError(f"compression {compression!r} is not known")
+
+
+def zstd() -> Any:
+    """Return the module for zstd, which is part of Python from 3.14 on."""
+    if sys.version_info >= (3, 14):
+        from compression import zstd as module
+    else:
+        from backports import zstd as module
+    return module
+
 
 _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _DATA_END = 0x04, 0x05, 0x06, 0x07, 0x0F
 _MAGIC_SIZE, _FOOTER_SIZE = 8, 37
@@ -196,3 +279,30 @@ def _rows(data: ByteArray, starts: NDArray[np.int64], length: int) -> ByteArray:
         return view(data[starts[0] :], (starts.size, length), (int(steps[0]), 1), writeable=False)
     rows: ByteArray = data[starts[:, None] + np.arange(length)]
     return rows
+
+
+# In the order of writing: going through the index of times would jump about in the file.
+_MESSAGES = """
+SELECT timestamp, data FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE name = ?) ORDER BY id
+"""
+
+
+def read_sqlite(path: Path, topic: str) -> Iterator[MessageBlock]:
+    """Yield the messages of a topic, in the order in which they were written.
+
+    Parameters
+    ----------
+    path : Path
+        A complete file.
+    topic : str
+        Full name.
+
+    Raises
+    ------
+    Exception
+        Of any kind where the file is damaged.
+    """
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as connection:
+        rows = connection.execute(_MESSAGES, (topic,))
+        while block := rows.fetchmany(BLOCK):
+            yield MessageBlock.of([logged for logged, _ in block], [message for _, message in block])

@@ -20,8 +20,7 @@ from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_files import absolute_name, one_line, partial_path
-from slpi_ros.io.joint_state import JointStateBlock, encode_joint_states
-from slpi_ros.io.message_types import JOINT_STATE
+from slpi_ros.io.messages import JOINT_STATE, JointStateBlock, encode_joint_states
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 

@@ -6,8 +6,7 @@ from typing import NoReturn
 
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.columns import DISPLACEMENT, TIME, VOLTAGE, Column, Quantity, axis_of, begins, named, unit_in
-from slpi_ros.io.mat_table import MatTable
-from slpi_ros.io.table_files import CsvTable, called
+from slpi_ros.io.table_files import CsvTable, MatTable, called
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.io.joint_state import SECOND_NS
-from slpi_ros.io.message_blocks import MessageBlock
-from slpi_ros.io.message_types import MESSAGE_TYPES, MessageType
+from slpi_ros.io.bag_storage import MessageBlock
+from slpi_ros.io.messages import MESSAGE_TYPES, SECOND_NS, MessageType
 from slpi_ros.io.record import FloatArray
 
 Deserialise = Callable[[bytes], Any]

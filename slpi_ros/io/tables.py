@@ -11,9 +11,8 @@ from slpi_ros.errors import RecordError
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.column_choice import Choice, Wishes, choose
 from slpi_ros.io.columns import Column
-from slpi_ros.io.mat_table import MatTable, load_mat
 from slpi_ros.io.record import FloatArray, Record
-from slpi_ros.io.table_files import CsvTable, called, load_csv
+from slpi_ros.io.table_files import CsvTable, MatTable, called, load_csv, load_mat
 
 # message stamps count seconds in int32
 _TIME_END = 2.0**31

@@ -9,17 +9,16 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.effects.base import Around, Effect
 from slpi_ros.effects.chain import Chain, Middle, backward, forward, loop_middle, reaching
-from slpi_ros.effects.effect import Around, Effect
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis import multi_slope as smpi
 from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.runs import require_finite
-from slpi_ros.model.stream import ROUNDING, AxisStream, Limits, accepted_range, refusal
-from slpi_ros.model.streaming import EffectStream
+from slpi_ros.hysteresis.reversals import require_finite
+from slpi_ros.model.streaming import ROUNDING, AxisStream, EffectStream, Limits, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slpi_ros.effects.coupling import Coupling
+from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Mask, Start
-from slpi_ros.model.stage_stream import StageStream
-from slpi_ros.model.stream import AxisStream, Limits
+from slpi_ros.model.streaming import AxisStream, Limits, StageStream
 
 __all__ = ["AxisModel", "FitQuality", "HeldAtLimitWarning", "StageModel", "Start", "check_time", "held_message"]
 

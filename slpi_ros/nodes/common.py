@@ -1,21 +1,180 @@
 """Start, spin and end one node: what every executable's ``main`` has in common."""
 
+import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.srv import ChangeState
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.io.messages import SECOND_NS
+
+COMMANDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+# Whoever joins late gets the last one.
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# What sensors send: the newest counts.
+MEASUREMENTS = qos_profile_sensor_data
+DIAGNOSTICS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
+    """Return stamp (ns), names and positions of a serialized JointState; one that makes no sense names nothing."""
+    try:
+        message = deserialize_message(data, JointState)
+    except RuntimeError:
+        return 0, (), ()
+    stamp = message.header.stamp
+    return stamp.sec * SECOND_NS + stamp.nanosec, message.name, message.position
+
+
+class LateService:
+    """A service that answers later, without a thread that waits: neither of the executors may be blocked.
+
+    Parameters
+    ----------
+    node : Node
+    name : str
+    start : callable
+        Starts what is asked for; returns why it cannot, or "".
+    """
+
+    def __init__(self, node: Node, name: str, start: Callable[[], str]) -> None:
+        self._start = start
+        self._waiting: list[Any] = []
+        self._service = node.create_service(Trigger, name, self._on_request)
+        # The executors send what the callback returns; only here is known whom an answer is for.
+        self._send = self._service.send_response
+        self._service.send_response = self._send_or_keep
+
+    def answer(self, success: bool, message: str) -> None:
+        """Answer everyone who waits."""
+        waiting, self._waiting = self._waiting, []
+        for header in waiting:
+            self._send(Trigger.Response(success=success, message=message), header)
+
+    def _on_request(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = self._start()
+        return response
+
+    def _send_or_keep(self, response: Trigger.Response, header: Any) -> None:
+        if response.message:
+            self._send(response, header)
+        else:
+            self._waiting.append(header)
+
+
+def refuse_impossible_transitions(node: LifecycleNode) -> None:
+    """Answer a request for a transition that the present state does not allow with a refusal.
+
+    Without this, rclpy lets the request end the process: ``ros2 lifecycle set NODE configure`` said twice would do.
+    """
+    for service in node.services:
+        if service.srv_type is ChangeState:
+            service.callback = _refusing(node, service.callback)
+
+
+def _refusing(node: LifecycleNode, change_state: Any) -> Any:
+    def on_request(request: Any, response: Any) -> Any:
+        try:
+            return change_state(request, response)
+        except RuntimeError as error:
+            wanted = request.transition.label or request.transition.id
+            node.get_logger().warning(f"no transition '{wanted}' from the present state: {error}")
+            response.success = False
+            return response
+
+    return on_request
+
+
+def ask_for_priority(node: Node, priority: int) -> None:
+    """Run all threads of this process under SCHED_FIFO, those of DDS too; without the right to it say so and go on."""
+    try:
+        for thread in Path("/proc/self/task").iterdir():
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, AttributeError) as error:
+        node.get_logger().warning(f"no realtime_priority {priority}: {error}; running as any other process")
+
+
+OK: bytes = DiagnosticStatus.OK
+WARN: bytes = DiagnosticStatus.WARN
+ERROR: bytes = DiagnosticStatus.ERROR
+
+
+@dataclass(frozen=True)
+class Health:
+    """How a node is.
+
+    Parameters
+    ----------
+    problems : sequence of (level, str)
+        What is wrong, worst or not; empty when all is well.
+    summary : str
+        What the node does when all is well.
+    values : mapping of str to object
+        Counters and states, shown as text.
+    hardware_id : str
+        The stage.
+    """
+
+    problems: tuple[tuple[bytes, str], ...]
+    summary: str
+    values: Mapping[str, object]
+    hardware_id: str = ""
+
+    @property
+    def level(self) -> bytes:
+        """The worst of the problems' levels."""
+        return max((level for level, _ in self.problems), default=OK)
+
+    @property
+    def message(self) -> str:
+        """All problems, the worst first, or the summary."""
+        worst_first = sorted(self.problems, key=lambda problem: problem[0], reverse=True)
+        return "; ".join(text for _, text in worst_first) or self.summary
+
+
+class Diagnostics:
+    """The publisher of one status, named after its node and what the node is."""
+
+    def __init__(self, node: Node, role: str) -> None:
+        self._node = node
+        self._name = f"{node.get_fully_qualified_name()}: {role}"
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
+        self.level = OK
+
+    def report(self, health: Health) -> None:
+        """Publish the health, and remember its level."""
+        self.level = health.level
+        status = DiagnosticStatus(
+            level=health.level,
+            name=self._name,
+            message=health.message,
+            hardware_id=health.hardware_id,
+            values=[KeyValue(key=key, value=str(value)) for key, value in health.values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)
+
 
 # A signal is noticed between two calls of spin_once: this bounds the wait on an idle graph.
 SPIN_TIMEOUT = 0.1

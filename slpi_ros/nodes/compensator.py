@@ -15,26 +15,29 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.rejection import RejectedError
+from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
-from slpi_ros.io.joint_state_bytes import JointStates
-from slpi_ros.io.wire import before_numbers
-from slpi_ros.nodes.common import run
+from slpi_ros.io.cdr import before_numbers
+from slpi_ros.io.messages import JointStates
+from slpi_ros.nodes.common import (
+    COMMANDS,
+    LATCHED,
+    MEASUREMENTS,
+    WARN,
+    as_rclpy_reads,
+    ask_for_priority,
+    refuse_impossible_transitions,
+    run,
+)
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_driver import Driver
 from slpi_ros.nodes.compensator_memory import MemoryKeeper
 from slpi_ros.nodes.compensator_models import Models
-from slpi_ros.nodes.compensator_parameters import DECLARATIONS
-from slpi_ros.nodes.compensator_priority import ask_for_priority
+from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings
 from slpi_ros.nodes.compensator_reset import MemoryReset
-from slpi_ros.nodes.compensator_settings import CompensatorSettings
 from slpi_ros.nodes.compensator_silence import Silence
 from slpi_ros.nodes.compensator_trajectory import TrajectoryFollower
-from slpi_ros.nodes.diagnostics import WARN
-from slpi_ros.nodes.joint_states import as_rclpy_reads
-from slpi_ros.nodes.lifecycle import refuse_impossible_transitions
 from slpi_ros.nodes.parameters import Parameters
-from slpi_ros.nodes.qos import COMMANDS, LATCHED, MEASUREMENTS
 
 LOG_PERIOD = 5.0
 # How often the node looks whether commands have stopped, seconds.

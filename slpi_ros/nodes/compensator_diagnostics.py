@@ -8,11 +8,11 @@ from rclpy.node import Node
 
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.timing import Timing, TimingReport
+from slpi_ros.compensator.statistics import Timing, TimingReport
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
+from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 from slpi_ros.nodes.compensator_silence import Silence
-from slpi_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Health
 
 Problem = tuple[bool, bytes, str]
 

@@ -7,8 +7,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from slpi_ros.compensator.controller import Compensation
-from slpi_ros.io.joint_state import SECOND_NS
-from slpi_ros.model.stream import LONGEST_STEP
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.streaming import LONGEST_STEP
 
 # Seconds from one voltage to the next.
 PERIOD = 0.004

@@ -5,12 +5,20 @@ from collections.abc import Mapping, Sequence
 from rclpy.node import Node
 
 from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.last_voltages import LastVoltages
-from slpi_ros.compensator.memory_trust import KNOWN, RESTORED
-from slpi_ros.compensator.persistence import SavedAxis, SavedMemory, last_voltages, load_memory, model_id, save_memory
+from slpi_ros.compensator.persistence import (
+    KNOWN,
+    RESTORED,
+    LastVoltages,
+    SavedAxis,
+    SavedMemory,
+    last_voltages,
+    load_memory,
+    model_id,
+    save_memory,
+)
 from slpi_ros.errors import SlpiError
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.stream import Limits
+from slpi_ros.model.streaming import Limits
 
 LOG_PERIOD = 60.0
 

@@ -13,7 +13,7 @@ from slpi_ros.model.document import load_model
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_memory import MemoryKeeper
-from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 from slpi_ros.nodes.jobs import Read, Reading
 
 

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from rclpy.node import Node
 
 from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.memory_trust import KNOWN
+from slpi_ros.compensator.persistence import KNOWN
+from slpi_ros.nodes.common import LateService
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_driver import Driver
-from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 from slpi_ros.nodes.compensator_silence import Silence
-from slpi_ros.nodes.late_service import LateService
 
 
 class MemoryReset:

@@ -5,7 +5,7 @@ from time import monotonic_ns
 
 from slpi_ros.compensator.controller import Compensation
 from slpi_ros.nodes.compensator_driver import Driver
-from slpi_ros.nodes.compensator_settings import CompensatorSettings
+from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 
 
 class Silence:

@@ -10,12 +10,11 @@ from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.rejection import EMPTY, INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
-from slpi_ros.compensator.timing import Timing
+from slpi_ros.compensator.statistics import Timing
 from slpi_ros.compensator.trajectory import Trajectory
-from slpi_ros.io.joint_state import SECOND_NS
-from slpi_ros.io.messages import TrajectoryArrays, decode_trajectory
-from slpi_ros.model.stream import LONGEST_STEP
+from slpi_ros.compensator.validation import EMPTY, INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
+from slpi_ros.io.messages import SECOND_NS, TrajectoryArrays, decode_trajectory
+from slpi_ros.model.streaming import LONGEST_STEP
 from slpi_ros.nodes.compensator_driver import Driver
 
 # How often a simulated clock is looked at, seconds.

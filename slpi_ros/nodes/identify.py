@@ -1,10 +1,13 @@
 """Node ``identify``: bags in, a latched model out."""
 
+import math
+import os
 import sys
+import tempfile
 import time
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rclpy.clock import Clock, ClockType
@@ -12,19 +15,247 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from slpi_ros.errors import SlpiError
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.identification.fit import KINDS
 from slpi_ros.io.bag_watch import PATIENCE, BagWatch
 from slpi_ros.model.document import parse_model
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.nodes.common import run
-from slpi_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Health
-from slpi_ros.nodes.fit_process import FitOutcome, FitProcess, FitRequest, StageIdentity
-from slpi_ros.nodes.identify_diagnosis import DiagnosisService, Identified
-from slpi_ros.nodes.identify_settings import DECLARATIONS, IdentifySettings
-from slpi_ros.nodes.parameters import Parameters
-from slpi_ros.nodes.qos import LATCHED
+from slpi_ros.nodes.common import ERROR, LATCHED, WARN, Diagnostics, Health, LateService, run
+from slpi_ros.nodes.jobs import (
+    DiagnosisOutcome,
+    DiagnosisProcess,
+    DiagnosisRequest,
+    FitOutcome,
+    FitProcess,
+    FitRequest,
+    StageIdentity,
+)
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, choice, number
+
+REPORT_PERIOD = (0.05, 3600.0)
+
+DECLARATIONS = (
+    Declaration(
+        "bags", [""],
+        "Bags to identify in one fit: rosbag2 folders, or lone mcap or db3 files. Setting a parameter later identifies "
+        "anew.",
+    ),
+    Declaration(
+        "watch_directory", "",
+        "Folder: every bag completed there is identified too, the newest one there at once, unless it is of another "
+        "stage than the published model; empty: none.",
+    ),
+    Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
+    Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}."),
+    Declaration("output", "", "File to write the model to as well; empty: none."),
+    Declaration(
+        "start", math.nan, "Fit from here on, seconds from the bag's first stamp; NaN or negative: from the first.",
+        number=True,
+    ),
+    Declaration(
+        "stop", math.nan, "Fit up to here, seconds from the bag's first stamp; NaN or negative: to the last.",
+        number=True,
+    ),
+    Declaration(
+        "diagnosis_directory", "",
+        "Folder that ~/diagnose writes into; empty: the folder NAME_diagnosis beside the output NAME.json, without an "
+        "output a temporary one, which the answer names.",
+    ),
+    Declaration(
+        "diagnostic_period", 1.0, "Seconds between two reports on /diagnostics.",
+        read_only=True, between=REPORT_PERIOD, number=True,
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class IdentifySettings:
+    """What the node is told by its parameters.
+
+    Parameters
+    ----------
+    request : FitRequest
+        What to identify; without bags, what to identify those of the watched folder like.
+    watch_directory : str
+        "": none.
+    diagnosis_directory : str
+        "": a temporary one.
+    diagnostic_period : float, seconds
+    """
+
+    request: FitRequest
+    watch_directory: str
+    diagnosis_directory: str
+    diagnostic_period: float
+
+    @classmethod
+    def of(cls, values: Values) -> "IdentifySettings":
+        """Make the settings of all parameters by name.
+
+        Raises
+        ------
+        UsageError
+            If a value makes no sense.
+        """
+        bags = tuple(bag for bag in values["bags"] if bag)
+        if not values["topic"]:
+            raise UsageError("parameter topic is empty; name the topic of the bag, as in stage_state")
+        kind = choice(values, "kind", KINDS)
+        start, stop = bound(values, "start"), bound(values, "stop")
+        if start is not None and stop is not None and not start < stop:
+            raise UsageError(f"parameter start is {start:g} s and stop {stop:g} s; start before you stop")
+        request = FitRequest(bags, values["topic"], kind, start, stop, values["output"])
+        folder = values["watch_directory"]
+        if folder:
+            BagWatch(folder)
+        diagnosis = values["diagnosis_directory"] or beside(request.output)
+        return cls(request, folder, diagnosis, number(values, "diagnostic_period", *REPORT_PERIOD))
+
+
+def beside(output: str) -> str:
+    """Return the folder beside the file of a model that its diagnosis goes to; "" for no file."""
+    return f"{os.path.splitext(output)[0]}_diagnosis" if output else ""
+
+
+def bound(values: Values, name: str) -> float | None:
+    """Return a time of the record, seconds; None where NaN or a negative number says that there is none."""
+    given = values[name]
+    if isinstance(given, float) and math.isnan(given):
+        return None
+    seconds = number(values, name, -math.inf, math.inf)
+    return seconds if seconds >= 0 else None
+
 
 POLL_PERIOD = 0.1
+NO_MODEL = "nothing to diagnose: no bag has been identified yet"
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A model and where it came from.
+
+    Parameters
+    ----------
+    bag, topic : str
+        The newest bag of the fit.
+    document : str
+    """
+
+    bag: str
+    topic: str
+    document: str
+
+
+class DiagnosisService:
+    """Says what the model in use gets wrong on the bag it was fitted to, and answers when that is known.
+
+    Writes files and publishes nothing: a diagnosis changes no model that is running.
+
+    Parameters
+    ----------
+    node : Node
+    identified : callable
+        Returns the model in use; None where there is none.
+    folder : callable
+        Returns the folder to write into; "": a temporary one.
+    report : callable
+        Is called when a diagnosis begins and when it ends.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        identified: Callable[[], Identified | None],
+        folder: Callable[[], str],
+        report: Callable[[], None],
+    ) -> None:
+        self._logger = node.get_logger()
+        self._identified, self._folder, self._report = identified, folder, report
+        self._job: DiagnosisProcess | None = None
+        self._last: DiagnosisRequest | None = None
+        self._outcome = DiagnosisOutcome()
+        self._temporary = ""
+        self._service = LateService(node, "~/diagnose", self._start)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._poll = node.create_timer(POLL_PERIOD, self._look, clock=steady, autostart=False)
+
+    @property
+    def error(self) -> str:
+        """Why the last diagnosis failed; "" where it did not."""
+        return self._outcome.error
+
+    @property
+    def doing(self) -> str:
+        """What is under way, in words; "" when nothing is."""
+        return f"diagnosing {self._job.request.bag} for {time.monotonic() - self._began:.0f} s" if self._job else ""
+
+    @property
+    def values(self) -> dict[str, object]:
+        """What ``/diagnostics`` shows."""
+        state = "diagnosing" if self._job else "failed" if self.error else "done" if self._last else "none"
+        return {
+            "diagnosis.state": state,
+            "diagnosis.bag": self._last.bag if self._last else "",
+            "diagnosis.folder": self._last.folder if self._last else "",
+            **{f"{axis}.verdict": verdict for axis, verdict in self._outcome.verdicts.items()},
+            **{f"{axis}.diagnosis": summary for axis, summary in self._outcome.summaries.items()},
+        }
+
+    def forget(self) -> None:
+        """Forget what was found: another model is in use."""
+        if not self._job:
+            self._last, self._outcome = None, DiagnosisOutcome()
+
+    def end(self) -> None:
+        """End the diagnosis under way."""
+        self._poll.cancel()
+        if self._job:
+            self._job.end()
+            self._job = None
+
+    def _start(self) -> str:
+        """Start a diagnosis, unless one is under way; return why that cannot be, or ""."""
+        if self._job:
+            return ""
+        identified = self._identified()
+        if not identified:
+            return NO_MODEL
+        try:
+            folder = os.path.abspath(self._folder() or self._temporary_folder())
+            request = DiagnosisRequest(identified.bag, identified.topic, identified.document, folder)
+            self._job, self._began = DiagnosisProcess(request), time.monotonic()
+        except OSError as error:
+            return f"no diagnosis can be started: {error}; free memory or disk, or set diagnosis_directory"
+        self._last, self._outcome = request, DiagnosisOutcome()
+        self._poll.reset()
+        self._report()
+        return ""
+
+    def _temporary_folder(self) -> str:
+        self._temporary = self._temporary or tempfile.mkdtemp(prefix="slpi_diagnosis_")
+        return self._temporary
+
+    def _look(self) -> None:
+        """Look whether the diagnosis is done."""
+        outcome = self._job.outcome() if self._job else None
+        if not self._job or not outcome:
+            return
+        folder, self._job, self._outcome = Path(self._job.request.folder), None, outcome
+        self._poll.cancel()
+        if outcome.error:
+            self._logger.error(outcome.error)
+            self._service.answer(False, outcome.error)
+        else:
+            said = "; ".join(
+                f"{axis}: {verdict.replace('_', ' ')}: {outcome.summaries[axis]}"
+                for axis, verdict in outcome.verdicts.items()
+            )
+            said += f" Page: {folder / 'report.html'}; extended model, not in use: {folder / 'extended_model.json'}"
+            self._logger.info(said)
+            self._service.answer(True, said)
+        self._report()
+
+
 WATCH_PERIOD = 0.5
 NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
 

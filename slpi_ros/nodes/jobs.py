@@ -1,17 +1,239 @@
 """The reading of one model document; a large one is checked in a process of its own."""
 
 import json
+import multiprocessing
 import os
+import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 from slpi_ros.compensator.persistence import model_id
-from slpi_ros.errors import ModelError, SlpiError
-from slpi_ros.model.document import model_from, parse_model
+from slpi_ros.diagnosis.diagnose import diagnose
+from slpi_ros.errors import ModelError, RecordError, SlpiError
+from slpi_ros.identification.fit import identify
+from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.record import Record
+from slpi_ros.model.document import format_model, model_from, parse_model, save_model
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.nodes.worker_process import WorkerProcess
+
+Request = TypeVar("Request")
+Outcome = TypeVar("Outcome")
+
+
+class WorkerProcess(Generic[Request, Outcome]):
+    """Work under way.
+
+    Parameters
+    ----------
+    work : callable
+        Makes the outcome of the request; a function of a module.
+    request : object
+    outcome : type
+        A dataclass of plain values. Made with `error` alone where the process ends without a result.
+    what : str
+        What is done, for that error.
+    """
+
+    def __init__(
+        self, work: Callable[[Request], Outcome], request: Request, outcome: Callable[..., Outcome], what: str
+    ) -> None:
+        self.request = request
+        self._make, self._what = outcome, what
+        # No fork: the threads of the middleware would not survive it.
+        context = multiprocessing.get_context("spawn")
+        self._receiver, sender = context.Pipe(duplex=False)
+        self._process = context.Process(target=_run, args=(sender, work, request), daemon=True)
+        # Ctrl-C reaches the whole group of processes; it is for this one to end the other.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        sender.close()
+
+    def outcome(self) -> Outcome | None:
+        """Return what came of it, or None while it is under way; never waits for it."""
+        if not self._receiver.poll():
+            return None
+        try:
+            outcome = self._make(**json.loads(self._receiver.recv_bytes()))
+        except EOFError:
+            self._process.join()
+            outcome = self._make(
+                error=f"{self._what} ended with exit code {self._process.exitcode} and no result; look for a lack of "
+                "memory, or try a shorter record"
+            )
+        self.end()
+        return outcome
+
+    def end(self) -> None:
+        """End it, done or not."""
+        self._process.kill()
+        self._process.join()
+        self._receiver.close()
+
+
+def _run(sender: Connection, work: Callable[[Any], Any], request: Any) -> None:
+    """Send the outcome of a request: what the process does."""
+    sender.send_bytes(json.dumps(asdict(work(request))).encode())
+
+
+@dataclass(frozen=True)
+class StageIdentity:
+    """What tells a stage from others.
+
+    Parameters
+    ----------
+    hardware_id : str
+        "": not known.
+    axes : tuple of str
+    """
+
+    hardware_id: str
+    axes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, model: StageModel, before: "StageIdentity | None") -> "StageIdentity":
+        """Return the stage of a model; its hardware id may be known from `before`, where the model does not say."""
+        return cls(model.hardware_id or (before.hardware_id if before else ""), tuple(model.axes))
+
+    def require(self, record: Record) -> None:
+        """Raise RecordError for a record of another stage."""
+        other, lacking = "", [axis for axis in self.axes if axis not in record.axes]
+        if lacking:
+            other = f"no axis '{lacking[0]}', only {', '.join(record.axes)}"
+        if record.hardware_id and self.hardware_id and record.hardware_id != self.hardware_id:
+            other = f"of stage '{record.hardware_id}'"
+        if other:
+            name = f" of stage '{self.hardware_id}'" if self.hardware_id else ""
+            raise RecordError(
+                f"{record.source}: {other}, and skipped: the published model{name} holds {', '.join(self.axes)}; give "
+                "each stage a node and a folder of its own, or name this bag in the parameter bags"
+            )
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """What to identify.
+
+    Parameters
+    ----------
+    bags : tuple of str
+        Paths; all in one fit.
+    topic : str
+    kind : str
+        Kind of hysteresis model.
+    start, stop : float or None, seconds
+        Part of the record to fit.
+    output : str
+        File that gets the model too; "": none.
+    stage : StageIdentity, optional
+        The only stage whose bags are wanted; by default any.
+    """
+
+    bags: tuple[str, ...]
+    topic: str
+    kind: str
+    start: float | None
+    stop: float | None
+    output: str
+    stage: StageIdentity | None = None
+
+    @property
+    def source(self) -> str:
+        """The bags, in words."""
+        return ", ".join(self.bags)
+
+
+@dataclass(frozen=True)
+class FitOutcome:
+    """What came of it: a model document, or an error, or both when only the file could not be written."""
+
+    document: str = ""
+    error: str = ""
+
+
+class FitProcess(WorkerProcess[FitRequest, FitOutcome]):
+    """An identification under way."""
+
+    def __init__(self, request: FitRequest) -> None:
+        super().__init__(fit, request, FitOutcome, f"{request.source}: the identification")
+
+
+def fit(request: FitRequest) -> FitOutcome:
+    """Read the bag, identify the model and write it to the file, if one is named."""
+    document = ""
+    try:
+        records = [read_bag(bag, request.topic) for bag in request.bags]
+        if request.stage:
+            for record in records:
+                request.stage.require(record)
+        model = identify(records, request.kind, start=request.start, stop=request.stop)
+        document = format_model(model)
+        if request.output:
+            save_model(model, request.output)
+    except SlpiError as error:
+        return FitOutcome(document, str(error))
+    return FitOutcome(document)
+
+
+@dataclass(frozen=True)
+class DiagnosisRequest:
+    """What to diagnose.
+
+    Parameters
+    ----------
+    bag, topic : str
+    document : str
+        The model's.
+    folder : str
+        Of the files to be written.
+    """
+
+    bag: str
+    topic: str
+    document: str
+    folder: str
+
+
+@dataclass(frozen=True)
+class DiagnosisOutcome:
+    """What came of it: of each axis the verdict and a summary, or an error."""
+
+    verdicts: dict[str, str] = field(default_factory=dict)
+    summaries: dict[str, str] = field(default_factory=dict)
+    error: str = ""
+
+
+class DiagnosisProcess(WorkerProcess[DiagnosisRequest, DiagnosisOutcome]):
+    """A diagnosis under way."""
+
+    def __init__(self, request: DiagnosisRequest) -> None:
+        super().__init__(judge, request, DiagnosisOutcome, f"{request.bag}: the diagnosis")
+
+
+def judge(request: DiagnosisRequest) -> DiagnosisOutcome:
+    """Read the bag, diagnose the model and write the files."""
+    # Plotting is slow to load, and a node that only identifies does without.
+    from slpi_ros.reports.diagnosis import make_room, write_files
+
+    folder = Path(request.folder)
+    try:
+        make_room(folder)
+        diagnosis = diagnose(read_bag(request.bag, request.topic), parse_model(request.document, "stage_model"))
+        write_files(folder, diagnosis)
+    except SlpiError as error:
+        return DiagnosisOutcome(error=str(error))
+    return DiagnosisOutcome(
+        {axis: found.verdict for axis, found in diagnosis.axes.items()},
+        {axis: found.summary for axis, found in diagnosis.axes.items()},
+    )
+
 
 # Characters. To check more of them, hostile ones, would keep commands waiting for more than some milliseconds, in
 # whatever thread it is done; documents of stages have some ten thousand, at the finest 300,000 for each axis.

@@ -11,10 +11,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from slpi_ros.errors import UsageError
-from slpi_ros.nodes.common import run
-from slpi_ros.nodes.qos import COMMANDS
-from slpi_ros.simulation.presets import p11_stage
-from slpi_ros.simulation.stage import Stage
+from slpi_ros.nodes.common import COMMANDS, run
+from slpi_ros.simulation.stage import Stage, p11_stage
 
 LOG_PERIOD = 5.0
 RATE_MAX = 10e3

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from slpi_ros.hysteresis.loops import Separation
+from slpi_ros.hysteresis.slpi_published import Separation
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.papers import compound, measured, slpi_exhibits
 from slpi_ros.papers import mpi_exhibits as mpi_paper

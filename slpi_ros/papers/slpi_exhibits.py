@@ -3,15 +3,24 @@
 from collections.abc import Mapping
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.slpi_published import SeparatedLoops
-from slpi_ros.identification.linear import PLAY_OPERATORS
+from slpi_ros.hysteresis.slpi_published import Loop, SeparatedLoops, Separation, SingleLoop
+from slpi_ros.identification.convex_fit import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import least_iterations
-from slpi_ros.papers import slpi_pictures as pictures
 from slpi_ros.papers.exhibit import Exhibit, Picture, Table
-from slpi_ros.papers.published import TABLE_2, TABLE_3, TABLE_4, TABLE_5, THRESHOLDS
-from slpi_ros.papers.slpi_compensation import compensation, other, straight_line, unseen
+from slpi_ros.papers.published import (
+    HIGHEST_MEAN,
+    OUTER_MAXIMUM,
+    OVERALL_MEAN,
+    SPREAD,
+    TABLE_2,
+    TABLE_3,
+    TABLE_4,
+    TABLE_5,
+    THRESHOLDS,
+)
 from slpi_ros.papers.slpi_study import (
     AT_REST,
     CLASSICAL,
@@ -19,17 +28,180 @@ from slpi_ros.papers.slpi_study import (
     DOUBLE_INNER_LOOP,
     DRAWN,
     FAMILY,
+    MODELS,
     OVERLAPPED,
+    STEP_S,
+    LoopErrors,
     Study,
+    UnseenPaths,
     gain,
     study,
     unseen_paths,
 )
-from slpi_ros.papers.slpi_tables import errors_table, turns_of, um
+from slpi_ros.reports.plots import COLOURS, DESIRED, MEASURED, label, panels
+
+
+def um(metres: float) -> str:
+    """Return a length in micrometres, three digits behind the point."""
+    return f"{metres * 1e6:.3f}"
+
+
+def turns_of(study: Study) -> str:
+    """Return the path in words."""
+    return " → ".join(f"{turn:.0f}" for turn in study.turns) + " V"
+
+
+def errors_table(errors: Mapping[str, LoopErrors], separation: Separation, what: str = "") -> Table:
+    """Return the errors of all models, loop by loop; the best one stands out."""
+    v = separation.voltage
+    levels = [f"{ROMAN[loop.level]} from {v[loop.vertex]:.0f} V" for loop in separation.loops]
+    rows = [
+        (name, um(e.overall), *(um(mean) for mean in e.means), um(e.maxima[0]), um(e.spread))
+        for name, e in errors.items()
+    ]
+    name = f"error {what} (µm)" if what else "error (µm)"
+    header = (name, "mean", *(f"mean, level {level}" for level in levels), "maximum, level 0", "spread")
+    return Table(header, tuple(rows), best=int(np.argmin([e.overall for e in errors.values()])))
+
 
 FloatArray = NDArray[np.float64]
 
-ROMAN = pictures.ROMAN
+COLOUR = dict(zip((CLASSICAL, AT_REST, CLOSING, FAMILY), COLOURS, strict=True))
+ROMAN = ("0", "I", "II", "III", "IV", "V")
+V, UM = "voltage (V)", "displacement (µm)"
+
+
+def path_and_curve(v: FloatArray, y: FloatArray) -> Figure:
+    """Draw a path over time, and displacement over voltage."""
+    figure, (left, right) = panels(1, 2, (11, 4.2))
+    left.plot(STEP_S * np.arange(v.size), v, ".-", color=DESIRED, markersize=3, linewidth=0.8)
+    label(left, "time (s)", V)
+    right.plot(v, y * 1e6, ".-", color=MEASURED, markersize=3, linewidth=0.8)
+    label(right, V, UM)
+    return figure
+
+
+def separated(separation: Separation) -> Figure:
+    """Draw every single loop: a triangle at its vertex, circles where inner loops were taken out."""
+    loops = separation.loops
+    figure, drawn = panels(1, len(loops), (11, 4.0), sharex=True, sharey=True)
+    v, y = separation.voltage, separation.displacement * 1e6
+    for panel, loop in zip(drawn, reversed(loops), strict=True):
+        panel.plot(v, y, color="#dfe5ea", linewidth=2.5)
+        panel.plot(v[loop.path], y[loop.path], ".-", color=DESIRED, markersize=3, linewidth=0.8)
+        panel.plot(v[loop.vertex], y[loop.vertex], "^", color=COLOURS[0], markersize=9, label="vertex")
+        if loop.sewn.size:
+            panel.plot(
+                v[loop.sewn], y[loop.sewn], "o", color=COLOURS[2], markersize=9, fillstyle="none", label="sewn here"
+            )
+        panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
+        panel.legend(frameon=False, loc="upper left")
+        label(panel, V, UM if panel is drawn[0] else "")
+    return figure
+
+
+def inclinations(separation: Separation) -> Figure:
+    """Draw all single loops from their vertices, one over the other."""
+    figure, (panel,) = panels(1, 1, (7, 4.2))
+    for colour, loop in zip(COLOURS, separation.loops, strict=False):
+        drive, y = _own(separation, loop)
+        panel.plot(drive, y * 1e6, ".-", color=colour, markersize=4, linewidth=0.9, label=f"level {ROMAN[loop.level]}")
+    label(panel, "from the vertex (V)", "from the vertex (µm)")
+    panel.legend(frameon=False)
+    return figure
+
+
+def single_inverses(study: Study) -> Figure:
+    """Draw the inverse of each single loop: voltage over displacement, from the vertex."""
+    loops = study.separation.loops
+    figure, drawn = panels(1, len(loops), (11, 4.0))
+    for number, (panel, loop) in enumerate(zip(drawn, reversed(loops), strict=True)):
+        drive, y = _own(study.separation, loop)
+        panel.plot(y * 1e6, drive, ".", color=MEASURED, markersize=5, label="measured")
+        for name, model in ((AT_REST, study.at_rest), (CLOSING, study.closing)):
+            single = model.loops[len(loops) - 1 - number]
+            panel.plot(y * 1e6, single.memory().inverse_array(y), color=COLOUR[name], linewidth=1.1, label=name)
+        panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
+        label(panel, "from the vertex (µm)", "from the vertex (V)" if panel is drawn[0] else "")
+    drawn[0].legend(frameon=False)
+    return figure
+
+
+def single_models(separation: Separation, models: Mapping[str, SeparatedLoops]) -> Figure:
+    """Draw each single loop in its own coordinates, with the PI models of it."""
+    loops = separation.loops
+    figure, drawn = panels(1, len(loops), (11, 4.0))
+    for number, (panel, loop) in enumerate(zip(drawn, reversed(loops), strict=True)):
+        drive, y = _own(separation, loop)
+        panel.plot(drive, y * 1e6, ".", color=MEASURED, markersize=5, label="measured")
+        for name, model in models.items():
+            single = model.loops[len(loops) - 1 - number]
+            panel.plot(drive, _moved(single, drive) * 1e6, color=COLOUR[name], linewidth=1.1, label=name)
+        panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
+        label(panel, "from the vertex (V)", "from the vertex (µm)" if panel is drawn[0] else "")
+    drawn[0].legend(frameon=False)
+    return figure
+
+
+def _own(separation: Separation, loop: Loop) -> tuple[FloatArray, FloatArray]:
+    path = loop.path
+    drive = loop.direction * (separation.voltage[path] - separation.voltage[loop.vertex])
+    return drive, loop.direction * (separation.displacement[path] - separation.displacement[loop.vertex])
+
+
+def _moved(single: SingleLoop, drive: FloatArray) -> FloatArray:
+    return single.memory().forward_array(drive)
+
+
+def over_data(separation: Separation, errors: Mapping[str, LoopErrors], names: tuple[str, ...]) -> Figure:
+    """Draw models over the measured curve, and their errors below."""
+    figure, drawn = panels(2, len(names), (11, 6.4), height_ratios=(3, 2), sharex=True, sharey="row")
+    v, y = separation.voltage, separation.displacement
+    for column, name in enumerate(names):
+        upper, lower = drawn[column], drawn[len(names) + column]
+        upper.plot(v, y * 1e6, ".", color=MEASURED, markersize=4, label="measured")
+        upper.plot(v, (y + errors[name].error) * 1e6, color=COLOUR[name], linewidth=1.0, label="model")
+        upper.set_title(name, fontsize=11)
+        label(upper, "", UM if not column else "")
+        lower.plot(v, errors[name].error * 1e6, ".-", color=COLOUR[name], markersize=3, linewidth=0.7)
+        label(lower, V, "error (µm)" if not column else "")
+    drawn[0].legend(frameon=False)
+    return figure
+
+
+def inverses(study: Study, names: tuple[str, ...]) -> Figure:
+    """Draw the rebuilt inverse: voltage over desired displacement; stars where loops are linked."""
+    figure, drawn = panels(1, len(names), (11, 4.0), sharex=True, sharey=True)
+    for panel, name in zip(drawn, names, strict=True):
+        desired, voltage = study.desired * 1e6, study.voltages[name]
+        panel.plot(desired, voltage, color=COLOUR[name], linewidth=1.0)
+        links = [loop.vertex for loop in study.separation.loops[1:]]
+        panel.plot(desired[links], voltage[links], "*", color=DESIRED, markersize=10)
+        panel.set_title(name, fontsize=11)
+        label(panel, "desired displacement (µm)", V if panel is drawn[0] else "")
+    return figure
+
+
+def draw_compensation(
+    study: Study, errors: Mapping[str, LoopErrors], desired: FloatArray, names: tuple[str, ...]
+) -> Figure:
+    """Draw achieved over desired displacement, and errors over the samples."""
+    figure, drawn = panels(2, len(names), (11, 6.4), height_ratios=(3, 2), sharey="row")
+    for column, name in enumerate(names):
+        upper, lower = drawn[column], drawn[len(names) + column]
+        upper.plot(desired * 1e6, (desired + errors[name].error) * 1e6, color=COLOUR[name], linewidth=1.0)
+        upper.set_title(name, fontsize=11)
+        label(upper, "desired (µm)", "achieved (µm)" if not column else "")
+        for loop in study.separation.loops:
+            lower.plot(loop.samples, errors[name].error[loop.samples] * 1e6, ".", markersize=4, label=ROMAN[loop.level])
+        label(lower, "sample", "error (µm)" if not column else "")
+    handles, levels = drawn[-1].get_legend_handles_labels()
+    figure.legend(
+        handles, levels, loc="outside lower center", title="level", ncols=len(handles), markerscale=3, frameon=False
+    )
+    return figure
+
+
 PRINTED = {2: TABLE_2, 1: TABLE_3, 0: TABLE_4}
 
 
@@ -61,7 +233,7 @@ def _nonlinear_curve(study: Study) -> Exhibit:
         "of two measurements. No numbers are printed.",
         ours=f"{turns_of(study)}; stroke {um(stroke)} µm, {um(remanence)} µm left at the end.",
         remark="The path is ours: the paper's is known as a picture only.",
-        pictures=(Picture(pictures.path_and_curve(study.separation.voltage, y), "Voltage over time; the curve."),),
+        pictures=(Picture(path_and_curve(study.separation.voltage, y), "Voltage over time; the curve."),),
     )
 
 
@@ -77,7 +249,7 @@ def _inclinations(study: Study) -> Exhibit:
         title="Fig. 7: inclination of the loops",
         paper="Three loops of different inclination at the same voltages; drawn, not measured.",
         ours=f"Slopes between the ends of the loops differ by {gain(max(slopes), min(slopes)):.1f} %.",
-        pictures=(Picture(pictures.inclinations(separation), "The loops, each from its vertex."),),
+        pictures=(Picture(inclinations(separation), "The loops, each from its vertex."),),
         remark="A translation-invariant model such as classical PI gives loops of one span one inclination.",
         tables=(Table(("level", "from … to (V)", "slope (µm/V)"), tuple(rows)),),
     )
@@ -97,7 +269,7 @@ def _separation(study: Study) -> Exhibit:
         ours=f"{len(separation.loops)} single loops; the table of all samples is in separation.csv.",
         remark="None: level and vertex are as the paper's rules give them.",
         tables=(Table(("level", "vertex (V)", "turns at (V)", "sewn at (V)", "samples"), tuple(rows)),),
-        pictures=(Picture(pictures.separated(separation), "Single loops, the highest level first."),),
+        pictures=(Picture(separated(separation), "Single loops, the highest level first."),),
     )
 
 
@@ -125,7 +297,7 @@ def _single_models(study: Study) -> Exhibit:
         remark="The weights are those of another stage. The inner loops are fitted closely; the outer one, which is "
         "not symmetric, is not.",
         tables=tuple(_weights(models, level, printed) for level, printed in PRINTED.items()),
-        pictures=(Picture(pictures.single_models(study.separation, models), "Single loops in their own coordinates."),),
+        pictures=(Picture(single_models(study.separation, models), "Single loops in their own coordinates."),),
     )
 
 
@@ -176,7 +348,7 @@ def _classical(study: Study) -> Exhibit:
             Table(("Table 5: r (V)", "ω, paper", "ω, ours (µm/V)"), tuple(rows)),
             errors_table(study.modelled, study.separation),
         ),
-        pictures=(Picture(pictures.over_data(study.separation, study.modelled, DRAWN), "Models over the data."),),
+        pictures=(Picture(over_data(study.separation, study.modelled, DRAWN), "Models over the data."),),
     )
 
 
@@ -188,7 +360,106 @@ def _inverse(study: Study) -> Exhibit:
         ours=f"Voltage from {low:.2f} to {high:.2f} V for the desired path of {study.desired.size} samples.",
         remark="Where loops are linked the voltage may jump: each loop keeps the place where it was measured.",
         pictures=(
-            Picture(pictures.single_inverses(study), "Fig. 12: inverses of the single loops."),
-            Picture(pictures.inverses(study, DRAWN), "Fig. 13: the rebuilt inverse, voltage over displacement."),
+            Picture(single_inverses(study), "Fig. 12: inverses of the single loops."),
+            Picture(inverses(study, DRAWN), "Fig. 13: the rebuilt inverse, voltage over displacement."),
         ),
+    )
+
+
+FIGURES = ("outer loop's maximum", "highest loop's mean", "spread between loops", "overall mean")
+PAPER = (OUTER_MAXIMUM, HIGHEST_MEAN, SPREAD, OVERALL_MEAN)
+
+
+def _percentages(errors: Mapping[str, LoopErrors]) -> Table:
+    rows = [("paper, SLPI", *(f"{value:.1f}" for value in PAPER))]
+    rows += [(f"ours, {name}", *(f"{fall:.1f}" for fall in _falls(errors, name))) for name in MODELS[1:]]
+    return Table(("less than classical PI by (%)", *FIGURES), tuple(rows))
+
+
+def _falls(errors: Mapping[str, LoopErrors], name: str) -> tuple[float, float, float, float]:
+    """Return by how much a model beats classical PI, in per cent, in the order of the paper's four figures."""
+    classical, other = errors[CLASSICAL], errors[name]
+    return (
+        gain(classical.maxima[0], other.maxima[0]),
+        gain(classical.means[-1], other.means[-1]),
+        gain(classical.spread, other.spread),
+        gain(classical.overall, other.overall),
+    )
+
+
+def _verdict(errors: Mapping[str, LoopErrors], name: str) -> str:
+    """Say how a model stands in each of the paper's four figures."""
+    parts = []
+    for what, paper, ours in zip(FIGURES, PAPER, _falls(errors, name), strict=True):
+        parts.append(f"{what} {-ours:+.1f} % ({'met' if ours >= paper else 'not met'})")
+    return ", ".join(parts)
+
+
+def compensation(study: Study) -> Exhibit:
+    """Show what each model makes of the path that turns where the record did."""
+    errors = study.compensated
+    return Exhibit(
+        title="Fig. 15 and the four percentages: compensation",
+        paper="Against classical PI: "
+        + ", ".join(f"{what} -{value} %" for what, value in zip(FIGURES, PAPER, strict=True))
+        + ".",
+        ours=f"Closing form: {_verdict(errors, CLOSING)}. At rest, as published: {_verdict(errors, AT_REST)}.",
+        remark="Desired: straight lines between the displacements measured at the turns, so that the loops are those "
+        "that were identified. The stage is a fresh one, errors are true ones, voltages stay within 0 to 100 V. The "
+        "spread grows where the inner loops gain more than the outer one, whose shape no PI model has.",
+        tables=(_percentages(errors), errors_table(errors, study.separation)),
+        pictures=(Picture(draw_compensation(study, errors, study.desired, DRAWN), "Achieved over desired; errors."),),
+    )
+
+
+def straight_line(study: Study) -> Exhibit:
+    """Show what each model makes of the paper's straight line."""
+    errors = study.straight
+    return Exhibit(
+        title="Fig. 15 with the paper's straight line",
+        paper="Expected is the straight line through zero and the maximum (4.1).",
+        ours=f"Closing form: {_verdict(errors, CLOSING)}. At rest, as published: {_verdict(errors, AT_REST)}.",
+        remark="This path turns at other displacements than the record did, by up to the hysteresis itself, so that no "
+        "published loop quite fits; and it ends below what the stage can reach at 0 V after the rise. The loop family "
+        "interpolates between vertices and loses little.",
+        tables=(_percentages(errors), errors_table(errors, study.separation)),
+    )
+
+
+def other(title: str, study: Study) -> Exhibit:
+    """Show the models of another path."""
+    errors = study.modelled
+    worst = {name: max(errors[name].means[1:]) for name in (CLASSICAL, CLOSING, FAMILY)}
+    return Exhibit(
+        title=title,
+        paper="SLPI describes the inner loops much better than classical PI; there was no error calculation.",
+        ours=f"{turns_of(study)}. Worst inner loop, mean error of the model: {um(worst[CLASSICAL])} µm (classical PI), "
+        f"{um(worst[CLOSING])} µm (SLPI closing), {um(worst[FAMILY])} µm (loop family).",
+        remark="As in the paper, and with numbers.",
+        tables=(
+            errors_table(errors, study.separation, "of the model"),
+            errors_table(study.compensated, study.separation, "compensated"),
+        ),
+        pictures=(
+            Picture(separated(study.separation), "The loops."),
+            Picture(over_data(study.separation, errors, DRAWN), "Models over data."),
+        ),
+    )
+
+
+def unseen(unseen: UnseenPaths) -> Exhibit:
+    """Show what the models make of paths that were not identified."""
+    rows = [
+        (name, *(um(mean) for mean in means), um(float(np.mean(means)))) for name, means in unseen.mean_errors.items()
+    ]
+    header = ("mean error (µm)", *(f"path {k + 1}" for k in range(len(unseen.turns))), "all")
+    paths = "; ".join(" → ".join(f"{turn:.0f}" for turn in turns) for turns in unseen.turns)
+    return Exhibit(
+        title="Paths whose loops were never identified",
+        paper="Not tried.",
+        ours=f"Models of the random path on {len(unseen.turns)} other paths (V): {paths}. "
+        f"{unseen.replaced} of their {unseen.loops} inner loops were never identified; the nearest stand in.",
+        remark="Published SLPI has nothing to say about loops it has not seen, and is no better than classical PI with "
+        "more operators there; the loop family interpolates.",
+        tables=(Table(header, tuple(rows), best=int(np.argmin([np.mean(e) for e in unseen.mean_errors.values()]))),),
     )

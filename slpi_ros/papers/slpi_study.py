@@ -7,16 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.loops import Loop, Separation, separate
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.hysteresis.slpi_published import KnownPath, SeparatedLoops, UnidentifiedLoopWarning
+from slpi_ros.hysteresis.slpi_published import (
+    KnownPath,
+    Loop,
+    SeparatedLoops,
+    Separation,
+    UnidentifiedLoopWarning,
+    separate,
+)
+from slpi_ros.identification.convex_fit import PLAY_OPERATORS
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.linear import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import default_thresholds, fit_plays, least_iterations
 from slpi_ros.io.record import Record
-from slpi_ros.papers.paths import ramps, straight_between_turns
-from slpi_ros.simulation.presets import flexure_stage
+from slpi_ros.papers.published import ramps, straight_between_turns
+from slpi_ros.simulation.stage import flexure_stage
 
 FloatArray = NDArray[np.float64]
 

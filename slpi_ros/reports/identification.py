@@ -9,16 +9,14 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import SlpiError
 from slpi_ros.identification.cross_validation import CLASSICAL, HeldOutTruth, Slice
-from slpi_ros.identification.findings import Finding, findings
-from slpi_ros.identification.record_quality import assess
+from slpi_ros.identification.record_quality import Finding, assess, findings
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import AxisModel, StageModel
 from slpi_ros.reports import views as charts
-from slpi_ros.reports.colours import AFTER, BEFORE
-from slpi_ros.reports.motion import Motion
+from slpi_ros.reports.chart import AFTER, BEFORE
 from slpi_ros.reports.page import Mood, Page
 from slpi_ros.reports.text import describe_axis
-from slpi_ros.reports.views import Curve
+from slpi_ros.reports.views import Curve, Motion
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 from urllib.parse import quote
 
-from slpi_ros.identification.findings import Finding
+from slpi_ros.identification.record_quality import Finding
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.reports.chart import Chart
 

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slpi_ros.reports.colours import COLOURS as COLOURS
-from slpi_ros.reports.colours import DESIRED as DESIRED
-from slpi_ros.reports.colours import MEASURED as MEASURED
+from slpi_ros.reports.chart import COLOURS as COLOURS
+from slpi_ros.reports.chart import DESIRED as DESIRED
+from slpi_ros.reports.chart import MEASURED as MEASURED
 
 FloatArray = NDArray[np.float64]
 

@@ -1,25 +1,108 @@
 """The charts of models over a record: loops, time, voltage and what the record visited."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import signal
 
-from slpi_ros.reports.chart import DISPLACEMENT, ERROR, SAMPLES, TIME, VOLTAGE, Chart, Panel, Quantity
-from slpi_ros.reports.colours import (
+from slpi_ros.identification import signal_statistics as readings
+from slpi_ros.identification.design_matrix import Walk
+from slpi_ros.identification.drive import hold_band, resting, smallest_turn, turning_points
+from slpi_ros.reports.chart import (
     COLOURS,
+    DESIRED,
+    DISPLACEMENT,
+    ERROR,
     ERROR_SCALE,
+    LINE_POINTS,
     MEASURED,
+    SAMPLES,
     SCALE,
+    TIME,
     UNFITTED_MEASURED,
     UNFITTED_MODEL,
     UNFITTED_SHADE,
+    VOLTAGE,
+    Chart,
+    Panel,
+    Quantity,
+    thin_cloud,
+    thin_line,
 )
-from slpi_ros.reports.motion import Motion
-from slpi_ros.reports.thinning import LINE_POINTS, thin_cloud, thin_line
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Samples to each side over which the speed is taken.
+_REACH = 3
+# A turn begins this near to its end (share of the range): what rests there has stopped before it turns.
+_ARRIVED = 1e-3
+_FEWEST_ARRIVALS = 5
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the drive does at each sample.
+
+    Parameters
+    ----------
+    speed : ndarray, shape (N,), volts per second
+        Negative where the voltage falls.
+    since_turn : ndarray, shape (N,), seconds
+        Since the voltage last turned or came to rest.
+    branch_from : ndarray, shape (N,), volts
+        Where the branch of the hysteresis began on which the sample lies.
+    runs : ndarray of int, shape (M + 1,)
+        Samples at which the voltage turns, with the first and the last one.
+    """
+
+    speed: FloatArray
+    since_turn: FloatArray
+    branch_from: FloatArray
+    runs: IntArray
+
+    @classmethod
+    def of(cls, t: FloatArray, v: FloatArray) -> "Motion":
+        """Look at a voltage, shape (N,), volts, finite, over time, shape (N,), seconds."""
+        if v.size < _FEWEST_ARRIVALS or not np.ptp(v) > 0.0:
+            return cls(np.zeros(v.size), t - t[:1], v.copy(), np.array([0, max(v.size - 1, 0)]))
+        noise = readings.noise(v, t)
+        runs = turning_points(v, smallest_turn(v, noise))
+        rests, _ = resting(t, v, hold_band(v, noise, readings.digit(v)))
+        stops = np.unique(np.concatenate([[0], runs, _arrivals(v, runs), rests]))
+        last = stops[np.searchsorted(stops, np.arange(v.size), side="right") - 1]
+        branch_from = Walk.along(_one_way(v, runs), symmetric_rest=False, primed=False).v_origin
+        return cls(_speed(t, v), t - t[last], branch_from, runs)
+
+
+def _arrivals(v: FloatArray, runs: IntArray) -> IntArray:
+    """Return the samples at which each run has come as far as it goes."""
+    near = _ARRIVED * float(np.ptp(v))
+    return np.array(
+        [start + int(np.argmax(np.abs(v[start : stop + 1] - v[stop]) <= near)) for start, stop in pairwise(runs)],
+        dtype=np.int64,
+    )
+
+
+def _one_way(v: FloatArray, runs: IntArray) -> FloatArray:
+    """Return the voltage without the noise of going back between two turns."""
+    clean = v.copy()
+    for start, stop in pairwise(runs):
+        further = np.maximum if v[stop] > v[start] else np.minimum
+        clean[start : stop + 1] = further.accumulate(clean[start : stop + 1])
+    return clean
+
+
+def _speed(t: FloatArray, v: FloatArray) -> FloatArray:
+    here = np.arange(v.size)
+    before, after = np.maximum(here - _REACH, 0), np.minimum(here + _REACH, v.size - 1)
+    step = t[after] - t[before]
+    return np.divide(v[after] - v[before], step, out=np.zeros(v.size), where=step > 0.0)
+
+
 Mask = NDArray[np.bool_]
 
 RISING, FALLING = COLOURS[3], COLOURS[0]
@@ -29,7 +112,7 @@ BEGAN, NOW = Quantity("branch began at", "V", digits=".2f"), Quantity("voltage",
 # In the legends.
 UNFITTED = "not fitted"
 # Points that show one way of a loop, cells on each side of the map, and classes of a histogram.
-_POINTS_OF_RUN, _CELLS, _CLASSES = 25, 40, 80
+_POINTS_OF_RUN, _CELLS, _HISTOGRAM_CLASSES = 25, 40, 80
 # A line is interrupted where it would go on after so many of its steps, or in another record.
 _PAUSE = 5.0
 # A chart shows this inner part (percent) of the errors first, and so much more (share of it) on both sides.
@@ -222,7 +305,11 @@ def histogram(chart: Chart, panel: int, curve: Curve) -> None:
         return
     low, high = float(x.min()), float(x.max())
     inner = float(np.subtract(*np.percentile(x, _INNER[::-1])))
-    classes = int(np.clip(np.ceil(_CLASSES * (high - low) / inner), 1, 10 * _CLASSES)) if inner > 0.0 else 1
+    classes = (
+        int(np.clip(np.ceil(_HISTOGRAM_CLASSES * (high - low) / inner), 1, 10 * _HISTOGRAM_CLASSES))
+        if inner > 0.0
+        else 1
+    )
     width = max((high - low) / classes, 1e-12)
     counts, edges = np.histogram(x, np.linspace(low - width, high + width, classes + 3))
     chart.steps(panel, curve.name, edges, counts.astype(np.float64), curve.colour)
@@ -261,3 +348,127 @@ def focus(chart: Chart, panels: Sequence[int], errors: Sequence[FloatArray], cho
         chart.show(panel, low, high)
     each = " of each" if len(errors) > 1 else ""
     return f"{beyond} samples{each} lie beyond what is shown first; double-click shows all."
+
+
+SPEED = Quantity("speed of the voltage", "V/s", digits=".4~g")
+SINCE = Quantity("time since the last turn or stop", "s", digits=".3~g", logarithmic=True)
+FREQUENCY = Quantity("frequency", "Hz", digits=".4~g", logarithmic=True)
+DENSITY = Quantity("spectral density", "nm/√Hz", 1e9, ".3~g", logarithmic=True)
+
+# Classes over which means are taken, and the fewest samples of one that tells something.
+_CLASSES, _FEWEST = 40, 5
+# Parts that windows of a spectrum are cut into, and the finest spectrum.
+_WINDOWS, _LONGEST_WINDOW = 8, 1 << 14
+_SPECTRUM_POINTS = 400
+
+
+def over_motion(v: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], motion: Motion) -> tuple[Chart, str]:
+    """Draw errors over voltage and over its speed: samples, and their means where the voltage rises and falls.
+
+    Parameters
+    ----------
+    v : ndarray, shape (N,), volts
+    curves : sequence of Curve
+        What is left.
+    parts : sequence of Curve
+        Of it; only their means are drawn.
+    motion : Motion
+
+    Returns
+    -------
+    Chart
+    str
+        How many samples lie beyond what is shown first, or "".
+    """
+    chart = Chart([Panel(VOLTAGE, ERROR), Panel(SPEED, ERROR)], height=430)
+    ways = [np.flatnonzero(motion.speed > 0.0), np.flatnonzero(motion.speed < 0.0)]
+    _add(chart, 0, v, curves, parts, lambda values: _joined([_means(v[way], values[way]) for way in ways]))
+    speed = motion.speed
+    _add(chart, 1, speed, curves, parts, lambda values: _means(speed, values, alike=True))
+    return chart, focus(chart, (0, 1), [curve.values for curve in curves])
+
+
+def over_rhythm(
+    t: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], motion: Motion, noise: float
+) -> tuple[Chart, str]:
+    """Draw errors over the time since the last turn, and their spectra; as `over_motion`, with `noise` (m rms)."""
+    chart = Chart([Panel(SINCE, ERROR), Panel(FREQUENCY, DENSITY)], height=430)
+    later = np.flatnonzero(motion.since_turn > 0.0)
+    since = motion.since_turn[later]
+    chosen = [Curve(curve.name, curve.values[later], curve.colour) for curve in (*curves, *parts)]
+    first, rest = chosen[: len(curves)], chosen[len(curves) :]
+    _add(chart, 0, since, first, rest, lambda values: _means(since, values, alike=True))
+    spectra = [_spectrum(t, curve.values) for curve in (*curves, *parts)]
+    for curve, spectrum in zip((*curves, *parts), spectra, strict=True):
+        chart.line(1, curve.name, *spectrum, curve.colour, width=1.2)
+    heights = np.concatenate([height for _, height in spectra[: len(curves)]])
+    if heights.size:
+        chart.show(1, float(heights.min()) / 3.0, float(heights.max()) * 3.0)
+    rate = _rate(t)
+    if noise > 0.0 and rate > 0.0:
+        ends = np.array([max(rate / t.size, 1e-9), rate / 2.0])
+        chart.line(1, "noise floor", ends, np.full(2, noise * np.sqrt(2.0 / rate)), DESIRED, width=1.0)
+    return chart, focus(chart, (0,), [curve.values for curve in curves])
+
+
+def _add(
+    chart: Chart,
+    panel: int,
+    x: FloatArray,
+    curves: Sequence[Curve],
+    parts: Sequence[Curve],
+    means: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+) -> None:
+    """Add dots for curves, and above them the means of curves and parts."""
+    for curve in curves:
+        kept = thin_cloud(x, curve.values)
+        chart.dots(panel, curve.name, x[kept], curve.values[kept], curve.colour, faint=True)
+    for curve in (*curves, *parts):
+        chart.line(panel, curve.name, *means(curve.values), curve.colour, width=2.2)
+
+
+def _means(x: FloatArray, values: FloatArray, *, alike: bool = False) -> tuple[FloatArray, FloatArray]:
+    """Return where classes along `x`, shape (N,), lie, and their means, shape (M,); `alike`: of one size."""
+    finite = np.isfinite(values)
+    x, values = x[finite], values[finite]
+    if x.size < _FEWEST:
+        return np.empty(0), np.empty(0)
+    edges = np.unique(np.quantile(x, np.linspace(0, 1, _CLASSES + 1))) if alike else np.linspace(x.min(), x.max(), 41)
+    which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(edges.size - 2, 0))
+    counts = np.bincount(which)
+    enough = counts >= _FEWEST
+    middle, mean = (np.bincount(which, weights=weights)[enough] / counts[enough] for weights in (x, values))
+    return middle, mean
+
+
+def _joined(lines: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """Return lines as one, interrupted between them."""
+    gap = np.array([np.nan])
+    x, y = zip(*lines, strict=True)
+    return np.concatenate([part for one in x for part in (one, gap)]), np.concatenate(
+        [part for one in y for part in (one, gap)]
+    )
+
+
+def _rate(t: FloatArray) -> float:
+    """Return the samples per second in the middle of all; 0 where there is none."""
+    period = float(np.median(np.diff(t))) if t.size > 1 else 0.0
+    return 1.0 / period if period > 0.0 else 0.0
+
+
+def _spectrum(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies (Hz) and amplitude densities (m/√Hz), shape (M,), by Welch's method."""
+    rate, finite = _rate(t), np.isfinite(values)
+    if not rate or np.count_nonzero(finite) < 2 * _WINDOWS:
+        return np.empty(0), np.empty(0)
+    even = np.interp(np.arange(t[0], t[-1], 1.0 / rate), t[finite], values[finite])
+    window = int(np.clip(2 * even.size // _WINDOWS, 2 * _WINDOWS, min(even.size, _LONGEST_WINDOW)))
+    frequency, power = signal.welch(even, rate, nperseg=window)
+    frequency, power = frequency[1:], power[1:]
+    # Evenly spread over the logarithm: a mean over many high frequencies, each low one by itself.
+    edges = np.unique(np.geomspace(1, frequency.size, _SPECTRUM_POINTS).astype(np.int64)) - 1
+    counts = np.diff(np.append(edges, frequency.size))
+    return (
+        np.add.reduceat(frequency, edges) / counts,
+        np.sqrt(np.maximum(np.add.reduceat(power, edges) / counts, 1e-40)),
+    )

@@ -6,14 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.simulation.amplifier import Amplifier
 from slpi_ros.simulation.bouc_wen import BoucWen
-from slpi_ros.simulation.mechanics import FlexureMode
+from slpi_ros.simulation.dynamics import Amplifier, FlexureMode, Relaxation, Viscosity
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage
-from slpi_ros.simulation.relaxation import Relaxation
-from slpi_ros.simulation.surroundings import Hum, Interferometer, Temperature
-from slpi_ros.simulation.viscosity import Viscosity
+from slpi_ros.simulation.sensor import Hum, Interferometer, Temperature
 
 FloatArray = NDArray[np.float64]
 

@@ -1,19 +1,277 @@
 """One axis of a simulated piezo stage: amplifier, Preisach relays, a reversible curve, creep, a flexure, a sensor."""
 
+from collections.abc import Callable
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.density import material
 from slpi_ros.simulation.dynamics import Dynamics
-from slpi_ros.simulation.figures import measure_loop
 from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.relays import RelayTriangle
+from slpi_ros.simulation.paths import measure_loop
 from slpi_ros.simulation.sensor import Sensor
 
-__all__ = ["PreisachStage", "StageParameters"]
-
 FloatArray = NDArray[np.float64]
+
+
+class Material(Protocol):
+    """What a stage needs to know of its piezo."""
+
+    def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
+        """Return weights of relays by bias and width (V), any unit, for RelayTriangle."""
+
+    def reversible(self, voltage: float) -> float:
+        """Return the part of the displacement without memory, any unit, at a voltage (V)."""
+
+
+class ExponentialMaterial:
+    """Relays whose number falls exponentially with their width and changes with bias; a cubic reversible curve.
+
+    Parameters
+    ----------
+    parameters : StageParameters
+        Of which the threshold range, `width_scale` and `width_growth`, `bias_slope`, `bias_bow` and `curvature` are
+        used.
+    """
+
+    def __init__(self, parameters: StageParameters) -> None:
+        self._parameters = parameters
+        low, high = parameters.threshold_min, parameters.threshold_max
+        self._centre, self._half_range = (low + high) / 2, (high - low) / 2
+
+    def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
+        """Return weights of relays.
+
+        Parameters
+        ----------
+        bias, width : ndarray, one shape, volts
+            Mean of the two thresholds and their distance.
+
+        Returns
+        -------
+        ndarray, same shape
+            In arbitrary units.
+        """
+        # The fall with width changes with bias too: a mere product of the two would be too easy a stage.
+        b = (bias - self._centre) / self._half_range
+        scale = self._parameters.width_scale * (1 + self._parameters.width_growth * b)
+        density = np.exp(self._parameters.bias_slope * b + self._parameters.bias_bow * b**2 - width / scale)
+        return np.asarray(density, dtype=np.float64)
+
+    def reversible(self, voltage: float) -> float:
+        """Return the reversible part at a voltage (V), in arbitrary units."""
+        x = (voltage - self._centre) / self._half_range
+        return x + self._parameters.curvature * x**3
+
+
+class PowerLawMaterial:
+    """Relays without a scale of their own: loops of every amplitude look alike.
+
+    With thresholds counted from `origin`, the density of relays that switch up at ``a`` and down at ``b <= a`` is
+    ``mu(a, b) = a^(p-2) (b/a)^m``, ``p`` the `exponent` and ``m`` the `width_exponent`: a relay's width counts relative
+    to its voltage, and the wider ones are rarer. Below the origin the density is its mirror image, and no relay has
+    one threshold on either side: a preloaded stack comes back to where it started. The sum over a triangle of relays
+    is the Everett function
+
+    ``E(a, b) = a^p [(1 - r^p) / p - (1 - r^(m+1)) / (m+1)] / (m+1-p)``, ``r = b/a``,
+
+    homogeneous of degree ``p``. The rise from the origin is ``V^p``, nearly straight where ``p`` is nearly 1; the fall
+    has the slope ``r^(p-1) - r^m``, little after the turn and more and more later: for ``p = m = 1`` the parabola of
+    Rayleigh's law, whose opening here grows with the amplitude and not with its square.
+
+    Parameters
+    ----------
+    parameters : StageParameters
+        Of which the threshold range, `levels`, `exponent`, `origin` and `width_exponent` are used.
+
+    References
+    ----------
+    I. D. Mayergoyz, Mathematical Models of Hysteresis, Springer 1991, Sec. 1.2 (Everett function).
+    """
+
+    def __init__(self, parameters: StageParameters) -> None:
+        self._origin, self._exponent = parameters.origin, parameters.exponent
+        self._width_exponent = parameters.width_exponent
+        self._half_cell = (parameters.threshold_max - parameters.threshold_min) / parameters.levels / 2
+
+    def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
+        """Return weights of relays, integrated over the cells of the grid.
+
+        The middle of a cell does not stand for the cell close to the origin, where the loops of small amplitude live.
+
+        Parameters
+        ----------
+        bias, width : ndarray, one shape, volts
+            Mean of the two thresholds and their distance, in the middle of each cell.
+
+        Returns
+        -------
+        ndarray, same shape
+            In arbitrary units.
+        """
+        up, down = bias + width / 2, bias - width / 2
+        up_low, up_high = up - self._half_cell, up + self._half_cell
+        down_low, down_high = down - self._half_cell, down + self._half_cell
+        outer = self.everett(up_high, down_low) + self.everett(up_low, down_high)
+        return np.maximum(outer - self.everett(up_low, down_low) - self.everett(up_high, down_high), 0.0)
+
+    def everett(self, up: FloatArray, down: FloatArray) -> FloatArray:
+        """Return the sum of the relays that a fall from one voltage to another switches.
+
+        Parameters
+        ----------
+        up, down : ndarray, one shape, volts
+            Where the fall begins and ends; where it would rise, the sum is 0.
+
+        Returns
+        -------
+        ndarray, same shape
+            In arbitrary units.
+        """
+        a, b = up - self._origin, down - self._origin
+        return self._above_origin(a, b) + self._above_origin(-b, -a)
+
+    def reversible(self, voltage: float) -> float:
+        """Return the reversible part at a voltage (V), in arbitrary units."""
+        x = voltage - self._origin
+        return float(np.sign(x) * abs(x) ** self._exponent)
+
+    def _above_origin(self, up: FloatArray, down: FloatArray) -> FloatArray:
+        p, m = self._exponent, self._width_exponent
+        up = np.maximum(up, 0.0)
+        ratio = np.divide(np.clip(down, 0.0, up), up, out=np.ones_like(up), where=up > 0)
+        fall = (1 - ratio**p) / p - (1 - ratio ** (m + 1)) / (m + 1)
+        return np.asarray(up**p * fall / (m + 1 - p), dtype=np.float64)
+
+
+def material(parameters: StageParameters) -> Material:
+    """Return the material of a stage.
+
+    Parameters
+    ----------
+    parameters : StageParameters
+        With an `exponent` relays spread by a power law, without one exponentially.
+
+    Returns
+    -------
+    Material
+        Its density and its reversible curve.
+    """
+    return PowerLawMaterial(parameters) if parameters.exponent else ExponentialMaterial(parameters)
+
+
+Density = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+class RelayTriangle:
+    """Relays that switch up at one threshold and down at a lower one, summed with weights.
+
+    Row ``i`` and column ``j <= i`` of the state matrix hold a bundle of relays whose up-thresholds are spread
+    evenly from ``low + i h`` to ``low + (i + 1) h`` and whose down-thresholds lie ``(i - j) h`` below them;
+    the state is the share of the bundle that is up. Without the spread, the level spacing ``h`` would show as
+    steps of tens of nanometres.
+
+    Parameters
+    ----------
+    low, high : float, volts
+        Range of the thresholds, and of the voltages the relays accept.
+    levels : int
+        Number of rows and of columns.
+    density : callable
+        ``density(bias, width)`` in arbitrary units: the weight of relays whose thresholds have the mean
+        ``bias`` (V) and the distance ``width`` (V); called once with arrays of shape (levels, levels).
+
+    Attributes
+    ----------
+    output : float
+        Weighted sum of the states, in the unit of `density`.
+    voltage : float, volts
+        The voltage of the last step.
+
+    References
+    ----------
+    I. D. Mayergoyz, Mathematical Models of Hysteresis, Springer 1991, Eq. (1.1).
+    """
+
+    def __init__(self, low: float, high: float, levels: int, density: Density) -> None:
+        self._low, self._high = low, high
+        self._spacing = (high - low) / levels
+        threshold = low + self._spacing * (np.arange(levels) + 0.5)
+        up, down = threshold[:, None], threshold[None, :]
+        self._weight: FloatArray = np.tril(density((up + down) / 2, np.maximum(up - down, 0.0)))
+        self._state: FloatArray = np.zeros((levels, levels))
+        self._index = np.arange(levels, dtype=np.float64)
+        self.all_down()
+
+    def all_down(self) -> None:
+        """Switch every relay down, as the lowest voltage does."""
+        self._state[:] = 0.0
+        self._position = 0.0
+        self.output = 0.0
+        self.voltage = self._low
+
+    def scale(self, factor: float) -> None:
+        """Multiply every weight, and so the output, by `factor`."""
+        self._weight *= factor
+        self.output *= factor
+
+    @property
+    def state(self) -> FloatArray:
+        """Share of relays up in each bundle, shape (levels, levels), 0 where there is none; a copy."""
+        return np.tril(self._state)
+
+    def check(self, voltage: float) -> None:
+        """Refuse a voltage (V) that is not a number between the lowest and the highest threshold: UsageError."""
+        if not self._low <= voltage <= self._high:
+            raise UsageError(f"stage: {voltage} V is not within {self._low} to {self._high} V; clip it")
+
+    def step(self, voltage: float) -> float:
+        """Apply a voltage and switch the relays it passes.
+
+        Parameters
+        ----------
+        voltage : float, volts
+            Any value between the lowest and the highest threshold.
+
+        Returns
+        -------
+        float
+            The weighted sum of the states, in the unit of the density.
+
+        Raises
+        ------
+        UsageError
+            If the voltage is not a number between the lowest and the highest threshold.
+        """
+        self.check(voltage)
+        position = (voltage - self._low) / self._spacing
+        if position > self._position:
+            self._rise(position)
+        elif position < self._position:
+            self._fall(position)
+        self._position, self.voltage = position, voltage
+        return self.output
+
+    def _rise(self, position: float) -> None:
+        # Rows below the old voltage are already up, rows above the new one are not reached.
+        first, end = int(self._position), min(int(position) + 1, len(self._index))
+        share = np.minimum(position - self._index[first:end, None], 1.0)
+        block = (slice(first, end), slice(0, end))
+        self._switch(block, np.maximum(self._state[block], share))
+
+    def _fall(self, position: float) -> None:
+        first, end = int(position), min(int(self._position) + 1, len(self._index))
+        share = np.maximum(position - self._index[None, first:end], 0.0)
+        block = (slice(first, None), slice(first, end))
+        self._switch(block, np.minimum(self._state[block], share))
+
+    def _switch(self, block: tuple[slice, slice], after: FloatArray) -> None:
+        self.output += float(np.sum(self._weight[block] * (after - self._state[block])))
+        self._state[block] = after
+
+
+__all__ = ["PreisachStage", "StageParameters"]
 
 
 class PreisachStage:

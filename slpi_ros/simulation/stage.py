@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from slpi_ros.errors import UsageError
+from slpi_ros.simulation.dynamics import Creep
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage
 
@@ -91,3 +92,99 @@ class Stage:
     def measure(self, displacements: Sequence[float]) -> list[float]:
         """Read every sensor: displacements in, readings out, both in metres and in the order of `axes`."""
         return [axis.measure(y) for axis, y in zip(self.axes.values(), displacements, strict=True)]
+
+
+_P11_PEAK = 89.189e-6
+_P11_HALF_PERIOD = 0.5
+
+
+def flexure_stage(seed: int = 0) -> PreisachStage:
+    """Return a stage like that of the SLPI paper: 0 to 100 V, quasi-static, loops that differ with bias.
+
+    - 0 to 100 V: the range of its voltage controller (2.2).
+    - Stroke 24 µm: chosen. The text states none; the operators of its Table 4 add up to 6.5 in a unit it leaves open.
+    - Hysteresis 14 % of the stroke: chosen, usual for soft piezo ceramics at full range. Table 4 gives 18 %.
+    - Thresholds from -30 V: chosen for a remanence near 8 % of the stroke; Table 4 leaves 0.545 of 6.52, 8.4 %.
+    - Density growing with bias (slope 0.8), wider relays at higher bias, flexure stiffening by 1 %: chosen, so that
+      inner loops of one width have another inclination at another bias and history (Fig. 7).
+    - No dynamics: a sample every 0.8 s, creep and temperature "can be ignored" (2.2).
+    - Noise 5 nm rms, digits of 1 nm: chosen; the resolution of a laser interferometer such as the paper's is 1 nm,
+      and the mean of two passes (2.2) leaves little noise.
+
+    Parameters
+    ----------
+    seed : int
+        Of the sensor noise; the stage is always the same.
+
+    Returns
+    -------
+    PreisachStage
+        At rest at 0 V.
+    """
+    parameters = StageParameters(
+        stroke=24e-6,
+        hysteresis=0.14,
+        nominal_voltage=100.0,
+        threshold_min=-30.0,
+        threshold_max=120.0,
+        levels=300,
+        bias_slope=0.8,
+        stiffening=0.01,
+        noise_rms=5e-9,
+        quantisation=1e-9,
+    )
+    return PreisachStage(parameters, seed)
+
+
+def p11_stage(seed: int = 0) -> Stage:
+    """Return a stage like the P11.XY100 of the MPI paper: two axes, 0 to 120 V nominal, creeping and ringing.
+
+    - -20 to 150 V: stated (2.1).
+    - Peak of 89.189 µm for a triangle of 120 V at 1 Hz: Table 1, where ``a`` is the peak at 1 Hz. The relays' part of
+      it is what creep, reckoned for a ramp of half a second, leaves.
+    - Exponent 1.15 and stiffening 0.03: the other five ``a`` of Table 1, met within 2 %. A larger exponent would meet
+      them better and make the rise, "highly linear" (2.3), less so.
+    - Relays of the power-law material: "the change in voltage amplitude basically does not affect the shape of the
+      hysteresis curve" (5); a nearly straight rise and a bulging fall (2.3, Fig. 2 and 3).
+    - Hysteresis of the relays 11 %, a loop of 13 % with creep at 0.1 Hz: chosen, usual for piezo stacks.
+    - Creep of 4.2 % in a decade between 1 ms and 100 s: makes the peaks fall as ``f^b`` with ``b = -0.015``, the mean
+      of Table 1, over its 0.1 to 20 Hz; the time constants reach beyond these on both sides.
+    - Flexure mode at 350 Hz, damping 0.05: chosen; triangles oscillate visibly at 10 and 20 Hz only (2.4, Fig. 4f and
+      g). At 20 Hz and 120 V it does so by 2.2 µm, where Table 2 leaves 1.4 µm to all that its model misses.
+    - Amplifier lag 0.2 ms: chosen; "the greater the frequency, the more obvious the hysteresis" (2.3), and yet its
+      influence "is not visible" (2.4): from 0.1 to 10 Hz the loop widens by 1 % of the stroke.
+    - Noise 10 nm rms: chosen, usual for strain gauges. Digits of 3 nm: 16 bits over -10 to 10 V (2.1), where 10 V stand
+      for 100 µm (chosen).
+    - The y axis differs by a few per cent: chosen; the paper says only that the axes are independent (2.2).
+
+    Parameters
+    ----------
+    seed : int
+        Of the sensor noise, another for each axis; the stage is always the same.
+
+    Returns
+    -------
+    Stage
+        Axes ``x`` and ``y``, at rest at 0 V.
+    """
+    x = StageParameters(
+        hysteresis=0.11,
+        nominal_voltage=120.0,
+        threshold_min=-20.0,
+        threshold_max=150.0,
+        levels=340,
+        exponent=1.15,
+        stiffening=0.03,
+        creep_gain=0.042,
+        creep_shortest=1e-3,
+        creep_longest=100.0,
+        resonance_frequency=350.0,
+        resonance_damping=0.05,
+        amplifier_lag=0.2e-3,
+        noise_rms=10e-9,
+        quantisation=3e-9,
+    )
+    creep = Creep(x.creep_gain, x.creep_shortest, x.creep_longest)
+    x = replace(x, stroke=_P11_PEAK / creep.after_ramp(_P11_HALF_PERIOD))
+    y = replace(x, stroke=0.97 * x.stroke, hysteresis=0.115, exponent=1.14, creep_gain=0.040, resonance_frequency=330.0)
+    return Stage({"x": PreisachStage(x, seed), "y": PreisachStage(y, seed + 1000)})

@@ -10,7 +10,7 @@ from strategies import FAMILY_CASE, fractions
 
 from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.errors import UsageError
-from slpi_ros.model.stream import AxisStream, Limits
+from slpi_ros.model.streaming import AxisStream, Limits
 
 INF = float("inf")
 NAN = float("nan")

@@ -8,13 +8,10 @@ import pytest
 from strategies import FAMILY_CASE, axis_model
 
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.feedback import PidGains
-from slpi_ros.compensator.following import Following
-from slpi_ros.compensator.loop import LoopSettings
-from slpi_ros.compensator.plan import prepare
-from slpi_ros.compensator.trajectory import Trajectory
+from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.compensator.trajectory import Following, Trajectory, prepare
 from slpi_ros.errors import SlpiError
-from slpi_ros.model.stream import Limits
+from slpi_ros.model.streaming import Limits
 
 MS = 1_000_000
 START = 10**18
@@ -151,7 +148,7 @@ def test_nor_one_that_reckoned_with_a_path_that_became_another(what, accepted):
 def test_what_comes_after_a_path_that_was_kept_to_is_given_as_planned(limits):
     made = axes(**limits)
     following, plans = Following(made), []
-    with mock.patch("slpi_ros.compensator.following.prepare", lambda *a: plans.append(prepare(*a)) or plans[-1]):
+    with mock.patch("slpi_ros.compensator.trajectory.prepare", lambda *a: plans.append(prepare(*a)) or plans[-1]):
         following.start(trajectory("xy"), lambda: START, START - 1000 * MS)
         follow(following, made, START + 50 * MS)
         following.start(trajectory("x", PATH[::-1], START + 150 * MS), lambda: START + 50 * MS, START)

@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model, cases, fractions, paths, stream_forward
 
 from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.memory_trust import ASSUMED, KNOWN, RESETTING, MemoryTrust
-from slpi_ros.compensator.ramp import Ramp
-from slpi_ros.compensator.reset import decaying_turns
+from slpi_ros.compensator.persistence import ASSUMED, KNOWN, RESETTING, MemoryTrust
+from slpi_ros.compensator.ramps import Ramp, decaying_turns
 from slpi_ros.errors import UsageError
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.stream import Limits, Pace
+from slpi_ros.model.streaming import Limits, Pace
 
 LIMITS = Limits(0.0, 100.0)
 

@@ -9,10 +9,9 @@ from strategies import FAMILY_CASE, PI_CASE, axis_model
 
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.feedback import PidGains
-from slpi_ros.compensator.loop import LoopSettings
+from slpi_ros.compensator.driving import Driving
+from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.model_swap import take_over
-from slpi_ros.compensator.ramps import Driving
 from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
@@ -20,7 +19,7 @@ from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.stream import Limits
+from slpi_ros.model.streaming import Limits
 
 MS, START = 1_000_000, 10**18
 DT = 1e-3

@@ -10,19 +10,22 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from strategies import two_axes
 
-from slpi_ros.compensator.last_voltages import LastVoltages, read_last_voltages
-from slpi_ros.compensator.memory_trust import ASSUMED, RESTORED, MemoryTrust
 from slpi_ros.compensator.persistence import (
+    ASSUMED,
     CRASHED,
+    RESTORED,
+    LastVoltages,
+    MemoryTrust,
     SavedAxis,
     SavedMemory,
     last_voltages,
     load_memory,
     model_id,
+    read_last_voltages,
     save_memory,
 )
 from slpi_ros.errors import ModelError
-from slpi_ros.model.stream import Limits
+from slpi_ros.model.streaming import Limits
 
 MODEL = two_axes()
 SAVED = SavedMemory(

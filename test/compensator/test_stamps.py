@@ -4,9 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slpi_ros.compensator.rejection import DUPLICATE, TIME_BACKWARDS, RejectedError
-from slpi_ros.compensator.validation import Stamps
-from slpi_ros.io.joint_state import SECOND_NS
+from slpi_ros.compensator.validation import DUPLICATE, TIME_BACKWARDS, RejectedError, Stamps
+from slpi_ros.io.messages import SECOND_NS
 
 # Beyond what floats hold to the nanosecond.
 NOW = 1_700_000_000_123_456_789

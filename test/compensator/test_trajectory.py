@@ -11,14 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, PI_CASE, Case, axis_model, cases, fractions, paths
 
-from slpi_ros.compensator import deadlines, rejection
-from slpi_ros.compensator.deadlines import Streamer
-from slpi_ros.compensator.plan import Plan, Standing, prepare
-from slpi_ros.compensator.rejection import RejectedError
-from slpi_ros.compensator.trajectory import Trajectory
+from slpi_ros.compensator import trajectory as deadlines
+from slpi_ros.compensator import validation as rejection
+from slpi_ros.compensator.trajectory import Plan, Standing, Streamer, Trajectory, prepare
+from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
 from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.stream import LONGEST_STEP, AxisStream, Limits, accepted_range
+from slpi_ros.model.streaming import LONGEST_STEP, AxisStream, Limits, accepted_range
 
 MS = 1_000_000
 # A pause of 100 ms is the longest that counts in full.

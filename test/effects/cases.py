@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from slpi_ros.effects.base import Around, Effect
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
-from slpi_ros.effects.effect import Around, Effect
 from slpi_ros.effects.hum import Hum
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model
 
-from slpi_ros.effects.effect import Around
+from slpi_ros.effects.base import Around
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import in_order
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.stream import Limits
-from slpi_ros.simulation.viscosity import RateLaw, Viscosity
+from slpi_ros.model.streaming import Limits
+from slpi_ros.simulation.dynamics import RateLaw, Viscosity
 
 BARE = replace(axis_model(FAMILY_CASE), voltage_range=(-20.0, 120.0))
 SPAN, DT = 10e-6, 1e-3

@@ -17,7 +17,7 @@ from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.simulation import creep as physics
+from slpi_ros.simulation import dynamics as physics
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.paths import scan_path
 from slpi_ros.simulation.preisach import PreisachStage

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lsim
 
+from slpi_ros.effects.base import Around, Effect
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.delay import Delay
-from slpi_ros.effects.effect import Around, Effect
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS, from_document, in_order, to_document

@@ -10,8 +10,7 @@ from excitation.loops import fastest, holds, turning_points
 from slpi_ros.errors import UsageError
 from slpi_ros.excitation.drives import CALIBRATION, DRIVES, excite
 from slpi_ros.excitation.effects import EFFECTS, for_effect
-from slpi_ros.simulation.mechanics import FlexureMode
-from slpi_ros.simulation.relaxation import Relaxation
+from slpi_ros.simulation.dynamics import FlexureMode, Relaxation
 
 VOCABULARY = {
     "delay", "lag", "saturation", "rate_dependence", "creep", "resonance", "cross_coupling", "thermal_drift",

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slpi_ros.excitation.drives import DRIVES, excite
-from slpi_ros.excitation.playback import Playback
+from slpi_ros.excitation.drives import DRIVES, Playback, excite
 
 
 def drive_of(name="calibration", slew=(0.0, 400.0), start=(20.0, -10.0)):

@@ -11,7 +11,7 @@ from strategies import UNITS, Case, fractions, paths, stream_forward, stream_inv
 
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.mpi import MultiSlope, falling_envelope, thresholds_for
+from slpi_ros.hysteresis.multi_slope import MultiSlope, falling_envelope, thresholds_for
 
 FloatArray = NDArray[np.float64]
 

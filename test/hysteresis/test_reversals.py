@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slpi_ros.hysteresis.runs import count_before, monotone_runs
+from slpi_ros.hysteresis.reversals import count_before, monotone_runs
 
 STEPS = st.lists(st.sampled_from((-2.0, -1.0, 0.0, 0.0, 1.0, 3.0)), max_size=40)
 

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError, UsageError
-from slpi_ros.hysteresis.loops import separate
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, UnidentifiedLoopWarning
+from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, UnidentifiedLoopWarning, separate
 
 FloatArray = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slpi_ros.hysteresis.runs import without_small_reversals
+from slpi_ros.hysteresis.reversals import without_small_reversals
 from slpi_ros.identification.drive import Runs, covered, holds, turning_points
 
 T = np.arange(8000) * 1e-3

@@ -6,7 +6,7 @@ import scipy.sparse as sp
 from scipy.optimize import minimize, nnls
 
 from slpi_ros.errors import IdentificationError
-from slpi_ros.identification.qp import solve_free, solve_qp
+from slpi_ros.identification.least_squares import solve_free, solve_qp
 
 
 @pytest.mark.parametrize("seed", range(5))

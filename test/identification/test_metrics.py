@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slpi_ros.errors import UsageError
-from slpi_ros.identification.metrics import error_metrics
+from slpi_ros.identification.signal_statistics import error_metrics
 
 
 def test_figures_by_hand():

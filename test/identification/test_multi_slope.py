@@ -8,18 +8,17 @@ from identification.records import record_of
 
 from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.mpi import MultiSlope, thresholds_for
-from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
+from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope, thresholds_for
 from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.multi_slope import (
+from slpi_ros.identification.least_squares import solve_qp
+from slpi_ros.identification.published_kinds import (
     MultiSlopeBasis,
     PeakFrequency,
     cycle_peaks,
     fit_peak_frequency,
     peak_line,
 )
-from slpi_ros.identification.qp import solve_qp
 
 WEIGHTS = 1e-7 * np.array([5, 0, 1, 2, 0, 0, 1, 0.5, 0, 0, 0, 0.2, 0])
 MODEL = MultiSlope(-5.0, 120.0, thresholds_for(120.0), WEIGHTS)

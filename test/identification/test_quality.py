@@ -10,8 +10,7 @@ from identification.records import record_of, stage
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.identification.findings import Finding, findings, require_usable
-from slpi_ros.identification.record_quality import assess
+from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
 from slpi_ros.io.tables import import_table
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage

@@ -8,9 +8,8 @@ import pytest
 from identification.records import record_of, rms
 
 from slpi_ros.errors import IdentificationError, UsageError
-from slpi_ros.hysteresis.loops import separate
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
+from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, separate
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.published_kinds import default_thresholds, least_iterations
 from slpi_ros.model.document import format_model, parse_model

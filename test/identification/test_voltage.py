@@ -6,8 +6,8 @@ from identification.records import calibration, record_of, rms, stage
 
 import slpi_ros
 from slpi_ros.excitation.drives import DRIVES, calibration_drive, excite
-from slpi_ros.hysteresis.runs import monotone_runs
-from slpi_ros.identification.voltage import voltage_noise, without_noise
+from slpi_ros.hysteresis.reversals import monotone_runs
+from slpi_ros.identification.signal_statistics import voltage_noise, without_noise
 
 
 @pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])

@@ -12,8 +12,8 @@ from rclpy.serialization import serialize_message  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 
-from slpi_ros.io.joint_state_bytes import JointStates  # noqa: E402
-from slpi_ros.io.wire import before_numbers  # noqa: E402
+from slpi_ros.io.cdr import before_numbers  # noqa: E402
+from slpi_ros.io.messages import JointStates  # noqa: E402
 
 NUMBERS = st.lists(st.floats(allow_nan=False), max_size=4)
 TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)

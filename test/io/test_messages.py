@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from slpi_ros.errors import RecordError
-from slpi_ros.io.joint_state import JointStateBlock, encode_joint_states, joint_state_layout
-from slpi_ros.io.message_blocks import MessageBlock
-from slpi_ros.io.message_types import JOINT_STATE
+from slpi_ros.io.bag_storage import MessageBlock
+from slpi_ros.io.messages import JOINT_STATE, JointStateBlock, encode_joint_states, joint_state_layout
 from slpi_ros.io.signals import decode_signals
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -10,7 +10,7 @@ from strategies import FAMILY_CASE, Case, cases, fractions, paths
 from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.model.stream import TOLERATED_SHARE, AxisStream, Limits, Pace
+from slpi_ros.model.streaming import TOLERATED_SHARE, AxisStream, Limits, Pace
 
 RANGE = (2e-6, 14e-6)
 

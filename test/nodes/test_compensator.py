@@ -14,7 +14,7 @@ from nodes.compensator_client import PERIOD_NS, SECOND_NS, START_NS, compensator
 from nodes.ros_helpers import LATCHED, stage_model, voltage_path  # noqa: E402
 from std_msgs.msg import Float64, Float64MultiArray, String  # noqa: E402
 
-from slpi_ros.compensator.rejection import CAUSES  # noqa: E402
+from slpi_ros.compensator.validation import CAUSES  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
 from slpi_ros.model.stage_model import HeldAtLimitWarning  # noqa: E402
 
@@ -165,7 +165,7 @@ def test_unnamed_displacements_go_by_the_order_of_axes(xy_file, kind):
 LATCH = """
 import sys, time, rclpy
 from std_msgs.msg import String
-from slpi_ros.nodes.qos import LATCHED
+from slpi_ros.nodes.common import LATCHED
 rclpy.init()
 node = rclpy.create_node("model_source")
 publisher = node.create_publisher(String, "stage_model", LATCHED)

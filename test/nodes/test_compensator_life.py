@@ -18,8 +18,11 @@ from nodes.ros_helpers import LATCHED, NodeProcess, on_graph, stage_model, start
 from rcl_interfaces.srv import DescribeParameters, GetParameters  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from slpi_ros.hysteresis.mpi import MultiSlope, thresholds_for  # noqa: E402
-from slpi_ros.hysteresis.multi_slope import AmplitudeScaled  # noqa: E402
+from slpi_ros.hysteresis.multi_slope import (  # noqa: E402
+    AmplitudeScaled,  # noqa: E402
+    MultiSlope,
+    thresholds_for,
+)
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
 from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start  # noqa: E402
 

@@ -12,9 +12,8 @@ import yaml
 rclpy = pytest.importorskip("rclpy")
 
 from slpi_ros.errors import UsageError  # noqa: E402
-from slpi_ros.model.stream import Limits  # noqa: E402
-from slpi_ros.nodes.compensator_parameters import DECLARATIONS  # noqa: E402
-from slpi_ros.nodes.compensator_settings import CompensatorSettings  # noqa: E402
+from slpi_ros.model.streaming import Limits  # noqa: E402
+from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 COMPENSATORS = sorted(path for path in CONFIG.glob("*.yaml") if path.stem != "exciter")

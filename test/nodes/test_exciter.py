@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
 from slpi_ros.errors import UsageError  # noqa: E402
 from slpi_ros.excitation.drives import excite  # noqa: E402
-from slpi_ros.nodes.exciter_settings import DECLARATIONS, ExciterSettings  # noqa: E402
+from slpi_ros.nodes.exciter import DECLARATIONS, ExciterSettings  # noqa: E402
 
 RATE = 100.0
 LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0, "rate": RATE}

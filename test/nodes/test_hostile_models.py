@@ -15,10 +15,10 @@ rclpy = pytest.importorskip("rclpy")
 from nodes.ros_helpers import stage_model  # noqa: E402
 
 from slpi_ros.compensator.controller import Compensation  # noqa: E402
-from slpi_ros.compensator.rejection import RejectedError  # noqa: E402
+from slpi_ros.compensator.validation import RejectedError  # noqa: E402
 from slpi_ros.errors import SlpiError  # noqa: E402
 from slpi_ros.model.document import format_model, parse_model  # noqa: E402
-from slpi_ros.model.stream import Limits  # noqa: E402
+from slpi_ros.model.streaming import Limits  # noqa: E402
 
 SLPI = json.loads(format_model(stage_model()))
 PI = copy.deepcopy(SLPI)

@@ -34,7 +34,7 @@ from slpi_ros.io.bag_reader import read_bag, write_bag  # noqa: E402
 from slpi_ros.io.record import Record  # noqa: E402
 from slpi_ros.io.schemas import validate  # noqa: E402
 from slpi_ros.model.document import load_model, parse_model  # noqa: E402
-from slpi_ros.nodes.fit_process import FitProcess, FitRequest  # noqa: E402
+from slpi_ros.nodes.jobs import FitProcess, FitRequest  # noqa: E402
 
 NAME = "/identify: identify"
 # Quick to fit, and needs no better.

@@ -6,12 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slpi_ros.compensator.feedback import PidGains
-from slpi_ros.papers import mpi_published as published
-from slpi_ros.papers.compound import present
-from slpi_ros.papers.compound_study import RATE, WARM_UP, Outcome, follow, path, run_study, tune
+from slpi_ros.papers import mpi_study as published
+from slpi_ros.papers.compound import RATE, WARM_UP, Outcome, follow, path, present, run_study, tune
 from slpi_ros.papers.mpi_study import FAMILY, SMPI
 from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.presets import p11_stage
+from slpi_ros.simulation.stage import p11_stage
 
 GAIN = 0.7e-6
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slpi_ros.papers import mpi_published as published
+from slpi_ros.papers import mpi_study as published
 from slpi_ros.papers.mpi_exhibits import present
 from slpi_ros.papers.mpi_study import (
     AMPLITUDES,
@@ -19,7 +19,7 @@ from slpi_ros.papers.mpi_study import (
     run_study,
     triangle_record,
 )
-from slpi_ros.simulation.presets import p11_stage
+from slpi_ros.simulation.stage import p11_stage
 
 SAMPLES = 200
 FREQUENCIES = (2, 20)

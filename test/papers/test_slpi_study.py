@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slpi_ros.hysteresis.loops import separate
+from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.papers import slpi_exhibits
-from slpi_ros.papers.paths import ramps, straight_between_turns, triangles, turning_points
-from slpi_ros.papers.published import OVERALL_MEAN
+from slpi_ros.papers.published import OVERALL_MEAN, ramps, straight_between_turns, triangles, turning_points
 from slpi_ros.papers.slpi_study import (
     AT_REST,
     CLASSICAL,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slpi_ros.reports.motion import Motion
+from slpi_ros.reports.views import Motion
 
 
 def triangle(noise=0.0):

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slpi_ros.reports.thinning import thin_cloud, thin_line
+from slpi_ros.reports.chart import thin_cloud, thin_line
 
 
 @given(st.integers(0, 4000), st.integers(20, 300), st.integers(1, 3), st.floats(0.0, 0.5), st.integers(0, 2**32 - 1))

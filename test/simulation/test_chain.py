@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from simulation.oracles import lagged, ringing
 
-from slpi_ros.simulation.amplifier import Amplifier
 from slpi_ros.simulation.bouc_wen import BoucWen
 from slpi_ros.simulation.chain import Flexure, Physics, SlowDomains, own_motion, sensed
+from slpi_ros.simulation.dynamics import Amplifier, RateLaw, Viscosity
 from slpi_ros.simulation.preisach import PreisachStage, StageParameters
-from slpi_ros.simulation.surroundings import Hum, Interferometer, Temperature
-from slpi_ros.simulation.viscosity import RateLaw, Viscosity
+from slpi_ros.simulation.sensor import Hum, Interferometer, Temperature
 
 STAGE = StageParameters(levels=140, stiffening=0.02, offset=1e-7)
 T = np.arange(1500) / 2000

@@ -3,7 +3,7 @@ import pytest
 from scipy.special import exp1
 from simulation.oracles import lagged
 
-from slpi_ros.simulation.creep import Creep
+from slpi_ros.simulation.dynamics import Creep
 
 GAIN, SHORTEST, LONGEST = 0.04, 1e-3, 100.0
 

@@ -6,10 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
-from slpi_ros.simulation.density import ExponentialMaterial, PowerLawMaterial, material
-from slpi_ros.simulation.figures import measure_loop
-from slpi_ros.simulation.preisach import PreisachStage, StageParameters
-from slpi_ros.simulation.relays import RelayTriangle
+from slpi_ros.simulation.paths import measure_loop
+from slpi_ros.simulation.preisach import (
+    ExponentialMaterial,
+    PowerLawMaterial,
+    PreisachStage,
+    RelayTriangle,
+    StageParameters,
+    material,
+)
 
 POWER_LAW = StageParameters(
     stroke=80e-6,

@@ -5,7 +5,7 @@ import pytest
 from simulation.oracles import lagged, ringing
 
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.creep import Creep
+from slpi_ros.simulation.dynamics import Creep
 from slpi_ros.simulation.preisach import PreisachStage, StageParameters
 
 STATIC = StageParameters(levels=140, noise_rms=0.0, quantisation=0.0, offset=1e-7, stiffening=0.02)

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulation.oracles import integrated, ringing
 
-from slpi_ros.simulation.mechanics import FlexureMode
+from slpi_ros.simulation.dynamics import FlexureMode
 
 FREQUENCY, DAMPING = 300.0, 0.04
 OMEGA = 2 * np.pi * FREQUENCY

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.figures import measure_loop
+from slpi_ros.simulation.paths import measure_loop
 from slpi_ros.simulation.preisach import PreisachStage, StageParameters
 from slpi_ros.simulation.sensor import Sensor
 

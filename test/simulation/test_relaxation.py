@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulation.oracles import integrated, lagged
 
-from slpi_ros.simulation.relaxation import Relaxation
+from slpi_ros.simulation.dynamics import Relaxation
 
 TIME_CONSTANTS = np.array([1e-3, 0.05, 7.0])
 values = st.floats(-100, 100)

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.relays import RelayTriangle
+from slpi_ros.simulation.preisach import RelayTriangle
 
 LOW, HIGH, LEVELS = -20.0, 120.0, 40
 voltages = st.floats(LOW, HIGH)

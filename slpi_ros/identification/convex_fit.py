@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
-from slpi_ros.identification.fitted import Fitted
 from slpi_ros.identification.initial_history import Beginning, choose_start, warn_of_beginning, warn_of_rest
-from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem
-from slpi_ros.identification.multi_slope import MultiSlopeBasis
+from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Fitted, Problem
 from slpi_ros.identification.progress import tell
+from slpi_ros.identification.published_kinds import MultiSlopeBasis
 from slpi_ros.identification.samples import Samples
 from slpi_ros.model.stage_model import Start
 

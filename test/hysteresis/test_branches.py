@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from strategies import cases_and_paths
 
-from slpi_ros.hysteresis.reversals import AT_REST, LONG_FALL, Piece, trace
+from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, Piece, trace
 
 FloatArray = NDArray[np.float64]
 

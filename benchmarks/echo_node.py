@@ -7,7 +7,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from slpi_ros.io.cdr import before_numbers
+from slpi_ros.io.cdr import multiarray_header
 from slpi_ros.io.messages import JointStates
 from slpi_ros.nodes.common import COMMANDS, run
 
@@ -34,7 +34,7 @@ class BytesEcho(Node):
     def __init__(self) -> None:
         super().__init__("bytes_echo")
         self._reader = JointStates()
-        self._before = before_numbers(2)
+        self._before = multiarray_header(2)
         self._publisher = self.create_publisher(Float64MultiArray, "voltage_command", COMMANDS)
         self.create_subscription(JointState, "desired_displacement", self._on_desired, COMMANDS, raw=True)
 

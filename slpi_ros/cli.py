@@ -18,7 +18,7 @@ import numpy as np
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, excite
-from slpi_ros.identification.cross_validation import held_out_truth
+from slpi_ros.identification.cross_validation import cross_validate
 from slpi_ros.identification.fit import KINDS, fit_of, identify
 from slpi_ros.identification.progress import shown_on
 from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
@@ -253,7 +253,7 @@ def _identify(options: argparse.Namespace) -> None:
         from slpi_ros.reports.identification import write_report
 
         truth = {
-            axis: held_out_truth(records, axis, options.kind, loops_at_rest=options.loops_at_rest, **part)
+            axis: cross_validate(records, axis, options.kind, loops_at_rest=options.loops_at_rest, **part)
             for axis in model.axes
         }
         write_report(Path(options.report), records[0], model, truth=truth, found=found[0], **part)

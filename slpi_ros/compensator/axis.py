@@ -5,12 +5,12 @@ from time import monotonic
 
 from slpi_ros.compensator.feedback import ClosedLoop, Drift, LoopSettings
 from slpi_ros.compensator.model_swap import go_on, including, take_over, turning_voltages, whole_way
-from slpi_ros.compensator.persistence import MemoryTrust
+from slpi_ros.compensator.persistence import MemoryConfidence
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.validation import Stamps, implausible
 from slpi_ros.errors import UsageError
 from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.streaming import AxisStream, Limits
+from slpi_ros.model.streaming import Limits, StreamingInverse
 
 
 class Axis:
@@ -42,7 +42,7 @@ class Axis:
         Whether the last sample waits at a voltage limit, or is still on its way.
     """
 
-    stream: AxisStream
+    stream: StreamingInverse
     _ramp: Ramp | Brake
 
     def __init__(
@@ -51,7 +51,7 @@ class Axis:
         self.name, self.place, self.limits = name, place, limits
         self.stamps = Stamps()
         self.model: AxisModel | None = None
-        self.trust = MemoryTrust()
+        self.trust = MemoryConfidence()
         self.held = self.slewing = False
         self._loop_settings = loop_settings
         self._loop: ClosedLoop | None = None
@@ -87,29 +87,29 @@ class Axis:
         return self._loop.residuals.drift() if self._loop else None
 
     @property
-    def went_through(self) -> tuple[float, ...]:
+    def reversal_voltages(self) -> tuple[float, ...]:
         """Voltages (V) at which the drive turned, oldest first, and last the present one."""
         return whole_way(self._loop.applied if self._loop else self.stream)
 
-    def prepare(self, model: AxisModel, went_through: Sequence[float] | None = None) -> AxisStream:
+    def prepare(self, model: AxisModel, reversal_voltages: Sequence[float] | None = None) -> StreamingInverse:
         """Return the stream of a new model, for `use`.
 
         Parameters
         ----------
         model : AxisModel
         went_through : sequence of float, volts
-            As `went_through` of this axis, which stands for None.
+            As `reversal_voltages` of this axis, which stands for None.
 
         Raises
         ------
         SlpiError
             If the model cannot serve.
         """
-        if went_through is None:
-            went_through = turning_voltages(self.stream.memory) if self.driven else ()
-        return take_over(model, self.limits, went_through)
+        if reversal_voltages is None:
+            reversal_voltages = turning_voltages(self.stream.memory) if self.driven else ()
+        return take_over(model, self.limits, reversal_voltages)
 
-    def use(self, model: AxisModel, stream: AxisStream) -> None:
+    def use(self, model: AxisModel, stream: StreamingInverse) -> None:
         """Go on with a new model; the voltage stays."""
         if self.driven:
             stream.resume(self.stream)
@@ -178,11 +178,11 @@ class Axis:
         Parameters
         ----------
         ahead : float, seconds
-            Not more than 0: no time has passed. A pause frees no longer way than `LONGEST_STEP`.
+            Not more than 0: no time has passed. A pause frees no longer way than `MAX_DT`.
         y : float, metres
         """
         stream = self.stream
-        dt = stream.pace.counted(ahead)
+        dt = stream.pace.clamp_dt(ahead)
         if ahead > dt:
             stream.wait(ahead - dt)
         v = stream.move(dt, y)
@@ -207,7 +207,7 @@ class Axis:
             For this sample and the one before. The voltage comes as near as slew and acceleration allow.
         """
         stream = self.stream
-        dt = stream.pace.counted(ahead)
+        dt = stream.pace.clamp_dt(ahead)
         if ahead > dt:
             stream.wait(ahead - dt)
         v = stream.pace.step(stream.voltage, planned, dt, planned_before)
@@ -285,7 +285,7 @@ class Axis:
 
     def _close_loop(self) -> None:
         stream = self.stream
-        self._loop = ClosedLoop(self._loop_settings, including(stream.limits, stream.voltage), stream.twin())
+        self._loop = ClosedLoop(self._loop_settings, including(stream.limits, stream.voltage), stream.copy())
 
     def _correct(self, ahead: float, dt: float, y: float, v: float) -> float:
         """Let measurements correct the voltage `v` (V)."""

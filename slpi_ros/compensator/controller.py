@@ -104,7 +104,7 @@ class Compensation:
         for axis in self.axes:
             one = model.axis(axis.name)
             try:
-                turns = saved[axis.name].went_through if saved else None
+                turns = saved[axis.name].reversal_voltages if saved else None
                 prepared.append((axis, one, axis.prepare(one, turns)))
             except SlpiError as error:
                 raise type(error)(f"axis '{axis.name}': {error}") from None

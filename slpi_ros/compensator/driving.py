@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.persistence import KNOWN, RESETTING, MemoryTrust
+from slpi_ros.compensator.persistence import KNOWN, RESETTING, MemoryConfidence
 from slpi_ros.compensator.ramps import Ramp, decaying_turns
 
 
@@ -42,7 +42,7 @@ class Driving:
         for axis, final in zip(self._axes, finals, strict=True):
             limits = axis.stream.limits
             axis.start_drive(Ramp(decaying_turns(limits, limits.clip(final), cycles), rate))
-            axis.trust = MemoryTrust(RESETTING)
+            axis.trust = MemoryConfidence(RESETTING)
         self._spans = [(axis.stream.voltage,) * 2 for axis in self._axes]
         self.on = self.resetting = True
 
@@ -91,7 +91,7 @@ class Driving:
             axis.stop_drive()
         if self.resetting:
             for axis, span in zip(self._axes, self._spans, strict=True):
-                axis.trust = MemoryTrust(doubt="the reset was interrupted")
+                axis.trust = MemoryConfidence(doubt="the reset was interrupted")
                 if axis.arrived and axis.model:
-                    axis.trust = MemoryTrust(KNOWN, spanned=span).over(axis.model.voltage_range)
+                    axis.trust = MemoryConfidence(KNOWN, spanned=span).over(axis.model.voltage_range)
         self.on = self.resetting = False

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from math import exp, expm1, inf, isfinite, sqrt
 
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.model.streaming import AxisStream, Limits, Pace
+from slpi_ros.model.streaming import Limits, RateLimiter, StreamingInverse
 
 
 @dataclass(frozen=True)
@@ -369,11 +369,11 @@ class ClosedLoop:
         Of the voltage in total.
     """
 
-    def __init__(self, settings: LoopSettings, limits: Limits, applied: AxisStream) -> None:
+    def __init__(self, settings: LoopSettings, limits: Limits, applied: StreamingInverse) -> None:
         self.applied = applied
-        self.residuals = ResidualWindow(applied.own)
+        self.residuals = ResidualWindow(applied.uncoupled_displacement)
         self._settings = settings
-        self.pace = Pace(limits)
+        self.pace = RateLimiter(limits)
         self.pace.go_on(applied.pace)
         self._t, self._wanted = 0.0, applied.voltage
         self._desired: float | None
@@ -395,17 +395,17 @@ class ClosedLoop:
         """Whether the last sample had a measurement to act on."""
         return self._acting
 
-    def swap(self, limits: Limits, applied: AxisStream) -> None:
+    def swap(self, limits: Limits, applied: StreamingInverse) -> None:
         """Go on with another model; the correction stays."""
         self.limit(limits)
         self.applied = applied
-        self.residuals.forget(applied.own)
+        self.residuals.forget(applied.uncoupled_displacement)
 
-    def settle(self, pace: Pace) -> None:
+    def settle(self, pace: RateLimiter) -> None:
         """Start anew where the axis is, going on at a pace, without a correction."""
         self.pace.go_on(pace)
         self._start()
-        self.residuals.forget(self.applied.own)
+        self.residuals.forget(self.applied.uncoupled_displacement)
 
     def retune(self, settings: LoopSettings) -> None:
         """Go on with other settings, without a jump."""

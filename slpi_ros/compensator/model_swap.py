@@ -8,10 +8,10 @@ from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.shape import FAR
 from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.streaming import TOLERATED_SHARE, AxisStream, Limits
+from slpi_ros.model.streaming import TOLERATED_SHARE, Limits, StreamingInverse
 
 
-def take_over(axis: AxisModel, limits: Limits, went_through: Sequence[float] = ()) -> AxisStream:
+def take_over(axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = ()) -> StreamingInverse:
     """Return a stream of a new model.
 
     Parameters
@@ -37,18 +37,18 @@ def take_over(axis: AxisModel, limits: Limits, went_through: Sequence[float] = (
     allowed = limits.within(axis.voltage_range)
     try_out(axis, allowed)
     memory = axis.memory()
-    if not went_through:
+    if not reversal_voltages:
         return axis.stream_from(memory, allowed)
-    present = went_through[-1]
+    present = reversal_voltages[-1]
     require_near(present, allowed)
-    replay(memory, went_through)
+    replay(memory, reversal_voltages)
     # No jump: a voltage just outside goes inside with the next samples, as fast as it may.
     stream = axis.stream_from(memory, including(allowed, present))
     stream.limits = allowed
     return stream
 
 
-def go_on(axis: AxisModel, allowed: Limits, before: AxisStream) -> tuple[Limits, AxisStream]:
+def go_on(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> tuple[Limits, StreamingInverse]:
     """Return a stream of a new model where another one has been, and `allowed`, wide enough for it."""
     memory = axis.memory()
     replay(memory, turning_voltages(before.memory))
@@ -65,7 +65,7 @@ def turning_voltages(memory: Memory) -> tuple[float, ...]:
     return (*(v for v in state.turn_voltages if abs(v) < FAR / 2), state.voltage)
 
 
-def whole_way(stream: AxisStream) -> tuple[float, ...]:
+def whole_way(stream: StreamingInverse) -> tuple[float, ...]:
     """Return the voltages (V) at which the drive turned, oldest first, and last the command that it lags behind."""
     turns = turning_voltages(stream.memory)
     return turns if turns[-1] == stream.voltage else (*turns, stream.voltage)
@@ -87,7 +87,7 @@ def try_out(axis: AxisModel, allowed: Limits) -> None:
     """
     low, high = axis.displacement_range
     margin = TOLERATED_SHARE * (high - low) * (1.0 - 1e-9)
-    stream = AxisStream(axis.memory(), axis.displacement_range, replace(allowed, slew=inf, acceleration=inf))
+    stream = StreamingInverse(axis.memory(), axis.displacement_range, replace(allowed, slew=inf, acceleration=inf))
     for v in (allowed.upper, allowed.lower):
         for y in (low - margin, high + margin) * 2:
             stream.memory.forward(v)

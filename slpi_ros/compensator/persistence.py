@@ -24,7 +24,7 @@ TOLERATED_SHARE = 0.01
 
 
 @dataclass(frozen=True)
-class MemoryTrust:
+class MemoryConfidence:
     """How far a memory is to be trusted.
 
     Parameters
@@ -41,7 +41,7 @@ class MemoryTrust:
     doubt: str = ""
     spanned: tuple[float, float] = (0.0, 0.0)
 
-    def over(self, identified: tuple[float, float]) -> "MemoryTrust":
+    def over(self, identified: tuple[float, float]) -> "MemoryConfidence":
         """Return what it is worth for a model identified on these voltages (V).
 
         Loops wider than the drive are not wiped by it: what the stage did there before still counts.
@@ -148,20 +148,20 @@ class SavedAxis:
         Why that may no longer be so; not saved.
     """
 
-    went_through: tuple[float, ...]
+    reversal_voltages: tuple[float, ...]
     certain: bool
     doubt: str = ""
 
-    def trust(self, identified: tuple[float, float]) -> MemoryTrust:
+    def trust(self, identified: tuple[float, float]) -> MemoryConfidence:
         """Return what the memory is worth to the model that it was saved with, identified on these voltages (V)."""
         if self.certain and not self.doubt:
-            return MemoryTrust(RESTORED, spanned=identified)
-        return MemoryTrust(doubt=self.doubt)
+            return MemoryConfidence(RESTORED, spanned=identified)
+        return MemoryConfidence(doubt=self.doubt)
 
     def after_crash(self, voltage: float) -> "SavedAxis":
         """Return what is known of the axis if it was given this voltage (V) last, after it was saved."""
-        moved = () if voltage == self.went_through[-1] else (voltage,)
-        return SavedAxis((*self.went_through, *moved), self.certain, CRASHED)
+        moved = () if voltage == self.reversal_voltages[-1] else (voltage,)
+        return SavedAxis((*self.reversal_voltages, *moved), self.certain, CRASHED)
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ class SavedMemory:
         for name, allowed in zip(names, limits, strict=True):
             if name not in self.axes:
                 raise ModelError(f"the saved memory has no axis '{name}'; it is left out")
-            voltage = self.axes[name].went_through[-1]
+            voltage = self.axes[name].reversal_voltages[-1]
             if not allowed.lower <= voltage <= allowed.upper:
                 raise ModelError(
                     f"the saved memory has {voltage:g} V for axis '{name}', outside {allowed.lower:g}.."
@@ -214,7 +214,7 @@ def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
         "model": memory.model,
         "complete": memory.complete,
         "axes": {
-            name: {"went_through_V": list(axis.went_through), "certain": axis.certain}
+            name: {"went_through_V": list(axis.reversal_voltages), "certain": axis.certain}
             for name, axis in memory.axes.items()
         },
     }
@@ -261,7 +261,7 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
         for name, axis in document["axes"].items()
     }
     if not document["complete"]:
-        saved = tuple(axis.went_through[-1] for axis in axes.values())
+        saved = tuple(axis.reversal_voltages[-1] for axis in axes.values())
         last = read_last_voltages(_beside(path), _mark(text), len(axes)) or saved
         axes = {name: axis.after_crash(v) for (name, axis), v in zip(axes.items(), last, strict=True)}
     return SavedMemory(document["model"], document["complete"], axes)

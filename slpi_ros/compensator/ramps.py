@@ -5,7 +5,7 @@ from dataclasses import replace
 from math import inf
 
 from slpi_ros.errors import UsageError
-from slpi_ros.model.streaming import Limits, Pace
+from slpi_ros.model.streaming import Limits, RateLimiter
 
 
 def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:
@@ -71,15 +71,15 @@ class Ramp:
         """Whether the last goal is reached."""
         return not self._goals
 
-    def step(self, present: float, dt: float, pace: Pace) -> float:
+    def step(self, present: float, dt: float, pace: RateLimiter) -> float:
         """Return the voltage (V) that follows `present` (V) after `dt` (s); a pause frees no longer way than usual."""
         if self.done:
             return present
-        limits, dt = pace.limits, pace.counted(dt)
+        limits, dt = pace.limits, pace.clamp_dt(dt)
         goal = limits.clip(self._goals[-1])
         # Where it is too fast at first, it has to brake.
         fastest = max(self._rate, abs(pace.rate) - limits.acceleration * dt) if dt else inf
-        own = Pace(replace(limits, slew=min(limits.slew, fastest)))
+        own = RateLimiter(replace(limits, slew=min(limits.slew, fastest)))
         own.go_on(pace)
         v = own.step(present, goal, dt)
         pace.go_on(own)
@@ -100,8 +100,8 @@ class Brake:
     def __init__(self) -> None:
         self.done = False
 
-    def step(self, present: float, dt: float, pace: Pace) -> float:
+    def step(self, present: float, dt: float, pace: RateLimiter) -> float:
         """Return the voltage (V) that follows `present` (V) after `dt` (s)."""
-        v = pace.step(present, present, pace.counted(dt))
+        v = pace.step(present, present, pace.clamp_dt(dt))
         self.done = not pace.in_motion
         return v

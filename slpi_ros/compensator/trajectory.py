@@ -22,12 +22,12 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.stage_model import AxisModel
 from slpi_ros.model.streaming import (
-    LONGEST_STEP,
+    MAX_DT,
     ROUNDING,
-    AxisStream,
     Limits,
-    Pace,
+    RateLimiter,
     StageStream,
+    StreamingInverse,
     accepted_range,
     refusal,
 )
@@ -293,7 +293,7 @@ def seconds_between(times_ns: TimeArray, since_ns: int) -> FloatArray:
     return elapsed
 
 
-def follow(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[FloatArray, Mask, FloatArray]:
+def follow(stream: StreamingInverse, y: FloatArray, elapsed: FloatArray) -> tuple[FloatArray, Mask, FloatArray]:
     """Move an axis through displacements, as `AxisStream.move` does one by one.
 
     In blocks where the path is slow enough, sample by sample where it is not.
@@ -303,7 +303,7 @@ def follow(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[Floa
     stream : AxisStream
     y : ndarray, shape (N,), metres
     elapsed : ndarray, shape (N,), seconds
-        Since the sample before. A pause longer than `LONGEST_STEP` counts as that, and the axis starts from rest.
+        Since the sample before. A pause longer than `MAX_DT` counts as that, and the axis starts from rest.
 
     Returns
     -------
@@ -334,7 +334,7 @@ def follow(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[Floa
     return v, late, reached
 
 
-def _until_too_fast(stream: AxisStream, y: FloatArray, elapsed: FloatArray, reached: FloatArray) -> FloatArray:
+def _until_too_fast(stream: StreamingInverse, y: FloatArray, elapsed: FloatArray, reached: FloatArray) -> FloatArray:
     """Move through `y` up to the first step that is too fast; return the voltages, and note what they reach."""
     memory, limits = stream.memory, stream.limits
     if stream.missed and limits.acceleration < inf:
@@ -353,13 +353,13 @@ def _until_too_fast(stream: AxisStream, y: FloatArray, elapsed: FloatArray, reac
     if free:
         last = float(v[free - 1])
         stream.drive(last)
-        stream.pace.moved(last - float(before[free - 1]), min(float(elapsed[free - 1]), LONGEST_STEP))
+        stream.pace.moved(last - float(before[free - 1]), min(float(elapsed[free - 1]), MAX_DT))
     return v[:free]
 
 
-def _too_fast(pace: Pace, v: FloatArray, before: FloatArray, elapsed: FloatArray) -> Mask:
+def _too_fast(pace: RateLimiter, v: FloatArray, before: FloatArray, elapsed: FloatArray) -> Mask:
     """Tell where a step is longer than what `Pace.reach` allows, all before it being taken."""
-    limits, dt = pace.limits, np.minimum(elapsed, LONGEST_STEP)
+    limits, dt = pace.limits, np.minimum(elapsed, MAX_DT)
     if limits.acceleration == inf:
         way = limits.slew * dt
         return np.asarray((v < before - way) | (v > before + way))
@@ -369,33 +369,35 @@ def _too_fast(pace: Pace, v: FloatArray, before: FloatArray, elapsed: FloatArray
     return np.asarray((v < before + down) | (v > before + up))
 
 
-def _rates_before(pace: Pace, steps: FloatArray, elapsed: FloatArray) -> FloatArray:
-    """Return the rate (V/s) before each step (V), as `Pace` remembers it."""
-    rates, dt = np.full(steps.size, pace.rate), np.minimum(elapsed[:-1], LONGEST_STEP)
+def _rates_before(pace: RateLimiter, steps: FloatArray, elapsed: FloatArray) -> FloatArray:
+    """Return the rate (V/s) before each step (V), as `RateLimiter` remembers it."""
+    rates, dt = np.full(steps.size, pace.rate), np.minimum(elapsed[:-1], MAX_DT)
     # Only the first step may take no time.
     np.divide(steps[:-1], dt, out=rates[1:], where=dt > 0.0)
-    rates[elapsed > LONGEST_STEP] = 0.0
+    rates[elapsed > MAX_DT] = 0.0
     return rates
 
 
-def _braking_way(pace: Pace, distance: FloatArray, dt: FloatArray) -> FloatArray:
-    """Return what `Pace` does: the longest steps (V) after which the voltage can still stop within a distance (V)."""
+def _braking_way(pace: RateLimiter, distance: FloatArray, dt: FloatArray) -> FloatArray:
+    """Return what `RateLimiter` does: the longest steps (V) that can still stop within a distance (V)."""
     acceleration, distance = pace.limits.acceleration, np.maximum(distance, 0.0)
     return np.minimum(acceleration * dt * (np.sqrt(dt * dt + 2.0 * distance / acceleration) - dt), distance)
 
 
-def _one_by_one(stream: AxisStream, y: FloatArray, elapsed: FloatArray) -> tuple[list[float], list[bool], list[float]]:
+def _one_by_one(
+    stream: StreamingInverse, y: FloatArray, elapsed: FloatArray
+) -> tuple[list[float], list[bool], list[float]]:
     """Move through `y`; return the voltages, where a displacement was missed, and those reached."""
     v, late, reached = [], [], []
     for wish, dt in zip(y.tolist(), elapsed.tolist(), strict=True):
-        v.append(stream.move(stream.pace.counted(dt), wish))
+        v.append(stream.move(stream.pace.clamp_dt(dt), wish))
         late.append(stream.missed)
         reached.append(stream.memory.displacement)
     return v, late, reached
 
 
 def follow_together(
-    streams: Mapping[str, AxisStream],
+    streams: Mapping[str, StreamingInverse],
     models: Mapping[str, AxisModel],
     paths: Mapping[str, FloatArray],
     elapsed: Mapping[str, FloatArray],
@@ -443,16 +445,16 @@ def follow_together(
     return answers
 
 
-def drive_through(stream: AxisStream, voltages: FloatArray, elapsed: FloatArray) -> None:
+def drive_through(stream: StreamingInverse, voltages: FloatArray, elapsed: FloatArray) -> None:
     """Move an axis through voltages, shape (N,), volts, each `elapsed` (s) after the one before."""
     for voltage, seconds in zip(voltages.tolist(), elapsed.tolist(), strict=True):
-        dt = min(seconds, LONGEST_STEP)
+        dt = min(seconds, MAX_DT)
         stream.wait(seconds - dt)
         stream.drive(voltage, dt)
 
 
-def _move(stream: AxisStream, elapsed: float, wish: float) -> float:
-    dt = stream.pace.counted(elapsed)
+def _move(stream: StreamingInverse, elapsed: float, wish: float) -> float:
+    dt = stream.pace.clamp_dt(elapsed)
     if elapsed > dt:
         stream.wait(elapsed - dt)
     return stream.move(dt, wish)
@@ -481,20 +483,20 @@ class Standing:
     """
 
     model: AxisModel
-    axis: AxisStream
+    axis: StreamingInverse
     since_ns: int
 
     def after(self, voltages: FloatArray, times_ns: TimeArray) -> "Standing":
         """Return where the axis stands once given voltages, shape (M,), volts, at times, shape (M,), M >= 1."""
         last, at_ns = float(voltages[-1]), int(times_ns[-1])
         before = float(voltages[-2]) if voltages.size > 1 else self.axis.voltage
-        axis, elapsed = self.axis.twin(), seconds_between(times_ns, self.since_ns)
+        axis, elapsed = self.axis.copy(), seconds_between(times_ns, self.since_ns)
         if axis.timeless:
             axis.memory.forward_array(voltages)
             axis.drive(last)
         else:
             drive_through(axis, voltages, elapsed)
-        axis.pace.moved(last - before, min(float(elapsed[-1]), LONGEST_STEP))
+        axis.pace.moved(last - before, min(float(elapsed[-1]), MAX_DT))
         return replace(self, axis=axis, since_ns=at_ns)
 
 
@@ -512,17 +514,17 @@ class Origin:
         What its memory will know by then, and last its voltage.
     """
 
-    axis: AxisStream
+    axis: StreamingInverse
     limits: Limits
-    went_through: tuple[float, ...]
+    reversal_voltages: tuple[float, ...]
 
-    def is_of(self, axis: AxisStream) -> bool:
+    def is_of(self, axis: StreamingInverse) -> bool:
         """Whether neither model nor limits have changed since."""
         return axis is self.axis and axis.limits == self.limits
 
-    def is_here(self, axis: AxisStream) -> bool:
+    def is_here(self, axis: StreamingInverse) -> bool:
         """Whether the axis stands as expected, but for rounding."""
-        here, there = whole_way(axis), self.went_through
+        here, there = whole_way(axis), self.reversal_voltages
         scale = ROUNDING * (1.0 + max(map(abs, there)))
         return len(here) == len(there) and all(abs(a - b) <= scale for a, b in zip(here, there, strict=True))
 
@@ -634,15 +636,15 @@ def _with_effects(
     if not _move_along(paths, standing):
         return {}
     return follow_together(
-        {name: here.axis.twin() for name, here in standing.items()},
+        {name: here.axis.copy() for name, here in standing.items()},
         {name: here.model for name, here in standing.items()},
         paths,
         {name: seconds_between(deadlines, standing[name].since_ns) for name in paths},
     )
 
 
-def _from_memory(model: AxisModel, axis: AxisStream, y: FloatArray, elapsed: FloatArray) -> AxisPlan:
-    v, late, reached = follow(axis.twin(), y, elapsed)
+def _from_memory(model: AxisModel, axis: StreamingInverse, y: FloatArray, elapsed: FloatArray) -> AxisPlan:
+    v, late, reached = follow(axis.copy(), y, elapsed)
     missing, (low, high) = y - reached, model.displacement_range
     # At a limit a wish may just be met, or lie on this side of it.
     rounding = ROUNDING * (high - low)

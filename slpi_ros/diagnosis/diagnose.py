@@ -17,7 +17,7 @@ from slpi_ros.diagnosis.structure import BIAS
 from slpi_ros.diagnosis.verdict import AxisDiagnosis, Diagnosis
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
-from slpi_ros.identification.progress import tell
+from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.signal_statistics import Floor, floor_of
 from slpi_ros.io.record import Record
@@ -88,7 +88,7 @@ def diagnose(
 def _diagnose_axis(
     record: Record, axis: str, model: AxisModel, start: float | None, stop: float | None
 ) -> tuple[AxisDiagnosis, AxisModel]:
-    tell(f"axis {axis}: fitting the hysteresis")
+    report_progress(f"axis {axis}: fitting the hysteresis")
     evidence = evidence_of(record, axis, model, start, stop)
     base = Explanation(evidence, model.effects)
     given, gain = _error_of(model, evidence, evidence.v, evidence.y)

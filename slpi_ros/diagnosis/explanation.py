@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from slpi_ros.diagnosis.evidence import Evidence
 from slpi_ros.diagnosis.joint import Joint, Score
 from slpi_ros.diagnosis.parameters import bounded, free, moved, names, steps
-from slpi_ros.effects.base import Around, Effect
+from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.chain import reaching
 from slpi_ros.effects.creep import Creep, settling
 from slpi_ros.effects.registry import in_order
@@ -54,7 +54,7 @@ class Explanation:
 
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
-        self.u, self._aside = reaching(self.effects, evidence.v, Around(evidence.t))
+        self.u, self._aside = reaching(self.effects, evidence.v, EffectContext(evidence.t))
         same = like is not None and np.array_equal(like.u, self.u)
         self.joint: Joint = (
             like.joint if like and same else Joint(evidence.problem(self.u), evidence.smoothness, evidence.lead)
@@ -119,9 +119,9 @@ class Explanation:
         return self.evidence.y - self.predicted
 
     @property
-    def around(self) -> Around:
+    def around(self) -> EffectContext:
         """What effects may look at."""
-        return Around(self.evidence.t, self.u, self._middle, self.evidence.others)
+        return EffectContext(self.evidence.t, self.u, self._middle, self.evidence.others)
 
     def _behind(self, effects: Sequence[Effect], h: FloatArray, u: FloatArray) -> FloatArray:
         """Return the displacement, shape (N,), metres, that effects make of what the hysteresis gives, `h`."""
@@ -162,9 +162,9 @@ class Explanation:
 
     def _whole(self, effects: Sequence[Effect]) -> FloatArray:
         """Return the prediction, shape (N,), metres, of the same hysteresis with other effects."""
-        u, aside = reaching(effects, self.evidence.v, Around(self.evidence.t))
+        u, reversible_bypass = reaching(effects, self.evidence.v, EffectContext(self.evidence.t))
         h = self.h if np.array_equal(u, self.u) else self.respond(u)
-        return self.settling + self._behind(effects, h + aside, u)
+        return self.settling + self._behind(effects, h + reversible_bypass, u)
 
     def prediction_without(self, name: str) -> FloatArray:
         """Return what it would give, shape (N,), metres, if one of its effects were not there and all else as it is."""

@@ -12,12 +12,12 @@ from slpi_ros.diagnosis.gather import one_speed
 from slpi_ros.diagnosis.joint import Score
 from slpi_ros.diagnosis.parameters import free
 from slpi_ros.diagnosis.structure import BIAS, STRUCTURES
-from slpi_ros.effects.base import Effect, Form, usual_step
+from slpi_ros.effects.base import Candidate, Effect, usual_step
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
-from slpi_ros.identification.progress import tell
+from slpi_ros.identification.progress import report_progress
 
 FloatArray = NDArray[np.float64]
 
@@ -113,8 +113,8 @@ def _screened(name: str, now: Explanation) -> tuple[float, Effect] | None:
     return score.rms, effect
 
 
-def _scored(form: Form | Effect, now: Explanation) -> tuple[Score, Effect] | None:
-    if not isinstance(form, Form):
+def _scored(form: Candidate | Effect, now: Explanation) -> tuple[Score, Effect] | None:
+    if not isinstance(form, Candidate):
         return now.adding(form).held_out, form
     score = now.score(form.columns, positive=form.positive)
     try:
@@ -223,7 +223,7 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     rivals: dict[str, list[Contender]] = {}
     finest = FINEST * float(np.ptp(now.evidence.y[now.evidence.used]))
     while len(rivals) < MOST_EFFECTS and now.held_out.rms > finest:
-        tell(f"{len(now.effects)} effects found, {now.held_out.rms * 1e9:.3g} nm left, trying others")
+        report_progress(f"{len(now.effects)} effects found, {now.held_out.rms * 1e9:.3g} nm left, trying others")
         found = contenders(now)
         structure, with_structure = _best_structure(now, structures)
         if structure and (not found or _beats(with_structure.held_out, found[0].score)):

@@ -19,7 +19,7 @@ Removable = Literal["always", "path", "record", "never"]
 
 
 @dataclass(frozen=True)
-class Around:
+class EffectContext:
     """What an effect may look at besides the signal it changes.
 
     Parameters
@@ -83,14 +83,14 @@ class Effect(Protocol):
     def uncertainty(self) -> Mapping[str, float]:
         """Standard deviation by parameter, in the parameter's unit."""
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return what becomes of a signal, shape (N,), volts or metres; it begins at rest."""
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the signal that becomes the given one, shape (N,), volts or metres; the whole path is known."""
 
     @classmethod
-    def fit(cls, left: "Left") -> "Iterator[Form | Effect]":
+    def fit(cls, left: "ResidualView") -> "Iterator[Candidate | Effect]":
         """Yield what it may be in a record: forms for a fit to judge, linear in their gains, or effects as they are."""
 
     def describe(self) -> str:
@@ -105,7 +105,7 @@ LINE_WIDTH = 12
 
 
 @dataclass(frozen=True)
-class Form:
+class Candidate:
     """One form of an effect.
 
     Parameters
@@ -123,7 +123,7 @@ class Form:
     positive: int = 0
 
 
-class Left(Protocol):
+class ResidualView(Protocol):
     """A hysteresis with the effects found so far, and what they leave of a record of N samples."""
 
     @property
@@ -155,7 +155,7 @@ class Left(Protocol):
         """Motion of the other axes from their start, shape (N,), metres."""
 
     @property
-    def around(self) -> Around:
+    def around(self) -> EffectContext:
         """What effects may look at."""
 
     def respond(self, u: FloatArray) -> FloatArray:
@@ -191,7 +191,7 @@ def strongest_lines(
     return found
 
 
-def rhythms(left: Left, count: int, lowest: float) -> list[float]:
+def rhythms(left: ResidualView, count: int, lowest: float) -> list[float]:
     """Return the frequencies (Hz), from `lowest` on, that are strongest in what is left."""
     dt = usual_step(left.t)
     grid = np.arange(left.t[0], left.t[-1], dt)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import Around, Effect
+from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.rate_dependence import RateDependence
@@ -80,7 +80,7 @@ class Chain:
         return next(((effect.lower, effect.upper) for effect in found), (-np.inf, np.inf))
 
     def hysteresis_for(
-        self, own: FloatArray, around: Around, inverse: Callable[[FloatArray], FloatArray]
+        self, own: FloatArray, around: EffectContext, inverse: Callable[[FloatArray], FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
         """Return displacement (m) and voltage (V) of the hysteresis, shape (N,) each, for the axis's own displacement.
 
@@ -103,7 +103,7 @@ class Chain:
             if rate:
                 tried = rate.invert(slower, replace(around, u=u))
             elif coercivity:
-                tried = slower - coercivity.aside(coercivity.invert(u, around), u)
+                tried = slower - coercivity.reversible_bypass(coercivity.invert(u, around), u)
             change = float(np.abs(tried - h).max(initial=0.0))
             if not change < last_change:
                 break
@@ -112,25 +112,25 @@ class Chain:
         return h, u
 
 
-def reaching(effects: Sequence[Effect], v: FloatArray, around: Around) -> tuple[FloatArray, FloatArray]:
+def reaching(effects: Sequence[Effect], v: FloatArray, around: EffectContext) -> tuple[FloatArray, FloatArray]:
     """Return what effects let a command reach the hysteresis, and what goes round it: shape (N,), volts and metres."""
-    u, aside = v, np.zeros_like(v)
+    u, reversible_bypass = v, np.zeros_like(v)
     for effect in effects:
         if effect.side == "voltage":
             before, u = u, effect.apply(u, around)
             if isinstance(effect, RateDependence):
-                aside = effect.aside(before, u)
-    return u, aside
+                reversible_bypass = effect.reversible_bypass(before, u)
+    return u, reversible_bypass
 
 
-def forward(effects: tuple[Effect, ...], signal: FloatArray, around: Around) -> FloatArray:
+def forward(effects: tuple[Effect, ...], signal: FloatArray, around: EffectContext) -> FloatArray:
     """Return what effects make of a signal, shape (N,)."""
     for effect in effects:
         signal = effect.apply(signal, around)
     return signal
 
 
-def backward(effects: tuple[Effect, ...], signal: FloatArray, around: Around) -> FloatArray:
+def backward(effects: tuple[Effect, ...], signal: FloatArray, around: EffectContext) -> FloatArray:
     """Return the signal, shape (N,), of which effects make the given one."""
     for effect in reversed(effects):
         signal = effect.invert(signal, around)

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require, usual_step
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectContext,
+    FloatArray,
+    Removable,
+    ResidualView,
+    Side,
+    require,
+    usual_step,
+)
 from slpi_ros.effects.filters import Hold, Uniform, hold
 
 # What settles sooner (s) is called a lag.
@@ -57,7 +66,7 @@ class Creep:
             ("gains", sum(self.gains) <= 10, "at most 10 in sum"),
         )
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with creep, shape (N,), metres."""
         grid = Uniform.over(around.t)
         moved = grid.on(signal)
@@ -67,7 +76,7 @@ class Creep:
             crept += gain * lfilter([now, before], [1.0, -kept], moved)
         return signal + grid.off(crept)
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement before creep, shape (N,), metres."""
         grid = Uniform.over(around.t)
         crept = grid.on(signal)
@@ -83,7 +92,7 @@ class Creep:
         return signal - grid.off(crept - np.real(moved) / direct)
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator[Form]:
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield single relaxations from quick to slow, and several at once."""
         longest = float(left.t[-1] - left.t[0])
         shortest = max(10 * usual_step(left.t), FASTEST)
@@ -94,7 +103,7 @@ class Creep:
         for taus in (*single, *several):
             creeping = [cls((tau,), (1.0,)).apply(left.h, left.around) - left.h for tau in taus.tolist()]
             columns = np.column_stack([settling(taus.tolist(), left.t, left.used), *creeping])
-            yield Form(columns, partial(cls._times, taus), positive=taus.size)
+            yield Candidate(columns, partial(cls._times, taus), positive=taus.size)
 
     @classmethod
     def _times(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":

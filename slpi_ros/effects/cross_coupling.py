@@ -7,7 +7,7 @@ from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require
+from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 
 
 @dataclass(frozen=True)
@@ -41,24 +41,24 @@ class CrossCoupling:
             ),
         )
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with the part of the other axes, shape (N,), metres."""
         return signal + self.part(signal, around)
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement without the part of the other axes, shape (N,), metres."""
         return signal - self.part(signal, around)
 
-    def part(self, signal: FloatArray, around: Around) -> FloatArray:
+    def part(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return what the other axes add, shape (N,), metres."""
         known = (gain * around.others[axis] for axis, gain in self.gains.items() if axis in around.others)
         return sum(known, np.zeros_like(signal))
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator[Form]:
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield the motion of all other axes."""
         if left.others:
-            yield Form(np.column_stack(list(left.others.values())), partial(cls._of, tuple(left.others)))
+            yield Candidate(np.column_stack(list(left.others.values())), partial(cls._of, tuple(left.others)))
 
     @classmethod
     def _of(cls, axes: tuple[str, ...], gains: FloatArray) -> "CrossCoupling":
@@ -103,7 +103,7 @@ class Coupling:
         """Return what an axis takes from the others' own motions, metres; an axis that is not given rests."""
         return sum((gain * motions[other] for other, gain in self._gains[name].items() if other in motions), 0.0)
 
-    def apart(self, seen: Mapping[str, Motion], resting: Mapping[str, Motion]) -> dict[str, Motion]:
+    def decouple(self, seen: Mapping[str, Motion], resting: Mapping[str, Motion]) -> dict[str, Motion]:
         """Return the own motions that add up to the ones to be seen.
 
         Parameters

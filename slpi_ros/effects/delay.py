@@ -7,7 +7,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require, usual_step
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectContext,
+    FloatArray,
+    Removable,
+    ResidualView,
+    Side,
+    require,
+    usual_step,
+)
 
 
 @dataclass(frozen=True)
@@ -32,21 +41,21 @@ class Delay:
         """Refuse what is no delay."""
         require(self, ("seconds", abs(self.seconds) <= 100, "from -100 to 100 s"))
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Shift the signal, shape (N,), to later; the first value is held before."""
         return np.interp(around.t - self.seconds, around.t, signal) if signal.size else signal.copy()
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Shift the signal, shape (N,), to earlier: a preview of the path; its end is held."""
         return np.interp(around.t + self.seconds, around.t, signal) if signal.size else signal.copy()
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator[Form]:
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield shifts by a part of a sample and by some, either way."""
         dt = usual_step(left.t)
         for seconds in (-4.0 * dt, 0.5 * dt, 2.0 * dt, 8.0 * dt):
             column = left.respond(cls(seconds).apply(left.u, left.around)) - left.h
-            yield Form(column[:, None], partial(cls._times, seconds))
+            yield Candidate(column[:, None], partial(cls._times, seconds))
 
     @classmethod
     def _times(cls, seconds: float, gains: FloatArray) -> "Delay":

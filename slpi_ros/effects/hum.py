@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.effects.base import (
-    Around,
+    Candidate,
+    EffectContext,
     FloatArray,
-    Form,
-    Left,
     Removable,
+    ResidualView,
     Side,
     amplitude_and_phase,
     require,
@@ -56,11 +56,11 @@ class Hum:
             ("phase", abs(self.phase) <= 1e6, "within 1e6 rad"),
         )
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with hum, shape (N,), metres."""
         return signal + self.wave(around.t)
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement without hum, shape (N,), metres."""
         return signal - self.wave(around.t)
 
@@ -69,10 +69,10 @@ class Hum:
         return self.amplitude * np.sin(2 * pi * self.frequency * t + self.phase)
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator[Form]:
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield the strongest lines in the spectrum of what is left."""
         for frequency in rhythms(left, LINES, SLOWEST):
-            yield Form(wave(2 * np.pi * frequency * left.t), partial(cls._at, frequency))
+            yield Candidate(wave(2 * np.pi * frequency * left.t), partial(cls._at, frequency))
 
     @classmethod
     def _at(cls, frequency: float, gains: FloatArray) -> "Hum":

@@ -8,7 +8,16 @@ from typing import ClassVar
 import numpy as np
 from scipy.signal import lfilter
 
-from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require, usual_step
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectContext,
+    FloatArray,
+    Removable,
+    ResidualView,
+    Side,
+    require,
+    usual_step,
+)
 from slpi_ros.effects.filters import Hold, Uniform, hold
 
 # The exact inverse of the first-order hold lets the command alternate from sample to sample after every turn. Taking
@@ -37,13 +46,13 @@ class Lag:
         """Refuse what is no lag."""
         require(self, ("time_constant", 0 < self.time_constant <= 1e4, "more than 0 s, at most 10000 s"))
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the lagged voltage, shape (N,), volts; exact where the command is linear between samples."""
         grid = Uniform.over(around.t)
         now, before, kept = hold(grid.dt, self.time_constant)
         return grid.off(_filter(np.array([now, before]), np.array([1.0, -kept]), grid.on(signal)))
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the command, shape (N,), volts: ``u + tau du/dt``."""
         grid = Uniform.over(around.t)
         if not grid.dt:
@@ -55,12 +64,12 @@ class Lag:
         return grid.off(_filter(np.array([1.0, -kept, 0.0]), law, grid.on(signal)))
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator[Form]:
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield lags of a part of a sample and of many."""
         for samples in (0.5, 2.0, 8.0, 32.0):
             tau = samples * usual_step(left.t)
             column = left.respond(cls(tau).apply(left.u, left.around)) - left.h
-            yield Form(column[:, None], partial(cls._times, tau))
+            yield Candidate(column[:, None], partial(cls._times, tau))
 
     @classmethod
     def _times(cls, tau: float, gains: FloatArray) -> "Lag | None":

@@ -13,7 +13,7 @@ from typing import ClassVar, overload
 import numpy as np
 from scipy.signal import savgol_filter
 
-from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require
+from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
@@ -98,22 +98,22 @@ class CoercivityFollower:
         """Return the command (V) that moves the hysteresis on at `u` (V), in a direction, -1 or 1."""
         return u + direction * self._half_width(self._rate_out)
 
-    def within(self, aside: float) -> tuple[float | None, float]:
+    def within(self, reversible_bypass: float) -> tuple[float | None, float]:
         """Return the command (V) that leads a displacement (m) round the resting hysteresis; None: that must move.
 
         The other number is the direction of the command from the middle of the play, -1 or 1.
         """
         low, high = (self.between(self.ahead(self._u, side), self._u) for side in (-1.0, 1.0))
-        direction = 1.0 if aside > 0.5 * (low + high) else -1.0
-        if not low < aside < high:
+        direction = 1.0 if reversible_bypass > 0.5 * (low + high) else -1.0
+        if not low < reversible_bypass < high:
             return None, direction
         v, slope = self._u, 0.5 * (high - low) / self._half_width(self._rate_out)
         for _ in range(CHORDS):
-            v += (aside - self.between(v, self._u)) / slope
+            v += (reversible_bypass - self.between(v, self._u)) / slope
         return v, direction
 
     @property
-    def aside(self) -> float:
+    def reversible_bypass(self) -> float:
         """Displacement (m) that goes round the hysteresis."""
         return self.between(self._v, self._u)
 
@@ -320,14 +320,14 @@ class RateDependence:
         """Where it acts: on the voltage where thresholds grow."""
         return "voltage" if self.coercivity else "displacement"
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement of the wider loops, shape (N,), metres; or the voltage at the hysteresis, volts."""
         if self.coercivity:
             return play(signal, self._growth(settled_rate(around.t, signal, self.settling)))
         middle, speed, direction = self._drive(around)
         return signal + speed * (self.widening * (signal - middle) - self.backlash * direction)
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement of the loops at rest, shape (N,), metres, for the voltage that drives them.
 
         Or the command, shape (N,), volts, for the voltage at the hysteresis, whose rate is taken for its own.
@@ -339,34 +339,34 @@ class RateDependence:
         back = signal + speed * (self.widening * middle + self.backlash * direction)
         return np.asarray(back / (1 + speed * self.widening), dtype=np.float64)
 
-    def aside(self, v: FloatArray, u: FloatArray) -> FloatArray:
+    def reversible_bypass(self, v: FloatArray, u: FloatArray) -> FloatArray:
         """Return what goes round the hysteresis, shape (N,), metres, at commands `v` where that sees `u`, volts."""
         return reversible(v, self.reversible) - reversible(u, self.reversible)
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator[Form]:
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield several powers of the rate: on the displacement with quick and slow turns, and as coercivity."""
         reference = float(np.sqrt(np.mean(np.gradient(left.u, left.t) ** 2)))
         yield from cls._losing(left, reference)
         yield from cls._coercive(left, reference)
 
     @classmethod
-    def _losing(cls, left: Left, reference: float) -> Iterator[Form]:
+    def _losing(cls, left: ResidualView, reference: float) -> Iterator[Candidate]:
         for exponent in EXPONENTS:
             for transition in (float(share * np.ptp(left.u)) for share in TRANSITIONS):
                 one = cls(1.0, 1e-6, exponent, reference, transition)
                 parts = (replace(one, backlash=0.0), replace(one, widening=0.0))
                 columns = np.column_stack([part.apply(left.h, left.around) - left.h for part in parts])
-                yield Form(columns, partial(cls._times, one), positive=2)
+                yield Candidate(columns, partial(cls._times, one), positive=2)
 
     @classmethod
-    def _coercive(cls, left: Left, reference: float) -> Iterator[Form]:
+    def _coercive(cls, left: ResidualView, reference: float) -> Iterator[Candidate]:
         span, onset = float(np.ptp(left.u)), COERCIVE_ONSET * reference
         for share in COERCIVITIES:
             one = cls(0.0, 0.0, COERCIVE_EXPONENT, reference, span, share * span, onset, SETTLING)
             u = one.apply(left.u, left.around)
             through = [left.u**power - u**power for power in range(1, POWERS + 1)]
-            yield Form(np.column_stack([left.respond(u) - left.h, *through]), partial(cls._grown, one))
+            yield Candidate(np.column_stack([left.respond(u) - left.h, *through]), partial(cls._grown, one))
 
     @staticmethod
     def _grown(one: "RateDependence", gains: FloatArray) -> "RateDependence | None":
@@ -405,7 +405,7 @@ class RateDependence:
             return CoercivityFollower(self._growth, self.settling, self.reversible)
         return RateFollower(self.widening, self.backlash, self.exponent, self.reference_rate, self.transition)
 
-    def _drive(self, around: Around) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _drive(self, around: EffectContext) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the loop's middle (m), the speed to the power and the direction, shape (N,) each."""
         if around.u is None or around.middle is None:
             raise ModelError("effect 'rate_dependence' needs the voltage that drives the hysteresis, and its loop")

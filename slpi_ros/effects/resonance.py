@@ -10,7 +10,17 @@ from typing import ClassVar
 import numpy as np
 from scipy.signal import lfilter
 
-from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require, rhythms, usual_step
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectContext,
+    FloatArray,
+    Removable,
+    ResidualView,
+    Side,
+    require,
+    rhythms,
+    usual_step,
+)
 from slpi_ros.effects.filters import Mode, Uniform
 
 # Taps are so far apart at least, times 1 / w: nearer ones would only be larger.
@@ -168,7 +178,7 @@ class Resonance:
             ("damping", 1e-6 <= self.damping < 1, "from 1e-6 to below 1"),
         )
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with ringing, shape (N,), metres; exact where the input is linear between samples."""
         grid = Uniform.over(around.t)
         if not grid.dt:
@@ -177,7 +187,7 @@ class Resonance:
         moved = grid.on(signal)
         return grid.off(moved[0] + lfilter(numerator, denominator, moved - moved[0]))
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement that rings to the given one, shape (N,), metres."""
         grid = Uniform.over(around.t)
         if not grid.dt:
@@ -192,7 +202,7 @@ class Resonance:
         return grid.off(sum(parts, np.zeros_like(wished)))
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator[Form]:
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield modes where the spectrum of what is left has lines, and all over it."""
         highest = HIGHEST / usual_step(left.t)
         found = [frequency for frequency in rhythms(left, LINES, LOWEST) if frequency < highest]
@@ -200,7 +210,7 @@ class Resonance:
             for damping in DAMPINGS:
                 mode = cls(frequency, damping)
                 column = mode.apply(left.h, left.around) - left.h
-                yield Form(column[:, None], partial(cls._if_seen, mode), positive=1)
+                yield Candidate(column[:, None], partial(cls._if_seen, mode), positive=1)
 
     @staticmethod
     def _if_seen(mode: "Resonance", gains: FloatArray) -> "Resonance | None":

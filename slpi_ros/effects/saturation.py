@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Around, FloatArray, Left, Removable, Side, require_rules
+from slpi_ros.effects.base import EffectContext, FloatArray, Removable, ResidualView, Side, require_rules
 
 # Voltages are sorted into so many bins; the stage stands still where it moves by less than this share of the usual.
 BINS, STILL = 200, 0.35
@@ -40,16 +40,16 @@ class Saturation:
             ("upper", self.upper > self.lower, f"more than lower, {self.lower} V"),
         )
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the voltage, shape (N,), volts, within the range."""
         return np.clip(signal, self.lower, self.upper)
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the voltage, shape (N,), volts, within the range: more is not to be had."""
         return np.clip(signal, self.lower, self.upper)
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator["Saturation"]:
+    def fit(cls, left: ResidualView) -> Iterator["Saturation"]:
         """Yield limits where the displacement stands still although the voltage goes on."""
         v, low, width = left.u, float(left.u.min()), float(np.ptp(left.u)) / BINS
         # Increments over a few samples stand out of the noise.

@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.effects.base import (
-    Around,
+    Candidate,
+    EffectContext,
     FloatArray,
-    Form,
-    Left,
     Removable,
+    ResidualView,
     Side,
     amplitude_and_phase,
     require,
@@ -61,11 +61,11 @@ class SensorPeriodic:
             ("phase", abs(self.phase) <= 1e3, "within 1000 rad"),
         )
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return what the sensor reads, shape (N,), metres."""
         return signal + self.amplitude * np.sin(2 * pi / self.period * signal + self.phase)
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return where the stage is, shape (N,), metres, for what the sensor reads."""
         k, amplitude, phase = 2 * pi / self.period, self.amplitude, self.phase
         low, high, x = signal - amplitude, signal + amplitude, signal.copy()
@@ -80,7 +80,7 @@ class SensorPeriodic:
         return x
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator[Form]:
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield the strongest lines in the spectrum of what is left, as it lies over the displacement."""
         width = float(np.ptp(left.h)) / BINS
         place = ((left.h[left.used] - float(left.h.min())) / width).astype(np.int64)
@@ -88,7 +88,7 @@ class SensorPeriodic:
         lines = np.fft.rfftfreq(4 * BINS, width)
         power[(lines < 1 / LONGEST) | (lines > 1 / SHORTEST)] = 0.0
         for line in strongest_lines(power, lines, LINES, width=6):
-            yield Form(wave(2 * np.pi * line * left.h), partial(cls._of, 1 / line))
+            yield Candidate(wave(2 * np.pi * line * left.h), partial(cls._of, 1 / line))
 
     @classmethod
     def _of(cls, period: float, gains: FloatArray) -> "SensorPeriodic":

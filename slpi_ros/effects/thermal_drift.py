@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Around, FloatArray, Form, Left, Removable, Side, require
+from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 
 # Knots of the lines that may fit a record.
 KNOTS = (2, 3, 5, 8, 13)
@@ -44,22 +44,22 @@ class ThermalDrift:
             ("values", all(abs(value) <= 1e3 for value in self.values), "within 1000 m"),
         )
 
-    def apply(self, signal: FloatArray, around: Around) -> FloatArray:
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with drift, shape (N,), metres."""
         return signal + np.interp(around.t, self.times, self.values)
 
-    def invert(self, signal: FloatArray, around: Around) -> FloatArray:
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement without drift, shape (N,), metres."""
         return signal - np.interp(around.t, self.times, self.values)
 
     @classmethod
-    def fit(cls, left: Left) -> Iterator[Form]:
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield lines of few knots and of more."""
         for knots in KNOTS:
             times = np.linspace(left.t[0], left.t[-1], knots)
             # The displacement at rest takes up a constant.
             hats = np.column_stack([np.interp(left.t, times, row) for row in np.eye(knots)[1:]])
-            yield Form(hats, partial(cls._through, times))
+            yield Candidate(hats, partial(cls._through, times))
 
     @classmethod
     def _through(cls, times: FloatArray, gains: FloatArray) -> "ThermalDrift":

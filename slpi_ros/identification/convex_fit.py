@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
-from slpi_ros.identification.initial_history import Beginning, choose_start, warn_of_beginning, warn_of_rest
+from slpi_ros.identification.initial_history import InitialHistory, choose_start, warn_of_initial_history, warn_of_rest
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Fitted, Problem
-from slpi_ros.identification.progress import tell
+from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import MultiSlopeBasis
 from slpi_ros.identification.samples import Samples
 from slpi_ros.model.stage_model import Start
@@ -53,7 +53,7 @@ def fit_multi_slope(samples: Sequence[Samples]) -> Fitted:
     """Fit the MPI model of the amplitude that the records cover, from rest, by plain least squares as published."""
     samples = [part.thinned(round(PLAYS_SHARE * FIT_SAMPLES / len(samples))) for part in samples]
     problem = Problem.pose(samples, MultiSlopeBasis.over(*_voltage_range(samples)))
-    return _solved(samples, problem, FIRST_SMOOTHNESS, [Beginning((), only_wiped=False)] * len(samples))
+    return _solved(samples, problem, FIRST_SMOOTHNESS, [InitialHistory((), only_wiped=False)] * len(samples))
 
 
 def _voltage_range(samples: Sequence[Samples]) -> tuple[float, float]:
@@ -101,7 +101,7 @@ def fit_linear(
         problem = Problem.pose(fitted, problem.basis).reweighted()
     result = _solved(fitted, problem, chosen.smoothness, chosen.beginnings)
     judged = problem.judged[problem.weights > 0]
-    warn_of_beginning(result.errors[~judged], result.errors[judged])
+    warn_of_initial_history(result.errors[~judged], result.errors[judged])
     return result
 
 
@@ -111,7 +111,7 @@ class Choice:
 
     problem: Problem
     smoothness: float
-    beginnings: Sequence[Beginning]
+    beginnings: Sequence[InitialHistory]
 
 
 def choose(
@@ -119,12 +119,12 @@ def choose(
 ) -> Choice:
     """Choose start, basis and roughness weight; parameters and errors as in `fit_linear`."""
     thin = [part.thinned(round(share * SELECTION_SAMPLES / len(samples))) for part in samples]
-    tell("choosing what went before the record")
+    report_progress("choosing what went before the record")
     beginnings = [choose_start(part, lambda candidate: Problem.pose([candidate], bases[0])) for part in thin]
     thin = [beginning.of(part) for beginning, part in zip(beginnings, thin, strict=True)]
     candidates = []
     for number, basis in enumerate(bases, 1):
-        tell(f"choosing how fine and how smooth, {number} of {len(bases)}")
+        report_progress(f"choosing how fine and how smooth, {number} of {len(bases)}")
         problem = Problem.pose(thin, basis).reweighted()
         scores = problem.scores(smoothness)
         k = int(np.argmin(scores))
@@ -133,9 +133,11 @@ def choose(
     return Choice(problem, best, beginnings)
 
 
-def _solved(samples: Sequence[Samples], problem: Problem, smoothness: float, beginnings: Sequence[Beginning]) -> Fitted:
+def _solved(
+    samples: Sequence[Samples], problem: Problem, smoothness: float, beginnings: Sequence[InitialHistory]
+) -> Fitted:
     """Solve a problem of samples that have a history before them; the model starts as the first record does."""
-    tell(f"fit to {problem.count} samples")
+    report_progress(f"fit to {problem.count} samples")
     x = problem.solve(smoothness)
     history = beginnings[0].history
     recorded = [

@@ -17,7 +17,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.identification.drive import smallest_turn
 from slpi_ros.identification.fit import FITS, fit_of
-from slpi_ros.identification.initial_history import BeginningWarning
+from slpi_ros.identification.initial_history import InitialHistoryWarning
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.identification.signal_statistics import Floor, floor_of, noise
 from slpi_ros.io.record import Record
@@ -65,7 +65,7 @@ class Slice:
 
 
 @dataclass(frozen=True)
-class HeldOutTruth:
+class CrossValidationReport:
     """Errors on blocks left out of the fit, free-run.
 
     Parameters
@@ -120,7 +120,7 @@ class _Part:
         return cls(samples.at(kept), t[kept])
 
 
-def held_out_truth(
+def cross_validate(
     record: Record | Sequence[Record],
     axis: str,
     kind: str = "slpi",
@@ -128,7 +128,7 @@ def held_out_truth(
     start: float | None = None,
     stop: float | None = None,
     loops_at_rest: bool = False,
-) -> HeldOutTruth:
+) -> CrossValidationReport:
     """Fit a kind of model to a thinned record, block after block left out, and judge it there.
 
     Parameters
@@ -153,7 +153,7 @@ def held_out_truth(
     samples = [part.samples for part in parts]
     with threadpool_limits(1), warnings.catch_warnings():
         # What the fit of the whole record leaves aside has been said.
-        warnings.simplefilter("ignore", BeginningWarning)
+        warnings.simplefilter("ignore", InitialHistoryWarning)
         error = fit(samples).held_out
         classical = error if kind == CLASSICAL else _classical(samples)
     left_out = np.isfinite(error)
@@ -169,7 +169,7 @@ def held_out_truth(
     def cut(classes: Iterator[tuple[str, Mask]]) -> tuple[Slice, ...]:
         return tuple(_slice(name, error[chosen], classical[chosen]) for name, chosen in classes if chosen.any())
 
-    return HeldOutTruth(
+    return CrossValidationReport(
         axis=axis,
         kind=kind,
         floor=floors[len(floors) // 2],

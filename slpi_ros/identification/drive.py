@@ -114,8 +114,8 @@ def covered(v: FloatArray, runs: Runs) -> float:
     origin = np.repeat(cell[runs.ends[:-1]], np.diff(runs.ends))
     visited = np.bincount(_CELLS * origin + cell[runs.ends[0] : runs.ends[-1]], minlength=_CELLS**2) > 0
     # The diagonal is where every turn begins.
-    aside = ~np.eye(_CELLS, dtype=bool).ravel()
-    return float(np.mean(visited[aside]))
+    off_diagonal = ~np.eye(_CELLS, dtype=bool).ravel()
+    return float(np.mean(visited[off_diagonal]))
 
 
 def smallest_turn(v: FloatArray, noise: float) -> float:

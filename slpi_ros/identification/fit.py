@@ -11,7 +11,7 @@ from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.identification import convex_fit as linear
 from slpi_ros.identification import published_kinds as separated
 from slpi_ros.identification.least_squares import Fitted, noise_rms
-from slpi_ros.identification.progress import tell
+from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import fit_amplitude_scaled
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples
 from slpi_ros.io.record import Record
@@ -75,7 +75,7 @@ def identify(
     source = ", ".join(part.source for part in records)
     models = {}
     for axis in axes or records[0].axes:
-        tell(f"axis {axis}: identification")
+        report_progress(f"axis {axis}: identification")
         samples = [select_samples(part, axis, start, stop) for part in records]
         try:
             # The matrices are small: more threads than one only stand in each other's way.

@@ -22,7 +22,7 @@ DISAGREES = 3.0
 MISLEADING = 1.1
 
 
-class BeginningWarning(UserWarning):
+class InitialHistoryWarning(UserWarning):
     """The beginning of a record does not agree with the rest, whatever went before."""
 
 
@@ -49,7 +49,7 @@ def histories(samples: Samples) -> list[tuple[float, ...]]:
 
 
 @dataclass(frozen=True)
-class Beginning:
+class InitialHistory:
     """What a fit takes for granted about the beginning of a record.
 
     Parameters
@@ -68,7 +68,7 @@ class Beginning:
         return (samples.only(samples.wiped) if self.only_wiped else samples).after(self.history)
 
 
-def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> Beginning:
+def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> InitialHistory:
     """Choose the history that explains the record best.
 
     Parameters
@@ -100,24 +100,24 @@ def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> Beginning:
         if np.sqrt(np.mean(residuals[best][wiped] ** 2)) > MISLEADING * np.sqrt(np.mean(alone[wiped] ** 2)):
             only_wiped = True
             history = history or candidates[-1]
-    return Beginning(history, only_wiped)
+    return InitialHistory(history, only_wiped)
 
 
-def warn_of_rest(samples: Sequence[Samples], beginnings: Sequence[Beginning]) -> None:
+def warn_of_rest(samples: Sequence[Samples], beginnings: Sequence[InitialHistory]) -> None:
     """Warn of how many samples are left aside, as no history explains them."""
     pairs = zip(samples, beginnings, strict=True)
-    aside = sum(np.count_nonzero(part.fitted & ~part.wiped) for part, beginning in pairs if beginning.only_wiped)
-    if aside:
+    excluded = sum(np.count_nonzero(part.fitted & ~part.wiped) for part, beginning in pairs if beginning.only_wiped)
+    if excluded:
         count = sum(np.count_nonzero(part.fitted) for part in samples)
         warnings.warn(
-            f"{aside} of {count} samples are left aside: what comes before the voltage has gone over its whole range "
+            f"{excluded} of {count} samples are left out: what comes before the voltage has gone over its whole range "
             "does not agree with the rest, whatever went before; `slpi diagnose` tells whether it is something else",
-            BeginningWarning,
+            InitialHistoryWarning,
             stacklevel=3,
         )
 
 
-def warn_of_beginning(before: FloatArray, after: FloatArray) -> None:
+def warn_of_initial_history(before: FloatArray, after: FloatArray) -> None:
     """Warn where errors (m) from before the memory was wiped are much larger than those from after it."""
     if before.size and after.size:
         first, rest = (float(np.sqrt(np.mean(errors**2))) * 1e9 for errors in (before, after))
@@ -126,7 +126,7 @@ def warn_of_beginning(before: FloatArray, after: FloatArray) -> None:
                 f"{before.size} of {before.size + after.size} samples, before the voltage has gone over its whole "
                 f"range, are off by {first:.3g} nm rms and never left out; the others by {rest:.3g} nm; "
                 "`slpi diagnose` tells whether there is something beside the hysteresis",
-                BeginningWarning,
+                InitialHistoryWarning,
                 stacklevel=3,
             )
 

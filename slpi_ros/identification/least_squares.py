@@ -13,7 +13,7 @@ from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.identification.bases import Basis
 from slpi_ros.identification.design_matrix import Design, Walk
-from slpi_ros.identification.progress import tell
+from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.samples import Samples
 from slpi_ros.model.stage_model import Start
 
@@ -226,7 +226,7 @@ class Problem:
         """Return the error (m) of each sample, shape (N,), when it is left out of the fit; NaN where it never is."""
         errors = np.full(self.y.size, np.nan)
         for fold, chosen in enumerate(self.folds(), 1):
-            tell(f"fits with blocks left out, {fold} of {FOLDS}")
+            report_progress(f"fits with blocks left out, {fold} of {FOLDS}")
             weights = self.weights.copy()
             weights[chosen] = 0.0
             part = replace(self, weights=weights)
@@ -271,7 +271,7 @@ def held_out_errors(
     """
     errors = np.full(samples.v.size, np.nan)
     for fold, chosen in enumerate(blocked_folds(allowed), 1):
-        tell(f"fits with blocks left out, {fold} of {FOLDS}")
+        report_progress(f"fits with blocks left out, {fold} of {FOLDS}")
         kept = samples.fitted.copy()
         kept[chosen] = False
         errors[chosen] = (predict(kept) - samples.y)[chosen]

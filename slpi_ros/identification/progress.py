@@ -1,6 +1,6 @@
 """What a long computation is about, said to whoever listens.
 
-Whoever computes calls `tell`; who wants to know listens. So no fit has to hand a listener on.
+Whoever computes calls `report_progress`; who wants to know listens. So no fit has to hand a listener on.
 """
 
 import time
@@ -18,7 +18,7 @@ _CLEAR = "\r\x1b[K"
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
-def tell(what: str) -> None:
+def report_progress(what: str) -> None:
     """Say in a few words what is being done."""
     listener = _listener.get()
     if listener:

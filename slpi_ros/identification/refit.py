@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slpi_ros.effects.base import Around
+from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.chain import forward
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.hysteresis.loop_family import LoopFamily
@@ -121,7 +121,7 @@ def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -
     simulated = model.simulate(t, known)
     for axis in shared:
         own = model.axes[axis]
-        u = forward(own.chain.before, known[axis], Around(t))
+        u = forward(own.chain.before, known[axis], EffectContext(t))
         displacement[axis] = record.displacement[axis] - (simulated[axis] - replace(own, effects=()).simulate(t, u))
         voltage[axis] = np.where(np.isfinite(record.voltage[axis]), u, np.nan)
     return replace(record, voltage=voltage, displacement=displacement)

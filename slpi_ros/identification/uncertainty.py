@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from slpi_ros.errors import UsageError
 from slpi_ros.identification.convex_fit import SMOOTHNESS, choose, plays, surfaces
 from slpi_ros.identification.least_squares import Problem
-from slpi_ros.identification.progress import tell
+from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.io.record import Record
 
@@ -148,7 +148,7 @@ def _solutions(problem: Problem, smoothness: float, resamples: int) -> list[Floa
     blocks = np.array_split(np.arange(problem.y.size), BLOCKS)
     solutions = []
     for number in range(resamples):
-        tell(f"fits to other errors, {number + 1} of {resamples}")
+        report_progress(f"fits to other errors, {number + 1} of {resamples}")
         sign = np.repeat(rng.choice((-1.0, 1.0), BLOCKS), [block.size for block in blocks])
         drawn = weights * (predicted + sign * errors)
         vector = design.local.T @ drawn + design.at_turns.T @ (design.pick.T @ drawn)

@@ -190,7 +190,7 @@ class Reader:
         self._format.append(kind)
 
 
-def before_numbers(count: int) -> bytes:
+def multiarray_header(count: int) -> bytes:
     """Return what stands before the doubles, in this machine's order of bytes, of a Float64MultiArray of so many."""
     # No dimensions, no offset; then the doubles begin at a multiple of eight.
     return struct.pack("=2B2x3I4x", 0, sys.byteorder == "little", 0, 0, count)

@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import Around, Effect
+from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.chain import Chain, Middle, backward, forward, loop_middle, reaching
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import UnreachableError, UsageError
@@ -18,7 +18,7 @@ from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.model.streaming import ROUNDING, AxisStream, EffectStream, Limits, accepted_range, refusal
+from slpi_ros.model.streaming import ROUNDING, EffectStream, Limits, StreamingInverse, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -130,14 +130,14 @@ class AxisModel:
             memory.forward(v)
         return memory
 
-    def stream(self, limits: Limits | None = None) -> AxisStream:
+    def stream(self, limits: Limits | None = None) -> StreamingInverse:
         """Return a fresh stream within `limits` and the identified voltages."""
         return self.stream_from(self.memory(), self._allowed(limits))
 
-    def stream_from(self, memory: Memory, allowed: Limits) -> AxisStream:
+    def stream_from(self, memory: Memory, allowed: Limits) -> StreamingInverse:
         """Return a stream that goes on from a memory of this axis; its effects are at rest there."""
         if not self.effects:
-            return AxisStream(memory, self.displacement_range, allowed)
+            return StreamingInverse(memory, self.displacement_range, allowed)
         middle = self._middle if self.chain.rate_dependence else None
         return EffectStream(memory, self.displacement_range, allowed, self.chain, middle)
 
@@ -146,16 +146,20 @@ class AxisModel:
 
         Other axes rest. Time does not matter to a model without effects.
         """
-        return self.seen(t, self.own(t, v), {})
+        return self.seen(t, self.uncoupled_displacement(t, v), {})
 
-    def own(self, t: FloatArray, v: FloatArray) -> FloatArray:
+    def uncoupled_displacement(self, t: FloatArray, v: FloatArray) -> FloatArray:
         """Return the displacement, shape (N,), metres, that the voltage alone gives: before other axes come in."""
         if not self.effects:
             return self._forward_array(v)
-        around = Around(t - t[:1])
-        u, aside = reaching(self.chain.before, v, around)
+        around = EffectContext(t - t[:1])
+        u, reversible_bypass = reaching(self.chain.before, v, around)
         middle = self._middle if self.chain.rate_dependence else None
-        return forward(self.chain.own, self._forward_array(u) + aside, replace(around, u=u, middle=middle))
+        return forward(
+            self.chain.own,
+            self._forward_array(u) + reversible_bypass,
+            replace(around, u=u, middle=middle),
+        )
 
     def seen(self, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
         """Return the displacement that a sensor sees, shape (N,), metres.
@@ -164,11 +168,11 @@ class AxisModel:
         ----------
         t : ndarray, shape (N,), seconds
         own : ndarray, shape (N,), metres
-            What `own` gives.
+            What `uncoupled_displacement` gives.
         others : mapping of axis name to ndarray, shape (N,), metres
             Own motions of the other axes from their start.
         """
-        return forward(self.chain.shared, own, Around(t - t[:1], others=others)) if self.effects else own
+        return forward(self.chain.shared, own, EffectContext(t - t[:1], others=others)) if self.effects else own
 
     def compensate(self, t: FloatArray, y: FloatArray, limits: Limits | None = None) -> tuple[FloatArray, Mask]:
         """Return the voltage for a desired displacement `y`, shape (N,), metres, and where it waits at a limit.
@@ -182,9 +186,9 @@ class AxisModel:
         UsageError
             If a displacement is not finite.
         """
-        return self.command(t, self.unseen(t, y), limits)
+        return self.command(t, self.remove_sensor_effects(t, y), limits)
 
-    def unseen(self, t: FloatArray, y: FloatArray) -> FloatArray:
+    def remove_sensor_effects(self, t: FloatArray, y: FloatArray) -> FloatArray:
         """Return the own displacement, shape (N,), metres, for a desired one, shape (N,), metres; other axes rest.
 
         Raises
@@ -198,7 +202,7 @@ class AxisModel:
         if far.any():
             at = int(np.argmax(far))
             raise UnreachableError(f"sample {at}: {refusal(float(y[at]), accepted)}")
-        return backward(self.chain.shared, y, Around(t - t[:1])) if self.effects else y
+        return backward(self.chain.shared, y, EffectContext(t - t[:1])) if self.effects else y
 
     def command(self, t: FloatArray, own: FloatArray, limits: Limits | None = None) -> tuple[FloatArray, Mask]:
         """Return the voltage for an own displacement, shape (N,), metres, and where it waits at a limit."""
@@ -207,7 +211,7 @@ class AxisModel:
             return self._invert_hysteresis(own, allowed)
         chain, (lowest, highest) = self.chain, self.chain.clipped
         between = replace(allowed, lower=max(allowed.lower, lowest), upper=max(min(allowed.upper, highest), lowest))
-        around = Around(t - t[:1], middle=self._middle if chain.rate_dependence else None)
+        around = EffectContext(t - t[:1], middle=self._middle if chain.rate_dependence else None)
         if chain.coercivity and self.causal:
             return self._through_play(around, own, allowed, between)
         h, u = chain.hysteresis_for(own, around, lambda h: self._invert_hysteresis(h, between)[0])
@@ -215,7 +219,7 @@ class AxisModel:
         return self._kept(backward(chain.before, u, around), held, allowed)
 
     def _through_play(
-        self, around: Around, own: FloatArray, allowed: Limits, between: Limits
+        self, around: EffectContext, own: FloatArray, allowed: Limits, between: Limits
     ) -> tuple[FloatArray, Mask]:
         """Return what `command` does where the hysteresis sees the voltage through a play: one sample after another."""
         chain = self.chain
@@ -262,7 +266,7 @@ class AxisModel:
     def _invert_hysteresis(self, h: FloatArray, allowed: Limits) -> tuple[FloatArray, Mask]:
         """Return the voltage for a displacement without effects, shape (N,), metres, and where it waits at a limit."""
         # The axis may rest outside its limits; the first voltage it is given is inside.
-        path = self._known_path() or AxisStream(self.memory(), self.displacement_range, allowed).memory
+        path = self._known_path() or StreamingInverse(self.memory(), self.displacement_range, allowed).memory
         u = path.inverse_array(h, allowed.lower, allowed.upper)
         return u, self._missed(h, u, allowed)
 
@@ -274,7 +278,7 @@ class AxisModel:
             with warnings.catch_warnings():
                 # What stands in for loops that were never identified has been said.
                 warnings.simplefilter("ignore", slpi.UnidentifiedLoopWarning)
-                path = self._known_path() or AxisStream(self.memory(), self.displacement_range, allowed).memory
+                path = self._known_path() or StreamingInverse(self.memory(), self.displacement_range, allowed).memory
                 missed = path.forward_array(u) - h
             low, high = self.displacement_range
             held &= np.abs(missed) > ROUNDING * (high - low)

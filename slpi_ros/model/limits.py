@@ -6,7 +6,7 @@ from math import inf, sqrt
 from slpi_ros.errors import UsageError
 
 # A longer pause between two samples frees no longer way than this one, seconds.
-LONGEST_STEP = 0.1
+MAX_DT = 0.1
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Limits:
         return min(max(voltage, self.lower), self.upper)
 
 
-class Pace:
+class RateLimiter:
     """How far a voltage may go from one sample to the next.
 
     With a limit of acceleration every step leaves room to brake: before the voltage limits always, and before the goal
@@ -83,11 +83,11 @@ class Pace:
         """Whether the limit of acceleration forbids to stand still at the next sample."""
         return abs(self.rate) > self.limits.acceleration * self._dt
 
-    def counted(self, elapsed: float) -> float:
+    def clamp_dt(self, elapsed: float) -> float:
         """Return how much of the time since the last step (s) counts; after a pause the voltage starts from rest."""
-        if elapsed > LONGEST_STEP:
+        if elapsed > MAX_DT:
             self.rest()
-            return LONGEST_STEP
+            return MAX_DT
         return max(elapsed, 0.0)
 
     def reach(self, present: float, dt: float) -> tuple[float, float]:
@@ -138,7 +138,7 @@ class Pace:
         """Start anew from a voltage at rest."""
         self.rate = 0.0
 
-    def go_on(self, before: "Pace") -> None:
+    def go_on(self, before: "RateLimiter") -> None:
         """Go on as fast as another pace has been going."""
         self.rate, self._dt = before.rate, before._dt
 

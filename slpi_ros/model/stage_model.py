@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Mask, Start
-from slpi_ros.model.streaming import AxisStream, Limits, StageStream
+from slpi_ros.model.streaming import Limits, StageStream, StreamingInverse
 
 __all__ = ["AxisModel", "FitQuality", "HeldAtLimitWarning", "StageModel", "Start", "check_time", "held_message"]
 
@@ -72,7 +72,7 @@ class StageModel:
         own: dict[str, FloatArray] = {}
         for name, signal in voltage.items():
             with _naming(name, "voltage"):
-                own[name] = self.axis(name).own(time, signal)
+                own[name] = self.axis(name).uncoupled_displacement(time, signal)
         motions = {name: y - self.axes[name].start.displacement for name, y in own.items()}
         seen = {name: self.axes[name].seen(time, y, motions) for name, y in own.items()}
         return seen if isinstance(v, Mapping) else next(iter(seen.values()))
@@ -129,10 +129,10 @@ class StageModel:
         own: dict[str, FloatArray] = {}
         for name, signal in desired.items():
             with _naming(name, "displacement"):
-                own[name] = self.axis(name).unseen(time, signal)
+                own[name] = self.axis(name).remove_sensor_effects(time, signal)
         if self.coupling.on:
             starts = {name: self.axes[name].start.displacement for name in own}
-            apart = self.coupling.apart({name: z - starts[name] for name, z in own.items()}, {})
+            apart = self.coupling.decouple({name: z - starts[name] for name, z in own.items()}, {})
             own = {name: starts[name] + motion for name, motion in apart.items()}
         answers: dict[str, tuple[FloatArray, Mask]] = {}
         for name, z in own.items():
@@ -140,7 +140,7 @@ class StageModel:
                 answers[name] = self.axes[name].command(time, z, limits)
         return answers
 
-    def stream(self, axis: str) -> AxisStream:
+    def stream(self, axis: str) -> StreamingInverse:
         """Return a causal compensator of one axis: ``step(t, y) -> v``, seconds and metres to volts.
 
         Other axes are taken to rest.

@@ -16,9 +16,18 @@ from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.effects.rate_dependence import CoercivityFollower, RateDependence
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
 from slpi_ros.hysteresis.memory import Memory, MemoryState
-from slpi_ros.model.limits import LONGEST_STEP, Limits, Pace
+from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 
-__all__ = ["LONGEST_STEP", "ROUNDING", "AxisStream", "Limits", "Pace", "StreamState", "accepted_range", "refusal"]
+__all__ = [
+    "MAX_DT",
+    "ROUNDING",
+    "StreamingInverse",
+    "Limits",
+    "RateLimiter",
+    "StreamState",
+    "accepted_range",
+    "refusal",
+]
 
 # A wish farther outside the identified displacements than this share of their span is taken for a mistake (a wrong
 # unit, another stage) and refused; nearer ones are held at the voltage limit.
@@ -51,7 +60,7 @@ class StreamState:
     effects: Mapping[str, Any] = field(default_factory=dict)
 
 
-class AxisStream:
+class StreamingInverse:
     """Causal compensation of one axis: ``v = step(t, y)``.
 
     Parameters
@@ -80,7 +89,7 @@ class AxisStream:
     def __init__(self, memory: Memory, displacement_range: tuple[float, float], limits: Limits) -> None:
         self.memory = memory
         self.accepted = accepted_range(displacement_range)
-        self.pace = Pace(limits)
+        self.pace = RateLimiter(limits)
         self._t = -inf
         # The axis may rest outside its limits; the first voltage it is given is inside.
         memory.forward(limits.clip(memory.voltage))
@@ -104,11 +113,11 @@ class AxisStream:
         return self.memory.voltage
 
     @property
-    def own(self) -> float:
+    def uncoupled_displacement(self) -> float:
         """Displacement (m) that the model gives the present voltage, before other axes come in."""
         return self.memory.displacement
 
-    def unseen(self, y: float) -> float:
+    def remove_sensor_effects(self, y: float) -> float:
         """Return the place (m) at which a sensor sees the displacement `y` (m)."""
         return y
 
@@ -173,20 +182,22 @@ class AxisStream:
 
     def snapshot(self) -> StreamState:
         """Return the whole state, to be given back to `restore`."""
-        return StreamState(self.memory.snapshot(), self.voltage, self._goal, self.pace.rate, self.wish, self.own)
+        return StreamState(
+            self.memory.snapshot(), self.voltage, self._goal, self.pace.rate, self.wish, self.uncoupled_displacement
+        )
 
     def restore(self, state: StreamState) -> None:
         """Take over a state from `snapshot`."""
         self.memory.restore(state.memory)
         self._goal, self.pace.rate, self.wish = state.goal, state.rate, state.wish
 
-    def resume(self, before: "AxisStream") -> None:
+    def resume(self, before: "StreamingInverse") -> None:
         """Go on where another model's stream has been; its voltage stays, and what its effects have begun."""
         self.pace.go_on(before.pace)
         if self.voltage != before.voltage:
             self.drive(before.voltage)
 
-    def twin(self) -> "AxisStream":
+    def copy(self) -> "StreamingInverse":
         """Return a stream in the same state, which moves on its own."""
         twin = copy(self)
         twin.memory, twin.pace = copy(self.memory), copy(self.pace)
@@ -243,7 +254,7 @@ Followers = dict[str, Follower]
 TRIALS = 4
 
 
-class EffectStream(AxisStream):
+class EffectStream(StreamingInverse):
     """An axis with effects around its hysteresis, each followed sample by sample.
 
     A wish goes back through the effects behind the hysteresis, the hysteresis, and those before it. The voltage it asks
@@ -253,7 +264,7 @@ class EffectStream(AxisStream):
     Parameters
     ----------
     memory : Memory
-        As in `AxisStream`; the effects are at rest there.
+        As in `StreamingInverse`; the effects are at rest there.
     displacement_range : (float, float), metres
     limits : Limits
         Of the command; an amplifier that clips narrows them.
@@ -310,7 +321,7 @@ class EffectStream(AxisStream):
         return self._v
 
     @property
-    def own(self) -> float:
+    def uncoupled_displacement(self) -> float:
         """Displacement (m) that the model gives the present voltage, before other axes come in."""
         return self._place
 
@@ -329,7 +340,7 @@ class EffectStream(AxisStream):
         below = max(self._missing, self._short) < 0.0
         return below and self._v <= limits.lower + ROUNDING * (1.0 + abs(limits.lower))
 
-    def unseen(self, y: float) -> float:
+    def remove_sensor_effects(self, y: float) -> float:
         """Return the place (m) at which a sensor sees the displacement `y` (m)."""
         for follower in self._sensor.values():
             y = follower.inverse(0.0, y)
@@ -344,11 +355,11 @@ class EffectStream(AxisStream):
             If the model has no voltage for it.
         """
         counted = dt
-        if dt > LONGEST_STEP:
+        if dt > MAX_DT:
             # The voltage has stayed: only the last part of a pause may lead to the new one.
-            counted = LONGEST_STEP
+            counted = MAX_DT
             self.wait(dt - counted)
-        h = wish = self.unseen(y) - self.coupled
+        h = wish = self.remove_sensor_effects(y) - self.coupled
         for follower in reversed(self._own.values()):
             h = follower.inverse(counted, h)
         v = self._move_before(dt, counted, h) if self._before else self._move_at_once(dt, h)
@@ -382,7 +393,7 @@ class EffectStream(AxisStream):
             for name, follower in followers.items():
                 follower.restore(state.effects[name])
 
-    def resume(self, before: AxisStream) -> None:
+    def resume(self, before: StreamingInverse) -> None:
         """Go on where another model's stream has been; its voltage stays, and what its effects have begun."""
         self.pace.go_on(before.pace)
         self._v = self._goal = before.voltage
@@ -397,9 +408,9 @@ class EffectStream(AxisStream):
                     follower.resume(other, self.memory.displacement)
         self._answer(0.0)
 
-    def twin(self) -> "EffectStream":
+    def copy(self) -> "EffectStream":
         """Return a stream in the same state, which moves on its own."""
-        twin = super().twin()
+        twin = super().copy()
         assert isinstance(twin, EffectStream)
         twin._before, twin._own, twin._sensor, twin._play = deepcopy(
             (self._before, self._own, self._sensor, self._play)
@@ -416,9 +427,9 @@ class EffectStream(AxisStream):
         """Move where something stands between command and hysteresis."""
         memory, pace = self.memory, self.pace
         state = memory.snapshot()
-        goal, aside = self._played(h)
+        goal, reversible_bypass = self._played(h)
         u = memory.voltage
-        self._missing = self._beyond_rounding(h - aside)
+        self._missing = self._beyond_rounding(h - reversible_bypass)
         for follower in reversed(self._before.values()):
             if follower is not self._play:
                 goal = follower.inverse(counted, goal)
@@ -446,11 +457,11 @@ class EffectStream(AxisStream):
         v, direction = play.within(h - rest)
         if v is not None:
             return v, play.between(v, memory.voltage)
-        u, aside = memory.voltage, 0.0
+        u, reversible_bypass = memory.voltage, 0.0
         for _ in range(TRIALS):
             v = play.ahead(u, direction)
-            aside = play.between(v, u)
-            wanted = max(h - aside, rest) if direction > 0 else min(h - aside, rest)
+            reversible_bypass = play.between(v, u)
+            wanted = max(h - reversible_bypass, rest) if direction > 0 else min(h - reversible_bypass, rest)
             memory.restore(state)
             u = memory.inverse(wanted, limits.lower, limits.upper)
         v = play.ahead(u, direction)
@@ -464,7 +475,7 @@ class EffectStream(AxisStream):
 
     def _answer(self, dt: float) -> None:
         """Let the effects follow what the hysteresis does."""
-        place = self.memory.displacement + (self._play.aside if self._play else 0.0)
+        place = self.memory.displacement + (self._play.reversible_bypass if self._play else 0.0)
         if rate := self._driven():
             rate.drive(dt, self.memory.voltage)
         for follower in self._own.values():
@@ -503,7 +514,9 @@ class StageStream:
     streams : dict of axis name to AxisStream
     """
 
-    def __init__(self, streams: Mapping[str, AxisStream], coupling: Coupling, origins: Mapping[str, float]) -> None:
+    def __init__(
+        self, streams: Mapping[str, StreamingInverse], coupling: Coupling, origins: Mapping[str, float]
+    ) -> None:
         self.streams = dict(streams)
         self._coupling, self._origins = coupling, origins
 
@@ -532,9 +545,11 @@ class StageStream:
         if not self._coupling.on:
             return
         streams, origins = self.streams, self._origins
-        seen = {name: streams[name].unseen(wish) - origins[name] for name, wish in y.items()}
-        resting = {name: each.own - origins[name] for name, each in streams.items() if name not in seen}
-        motions = self._coupling.apart(seen, resting)
+        seen = {name: streams[name].remove_sensor_effects(wish) - origins[name] for name, wish in y.items()}
+        resting = {
+            name: each.uncoupled_displacement - origins[name] for name, each in streams.items() if name not in seen
+        }
+        motions = self._coupling.decouple(seen, resting)
         motions.update(resting)
         for name, stream in streams.items():
             stream.coupled = float(self._coupling.part(name, motions))

@@ -46,7 +46,7 @@ def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
     return stamp.sec * SECOND_NS + stamp.nanosec, message.name, message.position
 
 
-class LateService:
+class DeferredService:
     """A service that answers later, without a thread that waits: neither of the executors may be blocked.
 
     Parameters

@@ -17,7 +17,7 @@ from trajectory_msgs.msg import JointTrajectory
 from slpi_ros.compensator.controller import Compensation
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
-from slpi_ros.io.cdr import before_numbers
+from slpi_ros.io.cdr import multiarray_header
 from slpi_ros.io.messages import JointStates
 from slpi_ros.nodes.common import (
     COMMANDS,
@@ -71,7 +71,7 @@ class Compensator(LifecycleNode):
         self._compensation = Compensation(told.axes, told.limits, told.hardware_id, told.time, told.loops)
         self._parameter_set.follow(self._use_settings, check=lambda new: self._compensation.check_limits(new.limits))
         self._desired, self._measured = JointStates(), JointStates()
-        self._before_voltages = before_numbers(len(told.axes))
+        self._before_voltages = multiarray_header(len(told.axes))
         self._failure: SlpiError | None = None
         self._excursions = 0
         self._notes_voltages = told.memory_file != ""

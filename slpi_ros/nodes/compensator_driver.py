@@ -8,7 +8,7 @@ from rclpy.node import Node
 
 from slpi_ros.compensator.controller import Compensation
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.streaming import LONGEST_STEP
+from slpi_ros.model.streaming import MAX_DT
 
 # Seconds from one voltage to the next.
 PERIOD = 0.004
@@ -93,7 +93,7 @@ class Driver:
         self._last_ns = self.given_ns if moving else time.monotonic_ns()
 
     def _rest_after_pause(self) -> None:
-        if time.monotonic_ns() - self.given_ns > LONGEST_STEP * SECOND_NS:
+        if time.monotonic_ns() - self.given_ns > MAX_DT * SECOND_NS:
             self._compensation.driving.rest()
 
     def _on_tick(self) -> None:

@@ -60,7 +60,7 @@ class MemoryKeeper:
         if not self._path or model is None:
             return
         axes = {
-            axis.name: SavedAxis(axis.went_through, axis.memory_state in (KNOWN, RESTORED))
+            axis.name: SavedAxis(axis.reversal_voltages, axis.memory_state in (KNOWN, RESTORED))
             for axis in self._compensation.axes
         }
         memory = SavedMemory(model_id(model), complete, axes)

@@ -6,7 +6,7 @@ from rclpy.node import Node
 
 from slpi_ros.compensator.controller import Compensation
 from slpi_ros.compensator.persistence import KNOWN
-from slpi_ros.nodes.common import LateService
+from slpi_ros.nodes.common import DeferredService
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_driver import Driver
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
@@ -38,7 +38,7 @@ class MemoryReset:
     ) -> None:
         self._compensation, self._driver, self._reporter, self._settings = compensation, driver, reporter, settings
         self._silence = silence
-        self._service = LateService(node, "~/reset_memory", self._start)
+        self._service = DeferredService(node, "~/reset_memory", self._start)
 
     def _start(self) -> str:
         """Start a reset, unless one is under way; return why that cannot be, or ""."""

@@ -14,7 +14,7 @@ from slpi_ros.compensator.statistics import Timing
 from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.compensator.validation import EMPTY, INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
 from slpi_ros.io.messages import SECOND_NS, TrajectoryArrays, decode_trajectory
-from slpi_ros.model.streaming import LONGEST_STEP
+from slpi_ros.model.streaming import MAX_DT
 from slpi_ros.nodes.compensator_driver import Driver
 
 # How often a simulated clock is looked at, seconds.
@@ -85,7 +85,7 @@ class TrajectoryFollower:
         driven = [axis.name for axis in compensation.axes if axis.on_ramp]
         following = compensation.following
         following.start(trajectory, self._now_ns, given_ns, driven)
-        soon = (following.next_deadline_ns or 0) - self._now_ns() <= LONGEST_STEP * SECOND_NS
+        soon = (following.next_deadline_ns or 0) - self._now_ns() <= MAX_DT * SECOND_NS
         compensation.hold(but=following.names if soon or following.under_way else ())
         self._driver.go_on()
         self._on_simulated = self._simulated

@@ -20,7 +20,7 @@ from slpi_ros.identification.fit import KINDS
 from slpi_ros.io.bag_watch import PATIENCE, BagWatch
 from slpi_ros.model.document import parse_model
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.nodes.common import ERROR, LATCHED, WARN, Diagnostics, Health, LateService, run
+from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, run
 from slpi_ros.nodes.jobs import (
     DiagnosisOutcome,
     DiagnosisProcess,
@@ -175,7 +175,7 @@ class DiagnosisService:
         self._last: DiagnosisRequest | None = None
         self._outcome = DiagnosisOutcome()
         self._temporary = ""
-        self._service = LateService(node, "~/diagnose", self._start)
+        self._service = DeferredService(node, "~/diagnose", self._start)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._poll = node.create_timer(POLL_PERIOD, self._look, clock=steady, autostart=False)
 

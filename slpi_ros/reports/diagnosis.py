@@ -16,7 +16,7 @@ from slpi_ros.model.document import format_model
 from slpi_ros.reports import views as charts
 from slpi_ros.reports import views as residual_views
 from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, NOISE
-from slpi_ros.reports.page import Mood, Page, Share
+from slpi_ros.reports.page import Page, Severity, Share
 from slpi_ros.reports.views import Curve, Motion
 
 FloatArray = NDArray[np.float64]
@@ -58,7 +58,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
     return path
 
 
-def _mood(found: AxisDiagnosis) -> Mood:
+def _mood(found: AxisDiagnosis) -> Severity:
     if found.verdict == NOTHING_FOUND:
         return "good"
     if found.verdict == NAMED:

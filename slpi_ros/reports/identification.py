@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import SlpiError
-from slpi_ros.identification.cross_validation import CLASSICAL, HeldOutTruth, Slice
+from slpi_ros.identification.cross_validation import CLASSICAL, CrossValidationReport, Slice
 from slpi_ros.identification.record_quality import Finding, assess, findings
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import AxisModel, StageModel
 from slpi_ros.reports import views as charts
 from slpi_ros.reports.chart import AFTER, BEFORE
-from slpi_ros.reports.page import Mood, Page
+from slpi_ros.reports.page import Page, Severity
 from slpi_ros.reports.text import describe_axis
 from slpi_ros.reports.views import Curve, Motion
 
@@ -41,7 +41,7 @@ def write_report(
     record: Record,
     model: StageModel,
     *,
-    truth: Mapping[str, HeldOutTruth] | None = None,
+    truth: Mapping[str, CrossValidationReport] | None = None,
     found: Mapping[str, Sequence[Finding]] | None = None,
     start: float | None = None,
     stop: float | None = None,
@@ -99,7 +99,7 @@ def write_report(
     return path
 
 
-def _verdict(name: str, axis: AxisModel, truth: HeldOutTruth | None) -> tuple[str, Mood]:
+def _verdict(name: str, axis: AxisModel, truth: CrossValidationReport | None) -> tuple[str, Severity]:
     """Say in a sentence how good the model is."""
     quality = axis.quality
     error, floor = quality.held_out_rms, quality.floor_rms
@@ -122,7 +122,7 @@ def _verdict(name: str, axis: AxisModel, truth: HeldOutTruth | None) -> tuple[st
     return f"{said} 'slpi diagnose' looks for the cause.{beside}", "bad"
 
 
-def _figures(axis: AxisModel, truth: HeldOutTruth | None) -> dict[str, str]:
+def _figures(axis: AxisModel, truth: CrossValidationReport | None) -> dict[str, str]:
     quality = axis.quality
     if truth:
         figures = {
@@ -160,7 +160,7 @@ def _findings(record: Record, name: str, start: float | None, stop: float | None
         return [Finding("stop", str(error))]
 
 
-def _show_truth(page: Page, name: str, truth: HeldOutTruth) -> None:
+def _show_truth(page: Page, name: str, truth: CrossValidationReport) -> None:
     """Add the tables of errors on blocks left out, and the errors themselves."""
     page.section("Errors where the model was not fitted")
     floor = truth.floor

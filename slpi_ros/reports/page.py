@@ -17,7 +17,7 @@ from slpi_ros.reports.chart import Chart
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Mood = Literal["good", "warn", "bad"]
+Severity = Literal["good", "warn", "bad"]
 
 # Whatever a page holds, a browser that shows it must fetch nothing.
 _NOTHING_FROM_OUTSIDE = (
@@ -63,7 +63,7 @@ class Page:
         target = "" if axis is None else f' id="{html.escape(f"axis-{axis}")}"'
         self._parts.append(f"<h2{target}>{html.escape(text)}</h2>")
 
-    def verdict(self, axis: str, text: str, mood: Mood, word: str = "") -> None:
+    def verdict(self, axis: str, text: str, mood: Severity, word: str = "") -> None:
         """Add the sentence that sums up an axis, after a word; its element has the id ``verdict-<axis>``."""
         name, before = html.escape(f"verdict-{axis}"), f"<b>{html.escape(word.replace('_', ' '))}</b> " if word else ""
         said = f' data-verdict="{html.escape(word)}"' if word else ""

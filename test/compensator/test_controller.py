@@ -17,7 +17,7 @@ from slpi_ros.compensator.controller import Compensation  # noqa: E402
 from slpi_ros.compensator.validation import CAUSES, RejectedError  # noqa: E402
 from slpi_ros.errors import SlpiError, UsageError  # noqa: E402
 from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel, Start  # noqa: E402
-from slpi_ros.model.streaming import LONGEST_STEP, Limits  # noqa: E402
+from slpi_ros.model.streaming import MAX_DT, Limits  # noqa: E402
 
 MS = 1_000_000
 START_NS = 1_700_000_000_123_456_789
@@ -234,7 +234,7 @@ def test_no_flood_brings_a_voltage_outside(events, bounds):
             clean.move(now, names, displacements)
             for name, before, after in zip("xy", last, made.voltages, strict=True):
                 assert limits.lower <= after <= limits.upper
-                elapsed = min(max(now - latest.get(name, now), 0) * 1e-9, LONGEST_STEP)
+                elapsed = min(max(now - latest.get(name, now), 0) * 1e-9, MAX_DT)
                 assert slew == math.inf or abs(after - before) <= slew * elapsed + 1e-9
                 assert name in names or after == before
             latest |= dict.fromkeys(names, now)

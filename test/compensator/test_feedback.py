@@ -10,7 +10,7 @@ from strategies import FAMILY_CASE, fractions
 
 from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.errors import UsageError
-from slpi_ros.model.streaming import AxisStream, Limits
+from slpi_ros.model.streaming import Limits, StreamingInverse
 
 INF = float("inf")
 NAN = float("nan")
@@ -147,7 +147,7 @@ def test_a_wrong_gain_leaves_no_error(wrong):
     """The stage is the model, but for its gain: what is left without feedback is gone with it."""
     desired, errors = 7e-6, {}
     for active in (False, True):
-        stream = AxisStream(FAMILY_CASE.memory(), (2e-6, 14e-6), STAGE)
+        stream = StreamingInverse(FAMILY_CASE.memory(), (2e-6, 14e-6), STAGE)
         stage, feedback = FAMILY_CASE.memory(), Feedback(PI, STAGE, release_time=0.1)
         if active:
             feedback.enable()
@@ -184,7 +184,7 @@ def test_the_voltage_keeps_to_its_limits_and_their_slew(script, slew, start, gai
 @given(st.lists(samples_drawn, min_size=1), st.just(INF) | fractions(1, 1000), gains_drawn)
 def test_a_disabled_feedback_gives_what_the_stream_gives(samples, slew, gains):
     limits = Limits(5.0, 80.0, slew)
-    stream = AxisStream(FAMILY_CASE.memory(), (2e-6, 14e-6), limits)
+    stream = StreamingInverse(FAMILY_CASE.memory(), (2e-6, 14e-6), limits)
     feedback, t = Feedback(gains, limits), 0.0
     for dt, share, measured, _ in samples:
         t += dt

@@ -167,7 +167,7 @@ def test_points_that_are_late_are_skipped_and_the_memory_knows_what_was_given():
     given_points = list(range(0, 300, 7)) + ([299] if 299 % 7 else [])
     expected = [twin.move(1e-3, float(PATH[i])) for i in given_points]
     np.testing.assert_allclose(given, expected, rtol=0, atol=1e-9)
-    assert made["x"].went_through == pytest.approx(twin.went_through)
+    assert made["x"].reversal_voltages == pytest.approx(twin.reversal_voltages)
 
 
 def test_one_that_is_refused_changes_nothing():

@@ -190,7 +190,7 @@ def test_a_drive_starts_at_the_voltage_in_total_and_the_path_goes_on_from_its_en
     bench.axis.stop_drive()
     assert bench.axis.voltage == 20.0 and bench.axis.correction == 0.0
     assert bench.axis.move(0.0, PATH[1000]) == 20.0
-    assert bench.axis.went_through[-1] == 20.0
+    assert bench.axis.reversal_voltages[-1] == 20.0
 
 
 def test_the_health_of_a_stage_as_identified_is_its_noise_and_of_another_more():

@@ -9,18 +9,18 @@ from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model, cases, fractions, paths, stream_forward
 
 from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.persistence import ASSUMED, KNOWN, RESETTING, MemoryTrust
+from slpi_ros.compensator.persistence import ASSUMED, KNOWN, RESETTING, MemoryConfidence
 from slpi_ros.compensator.ramps import Ramp, decaying_turns
 from slpi_ros.errors import UsageError
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.streaming import Limits, Pace
+from slpi_ros.model.streaming import Limits, RateLimiter
 
 LIMITS = Limits(0.0, 100.0)
 
 
 def drive(ramp: Ramp, v: float, limits: Limits, dt: float = 0.01) -> list[float]:
     """Return the voltages of a whole ramp."""
-    pace, way = Pace(limits), []
+    pace, way = RateLimiter(limits), []
     while not ramp.done:
         v = ramp.step(v, dt, pace)
         way.append(v)
@@ -83,12 +83,12 @@ def test_a_ramp_takes_the_time_its_rate_tells():
 
 
 def test_a_late_step_of_a_ramp_frees_no_longer_way():
-    assert Ramp([90.0], 50.0).step(40.0, 7.0, Pace(LIMITS)) == 45.0
+    assert Ramp([90.0], 50.0).step(40.0, 7.0, RateLimiter(LIMITS)) == 45.0
 
 
 def test_a_ramp_that_is_done_stays():
     ramp = Ramp([], 1.0)
-    assert ramp.done and ramp.step(33.0, 0.1, Pace(LIMITS)) == 33.0
+    assert ramp.done and ramp.step(33.0, 0.1, RateLimiter(LIMITS)) == 33.0
 
 
 @pytest.mark.parametrize(("goals", "rate"), [([1.0], 0.0), ([1.0], -1.0), ([np.nan], 1.0), ([np.inf], 1.0)])
@@ -146,7 +146,7 @@ def test_only_a_drive_through_all_that_was_identified_makes_the_memory_known(lim
 
 
 def test_an_interrupted_reset_leaves_the_memory_assumed():
-    assert reset(LIMITS, stage(), steps=5).axes[0].trust == MemoryTrust(ASSUMED, "the reset was interrupted")
+    assert reset(LIMITS, stage(), steps=5).axes[0].trust == MemoryConfidence(ASSUMED, "the reset was interrupted")
 
 
 def test_a_new_model_knows_the_memory_only_where_it_was_wiped():

@@ -73,7 +73,7 @@ def test_an_axis_that_is_not_named_keeps_its_voltage_and_is_reckoned_with():
         move(made, k, "x")
     x, y = (axis.stream for axis in made.axes)
     assert made.voltages[1] == before
-    assert x.own + 0.05 * y.own == pytest.approx(PATHS["x"][399], abs=2e-9)
+    assert x.uncoupled_displacement + 0.05 * y.uncoupled_displacement == pytest.approx(PATHS["x"][399], abs=2e-9)
 
 
 def give(made, trajectory):
@@ -155,8 +155,8 @@ def test_the_way_that_is_kept_over_a_restart_ends_with_the_command():
     axis = with_effects(LAG)
     for k, y in enumerate(PATHS["x"][:110].tolist()):
         axis.move(DT if k else 0.0, y)
-    assert axis.went_through[-1] == axis.voltage != axis.stream.memory.voltage
-    assert take_over(axis.model, LIMITS, axis.went_through).voltage == axis.voltage
+    assert axis.reversal_voltages[-1] == axis.voltage != axis.stream.memory.voltage
+    assert take_over(axis.model, LIMITS, axis.reversal_voltages).voltage == axis.voltage
 
 
 def test_creep_goes_on_in_a_pause():
@@ -208,11 +208,11 @@ def test_reset_and_ramps_move_the_effects_too(effects):
     stage.drive(axis.voltage, DT)
     driving.stop()
     assert axis.voltage == pytest.approx(0.0, abs=1e-6)
-    assert axis.stream.own == pytest.approx(stage.own, abs=1e-15)
+    assert axis.stream.uncoupled_displacement == pytest.approx(stage.uncoupled_displacement, abs=1e-15)
     assert axis.memory_state == "known"
     # And wishes are met from there.
     errors = []
-    for y in np.linspace(stage.own, 5e-6, 400).tolist():
+    for y in np.linspace(stage.uncoupled_displacement, 5e-6, 400).tolist():
         errors.append(stage.drive(axis.move(DT, y), DT) - y)
     assert np.abs(errors[-50:]).max() < 2e-8
 

@@ -15,7 +15,7 @@ from slpi_ros.compensator.persistence import (
     CRASHED,
     RESTORED,
     LastVoltages,
-    MemoryTrust,
+    MemoryConfidence,
     SavedAxis,
     SavedMemory,
     last_voltages,
@@ -69,21 +69,21 @@ def crashed(path: Path, *commands: tuple[float, float]) -> SavedMemory:
 def test_after_a_crash_it_is_where_the_last_command_led(tmp_path):
     path = tmp_path / "memory.json"
     found = crashed(path, (1.0, 2.0), (3.0, -0.1), (0.1, 0.2))
-    assert found.axes["x"].went_through == (0.0, 60.0, 20.0, 1 / 3, 0.1)
-    assert found.axes["y"].went_through == (-0.1, 0.2)
+    assert found.axes["x"].reversal_voltages == (0.0, 60.0, 20.0, 1 / 3, 0.1)
+    assert found.axes["y"].reversal_voltages == (-0.1, 0.2)
     # The mark is the memory's: what was noted for another one is not believed, nor what an orderly end makes old.
     save_memory(replace(SAVED, complete=False, model="0" * 64), path)
-    assert load_memory(path).axes["x"].went_through == SAVED.axes["x"].went_through
+    assert load_memory(path).axes["x"].reversal_voltages == SAVED.axes["x"].reversal_voltages
     save_memory(SAVED, path)
     assert load_memory(path) == SAVED
 
 
 def test_after_a_crash_nothing_is_certain(tmp_path):
     found = crashed(tmp_path / "memory.json")
-    assert found.axes["x"] == SavedAxis(SAVED.axes["x"].went_through, True, CRASHED)
-    assert found.axes["x"].trust((0.0, 50.0)) == MemoryTrust(ASSUMED, CRASHED)
-    assert SAVED.axes["x"].trust((0.0, 50.0)) == MemoryTrust(RESTORED, "", (0.0, 50.0))
-    assert SAVED.axes["y"].trust((0.0, 50.0)) == MemoryTrust()
+    assert found.axes["x"] == SavedAxis(SAVED.axes["x"].reversal_voltages, True, CRASHED)
+    assert found.axes["x"].trust((0.0, 50.0)) == MemoryConfidence(ASSUMED, CRASHED)
+    assert SAVED.axes["x"].trust((0.0, 50.0)) == MemoryConfidence(RESTORED, "", (0.0, 50.0))
+    assert SAVED.axes["y"].trust((0.0, 50.0)) == MemoryConfidence()
 
 
 @given(st.integers(1, 5), st.integers(0, 100), st.integers(0, 300), st.binary(max_size=8))

@@ -17,7 +17,7 @@ from slpi_ros.compensator.trajectory import Plan, Standing, Streamer, Trajectory
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
 from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.streaming import LONGEST_STEP, AxisStream, Limits, accepted_range
+from slpi_ros.model.streaming import MAX_DT, Limits, StreamingInverse, accepted_range
 
 MS = 1_000_000
 # A pause of 100 ms is the longest that counts in full.
@@ -72,15 +72,15 @@ def drawn_axes(
 
 
 def one_by_one(
-    stream: AxisStream, y: np.ndarray, due: np.ndarray, since: int
+    stream: StreamingInverse, y: np.ndarray, due: np.ndarray, since: int
 ) -> tuple[list[float], list[bool], list[bool]]:
     """Voltages, where held and where slewed, by `AxisStream.move` and nothing else."""
     v, held, slewed = [], [], []
     for wish, now in zip(y.tolist(), due.tolist(), strict=True):
         dt = max(now - since, 0) * 1e-9
-        if dt > LONGEST_STEP:
+        if dt > MAX_DT:
             stream.pace.rest()
-        v.append(stream.move(min(dt, LONGEST_STEP), wish))
+        v.append(stream.move(min(dt, MAX_DT), wish))
         farther = wish > stream.memory.displacement
         at_limit = v[-1] == (stream.limits.upper if farther else stream.limits.lower)
         held.append(at_limit and stream.missed)
@@ -145,9 +145,9 @@ def apply(standing: Standing, streamer: Streamer[Plan], now: int, given: list[tu
         before = planned[due.point - 1] if due.point and not due.skipped else stream.voltage
         last = given[-1][0] if given else standing.since_ns
         dt = max(due.deadline_ns - last, 0) * 1e-9
-        if dt > LONGEST_STEP:
+        if dt > MAX_DT:
             stream.pace.rest()
-        stream.drive(stream.pace.step(stream.voltage, float(planned[due.point]), min(dt, LONGEST_STEP), float(before)))
+        stream.drive(stream.pace.step(stream.voltage, float(planned[due.point]), min(dt, MAX_DT), float(before)))
         given.append((due.deadline_ns, stream.voltage))
 
 
@@ -158,7 +158,7 @@ def test_a_plan_keeps_to_limits_and_slew(drawn):
     limits = standing.axis.limits
     assert ((limits.lower <= v) & (v <= limits.upper)).all()
     due = [drawn.since, *(10**18 + drawn.times).tolist()]
-    way = [limits.slew * min(max(b - a, 0) * 1e-9, LONGEST_STEP) for a, b in pairwise(due)]
+    way = [limits.slew * min(max(b - a, 0) * 1e-9, MAX_DT) for a, b in pairwise(due)]
     assert (
         np.abs(np.diff(v, prepend=standing.axis.voltage)) <= np.array(way) * (1 + 1e-12) + 1e-13 * drawn.case.width
     ).all()
@@ -191,7 +191,7 @@ def test_a_cancelled_trajectory_leaves_what_its_points_gave(drawn, share):
     # What comes next goes on from there.
     since = int(10**18 + drawn.times[done - 1]) if done else drawn.since
     now = since + 50 * MS
-    v, *_ = one_by_one(standing.axis.twin(), drawn.y, now + drawn.times, since)
+    v, *_ = one_by_one(standing.axis.copy(), drawn.y, now + drawn.times, since)
     again = prepared(drawn, replace(standing, since_ns=since), now=now)
     np.testing.assert_allclose(again.voltages[:, 0], v, rtol=0, atol=1e-8 * drawn.case.width)
 
@@ -215,7 +215,7 @@ def test_an_appended_trajectory_goes_on_from_where_the_first_will_be(drawn, hand
     expected, oracle = first.voltages[:kept, 0].tolist(), drawn.standing()
     due = [drawn.since, *(begin + drawn.times[:kept]).tolist()]
     for v, before, now in zip(expected, due, due[1:], strict=False):
-        oracle.axis.pace.moved(v - oracle.axis.voltage, min(max(now - before, 0) * 1e-9, LONGEST_STEP))
+        oracle.axis.pace.moved(v - oracle.axis.voltage, min(max(now - before, 0) * 1e-9, MAX_DT))
         oracle.axis.drive(v)
     since = due[-1]
     v, *_ = one_by_one(oracle.axis, drawn.y[second.trajectory.cut :], at + drawn.times[second.trajectory.cut :], since)
@@ -238,7 +238,7 @@ def test_a_late_clock_skips_points_but_never_the_slew_limit(drawn, ticks):
     v, since, limits = twin.axis.voltage, drawn.since, standing.axis.limits
     for due, after in given:
         assert limits.lower <= after <= limits.upper
-        way = limits.slew * min(max(due - since, 0) * 1e-9, LONGEST_STEP)
+        way = limits.slew * min(max(due - since, 0) * 1e-9, MAX_DT)
         assert abs(after - v) <= way * (1 + 1e-12) + 1e-13 * drawn.case.width
         v, since = after, due
         twin.axis.memory.forward(after)
@@ -487,7 +487,7 @@ def test_an_axis_in_motion_brakes_first_where_acceleration_is_limited():
     standing = Standing(model, model.stream(Limits(0.0, 100.0, 1000.0, 1e4)), 10**18)
     for _ in range(40):
         standing.axis.move(0.001, 10e-6)
-    here = standing.axis.twin().memory.forward(standing.axis.voltage + 0.35)
+    here = standing.axis.copy().memory.forward(standing.axis.voltage + 0.35)
     plan = prepare(
         Trajectory.of(["x"], MS * np.arange(1, 200), np.full((199, 1), here), axes=["x"]), {"x": standing}, 10**18
     )

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import Around, Effect
+from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
@@ -91,7 +91,7 @@ class Record:
     """A signal, shape (N,), V or m, that begins at rest, and what is around it."""
 
     signal: FloatArray
-    around: Around
+    around: EffectContext
 
     @property
     def span(self) -> float:
@@ -107,7 +107,7 @@ def records(draw: st.DrawFn, side: str) -> Record:
     u = 50 + 40 * _motion(t, rng)
     others = {"y": 1e-5 * _motion(t, rng)} if draw(st.booleans()) else {}
     signal = u if side == "voltage" else middle(u) + 1e-6 * _motion(t, rng)
-    return Record(signal, Around(t, u, middle, others))
+    return Record(signal, EffectContext(t, u, middle, others))
 
 
 def middle(u):

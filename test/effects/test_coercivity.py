@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model
 
-from slpi_ros.effects.base import Around
+from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import in_order
@@ -44,7 +44,7 @@ def widest(effect, v, t):
     rate = np.abs(np.diff(v) / np.diff(t)).max()
     law = replace(effect, reversible=(), settling=0.0)
     ramp = rate * np.array([0.0, 1.0, 2.0])
-    return float(np.ptp(law.apply(ramp, Around(np.arange(3.0))) - ramp))
+    return float(np.ptp(law.apply(ramp, EffectContext(np.arange(3.0))) - ramp))
 
 
 @given(coercivities(), records("voltage"))
@@ -81,8 +81,8 @@ def test_it_is_followed_nearly(effect, record):
     followed = [follower.forward(dt, v) for dt, v in zip(steps, record.signal.tolist(), strict=True)]
     missed = effect.apply(record.signal, record.around) - followed
     assert rms(missed) <= 0.2 * rms(effect.apply(record.signal, record.around) - record.signal) + 1e-12
-    assert follower.aside == pytest.approx(
-        float(effect.aside(record.signal[-1:], np.array(followed[-1:]))[0]), abs=1e-15
+    assert follower.reversible_bypass == pytest.approx(
+        float(effect.reversible_bypass(record.signal[-1:], np.array(followed[-1:]))[0]), abs=1e-15
     )
 
 
@@ -104,7 +104,7 @@ def test_a_snapshot_is_the_whole_state(effect, record, at):
 def test_at_rest_nothing_changes(effect, record, verb):
     rest = np.full_like(record.signal, 50.0)
     np.testing.assert_array_equal(getattr(effect, verb)(rest, record.around), rest)
-    assert not effect.aside(rest, rest).any()
+    assert not effect.reversible_bypass(rest, rest).any()
 
 
 @given(records("voltage"), st.floats(0.1, 4.0), st.floats(0.2, 0.9), st.floats(5e-4, 5e-3))
@@ -128,7 +128,7 @@ def test_a_ramp_back_and_forth():
     """At one rate it is a play of one width, from where the coercivity has settled."""
     t = np.arange(2000) * 1e-3
     v = 50 * (1 - np.abs(1 - t))
-    u = RateDependence(0.0, 0.0, 0.5, 100.0, 1.0, 2.0, settling=1e-3).apply(v, Around(t))
+    u = RateDependence(0.0, 0.0, 0.5, 100.0, 1.0, 2.0, settling=1e-3).apply(v, EffectContext(t))
     half_width = 2.0 * np.sqrt(0.5)
     np.testing.assert_allclose(u[100:900], v[100:900] - half_width, rtol=1e-12)
     np.testing.assert_allclose(u[1100:1900], v[1100:1900] + half_width, rtol=1e-12)
@@ -137,9 +137,9 @@ def test_a_ramp_back_and_forth():
 def test_no_samples_one_sample_and_no_time():
     effect = RateDependence(0.0, 0.0, 0.5, 100.0, 1.0, 2.0)
     for verb in (effect.apply, effect.invert):
-        assert verb(np.empty(0), Around(np.empty(0))).shape == (0,)
-        assert verb(np.array([3.0]), Around(np.array([7.0]))).tolist() == [3.0]
-        assert verb(np.array([3.0, 5.0, 4.0]), Around(np.zeros(3))).tolist() == [3.0, 5.0, 4.0]
+        assert verb(np.empty(0), EffectContext(np.empty(0))).shape == (0,)
+        assert verb(np.array([3.0]), EffectContext(np.array([7.0]))).tolist() == [3.0]
+        assert verb(np.array([3.0, 5.0, 4.0]), EffectContext(np.zeros(3))).tolist() == [3.0, 5.0, 4.0]
 
 
 def test_it_is_the_last_before_the_hysteresis():
@@ -174,7 +174,7 @@ def test_beside_a_lag_and_limits(effect):
     v, own = [], []
     for now, y in zip(T.tolist(), (1.4 * CORNERS).tolist(), strict=True):
         v.append(stream.step(now, y))
-        own.append(stream.own)
+        own.append(stream.uncoupled_displacement)
     assert (min(v), max(v)) == (10.0, 70.0)
     expected = [twin.drive(each, DT if k else 0.0) for k, each in enumerate(v)]
     # At rest a power of the rate makes much of rounding.
@@ -199,7 +199,7 @@ def test_twins_go_their_own_ways(effect):
     stream = replace(BARE, effects=(effect,)).stream()
     for now, y in zip(T[:700].tolist(), CORNERS.tolist(), strict=False):
         stream.step(now, y)
-    twin, state = stream.twin(), stream.snapshot()
+    twin, state = stream.copy(), stream.snapshot()
     ahead = [twin.move(DT, float(y)) for y in CORNERS[700:800]]
     assert stream.snapshot() == state
     assert [stream.move(DT, float(y)) for y in CORNERS[700:800]] == ahead

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lsim
 
-from slpi_ros.effects.base import Around, Effect
+from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.lag import Lag
@@ -168,7 +168,7 @@ def test_rate_dependence_is_followed_nearly(effect, record):
 def test_lag_against_lsim(lag, record):
     t, v = np.arange(record.signal.size) * record.around.t[1], record.signal - record.signal[0]
     _, expected, _ = lsim(([1.0], [lag.time_constant, 1.0]), v, t)
-    result = lag.apply(v, Around(t))
+    result = lag.apply(v, EffectContext(t))
     np.testing.assert_allclose(result, expected, rtol=0, atol=1e-9 * record.span)
 
 
@@ -177,7 +177,7 @@ def test_resonance_against_lsim(mode, record):
     t, h = np.arange(record.signal.size) * record.around.t[1], record.signal - record.signal[0]
     w = 2 * np.pi * mode.frequency
     _, expected, _ = lsim(([w * w], [1.0, 2 * mode.damping * w, w * w]), h, t)
-    np.testing.assert_allclose(mode.apply(h, Around(t)), expected, rtol=0, atol=1e-6 * record.span)
+    np.testing.assert_allclose(mode.apply(h, EffectContext(t)), expected, rtol=0, atol=1e-6 * record.span)
 
 
 @given(creeps(), records("displacement"))
@@ -186,7 +186,7 @@ def test_creep_against_python_control(creep, record):
     taus = np.array(creep.time_constants)
     system = control.ss(np.diag(-1 / taus), (1 / taus)[:, None], np.array([creep.gains]), [[1.0]])
     expected = control.forced_response(system, t, h).outputs
-    np.testing.assert_allclose(creep.apply(h, Around(t)), expected, rtol=0, atol=1e-9 * record.span)
+    np.testing.assert_allclose(creep.apply(h, EffectContext(t)), expected, rtol=0, atol=1e-9 * record.span)
 
 
 @pytest.mark.parametrize("name", ["lag", "creep", "resonance"])
@@ -201,14 +201,14 @@ def test_uneven_stamps_change_little(name, data):
     def motion(t):
         return 1e-5 * np.sin(np.pi * t / 3) ** 4 * np.sin(2 * np.pi * 1.5 * t)
 
-    one, other = (effect.apply(motion(t), Around(t)) for t in (even, uneven))
+    one, other = (effect.apply(motion(t), EffectContext(t)) for t in (even, uneven))
     np.testing.assert_allclose(np.interp(even, uneven, other), one, rtol=0, atol=3e-7)
 
 
 @given(sensors(), st.lists(st.floats(-1e-4, 1e-4), min_size=1, max_size=50))
 def test_readings_of_a_sensor_rise(sensor, places):
     places = np.sort(np.array(places))
-    readings = sensor.apply(places, Around(np.arange(places.size)))
+    readings = sensor.apply(places, EffectContext(np.arange(places.size)))
     assert (np.diff(readings) >= -1e-18).all()
 
 
@@ -222,7 +222,7 @@ def test_a_kick_ends_the_ringing():
     y = np.array(
         [follower.forward(d, follower.inverse(d, w)) for d, w in zip(np.diff(t, prepend=0), wish, strict=True)]
     )
-    rings = mode.apply(wish, Around(t)) - wish
+    rings = mode.apply(wish, EffectContext(t)) - wish
     settled = t > 0.05 + 0.005
     assert np.abs(y - wish)[settled].max() < 0.02 * np.abs(rings)[settled].max()
 
@@ -230,9 +230,9 @@ def test_a_kick_ends_the_ringing():
 def test_no_samples_one_sample_and_no_time():
     for effect in (Lag(0.01), Creep((0.1,), (0.1,)), Resonance(100.0, 0.1)):
         for verb in (effect.apply, effect.invert):
-            assert verb(np.empty(0), Around(np.empty(0))).shape == (0,)
-            assert verb(np.array([3.0]), Around(np.array([7.0]))).tolist() == [3.0]
-            assert np.isfinite(verb(np.array([3.0, 5.0, 4.0]), Around(np.zeros(3)))).all()
+            assert verb(np.empty(0), EffectContext(np.empty(0))).shape == (0,)
+            assert verb(np.array([3.0]), EffectContext(np.array([7.0]))).tolist() == [3.0]
+            assert np.isfinite(verb(np.array([3.0, 5.0, 4.0]), EffectContext(np.zeros(3)))).all()
 
 
 @given(EVERY)
@@ -268,7 +268,7 @@ def test_a_description_is_one_sentence(effect):
 
 def test_a_stamp_ahead_of_its_voltage_is_called_early():
     t = np.arange(100) * 1e-3
-    ahead = Delay(-0.02).apply(t, Around(t))
+    ahead = Delay(-0.02).apply(t, EffectContext(t))
     assert ahead[10] == pytest.approx(t[30]), "what the voltage is 20 ms later"
     assert "20 ms too early" in Delay(-0.02).describe()
 

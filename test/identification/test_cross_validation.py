@@ -11,7 +11,7 @@ from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification import cross_validation as truth
-from slpi_ros.identification.cross_validation import held_out_truth
+from slpi_ros.identification.cross_validation import cross_validate
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def recorded():
 
 @pytest.fixture(scope="module")
 def found(recorded):
-    return held_out_truth(recorded, "x")
+    return cross_validate(recorded, "x")
 
 
 def test_every_cut_holds_every_sample_once(found):
@@ -56,7 +56,7 @@ def test_a_wrong_region_shows_there(recorded):
     # Not repeatable, and only up there.
     high = v > 80.0
     y[high] += np.random.default_rng(0).normal(0.0, 60e-9, np.count_nonzero(high))
-    parts = held_out_truth(record_of(recorded.t, v, y), "x").by_region
+    parts = cross_validate(record_of(recorded.t, v, y), "x").by_region
     assert parts[-1].rms > 5 * max(part.rms for part in parts[:-1])
 
 
@@ -66,15 +66,15 @@ def test_classical_is_as_good_on_a_classical_stage():
     v = 50 - 50 * np.cos(2 * np.pi * t / 2) * np.interp(t, [0, 20], [1.0, 0.1])
     v[0] = 0.0
     y = Memory(shape).forward_array(v) + np.random.default_rng(0).normal(0.0, 8e-9, t.size)
-    judged = held_out_truth(record_of(t, v, y), "x")
+    judged = cross_validate(record_of(t, v, y), "x")
     assert judged.overall.classical_rms < 1.1 * judged.overall.rms
-    alone = held_out_truth(record_of(t, v, y), "x", "pi")
+    alone = cross_validate(record_of(t, v, y), "x", "pi")
     assert alone.overall.classical_rms == alone.overall.rms
 
 
 def test_a_long_record_is_thinned(recorded, found, monkeypatch):
     monkeypatch.setattr(truth, "SAMPLES", 1000)
-    thin = held_out_truth(recorded, "x")
+    thin = cross_validate(recorded, "x")
     assert 900 < thin.overall.samples < 1300
     assert thin.overall.rms == pytest.approx(found.overall.rms, rel=0.5)
 
@@ -83,10 +83,10 @@ def test_windows_gaps_and_several_records(recorded):
     v, y = recorded.voltage["x"].copy(), recorded.displacement["x"].copy()
     v[:7], v[500], y[900:950] = np.nan, np.nan, np.nan
     gappy = record_of(recorded.t, v, y)
-    judged = held_out_truth(gappy, "x", start=3.0, stop=18.0)
+    judged = cross_validate(gappy, "x", start=3.0, stop=18.0)
     assert judged.t.min() >= 3.0 and judged.t.max() < 18.0
     later = calibration(seed=1, duration=25.0)[0]
-    both = held_out_truth([gappy, later], "x")
+    both = cross_validate([gappy, later], "x")
     assert both.overall.samples > judged.overall.samples
     assert both.overall.rms < 1.5 * both.floor.rms
 
@@ -102,6 +102,6 @@ def test_the_table_says_it_all(found):
 
 def test_what_cannot_be_judged_is_said(recorded):
     with pytest.raises(UsageError, match="no axis 'z'"):
-        held_out_truth(recorded, "z")
+        cross_validate(recorded, "z")
     with pytest.raises(UsageError, match="unknown kind"):
-        held_out_truth(recorded, "x", "nonsense")
+        cross_validate(recorded, "x", "nonsense")

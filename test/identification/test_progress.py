@@ -6,7 +6,7 @@ import pytest
 from identification.records import calibration
 
 import slpi_ros
-from slpi_ros.identification.progress import listening, shown_on, tell
+from slpi_ros.identification.progress import listening, report_progress, shown_on
 
 
 class Terminal(io.StringIO):
@@ -16,12 +16,12 @@ class Terminal(io.StringIO):
 
 def test_only_who_listens_hears():
     heard = []
-    tell("before")
+    report_progress("before")
     with listening(heard.append):
-        tell("within")
+        report_progress("within")
         with listening(lambda _: None):
-            tell("to another")
-    tell("after")
+            report_progress("to another")
+    report_progress("after")
     assert heard == ["within"]
 
 
@@ -29,19 +29,19 @@ def test_a_terminal_shows_the_latest_of_long_work_and_is_left_clean():
     terminal, seconds = Terminal(), iter([0.0, 1.0, 3.0, 4.0])
     with pytest.raises(RuntimeError), shown_on(terminal, lambda: next(seconds)):
         for what in ("early", "later", "latest"):
-            tell(what)
+            report_progress(what)
         raise RuntimeError
     shown = terminal.getvalue()
     assert "early" not in shown and "3 s: later" in shown and "4 s: latest" in shown
     assert shown.endswith("\r\x1b[K")
-    tell("nobody listens any more")
+    report_progress("nobody listens any more")
     assert terminal.getvalue() == shown
 
 
 def test_short_work_and_other_streams_show_nothing():
     for stream in (io.StringIO(), Terminal()):
         with shown_on(stream, lambda: 0.0):
-            tell("something")
+            report_progress("something")
         assert stream.getvalue() == ""
 
 

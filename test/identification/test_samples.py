@@ -13,7 +13,7 @@ import slpi_ros
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.identification import convex_fit as linear
-from slpi_ros.identification.initial_history import BeginningWarning
+from slpi_ros.identification.initial_history import InitialHistoryWarning
 from slpi_ros.identification.samples import Samples, select_samples
 
 paths = st.lists(st.integers(0, 8), min_size=1, max_size=80).map(lambda values: np.array(values, dtype=np.float64))
@@ -97,8 +97,8 @@ def test_a_beginning_that_disagrees_is_told():
     first = np.arange(len(record)) < np.flatnonzero(select_samples(record, "x", None, None).wiped)[0]
     # Another axis moves as long as this one has not gone over its range, and couples into it.
     disturbed = record.displacement["x"] + np.where(first, 4e-7 * np.sin(9.0 * record.t), 0.0)
-    with pytest.warns(BeginningWarning, match="slpi diagnose"):
+    with pytest.warns(InitialHistoryWarning, match="slpi diagnose"):
         slpi_ros.identify(replace(record, displacement={"x": disturbed}))
     with warnings.catch_warnings():
-        warnings.simplefilter("error", BeginningWarning)
+        warnings.simplefilter("error", InitialHistoryWarning)
         slpi_ros.identify(record)

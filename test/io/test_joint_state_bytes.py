@@ -12,7 +12,7 @@ from rclpy.serialization import serialize_message  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 
-from slpi_ros.io.cdr import before_numbers  # noqa: E402
+from slpi_ros.io.cdr import multiarray_header  # noqa: E402
 from slpi_ros.io.messages import JointStates  # noqa: E402
 
 NUMBERS = st.lists(st.floats(allow_nan=False), max_size=4)
@@ -83,5 +83,5 @@ def test_any_bytes_are_read_or_not_but_nothing_else(first, second):
 
 @given(NUMBERS)
 def test_numbers_are_written_as_rclpy_does(numbers):
-    written = before_numbers(len(numbers)) + struct.pack(f"={len(numbers)}d", *numbers)
+    written = multiarray_header(len(numbers)) + struct.pack(f"={len(numbers)}d", *numbers)
     assert rclpy.serialization.deserialize_message(written, Float64MultiArray).data.tolist() == numbers

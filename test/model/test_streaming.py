@@ -10,13 +10,15 @@ from strategies import FAMILY_CASE, Case, cases, fractions, paths
 from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.model.streaming import TOLERATED_SHARE, AxisStream, Limits, Pace
+from slpi_ros.model.streaming import TOLERATED_SHARE, Limits, RateLimiter, StreamingInverse
 
 RANGE = (2e-6, 14e-6)
 
 
-def stream_of(case: Case = FAMILY_CASE, limits: Limits | None = None, reach: tuple[float, float] = RANGE) -> AxisStream:
-    return AxisStream(case.memory(), reach, limits or Limits(0.0, 100.0))
+def stream_of(
+    case: Case = FAMILY_CASE, limits: Limits | None = None, reach: tuple[float, float] = RANGE
+) -> StreamingInverse:
+    return StreamingInverse(case.memory(), reach, limits or Limits(0.0, 100.0))
 
 
 @st.composite
@@ -166,7 +168,7 @@ def test_held_is_what_would_stay_however_fast_it_might_go(drawn):
     for t, y in samples:
         v = stream.step(t, y)
         if stream.missed:
-            assert stream.held == (stream.twin().memory.inverse(y, limits.lower, limits.upper) == v)
+            assert stream.held == (stream.copy().memory.inverse(y, limits.lower, limits.upper) == v)
         else:
             assert not stream.held
 
@@ -174,7 +176,7 @@ def test_held_is_what_would_stay_however_fast_it_might_go(drawn):
 def test_check_agrees_with_step_on_what_no_voltage_reaches():
     """A range as wide as that is in no record, but may be in a document."""
     flat = Case(PrandtlIshlinskii(np.array([0.0]), np.array([1e-9])), (0.0, 0.0), False, (0.0, 100.0), ())
-    stream = AxisStream(flat.memory(), (-10.0, 10.0), Limits(-np.inf, np.inf))
+    stream = StreamingInverse(flat.memory(), (-10.0, 10.0), Limits(-np.inf, np.inf))
     before = stream.memory.snapshot()
     with pytest.raises(UsageError):
         stream.step(5.0, 9.0)
@@ -221,7 +223,7 @@ GENTLE = Limits(0.0, 100.0, 300.0, 5000.0)
 STEPS = st.lists(fractions(2e-3, 0.1), min_size=1, max_size=7)
 
 
-def gently(pace: Pace, v: float, goals: list[float], steps: list[float]) -> Iterator[tuple[float, float]]:
+def gently(pace: RateLimiter, v: float, goals: list[float], steps: list[float]) -> Iterator[tuple[float, float]]:
     """Yield time and voltage; check what a pace promises of every step."""
     t, rate, limits = 0.0, 0.0, pace.limits
     for i, goal in enumerate(goals):
@@ -237,12 +239,12 @@ def gently(pace: Pace, v: float, goals: list[float], steps: list[float]) -> Iter
 @given(st.lists(fractions(-50, 150), min_size=1, max_size=30), STEPS)
 def test_a_gentle_pace_keeps_all_limits_wherever_it_is_told_to_go(goals, steps):
     """Goals jump and turn, far outside the limits too; every one stays for a few samples."""
-    list(gently(Pace(GENTLE), 40.0, [goal for goal in goals for _ in range(5)], steps))
+    list(gently(RateLimiter(GENTLE), 40.0, [goal for goal in goals for _ in range(5)], steps))
 
 
 @given(fractions(0, 100), STEPS)
 def test_a_gentle_pace_comes_to_rest_at_its_goal_without_overshoot(goal, steps):
-    way = [v for _, v in gently(Pace(GENTLE), 40.0, [goal] * 400, steps)]
+    way = [v for _, v in gently(RateLimiter(GENTLE), 40.0, [goal] * 400, steps)]
     assert way[-1] == pytest.approx(goal, abs=1e-9)
     towards = np.diff(way) * np.sign(goal - 40.0)
     assert towards.min(initial=0.0) >= -1e-12
@@ -290,5 +292,5 @@ def test_a_gentle_stream_reaches_a_far_wish_and_stays_there():
 
 @pytest.mark.parametrize(("present", "expected"), [(60.0, 55.0), (52.0, 50.0), (10.0, 15.0), (38.0, 40.0)])
 def test_a_voltage_outside_new_limits_goes_inside_at_full_pace(present, expected):
-    pace = Pace(Limits(40.0, 50.0, 500.0))
+    pace = RateLimiter(Limits(40.0, 50.0, 500.0))
     assert pace.step(present, present, 0.01) == expected

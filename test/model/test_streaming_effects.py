@@ -16,7 +16,7 @@ from slpi_ros.effects.saturation import Saturation
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.errors import SlpiError
 from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
-from slpi_ros.model.streaming import AxisStream, Limits
+from slpi_ros.model.streaming import Limits, StreamingInverse
 
 LAG, MODE = Lag(0.015), Resonance(150.0, 0.02)
 RATE = RateDependence(0.1, 2e-8, 0.7, 500.0, 2.0)
@@ -59,7 +59,7 @@ def test_the_stream_knows_where_the_model_is(effects):
     v, own = [], []
     for now, wish in zip(T.tolist(), path(1e-6, 13e-6).tolist(), strict=True):
         v.append(stream.step(now, wish))
-        own.append(stream.own)
+        own.append(stream.uncoupled_displacement)
     assert (min(v), max(v)) == (10.0, 70.0)
     # The axis rests at its lower limit before.
     twin = axis.stream(Limits(10.0, 70.0))
@@ -174,7 +174,7 @@ def test_snapshots_and_twins(effects, at):
     stream, y = axis.stream(Limits(0.0, 80.0, 2000.0, 1e6)), path()[400:]
     for k in range(at):
         stream.step(k * DT, float(y[k]))
-    state, twin, other = stream.snapshot(), stream.twin(), axis.stream(stream.limits)
+    state, twin, other = stream.snapshot(), stream.copy(), axis.stream(stream.limits)
     other.restore(state)
     wishes_after = y[at : at + 30].tolist()
     expected = [stream.move(DT, wish) for wish in wishes_after]
@@ -185,10 +185,10 @@ def test_snapshots_and_twins(effects, at):
 
 
 def test_without_effects_there_is_nothing_in_the_way():
-    assert type(X.stream()) is AxisStream
+    assert type(X.stream()) is StreamingInverse
     stream = X.stream()
     followed(stream, path()[:500], T[:500])
-    twin, state = stream.twin(), stream.snapshot()
+    twin, state = stream.copy(), stream.snapshot()
     expected = stream.move(DT, 5e-6)
     assert twin.move(DT, 5e-6) == expected
     stream.restore(state)
@@ -215,11 +215,11 @@ def test_an_axis_that_is_not_named_keeps_its_voltage_and_counts():
     axes = {"x": with_effects(CrossCoupling({"y": gains["x"]})), "y": with_effects(CrossCoupling({"x": gains["y"]}))}
     stream = StageModel(axes).streams()
     stream.step(0.0, {"x": 5e-6, "y": 6e-6})
-    own = {name: each.own - 2e-6 for name, each in stream.streams.items()}
+    own = {name: each.uncoupled_displacement - 2e-6 for name, each in stream.streams.items()}
     assert own["x"] + gains["x"] * own["y"] == pytest.approx(3e-6)
     assert own["y"] + gains["y"] * own["x"] == pytest.approx(4e-6)
     assert list(stream.step(1.0, {"x": 7e-6})) == ["x"]
-    moved = {name: each.own - 2e-6 for name, each in stream.streams.items()}
+    moved = {name: each.uncoupled_displacement - 2e-6 for name, each in stream.streams.items()}
     assert moved["y"] == own["y"]
     assert moved["x"] + gains["x"] * own["y"] == pytest.approx(5e-6)
 

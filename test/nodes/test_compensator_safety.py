@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
-from slpi_ros.model.streaming import LONGEST_STEP  # noqa: E402
+from slpi_ros.model.streaming import MAX_DT  # noqa: E402
 from slpi_ros.nodes.compensator_driver import PERIOD  # noqa: E402
 
 SAFE = {"safe_voltage": 10, "ramp_rate": 200.0}
@@ -54,7 +54,7 @@ def test_silence_leads_to_the_safe_voltage_and_the_next_command_takes_over_from_
         sent = len(client.answers)
         wait_for_rest(client, 10.0)
         way = np.array([before, *voltages(client, sent)])
-        assert (np.diff(way) < 0).all() and np.abs(np.diff(way)).max() <= 200.0 * LONGEST_STEP
+        assert (np.diff(way) < 0).all() and np.abs(np.diff(way)).max() <= 200.0 * MAX_DT
         assert len(way) > 0.5 * (before - 10.0) / 200.0 / PERIOD
         ramped = len(client.answers)
         # No time has passed at the first sample of a new path: it starts where the ramp has ended.
@@ -95,7 +95,7 @@ def test_an_end_leads_to_the_safe_voltage_first(x_file, how):
             wait_for_rest(client, 10.0)
             client.report(state="finalized" if how == "shutdown" else "inactive")
         way = np.array([before, *voltages(client, 1)])
-        assert (np.diff(way) <= 0).all() and np.abs(np.diff(way)).max() <= 200.0 * LONGEST_STEP and len(way) > 20
+        assert (np.diff(way) <= 0).all() and np.abs(np.diff(way)).max() <= 200.0 * MAX_DT and len(way) > 20
 
 
 @pytest.mark.parametrize("how", ["deactivate", "signal"])

@@ -24,7 +24,7 @@ from std_msgs.msg import Float64, String  # noqa: E402
 from slpi_ros.compensator.controller import Compensation  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
 from slpi_ros.model.stage_model import StageModel  # noqa: E402
-from slpi_ros.model.streaming import LONGEST_STEP, Limits  # noqa: E402
+from slpi_ros.model.streaming import MAX_DT, Limits  # noqa: E402
 
 AXES = ["x", "y"]
 MODEL = stage_model(AXES)
@@ -64,7 +64,7 @@ class Twin:
         before = list(self.compensation.voltages)
         self.compensation.move(stamp_ns, AXES, row)
         answer = list(self.compensation.voltages)
-        elapsed = 0.0 if self._last_ns is None else min(max(stamp_ns - self._last_ns, 0) * 1e-9, LONGEST_STEP)
+        elapsed = 0.0 if self._last_ns is None else min(max(stamp_ns - self._last_ns, 0) * 1e-9, MAX_DT)
         for v, last in zip(answer, before, strict=True):
             assert LOW <= v <= HIGH
             assert abs(v - last) <= SLEW * elapsed + 1e-9

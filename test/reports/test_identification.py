@@ -12,7 +12,7 @@ from reports.pages import parsed, trace, unpacked
 import slpi_ros
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.identification.cross_validation import HeldOutTruth, Slice
+from slpi_ros.identification.cross_validation import CrossValidationReport, Slice
 from slpi_ros.identification.signal_statistics import Floor
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
@@ -37,7 +37,7 @@ def written(identified, tmp_path_factory):
 def truth_of(record):
     part = Slice("all samples", 2000, 12.3e-9, 45.6e-9, 78.9e-9)
     error = 1e-9 * np.arange(record.t.size)
-    return HeldOutTruth(
+    return CrossValidationReport(
         axis="x",
         kind="slpi",
         floor=Floor(8.7e-9, "repeats: 5 <moves>"),

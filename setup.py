@@ -31,6 +31,7 @@ setup(
         "setuptools",
         "jsonschema>=4.10",
         "matplotlib>=3.6",
+        "numba>=0.59",
         "numpy>=1.26,<3",
         "osqp>=1.0,<2",
         "rosbags>=0.11",

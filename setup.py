@@ -9,7 +9,7 @@ SHARE = f"share/{NAME}"
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="Hysteresis identification and compensation for piezo nanopositioning stages",
     license="Apache-2.0",
     maintainer="slpi_ros maintainers",

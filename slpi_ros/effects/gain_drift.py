@@ -11,8 +11,6 @@ from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removabl
 
 # Knots that are tried, as shares of the record: even ones, and early ones, as a stage changes most after a rest.
 KNOTS = (*(tuple(np.linspace(0.0, 1.0, count + 1)[1:].tolist()) for count in (1, 2, 4, 8)), (0.05, 0.15, 0.4, 1.0))
-# With so many even knots the origin is found.
-ORIGIN_KNOTS = 4
 
 
 @dataclass(frozen=True)
@@ -73,16 +71,24 @@ class GainDrift:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield curves of one knot and of more."""
-        origin = _origin(left)
+        """Yield curves of one knot and of more.
+
+        Each has a column for the changing sensitivity and one for a shift, from which the origin follows. An origin
+        outside the record's displacements would turn any thermal drift into a gain drift: it is kept inside.
+        """
+        t, low, high = left.t - left.t[0], float(left.h.min()), float(left.h.max())
+        moved = left.h - 0.5 * (low + high)
         for shares in KNOTS:
-            times = (left.t[-1] - left.t[0]) * np.array(shares)
-            columns = _hats(left.t - left.t[0], times) * (left.h - origin)[:, None]
-            yield Candidate(columns, partial(cls._through, times, origin))
+            times = t[-1] * np.array(shares)
+            hats = np.column_stack([np.interp(t, (0.0, *times), (0.0, *row)) for row in np.eye(times.size)])
+            yield Candidate(np.column_stack([hats * moved[:, None], hats]), partial(cls._through, times, low, high))
 
     @classmethod
-    def _through(cls, times: FloatArray, origin: float, gains: FloatArray) -> "GainDrift":
-        return cls(tuple(times.tolist()), tuple(gains.tolist()), origin)
+    def _through(cls, times: FloatArray, low: float, high: float, found: FloatArray) -> "GainDrift":
+        """Return the curve of gains ``a`` and shifts ``b``, shape (2 K,), of which ``b = -origin a`` fits best."""
+        gains, shifts = found.reshape(2, -1)
+        origin = 0.5 * (low + high) - float(gains @ shifts) / max(float(gains @ gains), 1e-300)
+        return cls(tuple(times.tolist()), tuple(gains.tolist()), min(max(origin, low), high))
 
     def describe(self) -> str:
         """Say how far, in which time, and when most of it."""
@@ -124,26 +130,3 @@ class GainFollower:
 
     def restore(self, state: tuple[()]) -> None:
         """Take over nothing."""
-
-
-def _hats(t: FloatArray, times: FloatArray) -> FloatArray:
-    """Return curves, shape (N, K), each 1 at one of the knots `times`, shape (K,), and 0 at the others and at 0."""
-    return np.column_stack([np.interp(t, (0.0, *times), (0.0, *row)) for row in np.eye(times.size)])
-
-
-def _origin(left: ResidualView) -> float:
-    """Return the displacement (m), within the record's, about which the residual grows or shrinks with time.
-
-    Least squares of ``sum_k hat_k(t) (a_k h + b_k) + c h + d``, where c and d stand for what the hysteresis has taken
-    up; the origin is the one of which ``b_k = -origin a_k`` fits best. One that were free outside the range would turn
-    any thermal drift into a gain drift.
-    """
-    t, h = left.t[left.used] - left.t[0], left.h[left.used]
-    low, high = float(h.min()), float(h.max())
-    middle, span = 0.5 * (low + high), (high - low) or 1.0
-    x = (h - middle) / span
-    hats = _hats(t, (t[-1] or 1.0) * np.arange(1, ORIGIN_KNOTS + 1) / ORIGIN_KNOTS)
-    columns = np.column_stack([hats * x[:, None], hats, x, np.ones_like(x)])
-    a, b = np.linalg.lstsq(columns, left.residual[left.used], rcond=None)[0][: 2 * ORIGIN_KNOTS].reshape(2, -1)
-    share = -float(a @ b) / max(float(a @ a), 1e-300)
-    return middle + span * min(max(share, -0.5), 0.5)

@@ -70,9 +70,9 @@ def test_fit_finds_the_course_of_a_simulated_change(form, pivot):
 def test_a_thermal_drift_is_no_gain_drift(drift):
     record = Residual(T, np.zeros_like(T), H, H + drift)
     for candidate in GainDrift.fit(record):
-        gains = np.linalg.lstsq(candidate.columns, record.residual, rcond=None)[0]
-        left = record.residual - candidate.columns @ gains
-        assert np.std(left) > 0.3 * np.std(drift)
+        effect = candidate.effect(np.linalg.lstsq(candidate.columns, record.residual, rcond=None)[0])
+        assert H.min() <= effect.origin <= H.max()
+        assert np.std(record.y - effect.apply(H, record.around)) > 0.5 * np.std(drift)
 
 
 def test_the_sentence_holds_the_figures():

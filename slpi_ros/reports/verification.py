@@ -202,8 +202,8 @@ def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence
         for record in axis.records
     ]
     caption = (
-        "Measured - model, free-run, without a constant offset for each record. The rms must be within the tolerance or, "
-        f"without one, {TIMES_THE_FLOOR:g} times the noise floor, but at least the model's held-out error. Floor: "
+        "Measured - model, free-run, without a constant offset for each record. The rms must be within the tolerance, "
+        f"else within {TIMES_THE_FLOOR:g} times the noise floor, but at least the model's held-out error. Floor: "
         f"{axis.records[0].floor_source}."
     )
     return header, rows, None, caption

@@ -64,8 +64,9 @@ def main() -> None:
                 elif case == "gain":
                     right = found.gain_changed and abs(found.gain_change / GAIN - 1.0) <= WITHIN and change.drifted
                 else:
-                    known = found.offset_uncertainty < ZERO
-                    right = not known or (found.zero_moved and abs(found.offset / ZERO - 1.0) <= WITHIN)
+                    # A record of a part of the range cannot tell a moved zero from another history.
+                    off = abs(found.offset - ZERO)
+                    right = off <= found.offset_uncertainty if number % 2 else found.zero_moved and off <= WITHIN * ZERO
                 told[case] += right
                 if not right:
                     print(

@@ -12,7 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.effects.base import Effect
 from slpi_ros.effects.chain import loop_middle
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.identification.samples import FEWEST, Samples
 from slpi_ros.model.stage_model import AxisModel, Start
 
@@ -231,7 +233,7 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Mat
     Match
     """
     time = np.arange(float(samples.v.size)) if t is None else t
-    axis = replace(axis, effects=tuple(effect for effect in axis.effects if effect.removable != "record"))
+    axis = replace(axis, effects=lasting_effects(axis))
     starts = _possible_starts(axis, float(samples.v[0]))
     predictions = [replace(axis, start=start).simulate(time, samples.v) for start in starts]
     fitted = samples.fitted
@@ -266,6 +268,18 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Mat
         known=known,
         residual=residual + zero,
     )
+
+
+def lasting_effects(axis: AxisModel) -> tuple[Effect, ...]:
+    """Return the effects of an axis that another record shows too: no drift or hum, and the gain that a drift left."""
+    lasting: list[Effect] = []
+    for effect in axis.effects:
+        if isinstance(effect, GainDrift):
+            # From the first moment on what it was at the end.
+            lasting.append(replace(effect, times=(1e-9,), gains=effect.gains[-1:], uncertainty={}))
+        elif effect.removable != "record":
+            lasting.append(effect)
+    return tuple(lasting)
 
 
 def _possible_starts(axis: AxisModel, v: float) -> list[Start]:

@@ -21,7 +21,7 @@ from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
 from slpi_ros.identification.convex_fit import FIT_SAMPLES
-from slpi_ros.identification.initial_history import Match, match
+from slpi_ros.identification.initial_history import Match, lasting_effects, match
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record
@@ -124,11 +124,8 @@ def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -
     if not any(model.axes[axis].effects for axis in shared):
         return record
     # A drift or hum of the old record is none of the new one.
-    lasting = {
-        name: replace(axis, effects=tuple(effect for effect in axis.effects if effect.removable != "record"))
-        for name, axis in model.axes.items()
-    }
-    model = replace(model, axes=lasting)
+    axes = {name: replace(axis, effects=lasting_effects(axis)) for name, axis in model.axes.items()}
+    model = replace(model, axes=axes)
     t, voltage, displacement = record.t, dict(record.voltage), dict(record.displacement)
     known = {axis: _held(record.voltage[axis]) for axis in shared}
     simulated = model.simulate(t, known)

@@ -195,8 +195,8 @@ def fit(request: FitRequest) -> FitOutcome:
     return FitOutcome(document)
 
 
-# A model takes the place of another one unasked only if its held-out error is less than so many times that of the other,
-# and its largest loop differs by less than this share of its height.
+# A model takes the place of another one unasked only if its held-out error is less than so many times as large, and its
+# largest loop differs by less than this share of its height.
 MUCH_WORSE, FOREIGN = 3.0, 0.1
 
 

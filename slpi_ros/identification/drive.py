@@ -13,7 +13,7 @@ IntArray = NDArray[np.int64]
 _CELLS = 10
 # Runs of nearly one swing are compared, and speeds that differ by less than this factor are one.
 _SWING_FACTOR = 1.6
-_SPEED_FACTOR = 1.5
+SPEED_FACTOR = 1.5
 # Anything shorter is a turn; creep shows from here on.
 _SHORTEST_HOLD = 0.5
 # Turns smaller than this share of the range say nothing about loops; larger ones than that are never noise.
@@ -57,17 +57,25 @@ class Runs:
         for size in np.unique(np.round(np.log(swing) / np.log(_SWING_FACTOR))).tolist():
             alike = np.abs(np.log(swing) / np.log(_SWING_FACTOR) - size) < 0.5
             found = _distinct(np.sort(speed[alike]))
-            if len(found) > len(best):
+            # Of equally varied sizes the largest.
+            if len(found) >= max(len(best), 1):
                 best = found
         return best
+
+    @property
+    def speed_range(self) -> tuple[float, float]:
+        """Speeds (V/s) of the slowest and the fastest stretch; zeros where none takes time."""
+        timed = (self.duration > 0.0) & (self.swing != 0.0)
+        speed = np.abs(self.swing[timed]) / self.duration[timed]
+        return (float(speed.min()), float(speed.max())) if speed.size else (0.0, 0.0)
 
 
 def _distinct(speeds: FloatArray) -> tuple[float, ...]:
     """Return one of each group of sorted speeds, of those that come at least twice."""
     result: list[float] = []
-    for group in np.split(speeds, np.flatnonzero(speeds[1:] > speeds[:-1] * np.sqrt(_SPEED_FACTOR)) + 1):
+    for group in np.split(speeds, np.flatnonzero(speeds[1:] > speeds[:-1] * np.sqrt(SPEED_FACTOR)) + 1):
         middle = float(np.median(group))
-        if group.size > 1 and (not result or middle > _SPEED_FACTOR * result[-1]):
+        if group.size > 1 and (not result or middle > SPEED_FACTOR * result[-1]):
             result.append(middle)
     return tuple(result)
 

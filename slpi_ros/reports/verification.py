@@ -134,7 +134,7 @@ def _summary(name: str, axis: AxisVerification) -> str:
 def _error(record: RecordVerification) -> str:
     error = record.error
     return (
-        f"measured - model is {_nm(error.rms)} rms, {_nm(error.maximum)} at most; {_nm(record.limit)} rms pass; "
+        f"measured - model is {_nm(error.rms)} rms (limit {_nm(record.limit)}), maximum {_nm(error.maximum)}; "
         f"noise floor {_nm(record.floor_rms)} rms"
     )
 
@@ -151,7 +151,7 @@ def _notes(record: RecordVerification) -> list[str]:
     if record.zero_moved:
         notes.append(f"the zero has moved by {_um(record.offset)} µm, which does not count as an error")
     if not record.passed:
-        notes.append(f"the displacement changes by {record.gain:+.2%} more than the model says")
+        notes.append(f"gain {record.gain:+.2%} against the model")
     if record.outside:
         notes.append(f"{record.outside} voltages lie outside of what the model was identified on: extrapolated there")
     if record.tracking:

@@ -30,10 +30,11 @@ from slpi_ros.io import tables
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.column_choice import Wishes
 from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.document import load_model, save_model
 from slpi_ros.model.stage_model import StageModel, check_time, held_message
 from slpi_ros.model.streaming import Limits
-from slpi_ros.reports.text import describe_change, describe_model
+from slpi_ros.reports.text import describe_change, describe_model, describe_start
 
 # Where a bag holds voltage and displacement, if nothing else is said.
 TOPIC = "stage_state"
@@ -199,6 +200,11 @@ def _compensate_options(command: Any) -> None:
     command.add_argument("-o", "--output", metavar="VOLTAGE.csv", required=True)
     command.add_argument("--voltage-min", metavar="V", type=float, default=-np.inf, help="default: what was identified")
     command.add_argument("--voltage-max", metavar="V", type=float, default=np.inf)
+    command.add_argument(
+        "--start-memory", choices=START_MEMORIES, default=START_MEMORIES[0],
+        help="what the stage went through before: up to the end of the identified record (default), up to its start, "
+        "or a decaying drive that wiped the memory",
+    )  # fmt: skip
 
 
 def _experiments_options(command: Any) -> None:
@@ -419,13 +425,14 @@ def _compensate(options: argparse.Namespace) -> None:
     known = _known(desired, model, options.table)
     limits = Limits(options.voltage_min, options.voltage_max)
     try:
-        answers = model.command(t, known, limits)
+        answers = model.command(t, known, limits, options.start_memory)
     except SlpiError as error:
         raise type(error)(f"{options.table}, {error}") from None
     for axis, (_, held) in answers.items():
         if held.any():
             print(f"slpi compensate: axis '{axis}': {held_message(held)}", file=sys.stderr)
     tables.write_table(options.output, t, {axis: v for axis, (v, _) in answers.items()}, "V")
+    print(describe_start(model, answers, options.start_memory))
 
 
 def _require_another_file(output: str, *inputs: str) -> None:

@@ -223,7 +223,7 @@ def follow(
 
 def _warm(model: AxisModel) -> AxisModel:
     """Return a model that starts at 0 V and at the sensor's zero, after a long fall."""
-    return replace(model, start=Start(0.0, 0.0, (0.0,) if model.causal else ()))
+    return replace(model, start=Start(0.0, 0.0, (0.0,) if model.causal else ()), end=None)
 
 
 def exhibits(seed: int = 0) -> list[Exhibit]:

@@ -134,13 +134,13 @@ def study(turns: tuple[float, ...]) -> Study:
     assert isinstance(at_rest, SeparatedLoops)
     assert isinstance(closing, SeparatedLoops)
     classical = classical_model(v, y)
-    family = identify(record).axis("x")
+    more_plays, family = (identify(record, kind).axis("x") for kind in ("pi", "slpi"))
     drives: dict[str, Callable[[], Drive]] = {
         CLASSICAL: lambda: Memory(classical, 0.0, float(y[0])),
-        MORE_PLAYS: identify(record, "pi").axis("x").memory,
+        MORE_PLAYS: lambda: more_plays.memory("start"),
         AT_REST: lambda: at_rest.along(0.0, float(y[0])),
         CLOSING: lambda: closing.along(0.0, float(y[0])),
-        FAMILY: family.memory,
+        FAMILY: lambda: family.memory("start"),
     }
     desired = straight_between_turns(y, v)
     straight = y[0] + (y.max() - y[0]) * v / v.max()

@@ -60,7 +60,17 @@ def describe_start(model: StageModel, axes: Iterable[str], start_memory: StartMe
 
 def describe_change(axis: str, change: AxisChange) -> list[str]:
     """Return lines of text on what a refit changed in one axis, in nm."""
-    verdict = "the stage has changed" if change.drifted else "no change beyond repeatability"
+    found = change.match
+    same = max(abs(found.gain_change), found.gain_uncertainty)
+    zero = f"the zero has moved by {found.offset * 1e6:+.3g} um since" if found.zero_moved else ""
+    if change.drifted:
+        verdict = f"the stage has changed{f' and {zero}' if zero else ''}"
+    elif zero:
+        verdict = f"{zero}; the loops are the same within {same:.2%}"
+    else:
+        verdict = f"no change beyond repeatability; the loops are the same within {same:.2%}"
+    if change.match.known_from:
+        verdict += "; the initial history of the new record is not known and was not judged"
     return [
         f"axis {axis}: {verdict}: the old model's error on the new record is {change.error_before * 1e9:.1f} nm rms, "
         f"it was known to {change.repeatability * 1e9:.1f} nm",

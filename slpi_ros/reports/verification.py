@@ -153,7 +153,7 @@ def _notes(record: RecordVerification) -> list[str]:
     if record.zero_moved:
         notes.append(f"the zero has moved by {_um(record.offset)} µm, which does not count as an error")
     if not record.passed:
-        notes.append(f"gain {record.gain:+.2%} against the model")
+        notes.append(f"against the model the gain is {record.gain:+.2%}, the width of the loops {record.width:+.2%}")
     if record.outside:
         notes.append(f"{record.outside} voltages lie outside of what the model was identified on: extrapolated there")
     return notes

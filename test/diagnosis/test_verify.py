@@ -126,7 +126,7 @@ def path(model):
 def tracked(model, history=(), limits=(0.0, 100.0), delay=0, gain=1.0, offset=0.0):
     """Return how a path was followed by a stage with another history, limits, delay, gain or zero."""
     t, desired = path(model)
-    v = np.clip(model.compensate(t, desired), *limits)
+    v = np.clip(model.compensate(t, desired, start_memory="start"), *limits)
     v = np.concatenate([np.full(delay, v[0]), v[: v.size - delay]])
     y = gain * after(history, 0.0).run(t + 100.0, v)[1] + offset
     return judged(record_of(t, v, y), model, desired=[{"x": desired}]).tracking
@@ -166,7 +166,7 @@ def folder(tmp_path_factory, model):
     slpi_ros.io.bag_reader.write_bag(folder / "good", unseen((100,), offset=-0.93e-6))
     slpi_ros.io.bag_reader.write_bag(folder / "bad", unseen(gain=1.02))
     t, desired = path(model)
-    v = model.compensate(t, desired)
+    v = model.compensate(t, desired, start_memory="start")
     y = after((0, 100, 0)).run(t + 100.0, v)[1]
     stamps = np.round(t * 1e9).astype(np.int64).tolist()
     topics = {

@@ -205,7 +205,7 @@ def _part(t: FloatArray, fitted: Mask) -> str:
     first, last = t[fitted][[0, -1]].tolist()
     return (
         f"Fitted were the samples from {first:.6g} s to {last:.6g} s, of {t[0]:.6g} s to {t[-1]:.6g} s. The others are "
-        f"drawn as '{views.UNFITTED}'; no figure, no histogram and no map counts them. Voltage before the part that "
+        f"drawn as '{views.UNUSED}'; no figure, no histogram and no map counts them. Voltage before the part that "
         "was fitted still moves the memory."
     )
 

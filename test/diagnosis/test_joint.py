@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slpi_ros.diagnosis.joint import Joint
+from slpi_ros.diagnosis.joint_fit import Joint
 from slpi_ros.identification.bases import SurfaceBasis
 from slpi_ros.identification.least_squares import Problem
 from slpi_ros.identification.samples import Samples

@@ -4,8 +4,8 @@ The hysteresis is linear in its parameters ``x``, and so is an effect in its gai
 parameters: ``y = A x + J g``. With the hysteresis eliminated once for every fold (Frisch-Waugh), trying other columns
 ``J`` takes a few products with sparse matrices; so hundreds of them can compete.
 
-Left out are blocks of every record, and where there are several, each record in turn: of that one nothing is estimated
-but its initial history and its constant.
+Left out are blocks of every record, and where there are several, each record in turn: the hysteresis is fitted to the
+others, and of that one nothing is estimated but how it began and its constant.
 """
 
 import operator
@@ -22,7 +22,7 @@ from scipy.optimize import lsq_linear
 
 from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, steps
 from slpi_ros.diagnosis.prepare import Evidence
-from slpi_ros.effects.base import Effect, EffectContext, longest
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
 from slpi_ros.effects.chain import reaching
 from slpi_ros.effects.creep import Creep, settling
 from slpi_ros.effects.registry import in_order
@@ -152,7 +152,7 @@ class Joint:
         """Return what the hysteresis gives for parameters `x`, shape (N,), metres."""
         return self.problem.design.predict(x)[self.evidence.rows] * self.problem.scale
 
-    def score(self, y: FloatArray, columns: FloatArray, *, positive: int = 0) -> Score:
+    def score(self, y: FloatArray, columns: FloatArray, *, positive: int = 0, starting: Sequence[int] = ()) -> Score:
         """Score hysteresis and columns on what is left out.
 
         Parameters
@@ -162,6 +162,8 @@ class Joint:
         columns : ndarray, shape (N, k), metres
         positive : int
             Number of the last columns whose gains may not be negative.
+        starting : sequence of int
+            Columns that tell how a record began: with its constant they are fitted to a record that is left out.
         """
         sums = _Sums.of(self, y, columns)
         errors = np.full(self.problem.y.size, np.nan)
@@ -170,13 +172,24 @@ class Joint:
             for group in left:
                 errors[self._groups[group]] = self._errors(sums, group, x, gains)
         losses = np.array([float(np.mean(errors[rows] ** 2)) for rows in self.blocks])
-        of_records = []
-        for (left, rest), factor in zip(self._records, self._record_factors, strict=True):
-            x, gains = sums.of_groups(rest).solve(factor, positive=positive)
-            of_records.append(float(np.var(np.concatenate([self._errors(sums, group, x, gains) for group in left]))))
         gains = sums.of_groups(range(len(self._groups))).solve(self._factor, positive=positive)[1]
         square = self.problem.scale**2
-        return Score(losses * square, gains, np.array(of_records) * square)
+        left_out = np.array([self._left_out(sums, k, gains, starting) for k in range(len(self._records))])
+        return Score(losses * square, gains, left_out * square)
+
+    def _left_out(self, sums: "_Sums", k: int, gains: FloatArray, starting: Sequence[int]) -> float:
+        """Return the mean square of the errors of a record by a hysteresis fitted to the others.
+
+        The gains of the columns are those of all records: one record at one speed does not tell them.
+        """
+        left, rest = self._records[k]
+        equations = sums.of_groups(rest)
+        vector = equations.a_y - equations.a_j @ gains
+        x = scipy.linalg.cho_solve(self._record_factors[k], vector, check_finite=False)
+        missed = np.concatenate([self._errors(sums, group, x, gains) for group in left])
+        began = np.concatenate([sums.columns[group][:, starting] for group in left])
+        own = np.column_stack([np.ones(missed.size), began[:, began.any(axis=0)]])
+        return float(np.mean((missed - own @ np.linalg.lstsq(own, missed, rcond=None)[0]) ** 2))
 
     def _errors(self, sums: "_Sums", group: int, x: FloatArray, gains: FloatArray) -> FloatArray:
         predicted = self._local[group] @ x + self._pick[group] @ (self._at_turns @ x)
@@ -332,7 +345,9 @@ class Explanation:
         )
         self.joint: Joint = like.joint if like and same and np.array_equal(like.u, self.u) else Joint(evidence, self.u)
         self.added = self._aside
-        self._before = np.column_stack([evidence.beside, settling(self._relaxations, evidence.around, evidence.used)])
+        starting = settling(self._relaxations, evidence.around, evidence.used)
+        self._before = np.column_stack([starting, evidence.beside])
+        self._starting = range(starting.shape[1])
         self._fit()
         if any(effect.side == "displacement" for effect in self.effects):
             for _ in range(MOST_TURNS):
@@ -467,15 +482,18 @@ class Explanation:
         """Return what it would give, shape (N,), metres, if one of its effects were not there and all else as it is."""
         return self._whole([effect for effect in self.effects if effect.name != name])
 
-    def score(self, columns: FloatArray, *, positive: int = 0) -> Score:
-        """Score it with `columns`, shape (N, k), metres, beside it: on blocks left out, all effects refitted."""
-        beside = np.column_stack([self._before, self.tangents, columns])
-        return self.joint.score(self.target, beside, positive=positive)
+    def score(self, candidate: Candidate) -> Score:
+        """Score it with a candidate beside it, all effects refitted."""
+        first = self._before.shape[1] + self.tangents.shape[1]
+        starting = [*self._starting, *range(first, first + candidate.starting)]
+        beside = np.column_stack([self._before, self.tangents, candidate.columns])
+        return self.joint.score(self.target, beside, positive=candidate.positive, starting=starting)
 
     @cached_property
     def held_out(self) -> Score:
         """Its own score."""
-        return self.joint.score(self.target, np.column_stack([self._before, self.tangents]))
+        beside = np.column_stack([self._before, self.tangents])
+        return self.joint.score(self.target, beside, starting=self._starting)
 
     @property
     def objective(self) -> float:

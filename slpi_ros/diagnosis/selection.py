@@ -199,7 +199,7 @@ def _each(forms: Sequence[Candidate], gains: FloatArray) -> EachRecord | None:
 def _scored(form: Candidate | Effect, now: Explanation) -> tuple[Score, Effect] | None:
     if not isinstance(form, Candidate):
         return now.adding(form).held_out, form
-    score = now.score(form.columns, positive=form.positive)
+    score = now.score(form)
     try:
         effect = form.effect(score.gains[-(form.positive or form.columns.shape[1]) :])
     except ModelError:
@@ -403,11 +403,15 @@ def _in_its_place(
         if rival.name not in present:
             effect = next(effect for effect in rival.explanation.effects if effect.name == rival.name)
             tried.append(Contender(rival.name, rest.adding(effect).refined(STEPS)))
-    tried.sort(key=lambda contender: contender.score.rms)
+    tried.sort(key=lambda contender: contender.rms)
     alone = one_speed(now.evidence)
     best = Contender(name, now)
-    alternatives = tuple(other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone))
-    return alternatives, (tried[0].name, tried[0].score.rms) if tried else None
+    alternatives = [other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone)]
+    inseparable = [other.name for other in tried if {name, other.name} <= DYNAMIC]
+    if alone and name in DYNAMIC and not alternatives:
+        # A better fit at one frequency says only which of them bends the loops in a more suitable way.
+        alternatives = inseparable[:1] or [one for one in ("rate_dependence", "creep") if one != name][:1]
+    return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None
 
 
 def _do_not_close(now: Explanation) -> FloatArray:

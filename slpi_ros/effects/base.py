@@ -144,11 +144,14 @@ class Candidate:
         Returns the effect for gains of shape (k,), or None where they make none.
     positive : int
         Number of the last columns whose gains may not be negative; `effect` is given those alone, if there are any.
+    starting : int
+        Number of the first columns that tell how a record began; their gains are each record's own.
     """
 
     columns: FloatArray
     effect: Callable[[FloatArray], Effect | None]
     positive: int = 0
+    starting: int = 0
 
 
 class ResidualView(Protocol):

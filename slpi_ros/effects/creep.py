@@ -106,17 +106,16 @@ class Creep:
             single = [np.array([tau]) for tau in np.geomspace(shortest, 0.5 * most, SINGLE)]
             several = [np.geomspace(shortest, share * most, count) for count, share in SEVERAL]
             for taus in (*single, *several):
-                yield Candidate(
-                    np.column_stack([settling(taus.tolist(), left.around, left.used), *cls._creeping(taus, left)]),
-                    partial(cls._each, taus),
-                    positive=taus.size,
-                )
+                starting = settling(taus.tolist(), left.around, left.used)
+                columns = np.column_stack([starting, *cls._creeping(taus, left)])
+                yield Candidate(columns, partial(cls._each, taus), taus.size, starting.shape[1])
         for fast, slow in ((fast, slow) for fast in LAW_FROM for slow in LAW_TO):
             first, last = max(fast, LAW_SAMPLES * step), slow * most
             if last > 10 * first:
                 taus = np.geomspace(first, last, max(LAW_FEWEST, 1 + round(LAW_PER_DECADE * np.log10(last / first))))
-                columns = [settling(taus.tolist(), left.around, left.used), np.sum(cls._creeping(taus, left), axis=0)]
-                yield Candidate(np.column_stack(columns), partial(cls._law, taus), positive=1)
+                starting = settling(taus.tolist(), left.around, left.used)
+                columns = np.column_stack([starting, np.sum(cls._creeping(taus, left), axis=0)])
+                yield Candidate(columns, partial(cls._law, taus), 1, starting.shape[1])
 
     @classmethod
     def _creeping(cls, taus: FloatArray, left: ResidualView) -> list[FloatArray]:
@@ -219,7 +218,7 @@ def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[
 def settling(time_constants: Sequence[float], around: EffectContext, used: NDArray[np.bool_]) -> FloatArray:
     """Return how creep from before each record may settle in it, shape (N, k): a column for each that soon ends.
 
-    What is slower goes on together where it follows the logarithmic law, as after one move before the record.
+    Where it follows the logarithmic law there is one column, as after one move before the record.
     """
     whole = []
     for own in range(max(len(around.records), 1)):
@@ -233,7 +232,6 @@ def settling(time_constants: Sequence[float], around: EffectContext, used: NDArr
 def _settling_of(time_constants: Sequence[float], t: FloatArray, used: NDArray[np.bool_]) -> list[FloatArray]:
     times = t[used]
     since = np.maximum(t - times[0], 0.0)
-    decays = {tau: np.exp(-since / tau) for tau in time_constants}
-    soon = [decays.pop(tau) for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]
-    slow = np.sum(list(decays.values()), axis=0)
-    return [*soon, slow] if decays and len(time_constants) >= LAW_FEWEST else soon
+    if len(time_constants) >= LAW_FEWEST:
+        return [np.sum([np.exp(-since / tau) for tau in time_constants], axis=0)]
+    return [np.exp(-since / tau) for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]

@@ -11,7 +11,7 @@ others, and of that one nothing is estimated but how it began and its constant.
 import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, reduce
+from functools import cache, cached_property, partial, reduce
 from typing import TypeVar
 
 import numpy as np
@@ -360,6 +360,7 @@ class Explanation:
     def _fit(self) -> None:
         fit = self.joint.fit(self.target, self._before)
         self._x, self.settling = fit.x, self._before @ fit.gains
+        self._loops = [cache(partial(self._loop, fit.x, k)) for k in range(len(self.evidence.parts))]
 
     @property
     def _relaxations(self) -> list[float]:
@@ -437,26 +438,21 @@ class Explanation:
 
         It is a function of voltages (V).
         """
-        part, first = self.evidence.parts[k], self.evidence.slices[k].start
+        return lambda u: np.asarray(np.interp(u, *self._loops[k]()), dtype=np.float64)
 
-        @cache
-        def loop() -> tuple[FloatArray, FloatArray]:
-            levels = np.linspace(float(self.u.min()), float(self.u.max()), LEVELS)
-            path = np.concatenate([self.u[first : first + 1], levels, levels[::-1], levels])
-            whole = Samples(path, path, np.ones(path.size, dtype=bool)).after(part.history)
-            x = self._x[: self.evidence.basis.size + 1]
-            y = (
-                Problem.pose([whole], self.evidence.basis).design.predict(x)[len(part.history) :]
-                * self.joint.problem.scale
-            )
-            falling, rising = y[1 + LEVELS : 1 + 2 * LEVELS][::-1], y[1 + 2 * LEVELS :]
-            return levels, 0.5 * (falling + rising) + float(self.joint.predict(self._x)[first]) - y[0]
-
-        return lambda u: np.asarray(np.interp(u, *loop()), dtype=np.float64)
+    def _loop(self, x: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
+        """Return voltages (V) and the middle of the largest loop there (m), for parameters `x`."""
+        evidence, part, first = self.evidence, self.evidence.parts[k], self.evidence.slices[k].start
+        levels = np.linspace(float(self.u.min()), float(self.u.max()), LEVELS)
+        path = np.concatenate([self.u[first : first + 1], levels, levels[::-1], levels])
+        whole = Samples(path, path, np.ones(path.size, dtype=bool)).after(part.history)
+        y = evidence.response([whole], x[: evidence.basis.size + 1])[len(part.history) :] * self.joint.problem.scale
+        falling, rising = y[1 + LEVELS : 1 + 2 * LEVELS][::-1], y[1 + 2 * LEVELS :]
+        return levels, 0.5 * (falling + rising) + float(self.joint.predict(x)[first]) - y[0]
 
     def respond(self, u: FloatArray) -> FloatArray:
         """Return what the hysteresis gives (m) for another voltage `u`, shape (N,), volts."""
-        response: FloatArray = self.evidence.problem(u).design.predict(self._x)[self.evidence.rows]
+        response = self.evidence.response(self.evidence.samples(u), self._x)[self.evidence.rows]
         return response * self.joint.problem.scale
 
     @cached_property

@@ -13,6 +13,7 @@ from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, SurfaceBasis
 from slpi_ros.identification.convex_fit import SELECTION_SAMPLES, SMOOTHNESS
+from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.drive import Runs
 from slpi_ros.identification.initial_history import choose_start
 from slpi_ros.identification.least_squares import Problem, solve_free
@@ -178,14 +179,23 @@ class Evidence:
             first += own.shape[1]
         return whole
 
-    def problem(self, u: FloatArray) -> Problem:
-        """Pose the problem of the hysteresis driven by `u`, shape (N,), volts."""
-        low, high = self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf)
-        samples = [
+    def samples(self, u: FloatArray) -> list[Samples]:
+        """Return the samples of each record, with its initial history, where `u`, shape (N,), V, drives the hysteresis."""
+        low, high = (self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf))
+        return [
             Samples(np.clip(u[rows], low, high), part.y, part.used).after(part.history)
             for rows, part in zip(self.slices, self.parts, strict=True)
         ]
-        return Problem.pose(samples, self.basis)
+
+    def problem(self, u: FloatArray) -> Problem:
+        """Pose the problem of the hysteresis driven by `u`, shape (N,), volts."""
+        return Problem.pose(self.samples(u), self.basis)
+
+    def response(self, samples: Sequence[Samples], x: FloatArray) -> FloatArray:
+        """Return what the hysteresis of parameters `x` gives for samples, in the unit of `x`."""
+        walks = [Walk.along(own.v, symmetric_rest=self.basis.symmetric_rest, primed=own.primed) for own in samples]
+        walk = Walk.joined(walks)
+        return Design.of(walk, self.basis.branch_part(walk)).predict(x)
 
     def of_record(self, k: int) -> "Evidence":
         """Return what one of the records says by itself."""

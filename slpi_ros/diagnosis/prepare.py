@@ -180,7 +180,7 @@ class Evidence:
         return whole
 
     def samples(self, u: FloatArray) -> list[Samples]:
-        """Return the samples of each record, with its initial history, where `u`, shape (N,), V, drives the hysteresis."""
+        """Return the samples of each record after its initial history, driven by `u`, shape (N,), volts."""
         low, high = (self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf))
         return [
             Samples(np.clip(u[rows], low, high), part.y, part.used).after(part.history)

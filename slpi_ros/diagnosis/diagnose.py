@@ -267,7 +267,7 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
     hysteresis, starts = now.hysteresis()
     y, errors = evidence.y[evidence.used], now.residual[evidence.used]
     voltage = evidence.v[evidence.used]
-    return replace(
+    extended = replace(
         model,
         kind="pi" if isinstance(evidence.basis, PlayBasis) else "slpi",
         hysteresis=hysteresis,
@@ -285,3 +285,4 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
             source=source,
         ),
     )
+    return replace(extended, end=extended.after(now.u))

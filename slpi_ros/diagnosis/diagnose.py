@@ -1,7 +1,7 @@
 """From records and a model to what the model gets wrong, why, and the model that gets it right."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -11,12 +11,14 @@ from threadpoolctl import threadpool_limits
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
-from slpi_ros.diagnosis.result import CERTAIN, CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
+from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
 from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, Selection, counts, select
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
+from slpi_ros.identification.initial_history import histories
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
+from slpi_ros.identification.samples import Samples
 from slpi_ros.identification.signal_statistics import Floor, floor_of
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import AxisModel, StageModel, Start
@@ -28,9 +30,9 @@ FloatArray = NDArray[np.float64]
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects that do the same wherever they are not told apart: one of them may stand for the other.
 SAME_ELSEWHERE = ({"delay", "lag"},)
-# A record tells a moved zero when it goes over this share of the model's voltages: then the initial history no longer
-# matters. The gain is compared on so many stretches, of so many samples at least.
-WHOLE_RANGE, STRETCHES, FEWEST = 0.95, 8, 50
+# Initial histories explain a record as well as the best one with so many times its error; a zero has moved when that is
+# so many times the error. The gain is compared on so many stretches, of so many samples at least.
+AS_WELL, ZERO, STRETCHES, FEWEST = 1.1, 4.0, 8, 50
 
 
 def diagnose(
@@ -108,7 +110,7 @@ def _diagnose_axis(
         before = base.held_out.rms_of_records
     else:
         # Such a kind is not fitted anew here: the loop family shows what it gets wrong.
-        selection, before = select(base, None), float(np.sqrt(np.mean(_errors_of(model, evidence) ** 2)))
+        selection, before = select(base, None), _given_rms(model, evidence)
         if before > WRONG_KIND * base.held_out.rms:
             selection = replace(selection, structures=(BIAS, *selection.structures))
     given = _given(model, selection)
@@ -155,22 +157,71 @@ def _floor(now: Explanation) -> Floor:
     return replace(worst, rms=min(max(worst.rms, now.evidence.rounding), now.held_out.rms))
 
 
-def _simulated(model: AxisModel, t: FloatArray, u: FloatArray, history: tuple[float, ...]) -> FloatArray:
-    """Return the displacement (m) but for a constant, driven by `u` (V), for an initial history (V)."""
-    started = replace(model, start=Start(float(u[0]), 0.0, history)) if model.causal else model
-    return started.simulate(t, u)
+@dataclass(frozen=True)
+class _FreeRun:
+    """A model along a record, from the initial history that suits it best.
+
+    Parameters
+    ----------
+    errors : ndarray, shape (N,), metres
+        Measured - model.
+    rms : float, metres
+        Without their constant.
+    offsets : (float, float), metres
+        Least and largest constant by initial histories that explain the record as well.
+    """
+
+    errors: FloatArray
+    rms: float
+    offsets: tuple[float, float]
+
+    @property
+    def offset(self) -> float:
+        """The constant nearest to none, metres."""
+        return min(self.offsets, key=abs)
+
+    @property
+    def moved(self) -> float:
+        """By how much (m) the zero has moved, whatever went before the record; 0 where that may be all of it."""
+        return 0.0 if self.offsets[0] <= 0.0 <= self.offsets[1] else self.offset
 
 
-def _errors_of(model: AxisModel, evidence: Evidence) -> FloatArray:
-    """Return the error (m) of the given model on each record, shape (records,), with the history that suits it best."""
-    found = []
-    for part in evidence.parts:
-        tried = [
-            (_simulated(model, part.t, part.v, history) - part.y)[part.used]
-            for history in {part.history, model.start.history}
-        ]
-        found.append(min(float(np.std(errors)) for errors in tried))
-    return np.array(found)
+def _free_run(model: AxisModel, part: Part) -> _FreeRun:
+    """Let a model run along a record from every initial history that may have been."""
+    errors = [part.y - replace(model, start=start).simulate(part.t, part.v) for start in _starts(model, part)]
+    chosen = _known(part)
+    rms = np.array([np.std(each[part.used]) for each in errors])
+    as_well = [each for each in errors if np.std(each[chosen]) <= AS_WELL * min(np.std(one[chosen]) for one in errors)]
+    offsets = [float(np.median(each[chosen])) for each in as_well]
+    best = int(np.argmin(rms))
+    return _FreeRun(errors[best], float(rms[best]), (min(offsets), max(offsets)))
+
+
+def _known(part: Part) -> NDArray[np.bool_]:
+    """Return which samples do not depend on the initial history, but for a constant; all used where these are few."""
+    known = part.used & part.wiped
+    return known if np.count_nonzero(known) >= FEWEST else part.used
+
+
+def _starts(model: AxisModel, part: Part) -> list[Start]:
+    """Return starts for several initial histories, each where the model says that it leads."""
+    if not model.causal:
+        return [model.start]
+    v0, (low, high) = float(part.v[0]), model.voltage_range
+    ends = np.array([min(low, v0), max(high, v0)])
+    whole = Samples(np.append(v0, ends), np.zeros(3), np.ones(3, dtype=bool))
+    # Whatever went before, a sweep over the whole range ends at one displacement.
+    swept = model.memory().forward_array(ends)[-1]
+    found = [model.start] if model.start.voltage == v0 else []
+    for history in dict.fromkeys((part.history, model.start.history, *histories(whole))):
+        way = replace(model, start=Start(v0, 0.0, history)).memory().forward_array(ends)[-1]
+        found.append(Start(v0, float(swept - way), history))
+    return found
+
+
+def _given_rms(model: AxisModel, evidence: Evidence) -> float:
+    """Return the error (m) of the given model, without the constant of each record."""
+    return float(np.sqrt(np.mean([_free_run(model, part).rms ** 2 for part in evidence.parts])))
 
 
 def _given(model: AxisModel, selection: Selection) -> Given:
@@ -183,22 +234,21 @@ def _given(model: AxisModel, selection: Selection) -> Given:
     if model.kind in REFITTED:
         span = max(motion, float(np.ptp(model.displacement_range)))
         require_own(best.hysteresis_rms, best.refitted_rms, span)
-    rms = float(np.sqrt(np.mean(_errors_of(model, evidence) ** 2)))
-    zero = _zero_moved(model, evidence)
-    # A constant that any initial history may have left says nothing.
-    clear = zero is not None and abs(zero) > CERTAIN * max(rms, best.hysteresis_rms, CHANGED * motion)
-    return replace(best, rms=rms, zero_moved=zero if clear else None, motion=motion)
+    runs = [_free_run(model, part) for part in evidence.parts]
+    rms = float(np.sqrt(np.mean([run.rms**2 for run in runs])))
+    zero = float(np.median([run.moved for run in runs]))
+    moved = abs(zero) > ZERO * max(rms, CHANGED * motion)
+    return replace(best, rms=rms, zero_moved=zero if moved else None, motion=motion)
 
 
 def _compared(bare: AxisModel, one: Explanation) -> Given:
     """Compare the hysteresis of the given model with what effects leave for one to explain."""
     errors, refitted, gains, deviations = [], [], [], []
     for part, rows in zip(one.evidence.parts, one.evidence.slices, strict=True):
-        chosen = part.used & part.wiped if np.count_nonzero(part.used & part.wiped) >= FEWEST else part.used
+        chosen = _known(part)
         target = (one.target - one.settling)[rows][chosen]
-        tried = [
-            _simulated(bare, part.t, one.u[rows], history)[chosen] for history in {part.history, bare.start.history}
-        ]
+        starts = _starts(bare, part)
+        tried = [replace(bare, start=start).simulate(part.t, one.u[rows])[chosen] for start in starts]
         h = min(tried, key=lambda h: float(np.std(target - h)))
         errors.append(np.var(target - h))
         refitted.append(np.var(one.residual[rows][chosen]))
@@ -228,37 +278,15 @@ def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:
     return whole, float(np.sqrt(np.sum(np.square(parts))) / max(float(moved @ moved), 1e-300))
 
 
-def _offset(model: AxisModel, part: Part) -> float:
-    """Return by how much (m) the zero of a record has moved against the given model, from its own start."""
-    chosen = part.used & part.wiped if np.count_nonzero(part.used & part.wiped) >= FEWEST else part.used
-    return float(np.median((part.y - model.simulate(part.t, part.v))[chosen]))
-
-
-def _zero_moved(model: AxisModel, evidence: Evidence) -> float | None:
-    """Return by how much (m) the zero has moved; None where a record does not tell that from its initial history."""
-    low, high = model.voltage_range
-    whole = [part for part in evidence.parts if np.ptp(part.v) >= WHOLE_RANGE * (high - low) and part.wiped.any()]
-    if not whole:
-        return None
-    return float(np.median([_offset(model, part) for part in whole]))
-
-
 def _outcomes(model: AxisModel, now: Explanation, final: Explanation | None) -> tuple[RecordOutcome, ...]:
     """Return what became of each record; without `final` the model stays as it is."""
-    given = _errors_of(model, now.evidence)
     left_out = np.sqrt(now.held_out.records).tolist() or [None]
-    return tuple(
-        RecordOutcome(
-            source=part.source,
-            offset=_offset(model, part),
-            before_rms=before,
-            after_rms=float(np.std(final.residual[rows][part.used])) if final else before,
-            left_out_rms=other,
-        )
-        for part, rows, before, other in zip(
-            now.evidence.parts, now.evidence.slices, given.tolist(), left_out, strict=True
-        )
-    )
+    outcomes = []
+    for part, rows, other in zip(now.evidence.parts, now.evidence.slices, left_out, strict=True):
+        run = _free_run(model, part)
+        after = float(np.std(final.residual[rows][part.used])) if final else run.rms
+        outcomes.append(RecordOutcome(part.source, run.offset, run.rms, after, other))
+    return tuple(outcomes)
 
 
 def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> AxisModel:

@@ -50,6 +50,8 @@ SHARES = (1.0, 0.4, 0.1)
 ALIKE = 1e-9
 # Share of the record that is its beginning.
 BEGINNING = 0.08
+# Of more samples every so manieth is fitted and judged, from all that effects and memory do to every one of them.
+MOST_ROWS = 20_000
 # Blocks of a fold are told apart when scores are compared.
 BLOCKS = 40
 
@@ -293,6 +295,7 @@ def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
     groups = []
     for rows in evidence.slices:
         fitted = evidence.rows[rows][problem.weights[evidence.rows[rows]] > 0]
+        fitted = fitted[:: -(-problem.count // MOST_ROWS)]
         settled = int(fitted[int(BEGINNING * fitted.size)]) if fitted.size else 0
         allowed = np.zeros(problem.y.size, dtype=bool)
         allowed[fitted] = judged[fitted]

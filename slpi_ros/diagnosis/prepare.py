@@ -181,7 +181,7 @@ class Evidence:
 
     def samples(self, u: FloatArray) -> list[Samples]:
         """Return the samples of each record after its initial history, driven by `u`, shape (N,), volts."""
-        low, high = (self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf))
+        low, high = self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf)
         return [
             Samples(np.clip(u[rows], low, high), part.y, part.used).after(part.history)
             for rows, part in zip(self.slices, self.parts, strict=True)

@@ -33,6 +33,7 @@ SEPARATES = (
     ({"lag", "delay"}, "lag"),
     ({"lag", "rate_dependence"}, "rate_dependence"),
     ({"delay", "rate_dependence"}, "rate_dependence"),
+    ({"gain_drift", "thermal_drift"}, "gain_drift"),
     ({"creep", "thermal_drift"}, "thermal_drift"),
     ({"creep", "lag"}, "creep"),
     ({"creep", "delay"}, "creep"),
@@ -312,7 +313,7 @@ def judged(
     """
     base, now = selection.base, selection.now
     effects = _named_effects(selection)
-    verdict = _verdict(selection, effects, floor)
+    verdict = _verdict(selection, effects, floor, left_out_of_model)
     return AxisDiagnosis(
         verdict=verdict,
         summary=_of_given(given, selection, before_rms)
@@ -378,9 +379,9 @@ def _left(selection: Selection, floor: Floor) -> bool:
     return selection.now.held_out.rms > max(ABOVE_FLOOR * floor.rms, _resolved(selection))
 
 
-def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor) -> str:
+def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor, left_out: Sequence[str]) -> str:
     if effects:
-        return AMBIGUOUS if any(named.alternatives for named in effects) else NAMED
+        return AMBIGUOUS if left_out or any(named.alternatives for named in effects) else NAMED
     wrong_kind = BIAS in selection.structures
     return UNEXPLAINED if wrong_kind or _left(selection, floor) else NOTHING_FOUND
 

@@ -12,9 +12,11 @@ from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import Evidence, drive_frequency, one_speed
 from slpi_ros.effects.base import Candidate, Effect, usual_step
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.hum import Hum
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.registry import EFFECTS
+from slpi_ros.effects.saturation import STILL, Saturation, outward_steps
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.thermal_drift import ThermalDrift
 from slpi_ros.errors import ModelError
@@ -149,10 +151,25 @@ def plausible(effect: Effect, now: Explanation) -> bool:
         case ThermalDrift():
             pairs = zip(np.diff(effect.values).tolist(), np.diff(effect.times).tolist(), strict=True)
             return effect.times[-1] >= DRIFT_TAKES and all(abs(dy) <= DRIFT_RATE * motion * dt for dy, dt in pairs)
+        case GainDrift():
+            return effect.times[-1] >= DRIFT_TAKES
+        case Saturation():
+            return _stands_still(effect, now)
         case Hum():
             return not _is_harmonic(effect.frequency, evidence)
         case SensorPeriodic():
             return bool(effect.period > ROUNDING_PERIOD * evidence.rounding)
+    return True
+
+
+def _stands_still(effect: Saturation, now: Explanation) -> bool:
+    """Return whether the stage stands still beyond the limits, where the voltage goes on."""
+    middle, dv, dy = outward_steps(now.evidence.v, now.y, now.used)
+    inside = (middle > effect.lower) & (middle < effect.upper)
+    usual = float(dv[inside] @ dy[inside] / max(float(dv[inside] @ dv[inside]), 1e-300))
+    for beyond in (middle >= effect.upper, middle <= effect.lower):
+        if beyond.any() and float(dv[beyond] @ dy[beyond]) > STILL * usual * float(dv[beyond] @ dv[beyond]):
+            return False
     return True
 
 

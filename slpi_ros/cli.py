@@ -119,7 +119,10 @@ def _identify_options(command: Any) -> None:
 
 
 def _diagnose_options(command: Any) -> None:
-    command.add_argument("bag", metavar="BAG", help="rosbag2 folder, or a lone mcap or sqlite3 file")
+    command.add_argument(
+        "bags", metavar="BAG", nargs="+",
+        help="rosbag2 folder, or a lone mcap or sqlite3 file; several records of the stage prove a cause on each other",
+    )  # fmt: skip
     command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
     command.add_argument(
         "-o", "--output", metavar="DIR", required=True,
@@ -322,14 +325,14 @@ def _diagnose(options: argparse.Namespace) -> None:
     model = load_model(options.model)
     folder = Path(options.output)
     make_room(folder)
-    record = _with_other_axes(options, topics)
+    records = [_with_other_axes(bag, options, topics) for bag in options.bags]
     try:
-        axes = options.axis or [axis for axis in model.axes if axis in record.axes]
-        for axis in axes:
+        axes = options.axis or [axis for axis in model.axes if all(axis in record.axes for record in records)]
+        for record, axis in ((record, axis) for record in records for axis in axes):
             record.require_axis(axis)
             model.axis(axis)
             require_usable(findings(assess(record, axis)), f"{record.source}: axis '{axis}'")
-        diagnosis = diagnose(record, model, axes=axes, start=options.start, stop=options.stop)
+        diagnosis = diagnose(records, model, axes=axes, start=options.start, stop=options.stop)
     except UsageError as error:
         # That bag and model do not go together shows only once both have been read.
         raise ModelError(str(error)) from None
@@ -338,17 +341,17 @@ def _diagnose(options: argparse.Namespace) -> None:
     print(f"{folder / PAGE}: open it in a browser")
 
 
-def _with_other_axes(options: argparse.Namespace, topics: str | bags.SeparateTopics) -> Record:
+def _with_other_axes(bag: str, options: argparse.Namespace, topics: str | bags.SeparateTopics) -> Record:
     """Return all axes of the bag: each may show on the others. Where that cannot be, only those asked for."""
     if options.axis and isinstance(topics, bags.SeparateTopics):
         # There the axes may have no names but those given.
-        return bags.read_bag(options.bag, topics, axes=options.axis)
+        return bags.read_bag(bag, topics, axes=options.axis)
     try:
-        return bags.read_bag(options.bag, topics)
+        return bags.read_bag(bag, topics)
     except RecordError:
         if not options.axis:
             raise
-        return bags.read_bag(options.bag, topics, axes=options.axis)
+        return bags.read_bag(bag, topics, axes=options.axis)
 
 
 def _verify(options: argparse.Namespace) -> int:

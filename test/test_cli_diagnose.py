@@ -16,7 +16,7 @@ from reports.browser import Browser
 import slpi_ros
 from benchmarks.hidden import hide
 from slpi_ros.cli import main
-from slpi_ros.diagnosis.verdict import AMBIGUOUS, AxisDiagnosis, Diagnosis, NamedEffect, Traces
+from slpi_ros.diagnosis.result import AMBIGUOUS, AxisDiagnosis, Diagnosis, NamedEffect, Traces
 from slpi_ros.effects.lag import Lag
 from slpi_ros.io.bag_reader import write_bag
 from slpi_ros.io.record import Record

@@ -13,7 +13,16 @@ from typing import ClassVar, overload
 import numpy as np
 from scipy.signal import savgol_filter
 
-from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectContext,
+    FloatArray,
+    Removable,
+    ResidualView,
+    Side,
+    by_record,
+    require,
+)
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
@@ -296,6 +305,7 @@ class RateDependence:
         """Where it acts: on the voltage where thresholds grow."""
         return "voltage" if self.coercivity else "displacement"
 
+    @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement of the wider loops, shape (N,), metres; or the voltage at the hysteresis, volts."""
         if self.coercivity:

@@ -17,6 +17,7 @@ from slpi_ros.effects.base import (
     Removable,
     ResidualView,
     Side,
+    by_record,
     require,
     rhythms,
     usual_step,
@@ -178,6 +179,7 @@ class Resonance:
             ("damping", 1e-6 <= self.damping < 1, "from 1e-6 to below 1"),
         )
 
+    @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with ringing, shape (N,), metres; exact where the input is linear between samples."""
         grid = Uniform.over(around.t)

@@ -7,7 +7,7 @@ import pytest
 from reports.browser import Browser
 from reports.pages import parsed, trace
 
-from slpi_ros.diagnosis.verdict import (
+from slpi_ros.diagnosis.result import (
     AMBIGUOUS,
     NAMED,
     NOTHING_FOUND,

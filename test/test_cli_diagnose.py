@@ -18,7 +18,7 @@ from benchmarks.hidden import hide
 from slpi_ros.cli import main
 from slpi_ros.diagnosis.result import AMBIGUOUS, AxisDiagnosis, Diagnosis, NamedEffect, Traces
 from slpi_ros.effects.lag import Lag
-from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
 
 SCHEMA = Path(__file__).resolve().parents[1] / "msg_schemas" / "diagnosis.schema.json"

@@ -5,7 +5,7 @@ from dataclasses import replace
 from math import inf
 
 from slpi_ros.errors import UsageError
-from slpi_ros.model.streaming import Limits, RateLimiter
+from slpi_ros.model.limits import Limits, RateLimiter
 
 
 def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:

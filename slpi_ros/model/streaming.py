@@ -96,7 +96,7 @@ class StreamingInverse:
         middle: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         chain = Chain.of(effects)
-        self.memory, self._clipped = memory, chain.clipped
+        self.memory, self._clipped, self._without_effects = memory, chain.clipped, not effects
         self.accepted = self._lowest, self._highest = accepted_range(displacement_range)
         self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
         self._t = -inf
@@ -139,7 +139,7 @@ class StreamingInverse:
         lower = min(max(limits.lower, self._clipped[0]), limits.upper)
         self.pace.limits = limits = replace(limits, lower=lower, upper=max(min(limits.upper, self._clipped[1]), lower))
         # The inverse of the hysteresis is all there is to do.
-        self._bare = not self._followers and limits.slew == limits.acceleration == inf
+        self._bare = self._without_effects and limits.slew == limits.acceleration == inf
 
     @property
     def timeless(self) -> bool:
@@ -229,8 +229,9 @@ class StreamingInverse:
             If the model has no voltage for it; without effects nothing has moved then.
         """
         if not self._followers:
-            v = self._move(dt, dt, y)
-            self.desired = y
+            h = y - self.coupled
+            v = self._move(dt, dt, h)
+            self.desired = h
             return v
         counted = dt
         if dt > MAX_DT:

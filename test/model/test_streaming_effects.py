@@ -17,7 +17,6 @@ from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.errors import SlpiError
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
-from slpi_ros.model.streaming import StreamingInverse
 
 LAG, MODE = Lag(0.015), Resonance(150.0, 0.02)
 RATE = RateDependence(0.1, 2e-8, 0.7, 500.0, 2.0)

@@ -10,9 +10,9 @@ from strategies import FAMILY_CASE, axis_model, cases, fractions, paths, stream_
 
 from slpi_ros.compensator.controller import Compensation
 from slpi_ros.compensator.persistence import ASSUMED, KNOWN, RESETTING, MemoryConfidence
-from slpi_ros.compensator.ramps import Ramp, decaying_turns
+from slpi_ros.compensator.ramps import Ramp
 from slpi_ros.errors import UsageError
-from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.limits import Limits, RateLimiter, decaying_turns
 from slpi_ros.model.stage_model import StageModel
 
 LIMITS = Limits(0.0, 100.0)

@@ -14,8 +14,9 @@ from slpi_ros.identification.fit import identify
 from slpi_ros.identification.record_quality import assess, findings
 from slpi_ros.identification.refit import refit
 from slpi_ros.io.record import Record
+from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.document import load_model, save_model
-from slpi_ros.model.stage_model import AxisModel, HeldAtLimitWarning, StageModel
+from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
 
 if TYPE_CHECKING:
     from slpi_ros.io.alignment import SeparateTopics

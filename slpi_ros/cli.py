@@ -34,8 +34,8 @@ from slpi_ros.io.columns import ColumnOptions
 from slpi_ros.io.record import FloatArray, Record
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.document import load_model, save_model
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel, check_time, held_message
-from slpi_ros.model.streaming import Limits
 from slpi_ros.reports.text import describe_change, describe_model, describe_start
 
 # Where a bag holds voltage and displacement, if nothing else is said.

@@ -16,7 +16,8 @@ from slpi_ros.hysteresis.kinds import Hysteresis, to_document
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 

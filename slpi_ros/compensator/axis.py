@@ -9,8 +9,9 @@ from slpi_ros.compensator.persistence import MemoryConfidence
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.validation import Stamps, implausible
 from slpi_ros.errors import UsageError
-from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.streaming import Limits, StreamingInverse
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.limits import Limits
+from slpi_ros.model.streaming import StreamingInverse
 
 
 class Axis:
@@ -188,7 +189,7 @@ class Axis:
         v = stream.move(dt, y)
         if self._loop is not None:
             v = self._correct(ahead, dt, y, v)
-        if stream.memory.displacement == stream.wish:
+        if stream.memory.displacement == stream.desired:
             self.held = self.slewing = False
         else:
             missed = stream.missed

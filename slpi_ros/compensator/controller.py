@@ -16,8 +16,9 @@ from slpi_ros.compensator.validation import RejectedError, TimeRules
 from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.streaming import Limits, StageStream
+from slpi_ros.model.streaming import StageStream
 
 OPEN_LOOP = LoopSettings(False, PidGains(0.0), 0.1)
 

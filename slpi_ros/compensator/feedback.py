@@ -5,7 +5,8 @@ from dataclasses import dataclass, fields
 from math import exp, expm1, inf, isfinite, sqrt
 
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.model.streaming import Limits, RateLimiter, StreamingInverse
+from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.streaming import StreamingInverse
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from math import inf
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.shape import FAR
-from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.streaming import TOLERATED_SHARE, Limits, StreamingInverse
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.limits import Limits
+from slpi_ros.model.streaming import TOLERATED_SHARE, StreamingInverse
 
 
 def take_over(axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = ()) -> StreamingInverse:

@@ -14,8 +14,8 @@ from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.streaming import Limits
 
 # Nobody knows where the stage has been; being wiped; wiped since; kept over a restart.
 ASSUMED, RESETTING, KNOWN, RESTORED = "assumed", "resetting", "known", "restored"

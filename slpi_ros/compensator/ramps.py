@@ -5,7 +5,7 @@ from dataclasses import replace
 from math import inf
 
 from slpi_ros.errors import UsageError
-from slpi_ros.model.streaming import RateLimiter
+from slpi_ros.model.limits import RateLimiter
 
 # So near a voltage counts as reached, volts: rounding, and the slow end of a gentle stop.
 NEAR = 1e-9

@@ -20,17 +20,9 @@ from slpi_ros.compensator.validation import NOT_FINITE, TIME_BACKWARDS, Rejected
 from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.streaming import (
-    MAX_DT,
-    ROUNDING,
-    Limits,
-    RateLimiter,
-    StageStream,
-    StreamingInverse,
-    accepted_range,
-    refusal,
-)
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
+from slpi_ros.model.streaming import ROUNDING, StageStream, StreamingInverse, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]
 TimeArray = NDArray[np.int64]

@@ -25,7 +25,8 @@ from slpi_ros.identification.initial_history import Match, lasting_effects, matc
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, StageModel, Start
+from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from rclpy.node import Node
 
 from slpi_ros.compensator.controller import Compensation
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.streaming import MAX_DT
+from slpi_ros.model.limits import MAX_DT
 
 # Seconds from one voltage to the next.
 PERIOD = 0.004

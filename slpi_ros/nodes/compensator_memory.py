@@ -17,8 +17,8 @@ from slpi_ros.compensator.persistence import (
     save_memory,
 )
 from slpi_ros.errors import SlpiError
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.streaming import Limits
 
 LOG_PERIOD = 60.0
 

@@ -6,7 +6,7 @@ from math import inf
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.validation import TimeRules
 from slpi_ros.errors import UsageError
-from slpi_ros.model.streaming import Limits
+from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.parameters import Declaration, Values, choice, number, numbers, whole
 
 DESIRED_TYPES = ("JointState", "Float64", "Float64MultiArray")

@@ -14,7 +14,7 @@ from slpi_ros.compensator.statistics import Timing
 from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.compensator.validation import EMPTY, INACTIVE, LENGTH, NO_MODEL, RESETTING, RejectedError
 from slpi_ros.io.messages import SECOND_NS, TrajectoryArrays, decode_trajectory
-from slpi_ros.model.streaming import MAX_DT
+from slpi_ros.model.limits import MAX_DT
 from slpi_ros.nodes.compensator_driver import Driver
 
 # How often a simulated clock is looked at, seconds.

@@ -12,8 +12,8 @@ from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, cycles
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.signal_statistics import ErrorMetrics, error_metrics
-from slpi_ros.model.stage_model import AxisModel, Start
-from slpi_ros.model.streaming import Limits
+from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.limits import Limits
 from slpi_ros.papers.exhibit import Exhibit, Picture, Table, um
 from slpi_ros.papers.mpi_exhibits import ERRORS, errors, followed, scheme
 from slpi_ros.papers.mpi_study import (

@@ -11,7 +11,8 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.identification.cross_validation import CLASSICAL, CrossValidationReport, Slice
 from slpi_ros.identification.record_quality import Finding, assess, findings
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, StageModel
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE
 from slpi_ros.reports.page import Page, Severity

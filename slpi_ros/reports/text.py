@@ -7,8 +7,8 @@ from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops
 from slpi_ros.identification.refit import AxisChange
-from slpi_ros.model.axis_model import StartMemory
-from slpi_ros.model.stage_model import AxisModel, StageModel
+from slpi_ros.model.axis_model import AxisModel, StartMemory
+from slpi_ros.model.stage_model import StageModel
 
 
 def describe_model(model: StageModel) -> list[str]:

@@ -16,8 +16,9 @@ from nodes.ros_helpers import axis_model, stage_model, voltage_path  # noqa: E40
 from slpi_ros.compensator.controller import Compensation  # noqa: E402
 from slpi_ros.compensator.validation import CAUSES, RejectedError  # noqa: E402
 from slpi_ros.errors import SlpiError, UsageError  # noqa: E402
-from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel, Start  # noqa: E402
-from slpi_ros.model.streaming import MAX_DT, Limits  # noqa: E402
+from slpi_ros.model.axis_model import Start  # noqa: E402
+from slpi_ros.model.limits import MAX_DT, Limits  # noqa: E402
+from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel  # noqa: E402
 
 MS = 1_000_000
 START_NS = 1_700_000_000_123_456_789

@@ -10,7 +10,8 @@ from strategies import FAMILY_CASE, fractions
 
 from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.errors import UsageError
-from slpi_ros.model.streaming import Limits, StreamingInverse
+from slpi_ros.model.limits import Limits
+from slpi_ros.model.streaming import StreamingInverse
 
 INF = float("inf")
 NAN = float("nan")

@@ -11,7 +11,7 @@ from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.trajectory import Following, Trajectory, prepare
 from slpi_ros.errors import SlpiError
-from slpi_ros.model.streaming import Limits
+from slpi_ros.model.limits import Limits
 
 MS = 1_000_000
 START = 10**18

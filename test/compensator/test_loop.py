@@ -10,7 +10,7 @@ from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.feedback import ENOUGH, WINDOW, LoopSettings, PidGains, ResidualWindow
 from slpi_ros.compensator.ramps import Ramp
 from slpi_ros.compensator.validation import RejectedError
-from slpi_ros.model.streaming import Limits
+from slpi_ros.model.limits import Limits
 
 LIMITS = Limits(0.0, 100.0, 2000.0)
 MODEL = replace(axis_model(FAMILY_CASE), displacement_range=(2e-6, 14e-6))

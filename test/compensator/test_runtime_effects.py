@@ -18,8 +18,8 @@ from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.resonance import Resonance
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.streaming import Limits
 
 MS, START = 1_000_000, 10**18
 DT = 1e-3

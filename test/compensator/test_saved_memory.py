@@ -25,7 +25,7 @@ from slpi_ros.compensator.persistence import (
     save_memory,
 )
 from slpi_ros.errors import ModelError
-from slpi_ros.model.streaming import Limits
+from slpi_ros.model.limits import Limits
 
 MODEL = two_axes()
 SAVED = SavedMemory(

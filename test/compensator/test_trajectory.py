@@ -16,8 +16,9 @@ from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.trajectory import Plan, Standing, Streamer, Trajectory, prepare
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
-from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.streaming import MAX_DT, Limits, StreamingInverse, accepted_range
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.limits import MAX_DT, Limits
+from slpi_ros.model.streaming import StreamingInverse, accepted_range
 
 MS = 1_000_000
 # A pause of 100 ms is the longest that counts in full.

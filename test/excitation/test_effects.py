@@ -8,7 +8,7 @@ import pytest
 from excitation.loops import fastest, holds, turning_points
 
 from slpi_ros.errors import UsageError
-from slpi_ros.excitation.drives import CALIBRATION, DRIVES, excite
+from slpi_ros.excitation.drives import CALIBRATION, DRIVES, SWEEP, excite
 from slpi_ros.excitation.effects import EFFECTS, for_effect
 from slpi_ros.simulation.dynamics import FlexureMode, Relaxation
 
@@ -49,13 +49,25 @@ def bursts(v):
 
 
 def test_there_is_a_drive_for_every_effect():
-    assert set(EFFECTS) == VOCABULARY and set(DRIVES) == VOCABULARY | {CALIBRATION}
+    assert set(EFFECTS) == VOCABULARY and set(DRIVES) == VOCABULARY | {CALIBRATION, SWEEP}
     for name, effect in EFFECTS.items():
         assert for_effect(name) is effect and effect.effect == name
         assert effect.why.endswith(".") and effect.why.count(". ") == 0 and len(effect.why) > 80
         json.dumps(effect.why)
     with pytest.raises(UsageError, match="no drive for the effect 'friction'; choose one of delay, "):
         for_effect("friction")
+
+
+def test_a_sweep_visits_both_ends_once():
+    made = excite(voltage_min=-20.0, voltage_max=80.0, drive=SWEEP, duration=10.0, start=10.0, slew_limit=60.0)
+    v = made.voltage["x"]
+    assert turning_points(v).tolist() == [-20.0, 80.0, -20.0]
+    assert v[0] == v[-1] == 10.0 and fastest(made.t, v) <= 60.0 * (1 + 1e-9)
+
+
+def test_calibration_begins_with_a_sweep():
+    v = excite(voltage_min=0.0, voltage_max=100.0).voltage["x"]
+    assert turning_points(v)[:2].tolist() == [100.0, 0.0]
 
 
 @pytest.mark.parametrize(("duration", "slew"), [(15.0, 0.0), (30.0, 0.0), (30.0, 150.0), (120.0, 0.0), (120.0, 70.0)])

@@ -18,7 +18,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E
 from slpi_ros.compensator.controller import Compensation  # noqa: E402
 from slpi_ros.compensator.feedback import LoopSettings, PidGains  # noqa: E402
 from slpi_ros.compensator.validation import RejectedError  # noqa: E402
-from slpi_ros.model.streaming import Limits  # noqa: E402
+from slpi_ros.model.limits import Limits  # noqa: E402
 from slpi_ros.nodes import compensator_driver, compensator_trajectory  # noqa: E402
 
 MS, START_NS = 1_000_000, 5_000_000_000

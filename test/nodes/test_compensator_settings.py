@@ -12,7 +12,7 @@ import yaml
 rclpy = pytest.importorskip("rclpy")
 
 from slpi_ros.errors import UsageError  # noqa: E402
-from slpi_ros.model.streaming import Limits  # noqa: E402
+from slpi_ros.model.limits import Limits  # noqa: E402
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"

@@ -23,8 +23,8 @@ from std_msgs.msg import Float64, String  # noqa: E402
 
 from slpi_ros.compensator.controller import Compensation  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
+from slpi_ros.model.limits import MAX_DT, Limits  # noqa: E402
 from slpi_ros.model.stage_model import StageModel  # noqa: E402
-from slpi_ros.model.streaming import MAX_DT, Limits  # noqa: E402
 
 AXES = ["x", "y"]
 MODEL = stage_model(AXES)

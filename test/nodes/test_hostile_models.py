@@ -18,7 +18,7 @@ from slpi_ros.compensator.controller import Compensation  # noqa: E402
 from slpi_ros.compensator.validation import RejectedError  # noqa: E402
 from slpi_ros.errors import SlpiError  # noqa: E402
 from slpi_ros.model.document import format_model, parse_model  # noqa: E402
-from slpi_ros.model.streaming import Limits  # noqa: E402
+from slpi_ros.model.limits import Limits  # noqa: E402
 
 SLPI = json.loads(format_model(stage_model()))
 PI = copy.deepcopy(SLPI)

@@ -15,7 +15,8 @@ from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.cross_validation import CrossValidationReport, Slice
 from slpi_ros.identification.signal_statistics import Floor
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.identification import write_report
 
 HOSTILE = """<script>alert(1)</script>"' onload=x &amp; <img src=http://x/y>"""

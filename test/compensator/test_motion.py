@@ -41,13 +41,12 @@ class Bench:
 
     def advance(self):
         """Do what is due, and note which axes that has moved."""
-        before = [axis.given_ns for axis in self.controller.axes]
-        driven = [axis.place for axis in self.controller.axes if axis.ramp]
+        before = [(axis.given_ns, axis.point_ns) for axis in self.controller.axes]
         if self.controller.advance(self.now_ns, self.now_ns):
             axes = self.controller.axes
             pairs = zip(axes, before, strict=True)
-            moved = {axis.place for axis, last_ns in pairs if axis.given_ns > last_ns}
-            self.publish(moved | set(driven))
+            moved = {axis.place for axis, last in pairs if (axis.given_ns, axis.point_ns) != last}
+            self.publish(moved)
 
     def run(self, seconds):
         end_ns = self.now_ns + int(seconds * 1e9)

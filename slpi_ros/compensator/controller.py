@@ -345,6 +345,10 @@ class Controller:
             raise RejectedError(rejection.FOLLOWING, f"{self.doing(now_ns)}; wait, or cancel it with an empty one")
         if count != len(names):
             raise RejectedError(rejection.LENGTH, f"{len(names)} axes but {count} displacements; send one for each")
+        return self._named(names)
+
+    def _named(self, names: Sequence[str]) -> list[Axis]:
+        """Return the named axes; RejectedError as `require_names`."""
         # Most senders name the same axes every time.
         if names != self._last_names:
             require_names(names, self._by_name)
@@ -477,13 +481,15 @@ class Controller:
 
     def _step_trajectory(self, now_ns: int, clock_ns: int) -> bool:
         """Give the point that is due, if there is one; return whether there was."""
+        tracks = self.trajectory.tracks
         point = self.trajectory.due(clock_ns)
         if point is None:
             return False
-        axes = [self._by_name[name] for name in point.names]
+        axes = self._named(point.names)
         aheads = []
         for axis in axes:
-            axis.stop_ramp(now_ns)
+            if axis.ramp:
+                axis.stop_ramp(now_ns)
             since = axis.point_ns if axis.point_ns is not None else clock_ns - (now_ns - axis.given_ns)
             aheads.append((point.deadline_ns - since) * 1e-9)
             axis.point_ns = point.deadline_ns
@@ -493,10 +499,10 @@ class Controller:
         if not self.trajectory.on:
             self._end_trajectory()
             self._let_go((), now_ns)
-        else:
+        elif self.trajectory.tracks < tracks:
+            # What comes next may not name the axes that are in motion now.
             going = self.trajectory.names
-            if any(axis.name not in going and not axis.ramp and axis.in_motion(now_ns) for axis in self.axes):
-                self._let_go([axis for axis in self.axes if axis.name in going], now_ns)
+            self._let_go([axis for axis in self.axes if axis.name in going], now_ns)
         return True
 
     # What moves without desired displacements
@@ -504,7 +510,10 @@ class Controller:
     @property
     def ramping(self) -> bool:
         """Whether an axis goes somewhere by itself."""
-        return any(axis.ramp for axis in self.axes)
+        for axis in self.axes:  # noqa: SIM110, quicker than any() by a microsecond in every command
+            if axis.ramp is not None:
+                return True
+        return False
 
     def next_due_ns(self, now_ns: int, clock_ns: int) -> int | None:
         """Return when `advance` is to be called next, on the clock of `now_ns`; None: not until something is asked."""

@@ -8,6 +8,7 @@ the voltage goes there at the slew limit.
 A `delay` in the model of an axis shifts when: its points are given so much earlier.
 """
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -25,6 +26,8 @@ TimeArray = NDArray[np.int64]
 
 # No clock shows a later time, and two of them can be added.
 LATEST_NS = 2**62
+# Points made lists of at once.
+BLOCK = 256
 
 
 @dataclass(frozen=True)
@@ -162,29 +165,58 @@ class Point(NamedTuple):
     deadline_ns: int
 
 
-@dataclass(eq=False)
 class _Track:
-    """Points of axes with the same delay: ``next:stop`` are still to be given, at `deadlines_ns`, shape (N,)."""
+    """Points of axes with the same delay, given one after the other.
 
-    names: tuple[str, ...]
-    positions: FloatArray
-    deadlines_ns: TimeArray
-    next: int
-    stop: int
-    # Where the axes of a trajectory have several delays, its points are counted once.
-    counted: bool
-    begun: bool = False
+    Parameters
+    ----------
+    names : tuple of str, length K
+    positions : ndarray, shape (N, K), metres
+    deadlines_ns : ndarray of int64, shape (N,), nanoseconds
+    first : int
+        The first point that is to be given.
+    counted : bool
+        Whether its points count: where the axes of a trajectory have several delays, they do once.
+    """
+
+    def __init__(
+        self, names: tuple[str, ...], positions: FloatArray, deadlines_ns: TimeArray, first: int, counted: bool
+    ) -> None:
+        self.names, self.counted, self.begun = names, counted, False
+        # The points ``next:stop`` are still to be given.
+        self.next, self.stop = first, deadlines_ns.size
+        self._positions, self._deadlines_ns = positions, deadlines_ns
+        self._load()
+
+    def _load(self) -> None:
+        """Make lists of the next points: to take numbers from arrays one by one is several times slower."""
+        self._from, block = self.next, slice(self.next, self.next + BLOCK)
+        self._times, self._rows = self._deadlines_ns[block].tolist(), self._positions[block].tolist()
 
     @property
     def next_ns(self) -> int:
-        return int(self.deadlines_ns[self.next])
+        """When the next point is due, nanoseconds."""
+        return int(self._times[self.next - self._from])
 
     def until(self, time_ns: int) -> int:
         """Return the first point from `next` on that is due at `time_ns` or later."""
-        after = self.next + 1
-        if after < self.stop and self.deadlines_ns[after] >= time_ns > self.deadlines_ns[self.next]:
-            return after
-        return self.next + int(np.searchsorted(self.deadlines_ns[self.next : self.stop], time_ns))
+        at = bisect_left(self._times, time_ns, self.next - self._from)
+        if at < len(self._times):
+            return min(self._from + at, self.stop)
+        return self.next + int(np.searchsorted(self._deadlines_ns[self.next : self.stop], time_ns))
+
+    def take(self, now_ns: int) -> tuple[Point, int]:
+        """Return the latest point that is due, and how many due before it are skipped."""
+        first, self.next = self.next, self.until(now_ns + 1)
+        at, self.begun = self.next - 1 - self._from, True
+        if at < len(self._rows):
+            point = Point(self.names, self._rows[at], self._times[at])
+        else:
+            last = self.next - 1
+            point = Point(self.names, self._positions[last].tolist(), int(self._deadlines_ns[last]))
+        if self.next < self.stop and self.next - self._from >= len(self._times):
+            self._load()
+        return point, self.next - 1 - first
 
 
 class TrajectoryExecutor:
@@ -223,7 +255,13 @@ class TrajectoryExecutor:
     @property
     def next_deadline_ns(self) -> int | None:
         """When the next point is due, nanoseconds; None: there is none."""
-        return min((track.next_ns for track in self._tracks), default=None)
+        tracks = self._tracks
+        return tracks[0].next_ns if len(tracks) == 1 else min((track.next_ns for track in tracks), default=None)
+
+    @property
+    def tracks(self) -> int:
+        """Number of trajectories that have points to come, counted again for each delay among their axes."""
+        return len(self._tracks)
 
     @property
     def begun(self) -> bool:
@@ -256,7 +294,7 @@ class TrajectoryExecutor:
             first = min(int(np.searchsorted(deadlines, now_ns)), due.size - 1)
             positions = useful.positions if len(columns) == len(useful.names) else useful.positions[:, columns]
             names = tuple(useful.names[i] for i in columns)
-            tracks.append(_Track(names, positions, deadlines, first, due.size, counted=not tracks))
+            tracks.append(_Track(names, positions, deadlines, first, counted=not tracks))
         begin_ns = min(track.next_ns for track in tracks)
         kept = self._tracks if trajectory.start_ns else []
         for track in kept:
@@ -277,9 +315,8 @@ class TrajectoryExecutor:
         track = self._tracks[0] if len(self._tracks) == 1 else min(self._tracks, key=lambda each: each.next_ns)
         if now_ns < track.next_ns:
             return None
-        first, track.next = track.next, track.until(now_ns + 1)
-        point, track.begun = track.next - 1, True
-        self.skipped += (point - first) if track.counted else 0
+        point, skipped = track.take(now_ns)
+        self.skipped += skipped if track.counted else 0
         if track.next == track.stop:
             self._tracks.remove(track)
-        return Point(track.names, track.positions[point].tolist(), int(track.deadlines_ns[point]))
+        return point

@@ -50,6 +50,7 @@ $(BUILD_STAMP): $(VENV_STAMP) $(INSTALLED)
 
 test: build
 	$(VENV) -m ruff check .
+	$(VENV) -m ruff format --check .
 	$(VENV) -m mypy
 	$(IN_WORKSPACE) $(VENV) -m pytest -n 2 --dist loadfile
 

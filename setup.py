@@ -9,7 +9,7 @@ SHARE = f"share/{NAME}"
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="Hysteresis identification and compensation for piezo nanopositioning stages",
     license="Apache-2.0",
     maintainer="slpi_ros maintainers",
@@ -31,6 +31,7 @@ setup(
         "setuptools",
         "jsonschema>=4.10",
         "matplotlib>=3.6",
+        "numba>=0.59",
         "numpy>=1.26,<3",
         "osqp>=1.0,<2",
         "rosbags>=0.11",

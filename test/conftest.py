@@ -5,8 +5,9 @@ import fcntl
 import os
 import signal
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -38,8 +39,41 @@ os.environ["ROS_DOMAIN_ID"] = str(_reserve_ros_domain())
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No verdict depends on the clock, and CI draws the same examples every time.
-hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize="CI" in os.environ)
+CI = bool(os.environ.get("CI"))
+hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize=CI)
 hypothesis.settings.load_profile("slpi_ros")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what needs ROS and what needs the measured records."""
+    for item in items:
+        if "nodes" in item.path.parent.name or "rclpy" in getattr(item.module, "__dict__", {}):
+            item.add_marker("ros")
+        if "measured_data" in getattr(item, "fixturenames", ()):
+            item.add_marker("measured")
+
+
+def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:
+    """Turn a skip into a failure under CI: there everything a test needs is installed."""
+    if CI and not os.environ.get("SLPI_ALLOW_SKIPS") and report.skipped and not hasattr(report, "wasxfail"):
+        report.outcome = "failed"
+        report.longrepr = f"skipped under CI: {report.longrepr}"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Generator[None, Any, Any]:
+    """See that nothing is skipped under CI."""
+    report = yield
+    _refuse_skip(report)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, Any, Any]:
+    """See that no module is skipped under CI."""
+    report = yield
+    _refuse_skip(report)
+    return report
 
 
 @pytest.fixture(scope="session")

@@ -124,3 +124,11 @@ def test_public_api_loads_neither_ros_nor_rosbags() -> None:
     loaded = set(subprocess.run(command, cwd=ROOT.parent, stdout=subprocess.PIPE, text=True, check=True).stdout.split())
     assert PACKAGE in loaded
     assert not {module for module in loaded if needs_ros(module)} | loaded & ONLY_IO
+
+
+def test_only_whole_paths_load_the_compiler() -> None:
+    """Neither the command line nor a node pays for it at its start."""
+    code = f"import sys, {PACKAGE}.cli, {PACKAGE}.nodes.compensator; print('numba' in sys.modules)"
+    command = [sys.executable, "-c", code]
+    said = subprocess.run(command, cwd=ROOT.parent, stdout=subprocess.PIPE, text=True, check=True).stdout
+    assert said.strip() == "False"

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
-from slpi_ros.compensator.model_swap import START_MEMORIES, go_on, take_over, turning_voltages, whole_way
+from slpi_ros.compensator.model_swap import go_on, take_over, turning_voltages, whole_way
 from slpi_ros.compensator.persistence import MemoryConfidence
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.validation import Stamps, implausible
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.stage_model import AxisModel
+from slpi_ros.model.axis_model import START_MEMORIES, AxisModel, StartMemory
 from slpi_ros.model.streaming import MAX_DT, Limits, StreamingInverse
 
 MAX_DT_NS = int(MAX_DT * SECOND_NS)
@@ -44,8 +44,8 @@ class Axis:
         Where the axis goes by itself; None: where desired displacements lead.
     held, slewing : bool
         Whether the last sample waits at a voltage limit, or is still on its way.
-    start_memory : str
-        Which of the model's memories it was started with, while nothing but the model speaks for it; "" once it has
+    start_memory : str or None
+        Which of the model's memories it was started with, while nothing but the model speaks for it; None once it has
         been given a voltage, or was restored.
     given_ns : int
         When its voltage was given last.
@@ -64,7 +64,7 @@ class Axis:
         self.confidence = MemoryConfidence()
         self.held = self.slewing = self.driven = False
         self.ramp: Ramp | Brake | None = None
-        self.start_memory = ""
+        self.start_memory: StartMemory | None = None
         self.given_ns = 0
         self.point_ns: int | None = None
         self._loop_settings = loop_settings
@@ -108,7 +108,7 @@ class Axis:
     # Model, limits, settings
 
     def prepare(
-        self, model: AxisModel, reversal_voltages: Sequence[float] | None = None, start_memory: str = "end"
+        self, model: AxisModel, reversal_voltages: Sequence[float] | None = None, start_memory: StartMemory = "end"
     ) -> StreamingInverse:
         """Return the stream of a new model, for `use`.
 
@@ -228,7 +228,7 @@ class Axis:
         self.held = missed and stream.held
         self.slewing = missed and not self.held
         self.given_ns = now_ns
-        self.start_memory = ""
+        self.start_memory = None
         return v
 
     def measure(self, displacement: float, now_ns: int) -> bool:
@@ -257,7 +257,7 @@ class Axis:
 
         The assumed one stays unless another fits better by more than the noise.
         """
-        assert self.model
+        assert self.model and self.start_memory
         quality, (low, high) = self.model.quality, self.model.displacement_range
         noise = FIT_SIGMAS * max(quality.held_out_rms, quality.floor_rms)
         assumed, streams, errors = self.start_memory, {}, {}
@@ -266,7 +266,7 @@ class Axis:
             stream.coupled = self.stream.coupled
             errors[name] = abs(measured - stream.drive(stream.voltage))
         best = min(START_MEMORIES, key=lambda name: errors[name])
-        self.start_memory = ""
+        self.start_memory = None
         if errors[best] > max(noise, FIT_SHARE * (high - low)):
             tried = ", ".join(f"{name} {error * 1e6:.4g} um" for name, error in errors.items())
             self.confidence = MemoryConfidence(
@@ -319,7 +319,7 @@ class Axis:
         if not moving:
             # Its time begins now.
             self.given_ns = now_ns
-        self.ramp, self.point_ns, self.start_memory = ramp, None, ""
+        self.ramp, self.point_ns, self.start_memory = ramp, None, None
 
     def brake(self, now_ns: int) -> None:
         """Come to rest with every `step_ramp`, as gently as the limit of acceleration asks for."""

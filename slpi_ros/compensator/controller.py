@@ -18,13 +18,15 @@ from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESETTING, MemoryConfidence, SavedAxis
-from slpi_ros.compensator.ramps import PERIOD, Ramp, Safety, decaying_turns
+from slpi_ros.compensator.ramps import PERIOD, Ramp, Safety
 from slpi_ros.compensator.statistics import Counts
 from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor
 from slpi_ros.compensator.validation import RejectedError, TimeRules, require_names
 from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.axis_model import StartMemory
+from slpi_ros.model.limits import decaying_turns
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.model.streaming import MAX_DT, Limits, StageStream
 
@@ -184,7 +186,7 @@ class Controller:
         self.mode = Mode.INACTIVE
 
     def use_model(
-        self, model: StageModel, saved: Mapping[str, SavedAxis] | None = None, start_memory: str = "end"
+        self, model: StageModel, saved: Mapping[str, SavedAxis] | None = None, start_memory: StartMemory = "end"
     ) -> None:
         """Take a model over; the voltages stay as they are.
 
@@ -216,7 +218,7 @@ class Controller:
                 raise type(error)(f"axis '{axis.name}': {error}") from None
         for axis, one, stream in prepared:
             if not axis.driven:
-                axis.start_memory = "" if saved else start_memory
+                axis.start_memory = None if saved else start_memory
             axis.use(one, stream)
             if saved:
                 axis.confidence = saved[axis.name].confidence(one.voltage_range)

@@ -7,15 +7,12 @@ from math import inf
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.shape import FAR
-from slpi_ros.model.stage_model import AxisModel
+from slpi_ros.model.axis_model import AxisModel, StartMemory
 from slpi_ros.model.streaming import TOLERATED_SHARE, Limits, StreamingInverse
-
-# The memories that a model knows: at the end of the record it was identified on, at its start, and wiped.
-START_MEMORIES = ("end", "start", "wiped")
 
 
 def take_over(
-    axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = (), start_memory: str = "end"
+    axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = (), start_memory: StartMemory = "end"
 ) -> StreamingInverse:
     """Return a stream of a new model.
 
@@ -28,7 +25,7 @@ def take_over(
         Where the drive turned, oldest first, and last its present voltage. The new memory goes through them from the
         model's start. Empty: they are not known, and the memory is the one that `start_memory` names.
     start_memory : str
-        ``end`` or ``start`` of the record that the model comes from, or ``wiped``.
+        See `AxisModel.initial`.
 
     Raises
     ------
@@ -44,10 +41,10 @@ def take_over(
     allowed = limits.within(axis.voltage_range)
     try_out(axis, allowed)
     if not reversal_voltages:
-        return axis.stream_from(memory_of(axis, start_memory), allowed)
+        return axis.stream_from(axis.memory(start_memory), allowed)
     present = reversal_voltages[-1]
     require_near(present, allowed)
-    memory = memory_of(axis, "start")
+    memory = axis.memory("start")
     replay(memory, reversal_voltages)
     # No jump: a voltage just outside goes inside with the next samples, as fast as it may.
     stream = axis.stream_from(memory, including(allowed, present))
@@ -57,16 +54,11 @@ def take_over(
 
 def go_on(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> StreamingInverse:
     """Return a stream of a new model where another one has been; its limits are wide enough for its voltage."""
-    memory = memory_of(axis, "start")
+    memory = axis.memory("start")
     replay(memory, turning_voltages(before.memory))
     stream = axis.stream_from(memory, including(including(allowed, before.voltage), memory.voltage))
     stream.resume(before)
     return stream
-
-
-def memory_of(axis: AxisModel, start_memory: str) -> Memory:
-    """Return a fresh memory: ``end`` or ``start`` of the model's record, or ``wiped``."""
-    return axis.memory()
 
 
 def turning_voltages(memory: Memory) -> tuple[float, ...]:
@@ -99,7 +91,7 @@ def try_out(axis: AxisModel, allowed: Limits) -> None:
     low, high = axis.displacement_range
     margin = TOLERATED_SHARE * (high - low) * (1.0 - 1e-9)
     stream = StreamingInverse(
-        memory_of(axis, "start"), axis.displacement_range, replace(allowed, slew=inf, acceleration=inf)
+        axis.memory("start"), axis.displacement_range, replace(allowed, slew=inf, acceleration=inf)
     )
     for v in (allowed.upper, allowed.lower):
         for y in (low - margin, high + margin) * 2:

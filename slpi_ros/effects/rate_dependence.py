@@ -31,30 +31,6 @@ def reversible(v: FloatArray, gains: Sequence[float]) -> FloatArray:
     return np.asarray(np.polynomial.polynomial.polyval(v, [0.0, *gains]), dtype=np.float64)
 
 
-def settled_rate(t: FloatArray, v: FloatArray, settling: float) -> FloatArray:
-    """Return the rate (V/s) that a path, shape (N,), volts, has of late, from rest, at times `t`, shape (N,), s."""
-    if v.size < 2:
-        return np.zeros_like(v)
-    # From the sample before to the one after; a follower knows only the one before.
-    dt, way = (np.append(x[1:], x[-1]) - np.insert(x[:-1], 0, x[0]) for x in (t, v))
-    rate = np.abs(np.divide(way, dt, out=np.zeros_like(v), where=dt > 0.0))
-    kept = np.exp(-np.diff(t, prepend=t[:1]) / settling) if settling else np.zeros_like(v)
-    settled, now = [], 0.0
-    for value, share in zip(rate.tolist(), kept.tolist(), strict=True):
-        now = value + (now - value) * share
-        settled.append(now)
-    return np.array(settled)
-
-
-def play(v: FloatArray, half_width: FloatArray) -> FloatArray:
-    """Return what is seen of a path, shape (N,), through a play of changing half-width, shape (N,), volts."""
-    seen, now = np.empty_like(v), float(v[0]) if v.size else 0.0
-    for place, (low, high) in enumerate(zip((v - half_width).tolist(), (v + half_width).tolist(), strict=True)):
-        now = min(max(now, low), high)
-        seen[place] = now
-    return seen
-
-
 class CoercivityFollower:
     """The play sample by sample.
 
@@ -323,6 +299,8 @@ class RateDependence:
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement of the wider loops, shape (N,), metres; or the voltage at the hysteresis, volts."""
         if self.coercivity:
+            from slpi_ros.effects.coercivity_path import play, settled_rate
+
             return play(signal, self._growth(settled_rate(around.t, signal, self.settling)))
         middle, speed, direction = self._drive(around)
         return signal + speed * (self.widening * (signal - middle) - self.backlash * direction)
@@ -333,6 +311,8 @@ class RateDependence:
         Or the command, shape (N,), volts, for the voltage at the hysteresis, whose rate is taken for its own.
         """
         if self.coercivity:
+            from slpi_ros.effects.coercivity_path import settled_rate
+
             half_width = self._growth(settled_rate(around.t, signal, self.settling))
             return signal + half_width * np.sign(np.gradient(signal)) if signal.size > 1 else signal.copy()
         middle, speed, direction = self._drive(around)

@@ -22,6 +22,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
+from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, Mode
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis, model_id
 from slpi_ros.compensator.ramps import PERIOD
@@ -456,13 +457,13 @@ class Compensator(LifecycleNode):
                 "to wipe it, or set reset_on_start"
             )
 
-    def _assumed(self, axis: Any) -> str:
+    def _assumed(self, axis: Axis) -> str:
         """Say what is assumed of the memory of an axis."""
         if axis.confidence.doubt or not axis.start_memory:
             return axis.confidence.doubt or "as it was left"
         where = {"end": "where its record ended", "start": "where its record began", "wiped": "wiped"}
         text = f"starts {where[axis.start_memory]} (start_memory {axis.start_memory})"
-        if axis.start_memory == "end" and getattr(axis.model, "end", None) is None:
+        if axis.start_memory == "end" and axis.model and axis.model.end is None:
             text += ", which the model does not tell: where it began is taken"
         return text
 

@@ -6,10 +6,10 @@ from math import inf
 from typing import Any
 
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
-from slpi_ros.compensator.model_swap import START_MEMORIES
 from slpi_ros.compensator.ramps import Safety
 from slpi_ros.compensator.validation import TimeRules
 from slpi_ros.errors import UsageError
+from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.streaming import Limits
 from slpi_ros.nodes.parameters import Declaration, Values
 

@@ -8,11 +8,13 @@ import pytest
 from effects.cases import coercivities, records
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 from strategies import FAMILY_CASE, axis_model
 
 from slpi_ros.effects.base import EffectContext
+from slpi_ros.effects.coercivity_path import play, settled_rate
 from slpi_ros.effects.lag import Lag
-from slpi_ros.effects.rate_dependence import RateDependence
+from slpi_ros.effects.rate_dependence import CoercivityFollower, RateDependence
 from slpi_ros.effects.registry import in_order
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.model.stage_model import StageModel
@@ -84,6 +86,39 @@ def test_it_is_followed_nearly(effect, record):
     assert follower.reversible_bypass == pytest.approx(
         float(effect.reversible_bypass(record.signal[-1:], np.array(followed[-1:]))[0]), abs=1e-15
     )
+
+
+@given(st.lists(st.tuples(st.floats(-100, 100), st.floats(0, 10)), max_size=50))
+def test_a_play_along_a_path_is_the_follower_s(samples):
+    v, widths = np.array(samples).reshape(-1, 2).T.copy()
+    followed = []
+    follower = CoercivityFollower(lambda _: float(widths[len(followed)]), 0.0, ())
+    follower.start(float(v[0]) if v.size else 0.0)
+    for x in v.tolist():
+        followed.append(follower.forward(1.0, x))
+    np.testing.assert_allclose(play(v, widths), followed, rtol=0, atol=1e-12)
+
+
+@given(st.lists(st.floats(1e-4, 1.0), min_size=1, max_size=50), st.floats(-1e3, 1e3), st.floats(1e-4, 1.0))
+def test_on_a_ramp_the_settled_rate_is_the_follower_s(steps, slope, settling):
+    """A ramp has one rate, whichever samples it is taken from; the stamps are uneven."""
+    t = np.cumsum([0.0, *steps])
+    rates, expected = [], [0.0]
+    follower = CoercivityFollower(lambda rate: rates.append(rate) or 0.0, settling, ())
+    for dt, v in zip(np.diff(t).tolist(), (slope * t[1:]).tolist(), strict=True):
+        del rates[:]
+        follower.forward(dt, v)
+        expected.append(rates[0])
+    np.testing.assert_allclose(settled_rate(t, slope * t, settling), expected, rtol=1e-12, atol=1e-12)
+
+
+@given(records("voltage"), st.floats(1e-4, 1e-1))
+def test_at_even_stamps_the_settled_rate_is_filtered(record, settling):
+    dt = record.around.t[1]
+    even = dt * np.arange(record.signal.size)
+    rate, kept = np.abs(np.gradient(record.signal, dt)), np.exp(-dt / settling)
+    expected = lfilter([1 - kept], [1.0, -kept], rate, zi=[-(1 - kept) * rate[0]])[0]
+    np.testing.assert_allclose(settled_rate(even, record.signal, settling), expected, rtol=1e-9, atol=1e-12)
 
 
 @given(coercivities(), records("voltage"), st.integers(1, 600))

@@ -13,8 +13,8 @@ from slpi_ros.excitation.effects import EFFECTS, for_effect
 from slpi_ros.simulation.dynamics import FlexureMode, Relaxation
 
 VOCABULARY = {
-    "delay", "lag", "saturation", "rate_dependence", "creep", "resonance", "cross_coupling", "thermal_drift",
-    "sensor_periodic", "hum",
+    "delay", "lag", "saturation", "rate_dependence", "creep", "resonance", "gain_drift", "cross_coupling",
+    "thermal_drift", "sensor_periodic", "hum",
 }  # fmt: skip
 RATE = 200.0
 
@@ -163,6 +163,16 @@ def test_thermal_drift_repeats_itself():
     period = int(np.diff(ups)[0])
     cycles = [v[up - period // 4 : up + period // 2] for up in ups[1:-1]]
     assert max(np.max(np.abs(cycle - cycles[0])) for cycle in cycles) < 3.0
+
+
+def test_gain_drift_repeats_full_loops_without_a_rest():
+    _, v, _ = drive("gain_drift", duration=120.0)
+    moves = bursts(v)[2:]
+    assert len(moves) >= 60 and {round(span) for span, _ in moves} == {100}
+    lengths = [steps for _, steps in moves]
+    assert max(lengths) - min(lengths) <= 2
+    rest = np.diff(v[v.size // 5 : -v.size // 20]) == 0
+    assert np.count_nonzero(rest) <= len(moves)
 
 
 def test_sensor_periodic_is_slow_and_steady_at_two_speeds():

@@ -139,8 +139,8 @@ class RecordVerification:
     floor_source : str
         Where that was seen.
     known_from : float or None, seconds
-        From when on the initial history adds nothing but a constant: judged from there. None: never, the initial history
-        is estimated and everything is judged.
+        From when on the initial history adds nothing but a constant: judged from there. None: never; everything is
+        judged, from the estimated history.
     history : tuple of float, volts
         The initial history that best explains the record, as in `slpi_ros.model.stage_model.Start`.
     offset : float, metres

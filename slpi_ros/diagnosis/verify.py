@@ -1,7 +1,7 @@
 """The model against records that it has not seen, and what is left of a compensated path's error.
 
 What happened before a record began is unknown: an initial history and a constant offset are estimated for each record,
-and nothing else. Where the record visits both ends of its voltage range, only what comes after that is judged.
+and nothing else. Judged is what comes when the initial history adds nothing but a constant, if that ever comes.
 """
 
 import warnings
@@ -139,8 +139,8 @@ class RecordVerification:
     floor_source : str
         Where that was seen.
     known_from : float or None, seconds
-        From when on the record makes its memory known, so that it is judged; None: never, the initial history is
-        estimated and everything is judged.
+        From when on the initial history adds nothing but a constant: judged from there. None: never; everything is
+        judged, from the estimated history.
     history : tuple of float, volts
         The initial history that best explains the record, as in `slpi_ros.model.stage_model.Start`.
     offset : float, metres

@@ -146,8 +146,7 @@ def _notes(record: RecordVerification) -> list[str]:
     start = (
         "the start is unknown: the initial history and the offset are those that best explain the record"
         if record.known_from is None
-        else f"the start is unknown: judged from {record.known_from:.4g} s on, when both ends of the voltage range had "
-        "been visited"
+        else f"the start is unknown: judged from {record.known_from:.4g} s on, where it adds nothing but a constant"
     )
     notes = [start]
     if record.zero_moved:
@@ -163,7 +162,7 @@ def _tracking_notes(tracking: Tracking) -> list[str]:
     """Return how well a compensator did, and the causes of its error."""
     error = tracking.error
     told = sorted(tracking.shares.items(), key=lambda item: -item[1])
-    shares = [f"{cause} {share:.0%}" for cause, share in told if share >= _SMALLEST_SHARE]
+    shares = [f"{cause} {share:.0%}" for cause, share in told if abs(share) >= _SMALLEST_SHARE]
     notes = [
         f"measured - desired is {_nm(error.rms)} rms, {_nm(error.maximum)} at most; of its mean square: "
         f"{', '.join(shares) or 'nothing'}",
@@ -245,7 +244,8 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
     """Add where the error of a compensated path comes from."""
     page.subsection("Measured - desired displacement")
     shares = {cause: share for cause, share in tracking.shares.items() if share >= _SMALLEST_SHARE}
-    page.shares([Share(cause, share, COLOUR[cause]) for cause, share in shares.items()])
+    whole = sum(shares.values())
+    page.shares([Share(cause, share / whole, COLOUR[cause]) for cause, share in shares.items()])
     page.definitions({cause: CAUSES[cause] for cause in shares})
     page.lines(_tracking_notes(tracking))
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)

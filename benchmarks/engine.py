@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.loop_family import LoopFamily
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.hysteresis.shape import Shape
+from slpi_ros.hysteresis.turning_points import Memory, Shape
 
 FloatArray = NDArray[np.float64]
 SPAN = 100.0

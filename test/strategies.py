@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.kinds import Hysteresis, to_document
 from slpi_ros.hysteresis.loop_family import LoopFamily
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
 
 FloatArray = NDArray[np.float64]

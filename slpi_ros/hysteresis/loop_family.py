@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.shape import END, FAR, Curve
+from slpi_ros.hysteresis.turning_points import END, FAR, Curve
 
 FloatArray = NDArray[np.float64]
 # A vertex (V, counted in the direction of its branches), the knots of the branch from it, and how they change with

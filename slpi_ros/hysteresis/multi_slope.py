@@ -19,9 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from slpi_ros.errors import ModelError, UsageError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.hysteresis.shape import END, FAR, Curve
+from slpi_ros.hysteresis.turning_points import END, FAR, Curve, Memory
 
 FloatArray = NDArray[np.float64]
 

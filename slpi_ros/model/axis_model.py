@@ -16,8 +16,8 @@ from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis import multi_slope as smpi
 from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.reversals import require_finite
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.streaming import ROUNDING, EffectStream, Limits, StreamingInverse, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]

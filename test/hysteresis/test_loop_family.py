@@ -8,7 +8,7 @@ from strategies import Case, cases_and_paths, loop_families, stream_forward, str
 
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.loop_family import LoopFamily
-from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.turning_points import Memory
 
 FloatArray = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.hysteresis.loop_family import LoopFamily
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.reversals import without_small_reversals
 from slpi_ros.hysteresis.slpi_published import SUSPECTED, TRUE_VERTEX, Separation, separate
+from slpi_ros.hysteresis.turning_points import Memory
 
 FloatArray = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from strategies import UNITS, Case, fractions, paths, stream_forward, stream_inverse
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.multi_slope import MultiSlope, falling_envelope, thresholds_for
+from slpi_ros.hysteresis.turning_points import Memory
 
 FloatArray = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from strategies import cases_and_paths, prandtl_ishlinskii, stream_forward, stream_inverse
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii, play
+from slpi_ros.hysteresis.turning_points import Memory
 
 FloatArray = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from strategies import fractions
 
 from slpi_ros.errors import ModelError, UsageError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope, cycles, thresholds_for
+from slpi_ros.hysteresis.turning_points import Memory
 
 ORIGIN = -10.0
 BASE = MultiSlope(ORIGIN, 120.0, thresholds_for(120.0), 1e-7 * np.array([5, 0, 1, 2, 0, 0, 1, 0.5, 0, 0, 0, 0.2, 0]))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from strategies import FAMILY_CASE, PI_CASE, axis_model, axis_models, cases, fractions, paths
 
 from slpi_ros.errors import RecordError, SlpiError, UnreachableError, UsageError
-from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.stage_model import AxisModel, HeldAtLimitWarning, StageModel, Start
 from slpi_ros.model.streaming import Limits
 

@@ -82,7 +82,7 @@ def batch() -> None:
     """Print times of the batch paths beside numpy.interp."""
     family = loop_family()
     print("batch, 1,000,000 samples, ms            forward  inverse  numpy.interp   share of its speed")
-    knots, values = family.grid, family.surface[:, 0]
+    knots, values = family.grid, family.everett[:, 0]
     for turns in (20, 200, 2000, 20000):
         v = (
             SPAN

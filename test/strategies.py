@@ -61,8 +61,8 @@ class Case:
             cells = np.diff(shape.grid)
             rows, columns = np.tril_indices(cells.size)
             slopes = np.concatenate([
-                (np.diff(shape.surface, axis=0)[rows, columns]) / cells[rows],
-                (-np.diff(shape.surface, axis=1)[rows + 1, columns]) / cells[columns],
+                (np.diff(shape.everett, axis=0)[rows, columns]) / cells[rows],
+                (-np.diff(shape.everett, axis=1)[rows + 1, columns]) / cells[columns],
                 np.diff(shape.rise) / cells,
                 [shape.edge_gain],
             ])  # fmt: skip
@@ -74,7 +74,7 @@ class Case:
         shape = self.shape
         if isinstance(shape, PrandtlIshlinskii):
             return float(shape.weights @ np.maximum(self.width - 2 * shape.thresholds, 0))
-        return float(shape.surface[-1, 0])
+        return float(shape.everett[-1, 0])
 
     def displacements(self, v: FloatArray) -> FloatArray:
         """Turn a path of voltages into one of displacements that the model reaches somewhere."""
@@ -99,7 +99,7 @@ def prandtl_ishlinskii(draw: st.DrawFn) -> PrandtlIshlinskii:
 
 @st.composite
 def loop_families(draw: st.DrawFn) -> LoopFamily:
-    """Draw a surface of branches on a grid that need not be uniform nor start at 0."""
+    """Draw an Everett function on a grid that need not be uniform nor start at 0."""
     unit = draw(st.sampled_from(UNITS))
     first = draw(st.sampled_from((0.0, -40.0, 20.0)) | fractions(-150, 150))
     if draw(st.booleans()):
@@ -110,13 +110,13 @@ def loop_families(draw: st.DrawFn) -> LoopFamily:
     n = grid.size
     steps = draw(st.lists(fractions(0.1, 1), min_size=7, max_size=7))
     cells = np.diff(grid)
-    surface = np.zeros((n, n))
+    everett = np.zeros((n, n))
     for i in range(1, n):
         for j in range(i - 1, -1, -1):
             step = unit * steps[(3 * i + 5 * j) % 7] * min(cells[i - 1], cells[j])
-            surface[i, j] = max(surface[i - 1, j], surface[i, j + 1]) + step
+            everett[i, j] = max(everett[i - 1, j], everett[i, j + 1]) + step
     rise = np.cumsum([0.0, *(cells * unit * steps[: n - 1])]) + unit * draw(fractions(-50, 50))
-    return LoopFamily(grid, surface, rise, unit * draw(fractions(0.2, 1)))
+    return LoopFamily(grid, everett, rise, unit * draw(fractions(0.2, 1)))
 
 
 @st.composite

@@ -33,7 +33,7 @@ def to_document(model: Hysteresis) -> dict[str, Any]:
         case LoopFamily():
             return {
                 "grid_V": model.grid.tolist(),
-                "surface_m": [row[: i + 1].tolist() for i, row in enumerate(model.surface)],
+                "surface_m": [row[: i + 1].tolist() for i, row in enumerate(model.everett)],
                 "first_rise_m": model.rise.tolist(),
                 "edge_gain_m_per_V": model.edge_gain,
             }
@@ -90,10 +90,10 @@ def _family_from(parameters: Mapping[str, Any]) -> LoopFamily:
         raise ModelError(
             f"surface_m: row i must hold i + 1 values, one row for each of the {grid.size} vertices of grid_V"
         )
-    surface = np.zeros((grid.size, grid.size))
+    everett = np.zeros((grid.size, grid.size))
     for i, row in enumerate(rows):
-        surface[i, : i + 1] = row
-    return LoopFamily(grid, surface, np.array(parameters["first_rise_m"]), parameters["edge_gain_m_per_V"])
+        everett[i, : i + 1] = row
+    return LoopFamily(grid, everett, np.array(parameters["first_rise_m"]), parameters["edge_gain_m_per_V"])
 
 
 def _multi_slope_from(parameters: Mapping[str, Any]) -> MultiSlope:

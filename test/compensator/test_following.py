@@ -79,7 +79,7 @@ def test_a_model_limits_or_lateness_in_between_make_the_rest_sample_by_sample():
 
 
 CURVES = MODEL.hysteresis
-STEEP = replace(MODEL, hysteresis=replace(CURVES, surface=1.2 * CURVES.surface, rise=1.2 * CURVES.rise))
+STEEP = replace(MODEL, hysteresis=replace(CURVES, everett=1.2 * CURVES.everett, rise=1.2 * CURVES.rise))
 
 
 def swapped(axis):

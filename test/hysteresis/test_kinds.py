@@ -23,7 +23,7 @@ def test_documents_keep_every_bit(shape):
     document = to_document(shape)
     again = from_document(kind, json.loads(json.dumps(document, allow_nan=False)))
     assert type(again) is type(shape)
-    for name in ("thresholds", "weights") if kind == "pi" else ("grid", "surface", "rise", "edge_gain"):
+    for name in ("thresholds", "weights") if kind == "pi" else ("grid", "everett", "rise", "edge_gain"):
         assert np.array_equal(getattr(again, name), getattr(shape, name))
     assert to_document(again) == document
 

@@ -1,4 +1,4 @@
-"""The hysteresis models by name: how each is written in a model document and read back."""
+"""The kinds of hysteresis models by name, and their parameters in a model document."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +11,7 @@ from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
 
-# Shapes on the engine: causal. The others need the whole path in advance.
+# Causal models are shapes on the engine; path models need the whole path in advance.
 CausalModel = LoopFamily | PrandtlIshlinskii | MultiSlope
 PathModel = SeparatedLoops | AmplitudeScaled
 Hysteresis = CausalModel | PathModel
@@ -26,7 +26,7 @@ DESCRIPTIONS = {
 
 
 def to_document(model: Hysteresis) -> dict[str, Any]:
-    """Return the parameters of a model, SI units, as they stand in a model document."""
+    """Return the parameters of a model, SI units, for a model document."""
     match model:
         case PrandtlIshlinskii():
             return _plays_document(model)
@@ -54,7 +54,14 @@ def to_document(model: Hysteresis) -> dict[str, Any]:
 
 
 def from_document(kind: str, parameters: Mapping[str, Any]) -> Hysteresis:
-    """Build the model of `kind` from the parameters of a valid model document.
+    """Build a model from the parameters of a valid model document.
+
+    Parameters
+    ----------
+    kind : str
+        One of `DESCRIPTIONS`.
+    parameters : mapping
+        SI units, as from `to_document`.
 
     Raises
     ------

@@ -200,7 +200,7 @@ def unseen_paths(known: Study, seed: int = 1) -> UnseenPaths:
         for loop in inner:
             span = float(np.ptp(v[loop.path]))
             place = loop.level, loop.direction, float(v[loop.vertex]), span
-            replaced += not known.closing.holds(known.closing.nearest(*place, 0), *place, 0)
+            replaced += not known.closing.matches(known.closing.nearest(*place, 0), *place, 0)
     return UnseenPaths(paths, {name: tuple(e) for name, e in errors.items()}, loops, replaced)
 
 

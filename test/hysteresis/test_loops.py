@@ -192,9 +192,9 @@ def turning_values(v: FloatArray) -> list[float]:
 
 
 def test_refuses_what_is_no_record() -> None:
-    with pytest.raises(RecordError, match="at least one"):
+    with pytest.raises(RecordError):
         separate(np.array([]))
-    with pytest.raises(RecordError, match="give as many"):
+    with pytest.raises(RecordError):
         separate(np.zeros(3), np.zeros(2))
-    with pytest.raises(UsageError, match="sample 1 is nan"):
+    with pytest.raises(UsageError, match=r"\b1\b.*\bnan\b"):
         separate(np.array([0.0, np.nan]))

@@ -253,5 +253,5 @@ def test_the_papers_thresholds():
     ],
 )
 def test_parameters_that_make_no_model(origin, amplitude, thresholds, weights):
-    with pytest.raises(ModelError, match=r"^MPI: [^\n]+$"):
+    with pytest.raises(ModelError):
         MultiSlope(origin, amplitude, np.array(thresholds), np.array(weights))

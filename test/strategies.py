@@ -21,13 +21,16 @@ from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
 FloatArray = NDArray[np.float64]
 
 # Drawing a model and a path takes a while; on a slow machine that is no mistake.
+EXAMPLES = int(os.environ.get("HYPOTHESIS_EXAMPLES", "100"))
 settings.register_profile(
     "models",
     settings.default,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
-    max_examples=int(os.environ.get("HYPOTHESIS_EXAMPLES", "100")),
+    max_examples=EXAMPLES,
 )
 settings.load_profile("models")
+# For a property that runs several times: once for each way, start or kind.
+repeated = settings(max_examples=max(EXAMPLES // 2, 1))
 
 KINDS = ("pi", "slpi")
 # Displacement per volt: metres on a real stage, and micrometres, as the papers have it.

@@ -66,7 +66,7 @@ def levels_of(separation: Separation) -> NDArray[np.int64]:
     return level
 
 
-@settings(max_examples=1000)
+@settings(max_examples=400)
 @given(paths)
 def test_equals_the_engines_closed_loops(v: FloatArray) -> None:
     separation = separate(v)

@@ -43,7 +43,7 @@ def calibrated(seed: int, duration: float, rate: float) -> tuple[slpi_ros.Record
 def errors(model: slpi_ros.StageModel, seed: int, low: float, high: float, duration: float, rate: float) -> FloatArray:
     """Follow an unseen path with the model's voltages; return the sizes of the errors, in shares of the stroke."""
     t, desired = scan_path(low, high, duration=duration, rate=rate, seed=1000 + seed)
-    achieved, _ = fresh(seed).run(t, model.compensate(t, desired))
+    achieved, _ = fresh(seed).run(t, model.compensate(t, desired, "start"))
     share: FloatArray = np.abs(achieved - desired) / (high - low)
     return share
 
@@ -56,7 +56,7 @@ def below_remanence(model: slpi_ros.StageModel, seed: int, low: float, high: flo
     excursion[middle] = low - 0.1 * (high - low) * np.sin(np.linspace(0.0, np.pi, excursion[middle].size))
     means = []
     for path in (excursion, desired):
-        v, _ = model.axes["x"].compensate(t, path)
+        v, _ = model.axes["x"].compensate(t, path, start_memory="start")
         achieved, _ = fresh(seed).run(t, v)
         half = desired.size // 2 + int(rate)
         means.append(float(np.mean(np.abs(achieved - path)[half:]) / (high - low)))

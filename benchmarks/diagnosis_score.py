@@ -146,7 +146,7 @@ def parameter_errors(truth: Truth, effect, hidden: Hidden) -> dict[str, float]:
     """Return relative errors by name; one for a wave with its phase, and one for a list of knots or relaxations.
 
     ``saturation``: relative to what is cut off. ``creep``: what a step becomes between 0.1 s and half of the record.
-    ``thermal_drift``: the path, without its mean. ``wave``: the periodic error itself, phase and all.
+    ``gain_drift``, ``thermal_drift``: the path, without its mean. ``wave``: the periodic error itself, phase and all.
     """
     true, t = truth.parameters, hidden.record.t
     v = hidden.record.voltage[truth.axis]
@@ -161,6 +161,8 @@ def parameter_errors(truth: Truth, effect, hidden: Hidden) -> dict[str, float]:
         case "creep":
             times = np.geomspace(0.1, t[-1] / 2, 40)
             return {"response": _mismatch(*(_after_a_step(each, times) for each in (effect, true)))}
+        case "gain_drift":
+            return {"course": _mismatch(*(_course(each, t) for each in (effect, true)))}
         case "thermal_drift":
             return {"path": _mismatch(*(_path(each, t) for each in (effect, true)))}
         case "sensor_periodic" | "hum":
@@ -197,6 +199,10 @@ def _after_a_step(source, times):
 
 def _path(source, t):
     return np.interp(t, _of(source, "times"), _of(source, "values"))
+
+
+def _course(source, t):
+    return np.interp(t, (0.0, *_of(source, "times")), (0.0, *_of(source, "gains")))
 
 
 def _wave(source, scale: str, y, t):

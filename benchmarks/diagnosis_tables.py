@@ -171,6 +171,7 @@ def _short(name: str) -> str:
         "rate_dependence": "rate",
         "saturation": "satur",
         "resonance": "reson",
+        "gain_drift": "gain",
         "cross_coupling": "coupl",
         "thermal_drift": "drift",
         "sensor_periodic": "period",

@@ -133,7 +133,7 @@ def unseen_errors(recording: Recording, seed: int, rate: float, low: float, high
     stage = fresh(seed)
     before = np.append(recording.before, recording.v[0])
     stage.run(np.arange(before.size) / rate, before)
-    achieved, _ = stage.run(before.size / rate + t, model.compensate(t, desired))
+    achieved, _ = stage.run(before.size / rate + t, model.compensate(t, desired, "start"))
     share: FloatArray = np.abs(achieved - desired) / (high - low)
     return share
 

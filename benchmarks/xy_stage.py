@@ -118,7 +118,7 @@ def segments(models: Mapping[str, slpi_ros.AxisModel], feedback: bool) -> str:
     limits = {"voltage_min": -20.0, "voltage_max": 150.0}
     with simulator(preset="p11", **limits) as stage:
         zero = stage.warm_up(top)
-        warm = {a: replace(models[a], start=Start(0.0, z, (0.0,))) for a, z in zip(AXES, zero, strict=True)}
+        warm = {a: replace(models[a], start=Start(0.0, z, (0.0,)), end=None) for a, z in zip(AXES, zero, strict=True)}
         loop = {"feedback": feedback, "measurement_timeout": 10.0, **told}
         remap = ["measured_displacement:=stage_state"]
         with compensator("bench", StageModel(warm), remap=remap, **limits, **loop):

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from slpi_ros.diagnosis.diagnose import diagnose
+from slpi_ros.diagnosis.verify import verify
 from slpi_ros.errors import SlpiError
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.record_quality import assess, findings
@@ -33,6 +34,7 @@ __all__ = [
     "read_bag",
     "refit",
     "save_model",
+    "verify",
 ]
 
 

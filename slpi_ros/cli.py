@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from slpi_ros.diagnosis.diagnose import diagnose
+from slpi_ros.diagnosis.verify import verify
 from slpi_ros.errors import ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, excite
 from slpi_ros.identification.cross_validation import cross_validate
@@ -29,10 +30,11 @@ from slpi_ros.io import tables
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.column_choice import Wishes
 from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.document import load_model, save_model
 from slpi_ros.model.stage_model import StageModel, check_time, held_message
 from slpi_ros.model.streaming import Limits
-from slpi_ros.reports.text import describe_change, describe_model
+from slpi_ros.reports.text import describe_change, describe_model, describe_start
 
 # Where a bag holds voltage and displacement, if nothing else is said.
 TOPIC = "stage_state"
@@ -71,6 +73,7 @@ def parser() -> argparse.ArgumentParser:
     _diagnose_options(
         commands.add_parser("diagnose", help="say what a model gets wrong on a bag, why, and what mends it")
     )
+    _verify_options(commands.add_parser("verify", help="judge a model on bags that it has not seen: pass or fail"))
     _excite_options(commands.add_parser("excite", help="make the voltages to record for an identification"))
     _refit_options(
         commands.add_parser("refit", help="update a model with a new bag; what the bag does not visit stays")
@@ -127,6 +130,24 @@ def _diagnose_options(command: Any) -> None:
     _span(command)
 
 
+def _verify_options(command: Any) -> None:
+    command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a lone mcap or sqlite3 file")
+    command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
+    command.add_argument(
+        "--tolerance", metavar="UM", type=float,
+        help="the largest rms error that passes, micrometres; default: three times the record's noise floor, but at "
+        "least the model's own held-out error",
+    )  # fmt: skip
+    command.add_argument("-o", "--output", metavar="DIR", help="folder of verification.json and report.html")
+    command.add_argument("--json", action="store_true", help="print the document instead of its summary")
+    command.add_argument(
+        "--desired-topic", metavar="TOPIC",
+        help=f"adds how well the stage was compensated; default: {bags.DESIRED}, where a bag holds it",
+    )  # fmt: skip
+    _where_in_the_bag(command)
+    _axes(command, help="default: every axis that bags and model share")
+
+
 def _axes(command: Any, **told: Any) -> None:
     command.add_argument("--axis", metavar="NAME", nargs="+", action=_EachOnce, **told)
 
@@ -179,6 +200,11 @@ def _compensate_options(command: Any) -> None:
     command.add_argument("-o", "--output", metavar="VOLTAGE.csv", required=True)
     command.add_argument("--voltage-min", metavar="V", type=float, default=-np.inf, help="default: what was identified")
     command.add_argument("--voltage-max", metavar="V", type=float, default=np.inf)
+    command.add_argument(
+        "--start-memory", choices=START_MEMORIES, default=START_MEMORIES[0],
+        help="what the stage went through before: up to the end of the identified record (default), up to its start, "
+        "or a decaying drive that wiped the memory",
+    )  # fmt: skip
 
 
 def _experiments_options(command: Any) -> None:
@@ -196,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = partial(_show_warning, options.command)
     try:
         with shown_on(sys.stderr):
-            COMMANDS[options.command](options)
+            return COMMANDS[options.command](options) or 0
     except SlpiError as error:
         print(f"slpi {options.command}: {_one_line(error)}", file=sys.stderr)
         return error.exit_code
@@ -205,7 +231,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return 130
-    return 0
 
 
 def _show_warning(command: str, message: Warning | str, *_: object) -> None:
@@ -256,7 +281,7 @@ def _identify(options: argparse.Namespace) -> None:
             axis: cross_validate(records, axis, options.kind, loops_at_rest=options.loops_at_rest, **part)
             for axis in model.axes
         }
-        write_report(Path(options.report), records[0], model, truth=truth, found=found[0], **part)
+        write_report(Path(options.report), records[0], model, held_out=truth, found=found[0], **part)
         told += [f"axis {axis}: {line}" for axis, held_out in truth.items() for line in held_out.lines()]
     if options.uncertainty:
         for axis in model.axes:
@@ -326,6 +351,33 @@ def _with_other_axes(options: argparse.Namespace, topics: str | bags.SeparateTop
         return bags.read_bag(options.bag, topics, axes=options.axis)
 
 
+def _verify(options: argparse.Namespace) -> int:
+    from slpi_ros.reports.verification import describe_verification, format_verification, make_room, write_files
+
+    topics = _topics(options)
+    if options.tolerance is not None and not 0.0 < options.tolerance < np.inf:
+        raise UsageError(f"--tolerance {options.tolerance:g}: give a positive one, micrometres")
+    model = load_model(options.model)
+    if options.output:
+        make_room(Path(options.output))
+    # The other axes may move those asked for; separate topics may have no names but those given.
+    axes = options.axis if isinstance(topics, bags.SeparateTopics) else None
+    records = bags.read_bags(options.bags, topics, axes=axes)
+    desired = [
+        bags.read_desired(bag, record, options.desired_topic) for bag, record in zip(options.bags, records, strict=True)
+    ]
+    tolerance = None if options.tolerance is None else 1e-6 * options.tolerance
+    try:
+        found = verify(records, model, tolerance, axes=options.axis, desired=desired)
+    except UsageError as error:
+        # That bags and model do not go together shows only once all have been read.
+        raise ModelError(str(error)) from None
+    if options.output:
+        write_files(Path(options.output), found)
+    print(format_verification(found) if options.json else "\n".join(describe_verification(found)))
+    return 0 if found.passed else 1
+
+
 def _excite(options: argparse.Namespace) -> None:
     drive = excite(
         options.axis,
@@ -373,13 +425,14 @@ def _compensate(options: argparse.Namespace) -> None:
     known = _known(desired, model, options.table)
     limits = Limits(options.voltage_min, options.voltage_max)
     try:
-        answers = model.command(t, known, limits)
+        answers = model.command(t, known, limits, options.start_memory)
     except SlpiError as error:
         raise type(error)(f"{options.table}, {error}") from None
     for axis, (_, held) in answers.items():
         if held.any():
             print(f"slpi compensate: axis '{axis}': {held_message(held)}", file=sys.stderr)
     tables.write_table(options.output, t, {axis: v for axis, (v, _) in answers.items()}, "V")
+    print(describe_start(model, answers, options.start_memory))
 
 
 def _require_another_file(output: str, *inputs: str) -> None:
@@ -412,10 +465,11 @@ def _show(options: argparse.Namespace) -> None:
     print("\n".join(describe_model(load_model(options.model))))
 
 
-COMMANDS: Mapping[str, Callable[[argparse.Namespace], None]] = {
+COMMANDS: Mapping[str, Callable[[argparse.Namespace], int | None]] = {
     "import": _import,
     "identify": _identify,
     "diagnose": _diagnose,
+    "verify": _verify,
     "excite": _excite,
     "refit": _refit,
     "simulate": _simulate,

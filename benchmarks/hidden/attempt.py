@@ -24,7 +24,7 @@ NOISE = (3e-9, 15e-9)
 # A size that was asked for is met within this share of it.
 CLOSE = 0.15
 # Effects that take their time.
-SLOW = {"creep", "thermal_drift"}
+SLOW = {"creep", "gain_drift", "thermal_drift"}
 # Seconds. Where the samples allow, records take no less.
 SHORTEST = 20.0
 
@@ -46,7 +46,7 @@ class Draw:
         self.t = (self.time_ns - self.time_ns[0]) * 1e-9
         room = rooms[self.victim]
         other = next((axis for axis in self.axes if axis != self.victim), "")
-        setting = Setting(self.t, rate, room.low, room.high, other)
+        setting = Setting(self.t, self.v[self.victim], rate, room.low, room.high, other)
         self.natures = {effect: DRAWS[effect](rng, setting) for effect in effects}
         self._own: dict[tuple[object, ...], FloatArray] = {}
 
@@ -56,7 +56,7 @@ class Draw:
         return sensed(physics, self.t, motion, axis)
 
     def _motion(self, axis: str, physics: Physics) -> FloatArray:
-        key = (axis, physics.amplifier, physics.viscosity, physics.creep, physics.flexure)
+        key = (axis, physics.amplifier, physics.viscosity, physics.creep, physics.flexure, physics.ageing)
         if key not in self._own:
             self._own[key] = own_motion(self.stage[axis], physics, self.t, self.v[axis])
         return self._own[key]

@@ -108,6 +108,7 @@ NEEDED: dict[str, tuple[Section, ...]] = {
     "rate_dependence": (tempos, varied),
     "creep": (holds,),
     "resonance": (steps,),
+    "gain_drift": (varied,),
     "cross_coupling": (varied,),
     "thermal_drift": (varied,),
     "sensor_periodic": (ramps,),

@@ -1,4 +1,4 @@
-"""Draws of the ten effects: the physics of each and the parameters by which it is known."""
+"""Draws of the eleven effects: the physics of each and the parameters by which it is known."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.simulation.chain import Flexure, Physics, SlowDomains
-from slpi_ros.simulation.dynamics import Amplifier, Creep, RateLaw, Viscosity
+from slpi_ros.simulation.dynamics import Ageing, Amplifier, Creep, RateLaw, Viscosity
 from slpi_ros.simulation.sensor import Hum, Interferometer, Temperature
 
 from .drives import log_uniform
@@ -24,10 +24,16 @@ class Setting:
     """What a draw may look at."""
 
     t: FloatArray
+    v: FloatArray
     rate: float
     low: float
     high: float
     other: str
+
+    @property
+    def travel(self) -> float:
+        """How far the voltage goes in all, volts."""
+        return float(np.abs(np.diff(self.v)).sum())
 
 
 @dataclass(frozen=True)
@@ -116,6 +122,29 @@ def _resonance(rng: np.random.Generator, setting: Setting) -> Nature:
     )
 
 
+def _gain_drift(rng: np.random.Generator, setting: Setting) -> Nature:
+    duration, sign = float(setting.t[-1]), float(rng.choice([-1.0, 1.0]))
+    form = str(rng.choice(["ramp", "settling", "cycles", "sine"]))
+    constant = {
+        "settling": float(rng.uniform(0.15, 0.7)) * duration,
+        "cycles": float(rng.uniform(0.15, 0.7)) * setting.travel,
+        "sine": float(rng.uniform(1.0, 3.0)) * duration,
+    }.get(form, 1.0)
+    # About the rest position, or about one that the sensor's mounting makes the fixed one.
+    pivot = float(rng.choice([0.0, rng.uniform(0.0, 15e-6)]))
+
+    def ageing(strength: float) -> Ageing:
+        return Ageing(sign * strength, form, constant, pivot)
+
+    times = np.linspace(0.0, duration, 41)[1:]
+
+    def parameters(strength: float) -> dict[str, tuple[float, ...]]:
+        course = ageing(strength).path(setting.t, setting.v)
+        return {"times": tuple(times), "gains": tuple(np.interp(times, setting.t, course))}
+
+    return Nature(1e-3, 0.1, lambda s: Physics(ageing=ageing(s)), parameters)
+
+
 def _cross_coupling(rng: np.random.Generator, setting: Setting) -> Nature:
     sign = float(rng.choice([-1.0, 1.0]))
     return Nature(
@@ -182,5 +211,6 @@ DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "thermal_drift": _thermal_drift,
     "sensor_periodic": _sensor_periodic,
     "hum": _hum,
+    "gain_drift": _gain_drift,
 }
 NAMES = tuple(DRAWS)

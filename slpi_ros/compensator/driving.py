@@ -4,7 +4,8 @@ from collections.abc import Collection, Sequence
 
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.persistence import KNOWN, RESETTING, MemoryConfidence
-from slpi_ros.compensator.ramps import Ramp, decaying_turns
+from slpi_ros.compensator.ramps import Ramp
+from slpi_ros.model.limits import decaying_turns
 
 
 class Driving:

@@ -12,6 +12,7 @@ SEPARATES = (
     ({"lag", "delay"}, "lag"),
     ({"lag", "rate_dependence"}, "rate_dependence"),
     ({"delay", "rate_dependence"}, "rate_dependence"),
+    ({"gain_drift", "thermal_drift"}, "gain_drift"),
     ({"creep", "thermal_drift"}, "thermal_drift"),
     ({"creep", "lag"}, "creep"),
     ({"creep", "delay"}, "creep"),

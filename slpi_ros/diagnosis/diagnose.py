@@ -161,7 +161,7 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
     hysteresis, at_start = now.hysteresis()
     y, errors = evidence.y[evidence.used], now.residual[evidence.used]
     voltage = evidence.v[evidence.used]
-    return replace(
+    extended = replace(
         model,
         kind="pi" if isinstance(evidence.basis, PlayBasis) else "slpi",
         hysteresis=hysteresis,
@@ -179,3 +179,4 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
             source=source,
         ),
     )
+    return replace(extended, end=extended.after(now.u))

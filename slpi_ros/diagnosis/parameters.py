@@ -22,6 +22,7 @@ FREE = {
     "rate_dependence": ("widening", "backlash", "exponent", "transition"),
     "creep": ("time_constants", "gains"),
     "resonance": ("frequency", "damping"),
+    "gain_drift": ("gains",),
     "cross_coupling": ("gains",),
     "thermal_drift": ("values",),
     "sensor_periodic": ("period", "amplitude", "phase"),

@@ -1,1 +1,1 @@
-"""What a stage does beside its hysteresis: ten effects, each with the same verbs."""
+"""What a stage does beside its hysteresis: eleven effects, each with the same verbs."""

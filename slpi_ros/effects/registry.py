@@ -9,6 +9,7 @@ from slpi_ros.effects.base import Effect, parameters_of
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.hum import Hum
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
@@ -23,7 +24,7 @@ EFFECTS: dict[str, type[Any]] = {
     kind.name: kind
     for kind in (
         *(Delay, Lag, Saturation),
-        *(RateDependence, Creep, Resonance, CrossCoupling, ThermalDrift, SensorPeriodic, Hum),
+        *(RateDependence, Creep, Resonance, GainDrift, CrossCoupling, ThermalDrift, SensorPeriodic, Hum),
     )
 }
 _PLACE = {name: place for place, name in enumerate(EFFECTS)}

@@ -177,6 +177,12 @@ def _thermal_drift(path: Path, room: Room) -> None:
         path.hold(0.2 * each)
 
 
+def _gain_drift(path: Path, room: Room) -> None:
+    shortest = 2 * max(room.quickest(1.0), _brisk(1.0))
+    repeats = min(max(int(_left(room) / shortest), 3), 60)
+    _loops(path, 0.0, 1.0, _left(room) / (2 * repeats), repeats)
+
+
 def _sensor_periodic(path: Path, room: Room) -> None:
     for share in (1 / 6, 1 / 3):
         _loops(path, 0.0, 1.0, share * _left(room), 1, straight=True)
@@ -226,6 +232,13 @@ EFFECTS = {
             "Small steps as fast as allowed with time to ring down, at three levels, then a sweep up to a sixth of the "
             "sampling rate: only a resonance rings on, at one frequency (sample at six times that or more).",
             _resonance,
+        ),
+        EffectDrive(
+            "gain_drift",
+            "Full loops one after the other, all alike and without a rest: voltage, memory and creep repeat, so a "
+            "stroke that grows or shrinks is the sensitivity, where a drift moves both ends of each loop by the same "
+            "(give it several minutes, or start after a rest).",
+            _gain_drift,
         ),
         EffectDrive(
             "cross_coupling",

@@ -56,13 +56,6 @@ def to_document(model: Hysteresis) -> dict[str, Any]:
 def from_document(kind: str, parameters: Mapping[str, Any]) -> Hysteresis:
     """Build a model from the parameters of a valid model document.
 
-    Parameters
-    ----------
-    kind : str
-        One of `DESCRIPTIONS`.
-    parameters : mapping
-        SI units, as from `to_document`.
-
     Raises
     ------
     ModelError

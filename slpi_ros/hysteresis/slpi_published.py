@@ -107,20 +107,6 @@ class Separation:
         return np.column_stack(columns).astype(np.float64)
 
 
-class _Marks:
-    """The columns of a `Separation` that `_judge` fills."""
-
-    def __init__(self, count: int) -> None:
-        self.phase = np.ones(count, dtype=np.int64)
-        self.level = np.zeros(count, dtype=np.int64)
-        self.vertex = np.full(count, NO_VERTEX)
-
-    def write(self, start: int, stop: int, phase: int, level: int) -> None:
-        """Set phase and level of the samples ``start:stop``."""
-        self.phase[start:stop] = phase
-        self.level[start:stop] = level
-
-
 def separate(voltage: FloatArray, displacement: FloatArray | None = None, *, dead_band: float = 0.0) -> Separation:
     """Separate a record into single loops.
 
@@ -151,34 +137,38 @@ def separate(voltage: FloatArray, displacement: FloatArray | None = None, *, dea
         raise RecordError(f"{v.shape} voltages and {d.shape} displacements; give as many of each, at least one")
     require_finite(v)
     v = without_small_reversals(v, dead_band)
-    marks = _Marks(v.size)
-    closed, suspects = _judge(v, marks)
+    phase, level, vertex = np.ones(v.size, np.int64), np.zeros(v.size, np.int64), np.full(v.size, NO_VERTEX)
+    closed, suspects = _judge(v, phase, level, vertex)
     resting = monotone_runs(v)[0][1]
     falls_first = bool(suspects) and suspects[0] < resting
-    marks.vertex[0] = TRUE_VERTEX
-    loops = _loops(closed, suspects, falls_first, marks.phase)
-    return Separation(v, d, marks.phase, marks.level, marks.vertex, loops)
+    vertex[0] = TRUE_VERTEX
+    return Separation(v, d, phase, level, vertex, _loops(closed, suspects, falls_first, phase))
 
 
-def _judge(v: FloatArray, marks: _Marks) -> tuple[list[tuple[int, int]], list[int]]:
-    """Find the closed loops, each as its vertex and the sample that closes it, and the vertices still suspected."""
+def _judge(
+    v: FloatArray, phase: IntArray, level: IntArray, vertex: IntArray
+) -> tuple[list[tuple[int, int]], list[int]]:
+    """Find the closed loops, each as its vertex and the sample that closes it, and the vertices still suspected.
+
+    The columns `phase`, `level` and `vertex` of the `Separation` are filled in.
+    """
     suspects: list[int] = []
     closed: list[tuple[int, int]] = []
-    phase = 1
+    now = 1
     for start, stop in monotone_runs(v)[1:]:
         direction = 1 if v[stop - 1] > v[start - 1] else -1
-        if direction != phase:
-            phase = direction
+        if direction != now:
+            now = direction
             suspects.append(start - 1)
-            marks.vertex[start - 1] = SUSPECTED
-            marks.write(start - 1, start, phase, len(suspects))
+            vertex[start - 1] = SUSPECTED
+            phase[start - 1], level[start - 1] = now, len(suspects)
         while start < stop:
             cut = stop
             if len(suspects) > 1:
-                cut = start + count_before(v[start:stop], phase, float(v[suspects[-2]]))
-            marks.write(start, cut, phase, len(suspects))
+                cut = start + count_before(v[start:stop], now, float(v[suspects[-2]]))
+            phase[start:cut], level[start:cut] = now, len(suspects)
             if cut < stop:
-                marks.vertex[suspects[-2]] = TRUE_VERTEX
+                vertex[suspects[-2]] = TRUE_VERTEX
                 closed.append((suspects[-2], cut))
                 del suspects[-2:]
             start = cut

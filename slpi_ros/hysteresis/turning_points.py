@@ -70,19 +70,7 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class MemoryState:
-    """A snapshot of a `Memory`.
-
-    Parameters
-    ----------
-    direction : int
-        +1 rising, -1 falling, 0 at rest.
-    voltage : float, volts
-    displacement : float, metres
-        The present point.
-    turn_voltages : tuple of float, length n, volts
-    turn_displacements : tuple of float, length n, metres
-        The turning points, oldest first.
-    """
+    """A snapshot of a `Memory`: direction (0 at rest), present point and turning points, oldest first (V and m)."""
 
     direction: int
     voltage: float
@@ -275,19 +263,15 @@ class Memory:
         if lower <= v <= upper:
             self._v, self._y = v, y
             return v
-        return self._stop_at(min(max(v, lower), upper))
-
-    def _stop_at(self, limit: float) -> float:
-        """Move to a voltage limit."""
-        self._turn_or_close_at_voltage(limit)
-        return limit
+        self._turn_or_close_at_voltage(min(max(v, lower), upper))
+        return self._v
 
     def _turn_or_close_at_displacement(self, y: float, lower: float, upper: float) -> float:
         """Push a reversal or pop closed loops on the way to `y`, where needed, and move there within the limits."""
         if not abs(y - self._rest[1]) < self._far[1]:
             raise UsageError(f"displacement {y} m is none that a stage can take; leave such samples out")
         if not lower <= self._v <= upper:
-            self._stop_at(min(max(self._v, lower), upper))
+            self._turn_or_close_at_voltage(min(max(self._v, lower), upper))
         if y == self._y:
             return self._v
         s = 1 if y > self._y else -1
@@ -297,7 +281,8 @@ class Memory:
         self._turn_to(s)
         while s * (y - self._close[1]) >= 0.0:
             if s * (limit - self._close[0]) < 0.0:
-                return self._stop_at(limit)
+                self._turn_or_close_at_voltage(limit)
+                return limit
             self._close_loop()
         return self._follow_to_displacement(y, lower, upper)
 
@@ -324,20 +309,9 @@ class Memory:
     ) -> Iterator[tuple[int, int]]:
         """Cut the monotone run ``start:stop`` of a drive where loops close, and move the stack along.
 
-        Parameters
-        ----------
-        x : ndarray, shape (N,), volts or metres
-        start, stop : int
-            The run, as from `monotone_runs`.
-        coordinate : int
-            What `x` is: 0 voltage, 1 displacement.
-        lower, upper : float, volts
-            The pieces end before a loop that closes beyond a limit.
-
-        Yields
-        ------
-        (int, int)
-            Samples ``begin:end`` on one branch. The caller must `advance_to` the last of them before it asks for more.
+        `coordinate` tells what `x`, shape (N,), is: 0 voltage (V), 1 displacement (m). The pieces lie each on
+        one branch and end before a loop that closes beyond a voltage limit (V). The caller must `advance_to` the last
+        sample of a piece before it takes the next.
         """
         s = 1 if x[stop - 1] > x[start - 1] else -1
         limit = upper if s > 0 else lower

@@ -136,17 +136,18 @@ def choose(
 def _solved(
     samples: Sequence[Samples], problem: Problem, smoothness: float, beginnings: Sequence[InitialHistory]
 ) -> Fitted:
-    """Solve a problem of samples that have a history before them; the model starts as the first record does."""
+    """Solve a problem of samples that have a history before them."""
     report_progress(f"fit to {problem.count} samples")
     x = problem.solve(smoothness)
-    history = beginnings[0].history
-    recorded = [
-        np.arange(part.v.size) >= len(beginning.history) for part, beginning in zip(samples, beginnings, strict=True)
-    ]
-    at_start = problem.design.predict(x)[len(history)] * problem.scale
+    predicted = np.split(problem.design.predict(x) * problem.scale, np.cumsum([part.v.size for part in samples])[:-1])
+    recorded, starts = [], []
+    for part, beginning, y in zip(samples, beginnings, predicted, strict=True):
+        first = len(beginning.history)
+        recorded.append(np.arange(part.v.size) >= first)
+        starts.append(Start(float(part.v[first]), float(y[first]), beginning.history))
     return Fitted(
         hysteresis=problem.basis.shape(x[: problem.basis.size + 1] * problem.scale, problem.gain),
-        start=Start(float(samples[0].v[len(history)]), float(at_start), history),
+        starts=tuple(starts),
         y=np.concatenate([part.y[part.fitted] for part in samples]),
         voltage_range=_fitted_range(samples),
         errors=problem.errors(x),

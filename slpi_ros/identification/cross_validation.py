@@ -158,8 +158,8 @@ def cross_validate(
         classical = error if kind == CLASSICAL else _classical(samples)
     left_out = np.isfinite(error)
     error, classical = error[left_out], classical[left_out]
-    level = np.concatenate([_levels(part.t, part.samples.v) for part in parts])[left_out]
-    speed = np.concatenate([_speeds(part.t, part.samples.v) for part in parts])[left_out]
+    level = np.concatenate([loop_levels(part.t, part.samples.v) for part in parts])[left_out]
+    speed = np.concatenate([speeds(part.t, part.samples.v) for part in parts])[left_out]
     t = np.concatenate([part.t for part in parts])[left_out]
     v = np.concatenate([part.samples.v for part in parts])[left_out]
 
@@ -174,9 +174,9 @@ def cross_validate(
         kind=kind,
         floor=floors[len(floors) // 2],
         overall=_slice("all", error, classical),
-        by_level=cut(_level_classes(level)),
-        by_region=cut(_region_classes(v)),
-        by_speed=cut(_speed_classes(speed)),
+        by_level=cut(level_classes(level)),
+        by_region=cut(region_classes(v)),
+        by_speed=cut(speed_classes(speed)),
         t=t,
         v=v,
         error=error,
@@ -202,7 +202,7 @@ def _slice(name: str, error: FloatArray, classical: FloatArray) -> Slice:
     return Slice(name, error.size, float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error))), classical_rms)
 
 
-def _levels(t: FloatArray, v: FloatArray) -> IntArray:
+def loop_levels(t: FloatArray, v: FloatArray) -> IntArray:
     """Return how deep the loop of each sample lies in others, shape (N,)."""
     level = np.zeros(v.size, np.int64)
     for loop in separate(v, dead_band=smallest_turn(v, noise(v, t))).loops:
@@ -210,7 +210,7 @@ def _levels(t: FloatArray, v: FloatArray) -> IntArray:
     return level
 
 
-def _speeds(t: FloatArray, v: FloatArray) -> FloatArray:
+def speeds(t: FloatArray, v: FloatArray) -> FloatArray:
     """Return the size of dv/dt (V/s), shape (N,), over some samples on each side."""
     at = np.arange(v.size)
     before, after = np.maximum(at - _SPEED_REACH, 0), np.minimum(at + _SPEED_REACH, v.size - 1)
@@ -218,21 +218,24 @@ def _speeds(t: FloatArray, v: FloatArray) -> FloatArray:
     return np.divide(np.abs(v[after] - v[before]), seconds, out=np.zeros(v.size), where=seconds > 0.0)
 
 
-def _level_classes(level: IntArray) -> Iterator[tuple[str, Mask]]:
+def level_classes(level: IntArray) -> Iterator[tuple[str, Mask]]:
+    """Yield classes of samples by the depth of their loop, shape (N,): name and which samples."""
     yield "outer loop", level == 0
     for depth in range(1, DEEPEST):
         yield f"loops of level {depth}", level == depth
     yield f"level {DEEPEST} and deeper", level >= DEEPEST
 
 
-def _region_classes(v: FloatArray) -> Iterator[tuple[str, Mask]]:
+def region_classes(v: FloatArray) -> Iterator[tuple[str, Mask]]:
+    """Yield classes of samples by voltage, shape (N,), volts: name and which samples."""
     edges = np.linspace(v.min(), v.max(), REGIONS + 1)
     region = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, REGIONS - 1)
     for number, (low, high) in enumerate(pairwise(edges.tolist())):
         yield f"{low:.4g} to {high:.4g} V", region == number
 
 
-def _speed_classes(speed: FloatArray) -> Iterator[tuple[str, Mask]]:
+def speed_classes(speed: FloatArray) -> Iterator[tuple[str, Mask]]:
+    """Yield classes of samples by the size of dv/dt, shape (N,), volts per second: name and which samples."""
     rest = speed <= _REST * float(np.quantile(speed, 0.95))
     yield "at rest", rest
     moving = speed[~rest]

@@ -1,6 +1,7 @@
 """From a record to a model: every axis by itself, by the fit that its kind of model needs."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -47,7 +48,8 @@ def identify(
     record : Record or sequence of Record
         Voltage before `start` still moves the memory; only the displacement there is not fitted. Several records share
         the hysteresis, but each has its own memory at the start and its own displacement at rest; the model starts as
-        the first one does. Kinds ``slpi``, ``pi`` and ``mpi`` can be fitted to several.
+        the first one given does, and ends as the last one by its stamps. Kinds ``slpi``, ``pi`` and ``mpi``
+        can be fitted to several.
     kind : str
         ``slpi`` (the loop family), ``slpi-published`` (a classical PI model for each separated loop), ``pi`` (classical
         Prandtl-Ishlinskii), ``mpi`` (multi-slope PI) or ``smpi`` (the same, scaled with the amplitude).
@@ -73,6 +75,7 @@ def identify(
     records = [record] if isinstance(record, Record) else list(record)
     hardware_id = _one_stage(records)
     source = ", ".join(part.source for part in records)
+    last = max(range(len(records)), key=lambda number: int(records[number].time_ns.max(initial=0)))
     models = {}
     for axis in axes or records[0].axes:
         report_progress(f"axis {axis}: identification")
@@ -80,7 +83,13 @@ def identify(
         try:
             # The matrices are small: more threads than one only stand in each other's way.
             with threadpool_limits(1):
-                models[axis] = _axis_model(kind, fit(samples), source)
+                fitted = fit(samples)
+                model = _axis_model(kind, fitted, source)
+                if model.causal:
+                    # The stage went on after `stop`.
+                    whole = samples[last] if stop is None else select_samples(records[last], axis, None, None)
+                    model = replace(model, end=replace(model, start=fitted.starts[last]).after(whole.v))
+                models[axis] = model
         except SlpiError as error:
             raise type(error)(f"{source}: axis '{axis}': {error}") from None
     return StageModel(models, hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))
@@ -112,7 +121,7 @@ def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:
     return AxisModel(
         kind=kind,
         hysteresis=fitted.hysteresis,
-        start=fitted.start,
+        start=fitted.starts[0],
         voltage_range=fitted.voltage_range,
         displacement_range=(float(y.min()), float(y.max())),
         quality=FitQuality(

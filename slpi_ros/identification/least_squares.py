@@ -27,7 +27,8 @@ class Fitted:
     Parameters
     ----------
     hysteresis : Hysteresis
-    start : Start
+    starts : tuple of Start
+        Where the memory starts in each record.
     y : ndarray, shape (number fitted,), metres
         Displacements it was fitted to.
     voltage_range : (float, float), volts
@@ -42,7 +43,7 @@ class Fitted:
     """
 
     hysteresis: Hysteresis
-    start: Start
+    starts: tuple[Start, ...]
     y: FloatArray
     voltage_range: tuple[float, float]
     errors: FloatArray

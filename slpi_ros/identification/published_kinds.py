@@ -98,7 +98,7 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
         raise IdentificationError(NEVER_TURNS)
     return Fitted(
         hysteresis=loops,
-        start=Start(float(samples.v[0]), offset),
+        starts=(Start(float(samples.v[0]), offset),),
         y=samples.y[samples.fitted],
         voltage_range=samples.voltage_range,
         errors=(_predict(loops, offset, samples.v) - samples.y)[samples.fitted],
@@ -478,7 +478,7 @@ def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
     problem = Problem.pose([samples.only(largest)], MultiSlopeBasis.over(*_ends(samples)))
     return Fitted(
         hysteresis=model,
-        start=Start(float(samples.v[0]), offset),
+        starts=(Start(float(samples.v[0]), offset),),
         y=samples.y[samples.fitted],
         voltage_range=samples.voltage_range,
         errors=(y - samples.y)[samples.fitted],

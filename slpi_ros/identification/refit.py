@@ -81,7 +81,7 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
     Returns
     -------
     StageModel
-        It starts as the record does.
+        Its memory starts and ends as that of the record.
     dict of axis name to AxisChange
 
     Raises
@@ -144,7 +144,7 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
             f"the record goes from {low:g} to {high:g} V, the model from {basis.grid[0]:g} to {basis.grid[-1]:g} V; "
             "identify the stage anew"
         )
-    samples = samples.thinned(FIT_SAMPLES)
+    recorded, samples = samples.v, samples.thinned(FIT_SAMPLES)
     beginning = choose_start(samples, lambda candidate: Problem.pose([candidate], basis))
     samples = beginning.of(samples)
     problem = Problem.pose([samples], basis).reweighted()
@@ -168,14 +168,17 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
     history = beginning.history
     at_start = float(problem.design.predict(x)[len(history)] * problem.scale)
     start = Start(float(samples.v[len(history)]), at_start, history)
+    hysteresis = basis.shape(x_new, problem.gain)
+    end = replace(old, hysteresis=hysteresis, start=start).after(recorded)
     if _same_start(start, old.start, repeatability):
         # One record more does not know the zero better than those before.
         start = old.start
     y = samples.y[samples.fitted]
     new = replace(
         old,
-        hysteresis=basis.shape(x_new, problem.gain),
+        hysteresis=hysteresis,
         start=start,
+        end=end,
         displacement_range=(
             min(old.displacement_range[0], float(y.min())),
             max(old.displacement_range[1], float(y.max())),

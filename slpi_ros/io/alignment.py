@@ -105,6 +105,44 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
     )
 
 
+def held_at(desired: Signals, record: Record, where: str) -> dict[str, FloatArray]:
+    """Return displacements (m), each held until the next message, at the samples of a record.
+
+    Parameters
+    ----------
+    desired : Signals
+        Of a topic of desired displacements.
+    record : Record
+    where : str
+        For messages.
+
+    Returns
+    -------
+    dict of axis name to ndarray, shape (N,), metres
+        Of the record's axes; NaN before the first message.
+
+    Raises
+    ------
+    RecordError
+        If their times do not overlap, or the columns are not those of the record's axes.
+    """
+    time = desired.logged if desired.stamp is None else desired.stamp
+    if not _overlap(time, record.time_ns):
+        raise RecordError(f"{where}: at no time were it and {record.source} both recorded; record them with one clock")
+    fields = (desired.fields.get(field, {}) for field in ("position", "data"))
+    columns = next(filter(None, fields), {})
+    axes = [axis for axis in record.axes if axis in columns] if desired.named else record.axes
+    order = np.argsort(time, kind="stable")
+    last = np.searchsorted(time[order], record.time_ns, side="right") - 1
+    held = {}
+    for axis, column in _assign(columns, desired.named, axes, where, alone=False).items():
+        # An axis that a message does not name stays where it was.
+        known = np.maximum.accumulate(np.where(np.isfinite(column[order]), np.arange(order.size), -1))
+        at = np.where(last >= 0, known[last], -1)
+        held[axis] = np.where(at >= 0, column[order][at], np.nan)
+    return held
+
+
 def _filled(signals: Signals, fields: Sequence[str], where: str) -> Mapping[str, FloatArray]:
     """Return the columns of the first field that is not empty or zero."""
     for field in fields:

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
 
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.io.alignment import SeparateTopics, combine
-from slpi_ros.io.bag_files import locate, match_topic, translated, unpacked
+from slpi_ros.io.alignment import SeparateTopics, combine, held_at
+from slpi_ros.io.bag_files import absolute_name, locate, match_topic, translated, unpacked
 from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.bag_writer import STORAGES, BagWriter, typestore
 from slpi_ros.io.messages import (
@@ -28,9 +29,20 @@ from slpi_ros.io.messages import (
 from slpi_ros.io.record import Record
 from slpi_ros.io.signals import Signals, decode_signals
 
-__all__ = ["JOINT_STATE", "STORAGES", "BagWriter", "SeparateTopics", "read_bag", "read_bags", "write_bag"]
+__all__ = [
+    "JOINT_STATE",
+    "STORAGES",
+    "BagWriter",
+    "SeparateTopics",
+    "read_bag",
+    "read_bags",
+    "read_desired",
+    "write_bag",
+]
 
 _Path = str | os.PathLike[str]
+
+DESIRED = "desired_displacement"
 
 
 def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: Sequence[str] | None = None) -> Record:
@@ -116,6 +128,36 @@ def read_bags(
     return records
 
 
+def read_desired(path: _Path, record: Record, topic: str | None = None) -> dict[str, NDArray[np.float64]] | None:
+    """Read the desired displacement beside a record of the same bag.
+
+    Parameters
+    ----------
+    path : path
+        The bag that `record` comes from.
+    record : Record
+    topic : str, optional
+        Of any type that the compensator takes; ``desired_displacement`` by default.
+
+    Returns
+    -------
+    dict of axis name to ndarray, shape (N,), metres, or None
+        At the record's samples: each message holds until the next one; NaN before the first. None where the bag has no
+        message on the default topic.
+
+    Raises
+    ------
+    RecordError
+        If the bag cannot be read, or the topic's clock is not that of the record.
+    """
+    path = Path(path)
+    with _Bag(locate(path), path) as bag:
+        if topic is None and not bag.holds(DESIRED):
+            return None
+        desired = bag.read(topic or DESIRED, MESSAGE_TYPES)
+    return held_at(desired, record, f"{path}, topic '{topic or DESIRED}'")
+
+
 def write_bag(path: _Path, record: Record, *, storage: str = "mcap", topic: str = "/stage_state") -> None:
     """Write a record as a new rosbag2 folder that ``read_bag`` reads back without loss.
 
@@ -178,6 +220,11 @@ class _Bag:
         # A folder has a storage for each of its files, unpacked where it was compressed; a lone file is one.
         storages = getattr(reader.storage, "storages", [reader.storage])
         self._files += [(storage.path, source) for storage in storages]
+
+    def holds(self, topic: str) -> bool:
+        """Return whether there is a message on a topic, named in full or by its last parts."""
+        wanted = absolute_name(topic)
+        return any(name.endswith(wanted) and self._counts[name] for name in self._topics)
 
     def read(self, topic: str, msgtypes: Iterable[str]) -> Signals:
         """Return what the messages of a topic hold, which is of one of the types."""

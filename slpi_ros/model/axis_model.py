@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +18,40 @@ from slpi_ros.hysteresis import multi_slope as smpi
 from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.hysteresis.turning_points import Memory
+from slpi_ros.hysteresis.turning_points import FAR, Memory
+from slpi_ros.model.limits import decaying_turns
 from slpi_ros.model.streaming import ROUNDING, EffectStream, Limits, StreamingInverse, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+StartMemory = Literal["end", "start", "wiped"]
+START_MEMORIES: tuple[StartMemory, ...] = ("end", "start", "wiped")
+
+# Turning voltages kept in a document.
+MOST_TURNS = 1000
+# Cycles of the decaying drive after which the memory is taken for wiped.
+WIPING_CYCLES = 10
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where the memory starts: at `voltage` (V) and `displacement` (m).
+    """A state of the memory: at `voltage` (V) and `displacement` (m), after `history`.
 
-    `history` holds the voltages (V) at which the drive is taken to have turned before, oldest first: a long fall to
-    the first of them wiped the memory. Empty: the stage has never been moved.
+    Parameters
+    ----------
+    voltage : float, volts
+    displacement : float, metres
+    history : tuple of float, volts
+        Voltages at which the drive turned before, oldest first. Empty: the stage has never been moved.
+    from_rest : bool
+        True: the stage had never been moved before it left the first voltage of `history`. False: a long fall to that
+        voltage wiped the memory.
     """
 
     voltage: float
     displacement: float
     history: tuple[float, ...] = ()
+    from_rest: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,12 +93,16 @@ class AxisModel:
         Name of the hysteresis model.
     hysteresis : Hysteresis
     start : Start
+        The memory where the record began.
     voltage_range : (float, float), volts
     displacement_range : (float, float), metres
         What the record covered. `compensate` keeps to these voltages.
     quality : FitQuality
     effects : tuple of Effect
         What the stage does beside its hysteresis, in the order in which it acts.
+    end : Start, optional
+        The memory where the record ended, the last one of several. None: not known, as in older documents, and for
+        kinds that are not causal.
 
     Raises
     ------
@@ -96,6 +117,7 @@ class AxisModel:
     displacement_range: tuple[float, float]
     quality: FitQuality
     effects: tuple[Effect, ...] = ()
+    end: Start | None = None
 
     def __post_init__(self) -> None:
         """Put the effects in order."""
@@ -106,33 +128,94 @@ class AxisModel:
         """Whether the model can follow a path that is not known in advance."""
         return not isinstance(self.hysteresis, PathModel)
 
-    def memory(self) -> Memory:
-        """Return a fresh memory at the start.
+    def initial(self, start_memory: StartMemory) -> Start:
+        """Return the state of the memory that a drive starts from.
+
+        Parameters
+        ----------
+        start_memory : str
+            ``end`` of the record (its start where the end is not known), ``start`` of it, or ``wiped``: after a
+            decaying drive over the identified voltages to 0 V, or the identified voltage nearest to that.
 
         Raises
         ------
         UsageError
-            If the model is not causal.
+            If `start_memory` is none of these, or ``wiped`` is asked of a model that is not causal.
         """
-        start = self.start
+        match start_memory:
+            case "start":
+                return self.start
+            case "end":
+                return self.end or self.start
+            case "wiped":
+                limits = Limits(*self.voltage_range)
+                return self.after(np.array(decaying_turns(limits, limits.clip(0.0), WIPING_CYCLES)), "end")
+        raise UsageError(f"start_memory is '{start_memory}'; give one of {', '.join(START_MEMORIES)}")
+
+    def memory(self, start_memory: StartMemory = "end") -> Memory:
+        """Return a fresh memory in the state that `start_memory` names, see `initial`.
+
+        Raises
+        ------
+        UsageError
+            If the model is not causal, or `start_memory` is not known.
+        """
         if isinstance(self.hysteresis, PathModel):
             raise UsageError(
                 f"kind '{self.kind}' needs the whole path in advance and cannot follow it sample by sample; "
                 "give it a whole path, or identify kind 'slpi'"
             )
+        start = self.initial(start_memory)
         if not start.history:
             return Memory(self.hysteresis, start.voltage, start.displacement)
         first, *turns = (*start.history, start.voltage)
         # Displacement is known at the end of the history: walk it once to learn how far it leads.
-        way = Memory(self.hysteresis, first, 0.0, primed=True).forward_array(np.array([first, *turns]))[-1]
-        memory = Memory(self.hysteresis, first, start.displacement - float(way), primed=True)
+        primed = not start.from_rest
+        way = Memory(self.hysteresis, first, 0.0, primed=primed).forward_array(np.array([first, *turns]))[-1]
+        memory = Memory(self.hysteresis, first, start.displacement - float(way), primed=primed)
         for v in turns:
             memory.forward(v)
         return memory
 
-    def stream(self, limits: Limits | None = None) -> StreamingInverse:
-        """Return a fresh stream within `limits` and the identified voltages."""
-        return self.stream_from(self.memory(), self._allowed(limits))
+    def after(self, u: FloatArray, start_memory: StartMemory = "start") -> Start:
+        """Return the state of the memory after a drive, reduced to the turns that are still remembered.
+
+        Parameters
+        ----------
+        u : ndarray, shape (N,), volts
+            Voltages that reach the hysteresis.
+        start_memory : str
+            Where the drive starts; see `initial`.
+
+        Returns
+        -------
+        Start
+            Of at most `MOST_TURNS` turns; some of the nested loops are left out where there are more.
+
+        Raises
+        ------
+        UsageError
+            As `memory`.
+        """
+        start, memory = self.initial(start_memory), self.memory(start_memory)
+        memory.forward_array(u)
+        state = memory.snapshot()
+        if not state.direction:
+            return Start(state.voltage, state.displacement)
+        from_rest = start.from_rest or not start.history
+        # A primed memory remembers a fall from farther than any stage has been.
+        turns = tuple(v for v in state.turn_voltages if abs(v) < FAR / 2)
+        if from_rest:
+            turns = ((*start.history, start.voltage)[0], *turns)
+        if len(turns) > MOST_TURNS:
+            # Loops are left out whole, evenly over the nested ones, so that every turn still changes the direction.
+            loops = np.unique(np.linspace(0, len(turns) // 2 - 1, MOST_TURNS // 2 - 1).astype(np.int64)) * 2
+            turns = tuple(turns[i] for first in loops for i in (first, first + 1)) + turns[len(turns) // 2 * 2 :]
+        return Start(state.voltage, state.displacement, turns or (state.voltage,), from_rest)
+
+    def stream(self, limits: Limits | None = None, start_memory: StartMemory = "end") -> StreamingInverse:
+        """Return a fresh stream within `limits` and the identified voltages; it starts as `initial` says."""
+        return self.stream_from(self.memory(start_memory), self._allowed(limits))
 
     def stream_from(self, memory: Memory, allowed: Limits) -> StreamingInverse:
         """Return a stream that goes on from a memory of this axis; its effects are at rest there."""
@@ -174,10 +257,13 @@ class AxisModel:
         """
         return forward(self.chain.shared, own, EffectContext(t - t[:1], others=others)) if self.effects else own
 
-    def compensate(self, t: FloatArray, y: FloatArray, limits: Limits | None = None) -> tuple[FloatArray, Mask]:
+    def compensate(
+        self, t: FloatArray, y: FloatArray, limits: Limits | None = None, start_memory: StartMemory = "end"
+    ) -> tuple[FloatArray, Mask]:
         """Return the voltage for a desired displacement `y`, shape (N,), metres, and where it waits at a limit.
 
-        Other axes rest. Time `t`, shape (N,), seconds, does not matter to a model without effects.
+        Other axes rest. Time `t`, shape (N,), seconds, does not matter to a model without effects. The memory starts as
+        `initial` says.
 
         Raises
         ------
@@ -186,7 +272,7 @@ class AxisModel:
         UsageError
             If a displacement is not finite.
         """
-        return self.command(t, self.remove_sensor_effects(t, y), limits)
+        return self.command(t, self.remove_sensor_effects(t, y), limits, start_memory)
 
     def remove_sensor_effects(self, t: FloatArray, y: FloatArray) -> FloatArray:
         """Return the own displacement, shape (N,), metres, for a desired one, shape (N,), metres; other axes rest.
@@ -204,8 +290,12 @@ class AxisModel:
             raise UnreachableError(f"sample {at}: {refusal(float(y[at]), accepted)}")
         return backward(self.chain.shared, y, EffectContext(t - t[:1])) if self.effects else y
 
-    def command(self, t: FloatArray, own: FloatArray, limits: Limits | None = None) -> tuple[FloatArray, Mask]:
+    def command(
+        self, t: FloatArray, own: FloatArray, limits: Limits | None = None, start_memory: StartMemory = "end"
+    ) -> tuple[FloatArray, Mask]:
         """Return the voltage for an own displacement, shape (N,), metres, and where it waits at a limit."""
+        if start_memory != "start":
+            return replace(self, start=self.initial(start_memory)).command(t, own, limits, "start")
         allowed = self._allowed(limits)
         if not self.effects:
             return self._invert_hysteresis(own, allowed)
@@ -225,7 +315,10 @@ class AxisModel:
         chain = self.chain
         h = backward(chain.own, own, around)
         stream = EffectStream(
-            self.memory(), self.displacement_range, between, replace(chain, before=chain.before[-1:], own=(), shared=())
+            self.memory("start"),
+            self.displacement_range,
+            between,
+            replace(chain, before=chain.before[-1:], own=(), shared=()),
         )
         u, held = np.empty_like(h), np.zeros(h.size, dtype=np.bool_)
         for place, (dt, wish) in enumerate(
@@ -255,7 +348,7 @@ class AxisModel:
         return (limits or Limits(-inf, inf)).within(self.voltage_range)
 
     def _forward_array(self, v: FloatArray) -> FloatArray:
-        return (self._known_path() or self.memory()).forward_array(v)
+        return (self._known_path() or self.memory("start")).forward_array(v)
 
     def _known_path(self) -> slpi.KnownPath | smpi.KnownPath | None:
         """Return what moves a model that is not causal along whole paths."""
@@ -263,11 +356,14 @@ class AxisModel:
             return self.hysteresis.along(self.start.voltage, self.start.displacement)
         return None
 
+    def _path(self, allowed: Limits) -> slpi.KnownPath | smpi.KnownPath | Memory:
+        """Return what moves the hysteresis from the start on, within voltages that are `allowed`."""
+        # The axis may rest outside its limits; the first voltage it is given is inside.
+        return self._known_path() or StreamingInverse(self.memory("start"), self.displacement_range, allowed).memory
+
     def _invert_hysteresis(self, h: FloatArray, allowed: Limits) -> tuple[FloatArray, Mask]:
         """Return the voltage for a displacement without effects, shape (N,), metres, and where it waits at a limit."""
-        # The axis may rest outside its limits; the first voltage it is given is inside.
-        path = self._known_path() or StreamingInverse(self.memory(), self.displacement_range, allowed).memory
-        u = path.inverse_array(h, allowed.lower, allowed.upper)
+        u = self._path(allowed).inverse_array(h, allowed.lower, allowed.upper)
         return u, self._missed(h, u, allowed)
 
     def _missed(self, h: FloatArray, u: FloatArray, allowed: Limits) -> Mask:
@@ -278,8 +374,7 @@ class AxisModel:
             with warnings.catch_warnings():
                 # What stands in for loops that were never identified has been said.
                 warnings.simplefilter("ignore", slpi.UnidentifiedLoopWarning)
-                path = self._known_path() or StreamingInverse(self.memory(), self.displacement_range, allowed).memory
-                missed = path.forward_array(u) - h
+                missed = self._path(allowed).forward_array(u) - h
             low, high = self.displacement_range
             held &= np.abs(missed) > ROUNDING * (high - low)
         return held

@@ -123,7 +123,7 @@ def _whole(text: str) -> int:
 
 
 def _axis_from(axis: dict[str, Any]) -> AxisModel:
-    start, quality = axis["start"], axis["quality"]
+    quality = axis["quality"]
     ranges = {key: (float(axis[key][0]), float(axis[key][1])) for key in ("voltage_range_V", "displacement_range_m")}
     for key, (low, high) in ranges.items():
         if not low < high:
@@ -131,7 +131,8 @@ def _axis_from(axis: dict[str, Any]) -> AxisModel:
     return AxisModel(
         kind=axis["kind"],
         hysteresis=kinds.from_document(axis["kind"], axis["hysteresis"]),
-        start=Start(float(start["voltage_V"]), float(start["displacement_m"]), tuple(map(float, start["history_V"]))),
+        start=_start_from(axis["start"]),
+        end=_start_from(axis["end"]) if "end" in axis else None,
         voltage_range=ranges["voltage_range_V"],
         displacement_range=ranges["displacement_range_m"],
         quality=FitQuality(
@@ -142,17 +143,28 @@ def _axis_from(axis: dict[str, Any]) -> AxisModel:
     )  # fmt: skip
 
 
+def _start_from(start: dict[str, Any]) -> Start:
+    history = tuple(map(float, start["history_V"]))
+    return Start(float(start["voltage_V"]), float(start["displacement_m"]), history, start.get("from_rest", False))
+
+
+def _start_document(start: Start) -> dict[str, Any]:
+    document = {
+        "voltage_V": start.voltage,
+        "displacement_m": start.displacement,
+        "history_V": list(start.history),
+    }
+    return document | ({"from_rest": True} if start.from_rest else {})
+
+
 def _axis_document(axis: AxisModel) -> dict[str, Any]:
-    start, quality = axis.start, axis.quality
+    quality = axis.quality
     return {
         "kind": axis.kind,
         "voltage_range_V": list(axis.voltage_range),
         "displacement_range_m": list(axis.displacement_range),
-        "start": {
-            "voltage_V": start.voltage,
-            "displacement_m": start.displacement,
-            "history_V": list(start.history),
-        },
+        "start": _start_document(axis.start),
+        **({"end": _start_document(axis.end)} if axis.end else {}),
         "hysteresis": kinds.to_document(axis.hysteresis),
         "effects": [registry.to_document(effect) for effect in axis.effects],
         "quality": {

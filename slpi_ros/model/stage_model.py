@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import RecordError, SlpiError, UsageError
-from slpi_ros.model.axis_model import AxisModel, FitQuality, Mask, Start
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Mask, Start, StartMemory
 from slpi_ros.model.streaming import Limits, StageStream, StreamingInverse
 
 __all__ = ["AxisModel", "FitQuality", "HeldAtLimitWarning", "StageModel", "Start", "check_time", "held_message"]
@@ -77,14 +77,17 @@ class StageModel:
         seen = {name: self.axes[name].seen(time, y, motions) for name, y in own.items()}
         return seen if isinstance(v, Mapping) else next(iter(seen.values()))
 
-    def compensate(self, t: ArrayLike, y: Signal) -> Any:
-        """Return the voltage that gives a desired displacement; the inverse of `simulate`.
+    def compensate(self, t: ArrayLike, y: Signal, start_memory: StartMemory = "end") -> Any:
+        """Return the voltage that gives a desired displacement; the inverse of `simulate` where both start alike.
 
         Parameters
         ----------
         t : array_like, shape (N,), seconds
             Not decreasing.
         y : array_like, shape (N,), or mapping of axis name to array_like, shape (N,), metres
+        start_memory : str
+            The memory that the stage is taken to have: ``end`` of the record (default), ``start`` of it, or ``wiped``;
+            see `AxisModel.initial`.
 
         Returns
         -------
@@ -99,19 +102,21 @@ class StageModel:
         SlpiError
             If axes, lengths or values do not fit.
         """
-        answers = self.command(t, y)
+        answers = self.command(t, y, start_memory=start_memory)
         for _, held in answers.values():
             if held.any():
                 warnings.warn(held_message(held), HeldAtLimitWarning, stacklevel=2)
         voltage = {name: v for name, (v, _) in answers.items()}
         return voltage if isinstance(y, Mapping) else next(iter(voltage.values()))
 
-    def command(self, t: ArrayLike, y: Signal, limits: Limits | None = None) -> dict[str, tuple[FloatArray, Mask]]:
+    def command(
+        self, t: ArrayLike, y: Signal, limits: Limits | None = None, start_memory: StartMemory = "end"
+    ) -> dict[str, tuple[FloatArray, Mask]]:
         """Return the voltage that gives a desired displacement, and where it waits at a limit.
 
         Parameters
         ----------
-        t, y
+        t, y, start_memory
             As in `compensate`.
         limits : Limits, optional
             Of every axis; the identified voltages are never left.
@@ -137,17 +142,17 @@ class StageModel:
         answers: dict[str, tuple[FloatArray, Mask]] = {}
         for name, z in own.items():
             with _naming(name, "displacement"):
-                answers[name] = self.axes[name].command(time, z, limits)
+                answers[name] = self.axes[name].command(time, z, limits, start_memory)
         return answers
 
-    def stream(self, axis: str) -> StreamingInverse:
+    def stream(self, axis: str, start_memory: StartMemory = "end") -> StreamingInverse:
         """Return a causal compensator of one axis: ``step(t, y) -> v``, seconds and metres to volts.
 
-        Other axes are taken to rest.
+        Other axes are taken to rest; `start_memory` is as in `compensate`.
         """
-        return self.axis(axis).stream()
+        return self.axis(axis).stream(start_memory=start_memory)
 
-    def streams(self) -> StageStream:
+    def streams(self, start_memory: StartMemory = "end") -> StageStream:
         """Return a causal compensator of all axes, ``step(t, {axis: y}) -> {axis: v}``, seconds and metres to volts.
 
         Raises
@@ -155,7 +160,8 @@ class StageModel:
         UsageError
             If a model is not causal.
         """
-        return StageStream({name: axis.stream() for name, axis in self.axes.items()}, self.coupling, self.origins)
+        streams = {name: axis.stream(start_memory=start_memory) for name, axis in self.axes.items()}
+        return StageStream(streams, self.coupling, self.origins)
 
     @cached_property
     def coupling(self) -> Coupling:

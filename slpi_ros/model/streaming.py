@@ -302,7 +302,8 @@ class EffectStream(StreamingInverse):
         if (rate := self._driven()) and middle:
             rate.attach(lambda u: float(middle(np.array(u))))
             rate.drive(0.0, memory.voltage)
-        self._v, self._place = memory.voltage, memory.displacement
+        self._v = memory.voltage
+        self._answer(0.0)
         # What the last wish asks of the voltage beyond what it gives (m or V), and of the axis as a whole (m).
         self._missing = self._short = 0.0
 

@@ -223,7 +223,7 @@ def follow(
 
 def _warm(model: AxisModel) -> AxisModel:
     """Let a model start at 0 V and at the sensor's zero, where a long fall has led."""
-    return replace(model, start=Start(0.0, 0.0, (0.0,) if model.causal else ()))
+    return replace(model, start=Start(0.0, 0.0, (0.0,) if model.causal else ()), end=None)
 
 
 PID = "PID"

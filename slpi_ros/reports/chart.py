@@ -1,6 +1,6 @@
-"""Interactive charts: what plotly.js, which the page carries, draws in the reader's browser.
+"""Interactive charts, drawn by the plotly.js bundle that every page carries.
 
-Everything is given in SI; a panel's quantities say in which unit it is shown.
+Input is in SI; the quantities of a panel convert it to the unit shown.
 """
 
 import base64
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 MEASURED, DESIRED, NOISE = "#8a97a5", "#1b2733", "#c9d2da"
 COLOURS = ("#c8553d", "#d99a26", "#2a7f62", "#3b6ea5")
-# Of what a model was not fitted to: the time, what was measured there, and what the model says.
+# Samples that were not fitted: their time, the measurement, and the model.
 UNFITTED_SHADE, UNFITTED_MEASURED, UNFITTED_MODEL = "#fbeccb", "#e6cc94", "#b98a2f"
 BEFORE, AFTER = COLOURS[0], COLOURS[2]
 # Of causes, in order of their weight; none is like BEFORE or AFTER.
@@ -29,12 +29,24 @@ IntArray = NDArray[np.int64]
 
 # Points of a line, and dots of a cloud: each dot is an element of the page.
 LINE_POINTS, CLOUD_POINTS = 5000, 1500
+# Pixels between panels, and what the names around the outer ones need.
+_GAP = {"row": 80, "column": 62}
+_MARGIN = {"l": 75, "r": 15, "t": 46, "b": 56}
+_WIDTH = 1085
+_GRID = {
+    "gridcolor": "#e4e9ee",
+    "zerolinecolor": "#b9c4ce",
+    "linecolor": "#b9c4ce",
+    "showline": True,
+    "ticks": "outside",
+}
+_SMALL = {"size": 13}
 
 
 def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
-    """Return the samples that draw lines as all of them would: of each stretch every signal's extremes, and the ends.
+    """Return the samples of thinned lines: the extremes of each signal in each stretch, and both ends.
 
-    Where a signal is NaN for as long as a stretch, one of them is kept too: a line is interrupted there.
+    Where a signal is NaN for as long as a stretch, one NaN is kept too, so that the line is interrupted there.
 
     Parameters
     ----------
@@ -67,14 +79,14 @@ def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
 
 
 def _holes(signal: FloatArray, length: int) -> IntArray:
-    """Return where a signal, shape (N,), is NaN for `length` samples or more: the first of each such row."""
+    """Return the first sample of each row of `length` or more NaN in a signal, shape (N,)."""
     missing = np.pad(np.isnan(signal), 1).astype(np.int8)
     first, after = np.flatnonzero(np.diff(missing) > 0), np.flatnonzero(np.diff(missing) < 0)
     return first[after - first >= length]
 
 
 def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArray:
-    """Return samples that show where a cloud of dots, shape (N,) each, lies: its outline along `x`, and some inside."""
+    """Return the samples of a thinned scatter plot, shape (N,) each: its outline along `x`, and some inside."""
     finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if finite.size <= most:
         return finite
@@ -82,20 +94,6 @@ def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArr
     outline = along[thin_line(y[along], most=most // 2)]
     inside = finite[np.linspace(0, finite.size - 1, most - outline.size).astype(np.int64)]
     return np.union1d(outline, inside)
-
-
-# Pixels between panels, and what the names around the outer ones need.
-_GAP = {"row": 80, "column": 62}
-_MARGIN = {"l": 75, "r": 15, "t": 46, "b": 56}
-_WIDTH = 1085
-_GRID = {
-    "gridcolor": "#e4e9ee",
-    "zerolinecolor": "#b9c4ce",
-    "linecolor": "#b9c4ce",
-    "showline": True,
-    "ticks": "outside",
-}
-_SMALL = {"size": 13}
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,7 @@ class Quantity:
 TIME = Quantity("time", "s", digits=".4f")
 VOLTAGE = Quantity("voltage", "V", digits=".3f")
 DISPLACEMENT = Quantity("displacement", "µm", 1e6, ".4f")
-ERROR = Quantity("measured less model", "nm", 1e9, ".1f")
+ERROR = Quantity("measured - model", "nm", 1e9, ".1f")
 SAMPLES = Quantity("samples", "", digits=",d")
 
 

@@ -1,4 +1,4 @@
-"""The page of a diagnosis: what the simulation gets wrong, why, what mends it, and what to do next."""
+"""The page and the files of a diagnosis: error of the model, its causes, and the next experiment."""
 
 import json
 from collections.abc import Mapping
@@ -13,8 +13,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
-from slpi_ros.reports import views as charts
-from slpi_ros.reports import views as residual_views
+from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, NOISE
 from slpi_ros.reports.page import Page, Severity, Share
 from slpi_ros.reports.views import Curve, Motion
@@ -26,6 +25,7 @@ _NOISE_ONLY = 1.5
 _SAME = 0.01
 
 BEFORE_NAME, AFTER_NAME = "without effects", "with effects"
+DOCUMENT, EXTENDED_MODEL, PAGE = "diagnosis.json", "extended_model.json", "report.html"
 
 
 def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
@@ -69,17 +69,17 @@ def _mood(found: AxisDiagnosis) -> Severity:
 def _figures(found: AxisDiagnosis) -> dict[str, str]:
     figures = {
         "error of the given model, rms": _nm(found.given_rms),
-        "of its hysteresis, refitted": _nm(found.before_rms),
+        "its hysteresis refitted": _nm(found.before_rms),
     }
     if found.effects:
         figures["with the effects found"] = _nm(found.after_rms)
         if found.before_rms > 0.0:
-            figures["less than without them"] = f"{1.0 - found.after_rms / found.before_rms:.0%}"
+            figures["reduction by them"] = f"{1.0 - found.after_rms / found.before_rms:.0%}"
     return figures | {"noise floor, rms": _nm(found.floor_rms)}
 
 
 def _show_causes(page: Page, found: AxisDiagnosis) -> None:
-    """Add what the error is made of, cause by cause, and what each one is worth."""
+    """Add the share of each cause in the error, its evidence, and the table of held-out errors."""
     page.section("What the error is made of")
     page.shares(_shares(found))
     for named in found.effects:
@@ -105,14 +105,14 @@ def _colours(count: int) -> list[str]:
 
 def _cause(named: NamedEffect) -> dict[str, str]:
     said = {
-        "What it is": named.effect.describe(),
+        "Description": named.effect.describe(),
         "Evidence": named.evidence,
-        "Gain": f"{named.gain_percent:.1f} % less error on blocks left out; "
+        "Gain": f"{named.gain_percent:.1f} % less held-out error; "
         f"{named.share_of_residual:.0%} of the mean square error without effects",
-        "By chance": f"at most once in {1.0 / named.p_value:.0f} records" if named.p_value > 0.0 else "never seen",
+        "p-value": f"{named.p_value:.2g}",
     }
     if named.alternatives:
-        said["Could as well be"] = f"{', '.join(named.alternatives)}: this record does not tell them apart"
+        said["Alternatives"] = f"{', '.join(named.alternatives)}: this record does not tell them apart"
     parameters = _parameters(to_document(named.effect))
     return said | ({"Parameters (SI)": parameters} if parameters else {})
 
@@ -156,9 +156,7 @@ def _steps(found: AxisDiagnosis) -> tuple[list[list[str]], int, str]:
     if abs(found.after_rms - error) > _SAME * error:
         rows.append(row("all fitted together", found.after_rms))
     best = len(rows) - 1
-    caption = (
-        f"Free-run; all but the given model's on blocks left out of the fit. The floor comes from {found.floor_source}."
-    )
+    caption = f"Free-run errors; all but that of the given model are held out. Floor: {found.floor_source}."
     return [*rows, row("noise floor", found.floor_rms)], best, caption
 
 
@@ -166,7 +164,7 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
     """Add the charts of one axis."""
     traces = found.traces
     t, v, y = traces.t, traces.voltage, traces.measured
-    page.section("What the simulation gets wrong")
+    page.section("Measured - model")
     if not t.size:
         page.text("The record holds no sample: there is nothing to draw.")
         return
@@ -177,35 +175,35 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
     left = [Curve(model.name, y - model.values, model.colour) for model in models]
     parts = _parts(traces)
     drawings = {
-        "time": charts.over_time(t, y, models, found.floor_rms, parts),
-        "motion": residual_views.over_motion(v, left, parts, motion),
-        "rhythm": residual_views.over_rhythm(t, left, parts, motion, found.floor_rms),
+        "time": views.over_time(t, y, models, found.floor_rms, parts),
+        "motion": views.over_motion(v, left, parts, motion),
+        "frequency": views.over_frequency(t, left, parts, motion, found.floor_rms),
     }
     captions = {
-        "time": "Over time: displacement, and below what is left of it; the grey band is the noise floor.",
-        "motion": "What is left over voltage (upper and lower line: means where it rises and where it falls), and over "
-        "the speed of the voltage.",
-        "rhythm": "What is left over the time since the last turn or stop, with means, and how it is spread over "
-        "frequencies.",
+        "time": "Displacement and measured - model over time; the grey band is plus and minus the noise floor.",
+        "motion": "Measured - model over voltage (lines: means for rising and falling voltage) and over its speed.",
+        "frequency": "Measured - model over the time since the last reversal or stop, with means, and its spectrum.",
     }
     for what, (chart, said) in drawings.items():
         page.chart(f"{name}-{what}", chart, f"{captions[what]} {said}")
     if parts:
         page.text(
-            "A line with an effect's name is its share of what is left without effects: what it does to the "
-            "displacement, less the part of it that the hysteresis alone had imitated."
+            "A line with an effect's name is its part of the residual without effects: its contribution to the "
+            "displacement without the part that the refitted hysteresis had absorbed."
         )
     page.section("The models over the data")
-    loops, said = charts.loops(v, y, models, motion)
+    loops, said = views.loops(v, y, models, motion)
     page.chart(
-        f"{name}-loops", loops, f"Displacement over voltage; beside it without the straight line through it. {said}"
+        f"{name}-loops",
+        loops,
+        f"Displacement over voltage; beside it displacement - the straight line through it. {said}",
     )
 
 
 def _parts(traces: Traces) -> list[Curve]:
-    """Return the share of each effect in what the model without effects leaves; together, what they explain of it.
+    """Return the part of each effect in the residual of the model without effects.
 
-    The hysteresis alone imitates a part of what effects do; that part is taken from those that it goes against.
+    The hysteresis fitted alone absorbs a part of the effects; that part is taken from those that it is correlated with.
     """
     effects = {name: values - np.mean(values) for name, values in traces.contributions.items()}
     if not effects:
@@ -226,11 +224,8 @@ def _nm(metres: float) -> str:
     return f"{metres * 1e9:.1f} nm"
 
 
-DOCUMENT, EXTENDED_MODEL, PAGE = "diagnosis.json", "extended_model.json", "report.html"
-
-
 def make_room(folder: Path) -> None:
-    """Make the folder of a diagnosis; before long work, so that its end is not in vain.
+    """Make the folder of a diagnosis; call it before long work, so that the results can be written.
 
     Raises
     ------
@@ -284,7 +279,7 @@ def format_diagnosis(diagnosis: Diagnosis) -> str:
 
 
 def describe_diagnosis(diagnosis: Diagnosis) -> list[str]:
-    """Return lines that say what a diagnosis found: per axis the verdict, the causes, and what to do next."""
+    """Return lines of text: for each axis the verdict, the causes, and the next experiment."""
     lines = []
     for name, found in diagnosis.axes.items():
         told = [f"verdict: {found.verdict.replace('_', ' ')}", found.summary]

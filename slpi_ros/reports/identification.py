@@ -1,4 +1,4 @@
-"""The page of an identification: what was measured, what the model makes of it, and what is left."""
+"""The page of an identification: the record, the model, its held-out error and its residual."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from slpi_ros.identification.cross_validation import CLASSICAL, CrossValidationR
 from slpi_ros.identification.record_quality import Finding, assess, findings
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import AxisModel, StageModel
-from slpi_ros.reports import views as charts
+from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE
 from slpi_ros.reports.page import Page, Severity
 from slpi_ros.reports.text import describe_axis
@@ -41,7 +41,7 @@ def write_report(
     record: Record,
     model: StageModel,
     *,
-    truth: Mapping[str, CrossValidationReport] | None = None,
+    held_out: Mapping[str, CrossValidationReport] | None = None,
     found: Mapping[str, Sequence[Finding]] | None = None,
     start: float | None = None,
     stop: float | None = None,
@@ -55,8 +55,8 @@ def write_report(
     record : Record
         What the model is shown on; of several bags the first.
     model : StageModel
-    truth : mapping of axis name to HeldOutTruth, optional
-        Errors on blocks left out, for the tables.
+    held_out : mapping of axis name to CrossValidationReport, optional
+        Held-out errors, for the tables.
     found : mapping of axis name to sequence of Finding, optional
         The quality of the record; found anew by default.
     start, stop : float, seconds, optional
@@ -76,12 +76,12 @@ def write_report(
     fitted = (t >= (-np.inf if start is None else start)) & (t < (np.inf if stop is None else stop))
     simulated = model.simulate(t, {name: record.voltage[name][driven] for name in model.axes})
     for name, axis in model.axes.items():
-        told = (truth or {}).get(name)
+        told = (held_out or {}).get(name)
         page.heading(f"Axis {name}", name)
         page.verdict(name, *_verdict(name, axis, told))
         page.tiles(_figures(axis, told))
         if told is not None:
-            _show_truth(page, name, told)
+            _show_held_out(page, name, told)
         page.section("The model")
         page.lines(describe_axis(axis))
         page.section("The record")
@@ -99,47 +99,47 @@ def write_report(
     return path
 
 
-def _verdict(name: str, axis: AxisModel, truth: CrossValidationReport | None) -> tuple[str, Severity]:
-    """Say in a sentence how good the model is."""
+def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None) -> tuple[str, Severity]:
+    """Return a sentence on the held-out error, and its severity."""
     quality = axis.quality
     error, floor = quality.held_out_rms, quality.floor_rms
     noise, floor_is = "the sensor noise", f"the sensor noise is {_nm(floor)} rms"
     beside = ""
-    if truth is not None:
-        error, floor = truth.overall.rms, truth.floor.rms
-        noise, floor_is = "that floor", f"the record repeats itself to {_nm(floor)} rms"
-        if np.isfinite(truth.overall.classical_rms) and truth.kind != CLASSICAL:
-            beside = f" Classical PI: {_nm(truth.overall.classical_rms)}."
+    if held_out is not None:
+        error, floor = held_out.overall.rms, held_out.floor.rms
+        noise, floor_is = "that floor", f"the repeatability floor is {_nm(floor)} rms"
+        if np.isfinite(held_out.overall.classical_rms) and held_out.kind != CLASSICAL:
+            beside = f" Classical PI: {_nm(held_out.overall.classical_rms)}."
     share = f"{error / _stroke(axis):.3%}" if _stroke(axis) > 0.0 else "?"
-    said = f"Axis {name}: on blocks left out of the fit the model is off by {_nm(error)} rms ({share} of the stroke)"
+    said = f"Axis {name}: the held-out error is {_nm(error)} rms ({share} of the stroke)"
     if not floor > 0.0:
         return f"{said}; the record shows no noise to compare with.{beside}", "warn"
     if error <= _NOISE_ONLY * floor:
-        return f"{said}; {floor_is}, so hardly anything else is left.{beside}", "good"
+        return f"{said}; {floor_is}, so hardly anything but noise is left.{beside}", "good"
     said = f"{said}; {floor_is}, and the error is {error / floor:.1f} times {noise}."
     if error <= _MORE_THAN_NOISE * floor:
         return said + beside, "warn"
     return f"{said} 'slpi diagnose' looks for the cause.{beside}", "bad"
 
 
-def _figures(axis: AxisModel, truth: CrossValidationReport | None) -> dict[str, str]:
+def _figures(axis: AxisModel, held_out: CrossValidationReport | None) -> dict[str, str]:
     quality = axis.quality
-    if truth:
+    if held_out:
         figures = {
-            "error on blocks left out, rms": _nm(truth.overall.rms),
-            "repeatability floor, rms": _nm(truth.floor.rms),
-            "classical PI there, rms": _nm(truth.overall.classical_rms),
+            "held-out error, rms": _nm(held_out.overall.rms),
+            "repeatability floor, rms": _nm(held_out.floor.rms),
+            "classical PI there, rms": _nm(held_out.overall.classical_rms),
         }
     else:
         figures = {
-            "error on blocks left out, rms": _nm(quality.held_out_rms),
+            "held-out error, rms": _nm(quality.held_out_rms),
             "sensor noise, rms": _nm(quality.floor_rms),
             "samples fitted": f"{quality.samples:,}",
         }
     return figures | {
-        "largest error where fitted": _nm(quality.maximum),
+        "maximum error where fitted": _nm(quality.maximum),
         "stroke": f"{_stroke(axis) * 1e6:.4g} µm",
-        "of the model seen": f"{quality.covered:.0%}",
+        "of the model covered": f"{quality.covered:.0%}",
     }
 
 
@@ -153,37 +153,41 @@ def _nm(metres: float) -> str:
 
 
 def _findings(record: Record, name: str, start: float | None, stop: float | None) -> list[Finding]:
-    """Return what is found about the record; a reason where it is good for nothing."""
+    """Return the findings on a record; the reason where it cannot be assessed."""
     try:
         return findings(assess(record, name, start=start, stop=stop))
     except SlpiError as error:
         return [Finding("stop", str(error))]
 
 
-def _show_truth(page: Page, name: str, truth: CrossValidationReport) -> None:
-    """Add the tables of errors on blocks left out, and the errors themselves."""
-    page.section("Errors where the model was not fitted")
-    floor = truth.floor
+def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> None:
+    """Add the table and the chart of held-out errors."""
+    page.section("Held-out errors")
+    floor = held_out.floor
     groups = {
-        "by loop level": truth.by_level,
-        "by region": truth.by_region,
-        "by speed": truth.by_speed,
+        "by loop level": held_out.by_level,
+        "by region": held_out.by_region,
+        "by speed": held_out.by_speed,
     }
-    rows: list[Sequence[str] | str] = [_row(truth.overall, floor.rms)]
+    rows: list[Sequence[str] | str] = [_row(held_out.overall, floor.rms)]
     for what, parts in groups.items():
         rows += [what, *(_row(part, floor.rms) for part in parts)]
     page.table(
-        ("", "samples", "rms (nm)", "times the floor", "largest (nm)", "classical PI, rms (nm)", "PI / model"),
+        ("", "samples", "rms (nm)", "times the floor", "maximum (nm)", "classical PI, rms (nm)", "PI / model"),
         rows,
         best=0,
-        caption="Free-run on blocks left out of the fit, the classical PI model on the same ones. "
+        caption="Free-run, on blocks left out of the fit; the classical PI model on the same blocks. "
         f"Floor: {_nm(floor.rms)} rms, {floor.source}.",
     )
-    curves = [Curve(truth.kind, -truth.error, AFTER)]
-    if truth.kind != CLASSICAL and np.isfinite(truth.classical).any():
-        curves.insert(0, Curve("classical PI", -truth.classical, BEFORE))
-    chart, said = charts.held_out(truth.t, curves, floor.rms)
-    page.chart(f"{name}-held-out", chart, f"Each block as predicted without it, and how often each error comes. {said}")
+    curves = [Curve(held_out.kind, -held_out.error, AFTER)]
+    if held_out.kind != CLASSICAL and np.isfinite(held_out.classical).any():
+        curves.insert(0, Curve("classical PI", -held_out.classical, BEFORE))
+    chart, said = views.held_out(held_out.t, curves, floor.rms)
+    page.chart(
+        f"{name}-held-out",
+        chart,
+        f"Measured - model, each block predicted by a fit without it, and the histogram. {said}",
+    )
 
 
 def _row(part: Slice, floor: float) -> list[str]:
@@ -195,13 +199,13 @@ def _row(part: Slice, floor: float) -> list[str]:
 
 
 def _part(t: FloatArray, fitted: Mask) -> str:
-    """Say which samples were fitted."""
+    """Return a sentence on which samples were fitted."""
     if not fitted.any():
         return "Nothing of this record was fitted."
     first, last = t[fitted][[0, -1]].tolist()
     return (
         f"Fitted were the samples from {first:.6g} s to {last:.6g} s, of {t[0]:.6g} s to {t[-1]:.6g} s. The others are "
-        f"drawn as '{charts.UNFITTED}'; no figure, no histogram and no map counts them. Voltage before the part that "
+        f"drawn as '{views.UNFITTED}'; no figure, no histogram and no map counts them. Voltage before the part that "
         "was fitted still moves the memory."
     )
 
@@ -212,19 +216,18 @@ def _show(page: Page, name: str, traces: _Traces, noise: float) -> None:
     motion, left = Motion.of(t, v), y - traces.simulated
     models = [Curve("model", traces.simulated, AFTER)]
     page.section("The record and the model, free-run from its start")
-    loops, said = charts.loops(v, y, models, motion, fitted)
-    beside = "Displacement over voltage; beside it without the straight line through it, so that the loops open."
+    loops, said = views.loops(v, y, models, motion, fitted)
+    beside = "Displacement over voltage; beside it displacement - the straight line through it, so that the loops open."
     page.chart(f"{name}-loops", loops, f"{beside} {said}")
-    over_time, said = charts.over_time(t, y, models, noise, fitted=fitted)
+    over_time, said = views.over_time(t, y, models, noise, fitted=fitted)
     page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus and minus the noise. {said}")
-    page.section("What the model leaves")
-    over_voltage, said = charts.over_voltage(v, left, motion, noise, fitted)
-    how = "Over voltage, where it rises and where it falls, and how often each value comes."
+    page.section("Measured - model")
+    over_voltage, said = views.over_voltage(v, left, motion, noise, fitted)
+    how = "Over rising and falling voltage, and the histogram."
     page.chart(f"{name}-residual", over_voltage, f"{how} {said}")
     page.chart(
         f"{name}-coverage",
-        charts.coverage(v, np.where(fitted, left, np.nan), motion),
-        "What was fitted: from which voltage a branch began, and where on it the fitted samples lie. Branches above "
-        "the diagonal rise, those below it fall. Where it is white nothing was fitted: there the model only continues "
-        "smoothly.",
+        views.coverage(v, np.where(fitted, left, np.nan), motion),
+        "Fitted samples by the voltage at which their branch began and their own voltage, and the rms error there. "
+        "Branches above the diagonal rise, those below it fall. White: no data; there the model extrapolates smoothly.",
     )

@@ -1,10 +1,13 @@
 """What a model holds, in words."""
 
+from collections.abc import Iterable
+
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops
 from slpi_ros.identification.refit import AxisChange
+from slpi_ros.model.axis_model import StartMemory
 from slpi_ros.model.stage_model import AxisModel, StageModel
 
 
@@ -19,7 +22,7 @@ def describe_model(model: StageModel) -> list[str]:
 
 def describe_axis(axis: AxisModel) -> list[str]:
     """Return lines that say what one axis holds."""
-    quality, start = axis.quality, axis.start
+    quality, start, end = axis.quality, axis.start, axis.end
     (v_low, v_high), (y_low, y_high) = axis.voltage_range, axis.displacement_range
     began = "a memory taken for wiped" if start.history else "rest"
     stroke = y_high - y_low
@@ -28,6 +31,10 @@ def describe_axis(axis: AxisModel) -> list[str]:
         f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} um "
         f"({quality.covered:.0%} of the model seen)",
         f"memory starts where the record did: {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um",
+        f"and ends where the record did, at {end.voltage:.4g} V, {end.displacement * 1e6:.4g} um, "
+        f"with {len(end.history)} turning voltages"
+        if end
+        else "the memory at the end of the record is not known",
         f"error on the record: {quality.rms * 1e9:.1f} nm rms ({quality.rms / stroke:.3%} of the displacement range), "
         f"{quality.maximum * 1e9:.1f} nm at most",
         f"error on blocks left out: {quality.held_out_rms * 1e9:.1f} nm rms; "
@@ -36,6 +43,19 @@ def describe_axis(axis: AxisModel) -> list[str]:
         *(f"{effect.name}: {effect.describe()}" for effect in axis.effects),
         *(() if axis.effects else ("effects: none",)),
     ]
+
+
+def describe_start(model: StageModel, axes: Iterable[str], start_memory: StartMemory) -> str:
+    """Return one line that says from which memory, voltage and displacement a drive of some axes is taken to start."""
+    told = []
+    for name in axes:
+        axis = model.axes[name]
+        start = axis.initial(start_memory)
+        known = {"end": "end of the record", "start": "start of the record", "wiped": "memory wiped"}[start_memory]
+        if start_memory == "end" and axis.end is None:
+            known = "start of the record, as the model does not know its end"
+        told.append(f"axis {name} at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um ({known})")
+    return f"assumed before the first sample: {'; '.join(told)}"
 
 
 def describe_change(axis: str, change: AxisChange) -> list[str]:

@@ -1,4 +1,7 @@
-"""The charts of models over a record: loops, time, voltage and what the record visited."""
+"""The charts of models over a record: displacement and residual over voltage, time, speed and frequency.
+
+A residual is measured - model.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,9 +12,9 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from slpi_ros.hysteresis.reversals import reversals
-from slpi_ros.identification import signal_statistics as readings
 from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn
+from slpi_ros.identification.signal_statistics import digit, noise
 from slpi_ros.reports.chart import (
     COLOURS,
     DESIRED,
@@ -36,12 +39,33 @@ from slpi_ros.reports.chart import (
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+RISING, FALLING = COLOURS[3], COLOURS[0]
+OPENED = Quantity("displacement - straight line", "µm", 1e6, ".4f")
+BEGAN, NOW = Quantity("branch began at", "V", digits=".2f"), Quantity("voltage", "V", digits=".2f")
+SPEED = Quantity("speed of the voltage", "V/s", digits=".4~g")
+SINCE = Quantity("time since the last reversal or stop", "s", digits=".3~g", logarithmic=True)
+FREQUENCY = Quantity("frequency", "Hz", digits=".4~g", logarithmic=True)
+DENSITY = Quantity("spectral density", "nm/√Hz", 1e9, ".3~g", logarithmic=True)
+# In the legends.
+UNFITTED = "not fitted"
 
 # Samples to each side over which the speed is taken.
 _REACH = 3
-# A turn begins this near to its end (share of the range): what rests there has stopped before it turns.
+# A branch ends this near to its reversal (share of the voltage range): what rests there has stopped before it reverses.
 _ARRIVED = 1e-3
 _FEWEST_ARRIVALS = 5
+# Points of one branch of a loop, cells on each side of the map, and classes of a histogram.
+_POINTS_OF_RUN, _CELLS, _HISTOGRAM_CLASSES = 25, 40, 80
+# A line is interrupted across a gap of so many of its sampling periods.
+_PAUSE = 5.0
+# A chart first shows this inner part (percent) of the errors, and so much more (share of it) on both sides.
+_INNER, _AROUND = (0.25, 99.75), 0.35
+# Classes over which means are taken, and the fewest samples of a mean.
+_CLASSES, _FEWEST = 40, 5
+# Welch windows in a record, the longest window, and the points that are drawn of a spectrum.
+_WINDOWS, _LONGEST_WINDOW, _SPECTRUM_POINTS = 8, 1 << 14, 400
 
 
 @dataclass(frozen=True)
@@ -53,11 +77,11 @@ class Motion:
     speed : ndarray, shape (N,), volts per second
         Negative where the voltage falls.
     since_turn : ndarray, shape (N,), seconds
-        Since the voltage last turned or came to rest.
+        Since the last reversal or stop of the voltage.
     branch_from : ndarray, shape (N,), volts
         Where the branch of the hysteresis began on which the sample lies.
     runs : ndarray of int, shape (M + 1,)
-        Samples at which the voltage turns, with the first and the last one.
+        Samples of the reversals, with the first and the last sample.
     """
 
     speed: FloatArray
@@ -67,20 +91,20 @@ class Motion:
 
     @classmethod
     def of(cls, t: FloatArray, v: FloatArray) -> "Motion":
-        """Look at a voltage, shape (N,), volts, finite, over time, shape (N,), seconds."""
+        """Return the motion of a finite voltage, shape (N,), volts, over time, shape (N,), seconds."""
         if v.size < _FEWEST_ARRIVALS or not np.ptp(v) > 0.0:
             return cls(np.zeros(v.size), t - t[:1], v.copy(), np.array([0, max(v.size - 1, 0)]))
-        noise = readings.noise(v, t)
-        runs = reversals(v, smallest_turn(v, noise))
-        rests, _ = resting(t, v, hold_band(v, noise, readings.digit(v)))
+        noise_rms = noise(v, t)
+        runs = reversals(v, smallest_turn(v, noise_rms))
+        rests, _ = resting(t, v, hold_band(v, noise_rms, digit(v)))
         stops = np.unique(np.concatenate([[0], runs, _arrivals(v, runs), rests]))
         last = stops[np.searchsorted(stops, np.arange(v.size), side="right") - 1]
-        branch_from = Walk.along(_one_way(v, runs), symmetric_rest=False, primed=False).v_origin
+        branch_from = Walk.along(_monotone_between(v, runs), symmetric_rest=False, primed=False).v_origin
         return cls(_speed(t, v), t - t[last], branch_from, runs)
 
 
 def _arrivals(v: FloatArray, runs: IntArray) -> IntArray:
-    """Return the samples at which each run has come as far as it goes."""
+    """Return the sample at which each run first reaches its end."""
     near = _ARRIVED * float(np.ptp(v))
     return np.array(
         [start + int(np.argmax(np.abs(v[start : stop + 1] - v[stop]) <= near)) for start, stop in pairwise(runs)],
@@ -88,8 +112,8 @@ def _arrivals(v: FloatArray, runs: IntArray) -> IntArray:
     )
 
 
-def _one_way(v: FloatArray, runs: IntArray) -> FloatArray:
-    """Return the voltage without the noise of going back between two turns."""
+def _monotone_between(v: FloatArray, runs: IntArray) -> FloatArray:
+    """Return the voltage made monotone between reversals."""
     clean = v.copy()
     for start, stop in pairwise(runs):
         further = np.maximum if v[stop] > v[start] else np.minimum
@@ -104,22 +128,6 @@ def _speed(t: FloatArray, v: FloatArray) -> FloatArray:
     return np.divide(v[after] - v[before], step, out=np.zeros(v.size), where=step > 0.0)
 
 
-Mask = NDArray[np.bool_]
-
-RISING, FALLING = COLOURS[3], COLOURS[0]
-OPENED = Quantity("displacement less straight line", "µm", 1e6, ".4f")
-BEGAN, NOW = Quantity("branch began at", "V", digits=".2f"), Quantity("voltage", "V", digits=".2f")
-
-# In the legends.
-UNFITTED = "not fitted"
-# Points that show one way of a loop, cells on each side of the map, and classes of a histogram.
-_POINTS_OF_RUN, _CELLS, _HISTOGRAM_CLASSES = 25, 40, 80
-# A line is interrupted where it would go on after so many of its steps, or in another record.
-_PAUSE = 5.0
-# A chart shows this inner part (percent) of the errors first, and so much more (share of it) on both sides.
-_INNER, _AROUND = (0.25, 99.75), 0.35
-
-
 @dataclass(frozen=True)
 class Curve:
     """A signal over the samples of a record, shape (N,), metres, and how it is shown."""
@@ -132,7 +140,7 @@ class Curve:
 def loops(
     v: FloatArray, y: FloatArray, models: Sequence[Curve], motion: Motion, fitted: Mask | None = None
 ) -> tuple[Chart, str]:
-    """Draw displacement over voltage, and beside it without the straight line through it, so that the loops open.
+    """Draw displacement over voltage, and beside it displacement - the straight line through it.
 
     Parameters
     ----------
@@ -140,7 +148,7 @@ def loops(
     y : ndarray, shape (N,), metres
         Measured.
     models : sequence of Curve
-        What each says.
+        Simulated displacements.
     motion : Motion
     fitted : ndarray of bool, shape (N,), optional
         All by default; others have colours of their own.
@@ -149,7 +157,7 @@ def loops(
     -------
     Chart
     str
-        Which part of a long record is drawn, or "".
+        Which share of a long record is drawn, or "".
     """
     chart = Chart([Panel(VOLTAGE, DISPLACEMENT), Panel(VOLTAGE, OPENED)], height=470)
     kept, said = _some_runs(v, y, motion)
@@ -178,7 +186,7 @@ def _add_loops(
     at: NDArray[np.int64],
     chosen: Mask,
 ) -> None:
-    """Add curves, each of a width, where they are `chosen`, over voltages `across`, and less the straight `line`."""
+    """Add curves, each of a width, where they are `chosen`, over voltages `across`, and curve - straight `line`."""
     for curve, width in curves:
         values = np.where(chosen, curve.values, np.nan)[at]
         chart.line(0, curve.name, across, values, curve.colour, width=width)
@@ -186,7 +194,7 @@ def _add_loops(
 
 
 def _straight(v: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the straight line, shape (N,), metres, that is nearest to a displacement."""
+    """Return the least-squares line of displacement over voltage, shape (N,), metres."""
     finite = np.isfinite(y)
     if not finite.any():
         return np.zeros_like(v)
@@ -197,7 +205,7 @@ def _straight(v: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _some_runs(v: FloatArray, y: FloatArray, motion: Motion) -> tuple[FloatArray, str]:
-    """Return samples that draw the loops, NaN between runs that do not follow each other, and a word on it."""
+    """Return the samples drawn, NaN between runs that do not follow each other, and a note where runs are left out."""
     count = motion.runs.size - 1
     most = LINE_POINTS // _POINTS_OF_RUN
     if count <= most:
@@ -207,7 +215,7 @@ def _some_runs(v: FloatArray, y: FloatArray, motion: Motion) -> tuple[FloatArray
         [*(start + thin_line(y[start : stop + 1], v[start : stop + 1], most=_POINTS_OF_RUN)).tolist(), np.nan]
         for start, stop in zip(motion.runs[:-1:every].tolist(), motion.runs[1::every].tolist(), strict=True)
     ]
-    return np.concatenate(samples), f"Of {count} ways from turn to turn every {every}th is drawn."
+    return np.concatenate(samples), f"Of {count} branches every {every}th is drawn."
 
 
 def over_time(
@@ -218,7 +226,7 @@ def over_time(
     parts: Sequence[Curve] = (),
     fitted: Mask | None = None,
 ) -> tuple[Chart, str]:
-    """Draw displacement over time, and below what models leave of it.
+    """Draw displacement over time, and the residuals of models below.
 
     Parameters
     ----------
@@ -229,7 +237,7 @@ def over_time(
     noise : float, metres
         Shaded; 0 for none.
     parts : sequence of Curve
-        Of what the first model leaves.
+        Parts of the first model's residual.
     fitted : ndarray of bool, shape (N,), optional
         All by default; others are shaded.
 
@@ -250,7 +258,7 @@ def over_time(
         chart.line(0, model.name, t[kept], model.values[kept], model.colour, width=1.0)
     first, *others = zip(models, left, strict=True)
     chart.line(1, first[0].name, t[kept], first[1][kept], first[0].colour, width=0.8)
-    # Parts lie on what they are parts of, and below what is left without them.
+    # Drawn above the residual that they are parts of, and below the smaller ones.
     for part in parts:
         some = thin_line(part.values, most=LINE_POINTS // 2)
         chart.line(1, part.name, t[some], part.values[some], part.colour, width=1.1)
@@ -268,7 +276,7 @@ def _rows(chosen: Mask) -> list[tuple[int, int]]:
 
 
 def over_voltage(v: FloatArray, left: FloatArray, motion: Motion, noise: float, fitted: Mask) -> tuple[Chart, str]:
-    """Draw what is left, shape (N,), metres, over voltage (V), by direction; and how often it comes where `fitted`."""
+    """Draw a residual, shape (N,), metres, over voltage (V), by direction, and its histogram where `fitted`."""
     chart = Chart([Panel(VOLTAGE, ERROR, 3.0), Panel(SAMPLES, ERROR, 1.0)], height=420)
     for name, colour, chosen in (
         (UNFITTED, UNFITTED_MEASURED, ~fitted),
@@ -285,7 +293,7 @@ def over_voltage(v: FloatArray, left: FloatArray, motion: Motion, noise: float, 
 
 
 def held_out(t: FloatArray, models: Sequence[Curve], noise: float) -> tuple[Chart, str]:
-    """Draw errors on blocks left out, each of `models` being one, over time (s), and their histograms."""
+    """Draw held-out residuals, one for each of `models`, over time (s), and their histograms."""
     chart = Chart([Panel(TIME, ERROR, 3.0), Panel(SAMPLES, ERROR, 1.0)], height=420)
     steps = np.abs(np.diff(t))
     gaps = 1 + np.flatnonzero(steps > _PAUSE * np.median(steps) if steps.size else steps)
@@ -300,7 +308,7 @@ def held_out(t: FloatArray, models: Sequence[Curve], noise: float) -> tuple[Char
 
 
 def histogram(chart: Chart, panel: int, curve: Curve) -> None:
-    """Add how often each value comes, as an outline."""
+    """Add a histogram as an outline."""
     x = curve.values[np.isfinite(curve.values)]
     if not x.size:
         return
@@ -317,9 +325,9 @@ def histogram(chart: Chart, panel: int, curve: Curve) -> None:
 
 
 def coverage(v: FloatArray, left: FloatArray, motion: Motion) -> Chart:
-    """Draw how many samples of what is left (m; NaN counts nowhere) lie where on the surface of branches, and its rms.
+    """Draw the samples of a residual (m; NaN is not counted) on the Everett plane, and its rms there.
 
-    The surface is that of all voltages `v`, shape (N,), which say where branches began.
+    The plane spans all voltages `v`, shape (N,).
     """
     chart = Chart([Panel(BEGAN, NOW), Panel(BEGAN, NOW)], height=490)
     low, high = float(v.min()), float(v.max())
@@ -336,7 +344,7 @@ def coverage(v: FloatArray, left: FloatArray, motion: Motion) -> Chart:
 
 
 def focus(chart: Chart, panels: Sequence[int], errors: Sequence[FloatArray], chosen: Mask | slice = slice(None)) -> str:
-    """Show first where nearly all of the `chosen` errors, shape (N,) each, metres, are; say how many are not there."""
+    """Zoom to nearly all of the `chosen` errors, shape (N,) each, metres; return how many samples lie beyond."""
     values = np.concatenate([error[chosen][np.isfinite(error[chosen])] for error in errors])
     if not values.size:
         return ""
@@ -351,28 +359,16 @@ def focus(chart: Chart, panels: Sequence[int], errors: Sequence[FloatArray], cho
     return f"{beyond} samples{each} lie beyond what is shown first; double-click shows all."
 
 
-SPEED = Quantity("speed of the voltage", "V/s", digits=".4~g")
-SINCE = Quantity("time since the last turn or stop", "s", digits=".3~g", logarithmic=True)
-FREQUENCY = Quantity("frequency", "Hz", digits=".4~g", logarithmic=True)
-DENSITY = Quantity("spectral density", "nm/√Hz", 1e9, ".3~g", logarithmic=True)
-
-# Classes over which means are taken, and the fewest samples of one that tells something.
-_CLASSES, _FEWEST = 40, 5
-# Parts that windows of a spectrum are cut into, and the finest spectrum.
-_WINDOWS, _LONGEST_WINDOW = 8, 1 << 14
-_SPECTRUM_POINTS = 400
-
-
 def over_motion(v: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], motion: Motion) -> tuple[Chart, str]:
-    """Draw errors over voltage and over its speed: samples, and their means where the voltage rises and falls.
+    """Draw residuals over voltage and over its speed: samples, and their means for rising and falling voltage.
 
     Parameters
     ----------
     v : ndarray, shape (N,), volts
     curves : sequence of Curve
-        What is left.
+        Residuals.
     parts : sequence of Curve
-        Of it; only their means are drawn.
+        Parts of them; only their means are drawn.
     motion : Motion
 
     Returns
@@ -389,10 +385,10 @@ def over_motion(v: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], 
     return chart, focus(chart, (0, 1), [curve.values for curve in curves])
 
 
-def over_rhythm(
+def over_frequency(
     t: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], motion: Motion, noise: float
 ) -> tuple[Chart, str]:
-    """Draw errors over the time since the last turn, and their spectra; as `over_motion`, with `noise` (m rms)."""
+    """Draw residuals over the time since the last reversal, and their spectra; `noise` (m rms) is the floor."""
     chart = Chart([Panel(SINCE, ERROR), Panel(FREQUENCY, DENSITY)], height=430)
     later = np.flatnonzero(motion.since_turn > 0.0)
     since = motion.since_turn[later]
@@ -420,7 +416,7 @@ def _add(
     parts: Sequence[Curve],
     means: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
 ) -> None:
-    """Add dots for curves, and above them the means of curves and parts."""
+    """Add dots of curves, and above them the means of curves and parts."""
     for curve in curves:
         kept = thin_cloud(x, curve.values)
         chart.dots(panel, curve.name, x[kept], curve.values[kept], curve.colour, faint=True)
@@ -429,7 +425,7 @@ def _add(
 
 
 def _means(x: FloatArray, values: FloatArray, *, alike: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Return where classes along `x`, shape (N,), lie, and their means, shape (M,); `alike`: of one size."""
+    """Return centres of classes along `x`, shape (N,), and means, shape (M,); `alike`: of equally many samples."""
     finite = np.isfinite(values)
     x, values = x[finite], values[finite]
     if x.size < _FEWEST:
@@ -443,7 +439,7 @@ def _means(x: FloatArray, values: FloatArray, *, alike: bool = False) -> tuple[F
 
 
 def _joined(lines: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """Return lines as one, interrupted between them."""
+    """Return lines as one, with NaN between them."""
     gap = np.array([np.nan])
     x, y = zip(*lines, strict=True)
     return np.concatenate([part for one in x for part in (one, gap)]), np.concatenate(
@@ -452,7 +448,7 @@ def _joined(lines: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray,
 
 
 def _rate(t: FloatArray) -> float:
-    """Return the samples per second in the middle of all; 0 where there is none."""
+    """Return the median sampling rate, hertz; 0 where there is none."""
     period = float(np.median(np.diff(t))) if t.size > 1 else 0.0
     return 1.0 / period if period > 0.0 else 0.0
 
@@ -466,7 +462,7 @@ def _spectrum(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray
     window = int(np.clip(2 * even.size // _WINDOWS, 2 * _WINDOWS, min(even.size, _LONGEST_WINDOW)))
     frequency, power = signal.welch(even, rate, nperseg=window)
     frequency, power = frequency[1:], power[1:]
-    # Evenly spread over the logarithm: a mean over many high frequencies, each low one by itself.
+    # Averaged over classes that are equally wide on a logarithmic axis.
     edges = np.unique(np.geomspace(1, frequency.size, _SPECTRUM_POINTS).astype(np.int64)) - 1
     counts = np.diff(np.append(edges, frequency.size))
     return (

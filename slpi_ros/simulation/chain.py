@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.simulation.bouc_wen import BoucWen
-from slpi_ros.simulation.dynamics import Amplifier, FlexureMode, Relaxation, Viscosity
+from slpi_ros.simulation.dynamics import Ageing, Amplifier, FlexureMode, Relaxation, Viscosity
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage
 from slpi_ros.simulation.sensor import Hum, Interferometer, Temperature
@@ -57,6 +57,7 @@ class Physics:
         Its ``coercivity`` only with a stage of relays.
     creep : SlowDomains, optional
     flexure : Flexure, optional
+    ageing : Ageing, optional
     coupling : mapping of axis name to float
         Share of another axis's motion from its start that shows on this one.
     temperature : Temperature, optional
@@ -68,6 +69,7 @@ class Physics:
     viscosity: Viscosity | None = None
     creep: SlowDomains | None = None
     flexure: Flexure | None = None
+    ageing: Ageing | None = None
     coupling: Mapping[str, float] = field(default_factory=dict)
     temperature: Temperature | None = None
     interferometer: Interferometer | None = None
@@ -101,6 +103,8 @@ def own_motion(base: StageParameters | BoucWen, physics: Physics, t: FloatArray,
         y = _creeping(physics.creep, t, y)
     if physics.flexure:
         y = _ringing(physics.flexure, t, y)
+    if physics.ageing:
+        y = physics.ageing.scaled(t, v, y)
     return base.offset + y
 
 

@@ -319,6 +319,45 @@ class Dynamics:
 
 
 @dataclass(frozen=True)
+class Ageing:
+    """A sensitivity that is not the same all along: the piezo depolarises, runs itself in, or warms up and cools down.
+
+    Parameters
+    ----------
+    change : float
+        Largest relative change of the sensitivity within the record, with its sign.
+    form : {"ramp", "settling", "cycles", "sine"}
+        A straight line in time; an exponential approach in time; one in the voltage travelled; a slow sine.
+    constant : float
+        Time constant of ``settling`` (s), travel constant of ``cycles`` (V), period of ``sine`` (s).
+    pivot : float, metres
+        Displacement from rest that keeps its place.
+    """
+
+    change: float
+    form: Literal["ramp", "settling", "cycles", "sine"] = "ramp"
+    constant: float = 60.0
+    pivot: float = 0.0
+
+    def path(self, t: FloatArray, v: FloatArray) -> FloatArray:
+        """Return the relative change, shape (N,), at times (s) with voltages (V), shape (N,) each; 0 at the start."""
+        match self.form:
+            case "ramp":
+                course = t - t[0]
+            case "settling":
+                course = -np.expm1(-(t - t[0]) / self.constant)
+            case "cycles":
+                course = -np.expm1(-np.cumsum(np.abs(np.diff(v, prepend=v[:1]))) / self.constant)
+            case "sine":
+                course = np.sin(2 * np.pi * (t - t[0]) / self.constant)
+        return np.asarray(self.change * course / max(float(np.max(np.abs(course))), 1e-300), dtype=np.float64)
+
+    def scaled(self, t: FloatArray, v: FloatArray, y: FloatArray) -> FloatArray:
+        """Return what becomes of a displacement from rest, shape (N,), metres."""
+        return self.pivot + (1.0 + self.path(t, v)) * (y - self.pivot)
+
+
+@dataclass(frozen=True)
 class RateLaw:
     """How a coercivity grows with the rate: by a power, or logarithmically as thermally activated domain walls do.
 

@@ -10,8 +10,9 @@ from strategies import FAMILY_CASE, axis_model, cases, fractions, paths, stream_
 
 from slpi_ros.compensator.controller import Compensation
 from slpi_ros.compensator.persistence import ASSUMED, KNOWN, RESETTING, MemoryConfidence
-from slpi_ros.compensator.ramps import Ramp, decaying_turns
+from slpi_ros.compensator.ramps import Ramp
 from slpi_ros.errors import UsageError
+from slpi_ros.model.limits import decaying_turns
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.model.streaming import Limits, RateLimiter
 

@@ -10,6 +10,7 @@ from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.hum import Hum
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
@@ -45,6 +46,13 @@ def drifts(draw: st.DrawFn) -> ThermalDrift:
 
 
 @st.composite
+def gain_drifts(draw: st.DrawFn) -> GainDrift:
+    gains = draw(st.lists(numbers(-0.3, 0.3), min_size=1, max_size=5))
+    steps = draw(st.lists(numbers(0.01, 1), min_size=len(gains), max_size=len(gains)))
+    return GainDrift(tuple(np.cumsum(steps).tolist()), tuple(gains), draw(numbers(-1e-5, 1e-5)))
+
+
+@st.composite
 def sensors(draw: st.DrawFn) -> SensorPeriodic:
     period = draw(powers(1e-7, 1e-5))
     return SensorPeriodic(period, draw(numbers(0, 0.98)) * period / (2 * np.pi), draw(numbers(-7, 7)))
@@ -76,6 +84,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     ),
     "creep": creeps(),
     "resonance": st.builds(Resonance, powers(20, 2000), powers(1e-3, 0.5)),
+    "gain_drift": gain_drifts(),
     "cross_coupling": st.builds(CrossCoupling, st.dictionaries(st.sampled_from("yz"), numbers(-0.4, 0.4), min_size=1)),
     "thermal_drift": drifts(),
     "sensor_periodic": sensors(),

@@ -20,7 +20,7 @@ from slpi_ros.effects.saturation import Saturation
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.schemas import load_schema
 
-EXACT = ("rate_dependence", "creep", "cross_coupling", "thermal_drift", "sensor_periodic", "hum")
+EXACT = ("rate_dependence", "creep", "gain_drift", "cross_coupling", "thermal_drift", "sensor_periodic", "hum")
 FOLLOWED = ("lag", "saturation", "creep", "resonance", "sensor_periodic")
 
 
@@ -243,7 +243,7 @@ def test_parameters_survive_the_document(effect):
         assert from_document(json.loads(text)) == one
 
 
-@given(st.lists(EVERY, unique_by=lambda effect: effect.name, max_size=10))
+@given(st.lists(EVERY, unique_by=lambda effect: effect.name, max_size=11))
 def test_effects_stand_in_the_order_of_the_chain(effects):
     ordered = in_order(effects)
     assert sorted(effect.name for effect in effects) == sorted(effect.name for effect in ordered)
@@ -328,6 +328,10 @@ RATE = {"widening": 0.0, "backlash": 0.0, "exponent": 0.5, "reference_rate": 100
         ("cross_coupling", {"gains": {}}),
         ("cross_coupling", {"gains": {"y": 1.5}}),
         ("cross_coupling", {"gains": [1.5]}),
+        ("gain_drift", {"times": [0.0, 1.0], "gains": [0.0, 0.1], "origin": 0.0}),
+        ("gain_drift", {"times": [1.0], "gains": [-1.0], "origin": 0.0}),
+        ("gain_drift", {"times": [1.0], "gains": [0.1, 0.2], "origin": 0.0}),
+        ("gain_drift", {"times": [1.0], "gains": [0.1], "origin": None}),
         ("thermal_drift", {"times": [1.0, 1.0], "values": [0.0, 0.0]}),
         ("sensor_periodic", {"period": 1e-7, "amplitude": 1e-7, "phase": 0.0}),
         ("hum", {"frequency": -50.0, "amplitude": 1e-9, "phase": 0.0}),

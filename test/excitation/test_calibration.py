@@ -142,7 +142,7 @@ def test_thirty_seconds_are_enough(seed):
     margin = 0.02 * (true.max() - remanent)
     low, high = remanent + margin, true.max() - margin
     path_t, desired = scan_path(low, high, duration=20.0, seed=1000 + seed)
-    error = np.abs(stage().run(path_t, model.compensate(path_t, desired))[0] - desired) / (high - low)
+    error = np.abs(stage().run(path_t, model.compensate(path_t, desired, "start"))[0] - desired) / (high - low)
     assert error.mean() < 0.0003 and error.max() < 0.003
 
 

@@ -162,6 +162,16 @@ def test_thermal_drift_repeats_itself():
     assert max(np.max(np.abs(cycle - cycles[0])) for cycle in cycles) < 3.0
 
 
+def test_gain_drift_repeats_full_loops_without_a_rest():
+    _, v, _ = drive("gain_drift", duration=120.0)
+    moves = bursts(v)[2:]
+    assert len(moves) >= 60 and {round(span) for span, _ in moves} == {100}
+    lengths = [steps for _, steps in moves]
+    assert max(lengths) - min(lengths) <= 2
+    rest = np.diff(v[v.size // 5 : -v.size // 20]) == 0
+    assert np.count_nonzero(rest) <= len(moves)
+
+
 def test_sensor_periodic_is_slow_and_steady_at_two_speeds():
     _, v, _ = drive("sensor_periodic")
     ramps = [(span, steps) for span, steps in bursts(v) if span == 100.0][2:]

@@ -32,7 +32,7 @@ T = DT * np.arange(4000)
 CREEP = Creep((0.03, 0.3, 3.0), (0.02, 0.02, 0.03))
 DRIFT = ThermalDrift((0.0, 2.0, 3.0), (0.0, 1e-7, -1e-7))
 # What is undone exactly, whatever the path.
-EXACT = ("creep", "thermal_drift", "sensor_periodic", "hum")
+EXACT = ("creep", "gain_drift", "thermal_drift", "sensor_periodic", "hum")
 
 
 def path(low=4e-6, high=10e-6, seed=0):

@@ -22,7 +22,7 @@ from slpi_ros.effects.hum import Hum
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.diagnosis import write_diagnosis
 
-CHARTS = ("time", "motion", "rhythm", "loops")
+CHARTS = ("time", "motion", "frequency", "loops")
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 
 
@@ -95,7 +95,7 @@ def test_shares_of_causes_add_up_to_what_effects_explain(written):
 
 
 def test_spectrum_shows_the_line_and_the_floor(written):
-    chart = parsed(written).charts["x-rhythm"]
+    chart = parsed(written).charts["x-frequency"]
     frequency, density = trace(chart, "without effects", "y2")
     high = frequency > 10.0
     assert np.isclose(frequency[high][np.argmax(density[high])], 50.0, rtol=0.02)

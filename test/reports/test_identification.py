@@ -31,7 +31,7 @@ def identified():
 @pytest.fixture(scope="module")
 def written(identified, tmp_path_factory):
     record, model = identified
-    return write_report(tmp_path_factory.mktemp("page") / "new", record, model, truth={"x": truth_of(record)})
+    return write_report(tmp_path_factory.mktemp("page") / "new", record, model, held_out={"x": truth_of(record)})
 
 
 def truth_of(record):
@@ -96,7 +96,7 @@ def maps_of(chart):
 
 def test_what_was_not_fitted_is_marked_and_counts_nowhere(identified, written, tmp_path):
     record, model = identified
-    path = write_report(tmp_path, record, model, truth={"x": truth_of(record)}, start=3.0, stop=9.0)
+    path = write_report(tmp_path, record, model, held_out={"x": truth_of(record)}, start=3.0, stop=9.0)
     charts, whole = parsed(path).charts, parsed(written).charts
     fitted = (record.t >= 3.0) & (record.t < 9.0)
     left = (record.displacement["x"] - model.simulate(record.t, record.voltage["x"]))[fitted]

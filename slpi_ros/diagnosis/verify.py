@@ -1,0 +1,610 @@
+"""The model against records that it has not seen, and what is left of a compensated path's error.
+
+What happened before a record began is unknown: an initial history and a constant offset are estimated for each record,
+and nothing else. Where the record visits both ends of its voltage range, only what comes after that is judged.
+"""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.diagnosis.diagnose import diagnose
+from slpi_ros.errors import RecordError, SlpiError, UsageError
+from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
+from slpi_ros.identification.cross_validation import (
+    level_classes,
+    loop_levels,
+    region_classes,
+    speed_classes,
+    speeds,
+)
+from slpi_ros.identification.initial_history import histories
+from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.signal_statistics import floor_of
+from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import AxisModel, StageModel, Start
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+SCHEMA = "slpi_ros/verification/1"
+# Without a tolerance an error passes up to so many times the noise floor.
+TIMES_THE_FLOOR = 3.0
+# Initial histories whose errors differ by less than this factor explain a record equally well.
+EQUALLY_WELL = 1.1
+# A change of gain is all that there is when it leaves less than this share of the error.
+MOSTLY = 0.5
+# Tables are made from about so many samples.
+TABLE_SAMPLES = 40_000
+# A voltage is at a limit when it stays at the record's own extreme for so many samples.
+FEWEST_AT_LIMIT = 3
+# The longest shift between desired displacement and model that is looked for, seconds and share of the record.
+LONGEST_DELAY, DELAY_SHARE, DELAY_STEPS = 0.5, 0.05, 200
+
+CAUSES = {
+    "zero": "the zero of the sensor has moved since the model was identified",
+    "memory": "the compensator started from another memory than the stage had",
+    "limits": "the voltage was at a limit",
+    "delay": "the displacement follows the desired one later",
+    "command": "the voltages are not those of this model: rate limits, feedback, a reset or another model",
+    "effects": "the stage does what the model does not hold; `slpi diagnose` names it",
+    "model": "the model's hysteresis is not that of the stage",
+    "noise": "noise of the sensor",
+}
+
+
+@dataclass(frozen=True)
+class ErrorPart:
+    """Errors of a part of the samples: how many they are, and their rms and maximum, metres."""
+
+    name: str
+    samples: int
+    rms: float
+    maximum: float
+
+    @classmethod
+    def of(cls, name: str, error: FloatArray) -> "ErrorPart":
+        """Summarise errors, shape (N,), metres, N > 0."""
+        return cls(name, error.size, _rms(error), float(np.abs(error).max()))
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the part as in ``msg_schemas/verification.schema.json``."""
+        return {"name": self.name, "samples": self.samples, "rms_m": self.rms, "maximum_m": self.maximum}
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How well a compensator followed a desired path, and where its error comes from.
+
+    Parameters
+    ----------
+    error : ErrorPart
+        Measured - desired displacement.
+    shares : mapping of cause to float
+        Parts of the mean square error, of `CAUSES`; they add up to 1, and one that counteracts others is negative.
+    delay : float, seconds
+        By how much the displacement follows later.
+    effects : tuple of str
+        What a diagnosis of the record named.
+    t, desired : ndarray, shape (N,), seconds and metres
+        For the charts.
+    parts : mapping of cause to ndarray, shape (N,), metres
+        The error, cause by cause; "model" holds noise and effects too.
+    """
+
+    error: ErrorPart
+    shares: Mapping[str, float]
+    delay: float
+    effects: tuple[str, ...]
+    t: FloatArray
+    desired: FloatArray
+    parts: Mapping[str, FloatArray]
+
+    @property
+    def blame(self) -> str:
+        """The cause with the largest share."""
+        return max(self.shares, key=lambda cause: self.shares[cause])
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the figures as in ``msg_schemas/verification.schema.json``."""
+        return {
+            "rms_m": self.error.rms,
+            "maximum_m": self.error.maximum,
+            "samples": self.error.samples,
+            "shares": dict(self.shares),
+            "blame": self.blame,
+            "delay_s": self.delay,
+            "effects": list(self.effects),
+        }
+
+
+@dataclass(frozen=True)
+class RecordVerification:
+    """One axis of one record.
+
+    Parameters
+    ----------
+    error : ErrorPart
+        Of measured - model over the samples judged, without the offset; its name is that of the record.
+    limit : float, metres
+        The largest rms error that passes.
+    floor_rms : float, metres
+        How well the record repeats itself.
+    floor_source : str
+        Where that was seen.
+    known_from : float or None, seconds
+        From when on the record makes its memory known, so that it is judged; None: never, the initial history is
+        estimated and everything is judged.
+    history : tuple of float, volts
+        The initial history that best explains the record, as in `slpi_ros.model.stage_model.Start`.
+    offset : float, metres
+        Measured - model, constant; by how much the zero has moved, as far as no initial history explains it.
+    zero_moved : bool
+        Whether the offset is more than the model is known to.
+    gain : float
+        By which share the measured displacement moves more than the model.
+    outside : int
+        Samples whose voltage lies outside of what the model was identified on.
+    t, v, measured, model : ndarray, shape (N,), seconds, volts and metres
+        The record, and the model with the offset.
+    judged : ndarray of bool, shape (N,)
+    tracking : Tracking or None
+        Where the desired displacement is known.
+    """
+
+    error: ErrorPart
+    limit: float
+    floor_rms: float
+    floor_source: str
+    known_from: float | None
+    history: tuple[float, ...]
+    offset: float
+    zero_moved: bool
+    gain: float
+    outside: int
+    t: FloatArray
+    v: FloatArray
+    measured: FloatArray
+    model: FloatArray
+    judged: Mask
+    tracking: Tracking | None = None
+
+    @property
+    def passed(self) -> bool:
+        """Whether the rms error is within the limit."""
+        return self.error.rms <= self.limit
+
+    @property
+    def left(self) -> FloatArray:
+        """Measured - model of the samples judged, shape (M,), metres."""
+        return (self.measured - self.model)[self.judged]
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the figures as in ``msg_schemas/verification.schema.json``."""
+        return {
+            "source": self.error.name,
+            "passed": self.passed,
+            "samples": self.error.samples,
+            "rms_m": self.error.rms,
+            "maximum_m": self.error.maximum,
+            "limit_m": self.limit,
+            "floor_rms_m": self.floor_rms,
+            "floor_source": self.floor_source,
+            "start": "estimated" if self.known_from is None else "known",
+            "known_from_s": self.known_from,
+            "offset_m": self.offset,
+            "zero_moved": self.zero_moved,
+            "gain_change": self.gain,
+            "outside_samples": self.outside,
+            "tracking": None if self.tracking is None else self.tracking.to_document(),
+        }
+
+
+@dataclass(frozen=True)
+class AxisVerification:
+    """One axis over all records.
+
+    Parameters
+    ----------
+    overall : ErrorPart
+    resolution : float, metres
+        The error that the model had on data held out when it was identified.
+    records : tuple of RecordVerification
+    by_level, by_speed, by_region : tuple of ErrorPart
+        By how deep the loop lies in others, by the size of dv/dt, and by voltage.
+    """
+
+    overall: ErrorPart
+    resolution: float
+    records: tuple[RecordVerification, ...]
+    by_level: tuple[ErrorPart, ...]
+    by_speed: tuple[ErrorPart, ...]
+    by_region: tuple[ErrorPart, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every record passes."""
+        return all(record.passed for record in self.records)
+
+    @property
+    def worst(self) -> RecordVerification:
+        """The record whose error is largest against its limit."""
+        return max(self.records, key=lambda record: record.error.rms / record.limit if record.limit else np.inf)
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the figures as in ``msg_schemas/verification.schema.json``."""
+        return {
+            "passed": self.passed,
+            "rms_m": self.overall.rms,
+            "maximum_m": self.overall.maximum,
+            "samples": self.overall.samples,
+            "resolution_m": self.resolution,
+            "records": [record.to_document() for record in self.records],
+            "by_level": [part.to_document() for part in self.by_level],
+            "by_speed": [part.to_document() for part in self.by_speed],
+            "by_region": [part.to_document() for part in self.by_region],
+        }
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The model of a stage against records that it has not seen.
+
+    Parameters
+    ----------
+    axes : mapping of axis name to AxisVerification
+    tolerance : float or None, metres
+        As given.
+    hardware_id : str
+        The stage.
+    """
+
+    axes: Mapping[str, AxisVerification]
+    tolerance: float | None
+    hardware_id: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether every axis passes on every record."""
+        return all(axis.passed for axis in self.axes.values())
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the verification document, ``msg_schemas/verification.schema.json``."""
+        return {
+            "schema": SCHEMA,
+            "hardware_id": self.hardware_id,
+            "passed": self.passed,
+            "tolerance_m": self.tolerance,
+            "axes": {name: axis.to_document() for name, axis in self.axes.items()},
+        }
+
+
+def verify(
+    records: Record | Sequence[Record],
+    model: StageModel,
+    tolerance: float | None = None,
+    *,
+    axes: Sequence[str] | None = None,
+    desired: Sequence[Mapping[str, FloatArray] | None] | None = None,
+) -> Verification:
+    """Judge a model on records that it has not seen, free-run.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+    model : StageModel
+        Of the same stage.
+    tolerance : float, metres, optional
+        The largest rms error that passes; by default three times the record's noise floor, or the error that the model
+        had on data held out when it was identified, if that is more.
+    axes : sequence of str, optional
+        All that records and model share by default.
+    desired : sequence of mapping of axis name to ndarray, shape (N,), metres, or None, optional
+        For each record the desired displacement at its samples, NaN where there was none; adds how well a compensator
+        followed it.
+
+    Returns
+    -------
+    Verification
+
+    Raises
+    ------
+    UsageError
+        If records and model are not of one stage or share no axis, or the tolerance is not positive.
+    RecordError
+        If a record says too little.
+    """
+    records = [records] if isinstance(records, Record) else list(records)
+    if tolerance is not None and not 0.0 < tolerance < np.inf:
+        raise UsageError(f"tolerance {tolerance:g} m; give a positive one, or none")
+    if not records:
+        raise UsageError("no record given; give at least one")
+    for record in records:
+        if model.hardware_id and record.hardware_id and model.hardware_id != record.hardware_id:
+            raise UsageError(
+                f"the model is of stage '{model.hardware_id}', {record.source} of '{record.hardware_id}'; "
+                "give records of the same stage"
+            )
+    names = axes or [name for name in model.axes if all(name in record.axes for record in records)]
+    if not names:
+        raise UsageError(
+            f"no axis is in the model ({', '.join(model.axes)}) and in every record; check the axes' names"
+        )
+    paths = desired or [None] * len(records)
+    found: dict[str, list[RecordVerification]] = {name: [] for name in names}
+    for record, path in zip(records, paths, strict=True):
+        runs = _free_run(record, model, names)
+        for name in names:
+            axis, run = model.axis(name), runs[name]
+            one = _judge(run, axis, record.source, tolerance)
+            if path is not None and name in path:
+                one = replace(one, tracking=_tracking(one, run, path[name], record, model, name))
+            found[name].append(one)
+    return Verification(
+        {name: _summary(found[name], model.axis(name).quality.held_out_rms) for name in names},
+        tolerance,
+        model.hardware_id,
+    )
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One axis of a record, the model free-run along it, and what initial histories say of its offset.
+
+    `simulated` starts from `start`; `assumed` is what the model says from its own start. Offsets (m) are those of all
+    initial histories that explain the record equally well.
+    """
+
+    t: FloatArray
+    samples: Samples
+    judged: Mask
+    start: Start
+    simulated: FloatArray
+    assumed: FloatArray
+    offsets: tuple[float, float]
+
+
+def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[str, _Run]:
+    """Choose the initial history of each axis that best explains the record, and simulate all axes from there."""
+    moving = [name for name in model.axes if name in record.axes and np.isfinite(record.voltage[name]).any()]
+    runs, motions = {}, {}
+    for name in dict.fromkeys((*names, *moving)):
+        axis = model.axis(name)
+        try:
+            samples = select_samples(record, name, None, None)
+        except SlpiError:
+            if name in names:
+                raise
+            # An axis that rests moves no other one.
+            continue
+        t = record.t[np.isfinite(record.voltage[name])]
+        with warnings.catch_warnings():
+            # The figures say what comes of loops that were never identified.
+            warnings.simplefilter("ignore", UnidentifiedLoopWarning)
+            runs[name] = _best_start(axis, t, samples)
+            own = replace(axis, start=runs[name].start).uncoupled_displacement(t, samples.v)
+        motions[name] = t, own - runs[name].start.displacement
+    coupled = {}
+    for name in names:
+        run, axis = runs[name], model.axis(name)
+        if axis.chain.gains:
+            others = {other: np.interp(run.t, *motion) for other, motion in motions.items() if other != name}
+            alone = {other: np.zeros_like(run.t) for other in others}
+            zero = np.zeros_like(run.t)
+            moved = axis.seen(run.t, zero, others) - axis.seen(run.t, zero, alone)
+            run = replace(run, simulated=run.simulated + moved, assumed=run.assumed + moved)
+        coupled[name] = run
+    return coupled
+
+
+def _best_start(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
+    """Choose the initial history that explains the record best, of equal ones that with the least offset."""
+    starts = _starts(axis, samples)
+    simulated = [replace(axis, start=start).simulate(t, samples.v) for start in starts]
+    errors, judged = [samples.y - one for one in simulated], samples.judged
+    best = _explaining(errors, samples.fitted)[0]
+    # What is judged may suit more of them: which one it was only shows before the voltage has been to both ends.
+    offsets = [float(np.median(errors[k][judged])) for k in (best, *_explaining(errors, judged))]
+    return _Run(
+        t=t,
+        samples=samples,
+        judged=judged,
+        start=starts[best],
+        simulated=simulated[best],
+        assumed=axis.simulate(t, samples.v),
+        offsets=(min(offsets), max(offsets)),
+    )
+
+
+def _explaining(errors: Sequence[FloatArray], chosen: Mask) -> IntArray:
+    """Return which errors, shape (N,) each, are about the smallest but for their offset; the least offset first."""
+    offsets = np.array([np.median(error[chosen]) for error in errors])
+    scores = np.array([_rms(error[chosen] - o) for error, o in zip(errors, offsets.tolist(), strict=True)])
+    alike = np.flatnonzero(scores <= EQUALLY_WELL * scores.min())
+    return alike[np.argsort(np.abs(offsets[alike]), kind="stable")]
+
+
+def _starts(axis: AxisModel, samples: Samples) -> list[Start]:
+    """Return starts with the histories that may have gone before, each where the model says that it leads."""
+    v0, (low, high) = float(samples.v[0]), axis.voltage_range
+    if not axis.causal:
+        return [Start(v0, axis.start.displacement)]
+    ends = np.array([min(low, v0), max(high, v0)])
+    whole = Samples(np.append(v0, ends), np.zeros(3), np.ones(3, dtype=bool))
+    # Whatever went before, a sweep over the whole range ends at one displacement.
+    swept = axis.memory().forward_array(ends)[-1]
+    found = []
+    for history in dict.fromkeys((*histories(whole), axis.start.history)):
+        way = replace(axis, start=Start(v0, 0.0, history)).memory().forward_array(ends)[-1]
+        found.append(Start(v0, float(swept - way), history))
+    return found
+
+
+def _judge(run: _Run, axis: AxisModel, source: str, tolerance: float | None) -> RecordVerification:
+    samples, judged = run.samples, run.judged
+    offset = float(np.median((samples.y - run.simulated)[judged]))
+    error = (samples.y - run.simulated - offset)[judged]
+    floor = floor_of(run.t[judged], samples.v[judged], samples.y[judged])
+    limit = max(TIMES_THE_FLOOR * floor.rms, axis.quality.held_out_rms)
+    gain, by_gain = _gain(run, axis)
+    low, high = (x - by_gain for x in run.offsets)
+    least = 0.0 if low - limit <= 0.0 <= high + limit else min(low, high, key=abs)
+    v_low, v_high = axis.voltage_range
+    margin = 1e-6 * (v_high - v_low)
+    return RecordVerification(
+        error=ErrorPart.of(source, error),
+        limit=limit if tolerance is None else tolerance,
+        floor_rms=floor.rms,
+        floor_source=floor.source,
+        known_from=float(run.t[judged][0]) if samples.mostly_wiped else None,
+        history=run.start.history,
+        offset=least or offset - by_gain,
+        zero_moved=least != 0.0,
+        gain=gain,
+        outside=int(np.count_nonzero((samples.v < v_low - margin) | (samples.v > v_high + margin))),
+        t=run.t,
+        v=samples.v,
+        measured=np.where(samples.fitted, samples.y, np.nan),
+        model=run.simulated + offset,
+        judged=judged,
+    )
+
+
+def _gain(run: _Run, axis: AxisModel) -> tuple[float, float]:
+    """Return by which share the stage moves more than the model, and the constant (m) that this adds.
+
+    Of a stage that moves more, the place where the model starts stays. Where a gain does not explain most of the error,
+    it adds nothing.
+    """
+    simulated, error = run.simulated[run.judged], (run.samples.y - run.simulated)[run.judged]
+    error = error - np.median(error)
+    moved = simulated - simulated.mean()
+    gain = float(moved @ error / max(float(moved @ moved), 1e-300))
+    explained = _rms(error - gain * moved) < MOSTLY * _rms(error)
+    return gain, gain * float(simulated.mean() - axis.start.displacement) if explained else 0.0
+
+
+def _summary(records: Sequence[RecordVerification], resolution: float) -> AxisVerification:
+    """Return the errors of all records together, and by level, speed and region."""
+    kept = [_thinned(record, TABLE_SAMPLES // len(records)) for record in records]
+    error = np.concatenate([(one.measured - one.model)[at] for one, at in zip(records, kept, strict=True)])
+    v, level, speed = (
+        np.concatenate([signal[at] for signal, at in zip(signals, kept, strict=True)])
+        for signals in (
+            [one.v for one in records],
+            [loop_levels(one.t, one.v) for one in records],
+            [speeds(one.t, one.v) for one in records],
+        )
+    )
+
+    def cut(classes: Iterator[tuple[str, Mask]]) -> tuple[ErrorPart, ...]:
+        return tuple(ErrorPart.of(name, error[chosen]) for name, chosen in classes if chosen.any())
+
+    return AxisVerification(
+        overall=ErrorPart.of("all", np.concatenate([one.left for one in records])),
+        resolution=resolution,
+        records=tuple(records),
+        by_level=cut(level_classes(level)),
+        by_speed=cut(speed_classes(speed)),
+        by_region=cut(region_classes(v)),
+    )
+
+
+def _thinned(record: RecordVerification, most: int) -> IntArray:
+    """Return about `most` of the samples judged."""
+    at = np.flatnonzero(record.judged)
+    return at[:: max(1, round(at.size / most))]
+
+
+def _tracking(
+    one: RecordVerification, run: _Run, path: FloatArray, record: Record, model: StageModel, name: str
+) -> Tracking:
+    """Take the error measured - desired apart.
+
+    With the model ``m`` from the initial history that explains the record, ``a`` from the model's own start, which the
+    compensator assumes, and the desired ``d`` (``d'``: as late as the stage follows)::
+
+        y - d = (y - offset - m) + offset + (m - a) + (a - d') + (d' - d)
+                 model, noise      zero     memory    command    delay
+    """
+    driven = np.isfinite(record.voltage[name])
+    d = path[driven]
+    at = np.isfinite(d) & run.samples.fitted
+    if np.count_nonzero(at) < 2:
+        raise RecordError(f"{record.source}: axis '{name}': no desired displacement while it was measured; record both")
+    t, v, y, d = run.t[at], run.samples.v[at], run.samples.y[at], d[at]
+    offset = one.offset if one.zero_moved else 0.0
+    found = float(np.median((run.samples.y - run.simulated)[run.judged]))
+    # An initial history explains a constant as far as those that suit the record as well do; a gain comes first.
+    estimated = run.simulated[at] + found - float(np.clip(_gain(run, model.axis(name))[1], *run.offsets))
+    delay = _delay(t, d, run.assumed[at])
+    late = np.interp(t - delay, t, d)
+    command = run.assumed[at] - late
+    limited = _at_limit(v, command)
+    parts = {
+        "zero": np.full(t.size, offset),
+        "memory": estimated - run.assumed[at],
+        "limits": np.where(limited, command, 0.0),
+        "delay": late - d,
+        "command": np.where(limited, 0.0, command),
+        "model": y - offset - estimated,
+    }
+    error = y - d
+    total = float(error @ error)
+    shares = {cause: float(part @ error) / total if total else 0.0 for cause, part in parts.items()}
+    named, explained = _effects(one, record, model, name)
+    noise = min(one.floor_rms**2 * error.size / total if total else 0.0, max(shares["model"], 0.0))
+    effects = explained * max(shares["model"] - noise, 0.0)
+    shares |= {"model": shares["model"] - noise - effects, "effects": effects, "noise": noise}
+    return Tracking(
+        error=ErrorPart.of(record.source, error),
+        shares={cause: shares[cause] for cause in CAUSES},
+        delay=delay,
+        effects=named,
+        t=t,
+        desired=d,
+        parts=parts,
+    )
+
+
+def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
+    """Return by how much the model follows later than desired, seconds; 0 where no shift does better."""
+    longest = min(LONGEST_DELAY, DELAY_SHARE * float(t[-1] - t[0]))
+    shifts = np.linspace(0.0, longest, DELAY_STEPS + 1)
+    misses = [_rms(model - np.interp(t - shift, t, desired)) for shift in shifts.tolist()]
+    best = int(np.argmin(misses))
+    return float(shifts[best]) if misses[best] < misses[0] / EQUALLY_WELL else 0.0
+
+
+def _at_limit(v: FloatArray, command: FloatArray) -> Mask:
+    """Return where a voltage stays at the record's extreme and a displacement (m) beyond it was desired, shape (N,)."""
+    margin = 1e-6 * float(np.ptp(v))
+    limited = np.zeros(v.size, dtype=bool)
+    for extreme, missing in ((v.max(), command < 0.0), (v.min(), command > 0.0)):
+        there = np.abs(v - extreme) <= margin
+        edges = np.flatnonzero(np.diff(np.pad(there, 1).astype(np.int8)))
+        for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            if stop - start >= FEWEST_AT_LIMIT:
+                limited[start:stop] |= missing[start:stop]
+    return limited
+
+
+def _effects(one: RecordVerification, record: Record, model: StageModel, name: str) -> tuple[tuple[str, ...], float]:
+    """Diagnose a record that the model does not describe: return what is named, and its share of the residual."""
+    if one.error.rms <= max(TIMES_THE_FLOOR * one.floor_rms, model.axis(name).quality.held_out_rms):
+        return (), 0.0
+    try:
+        found = diagnose(record, model, axes=[name]).axes[name].effects
+    except SlpiError:
+        # A record that says too little for a diagnosis still tells how large the model's part is.
+        return (), 0.0
+    return tuple(effect.name for effect in found), min(sum(max(one.share_of_residual, 0.0) for one in found), 1.0)
+
+
+def _rms(error: FloatArray) -> float:
+    return float(np.sqrt(np.mean(error**2)))

@@ -1,0 +1,132 @@
+"""Gain drift: the sensitivity of the stage itself changes slowly."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
+
+# Knots that are tried, as shares of the record: even ones, and early ones, as a stage changes most after a rest.
+KNOTS = (*(tuple(np.linspace(0.0, 1.0, count + 1)[1:].tolist()) for count in (1, 2, 4, 8)), (0.05, 0.15, 0.4, 1.0))
+
+
+@dataclass(frozen=True)
+class GainDrift:
+    """A factor on the displacement that depends on time only, ``y = origin + (1 + g(t)) (x - origin)``.
+
+    ``g`` is 0 at the record's start, linear between knots, and keeps its last value after the last one: a sensitivity
+    that has changed by the record's end stays changed. So `apply` and `invert` use the record's clock, and `follower`
+    the last value.
+
+    The change of the active material scales hysteresis, creep and resonance alike: it acts behind them. Another axis
+    sees the scaled motion: it acts before the coupling.
+
+    Parameters
+    ----------
+    times : tuple of float, length K >= 1, seconds
+        Knots, strictly increasing, after the record's start.
+    gains : tuple of float, length K
+        ``g`` at the knots.
+    origin : float, metres
+        The displacement that a change of the sensitivity leaves where it is.
+    uncertainty : mapping of str to float
+        Of single elements as ``gains.0``.
+    """
+
+    name: ClassVar[str] = "gain_drift"
+    side: ClassVar[Side] = "displacement"
+    removable: ClassVar[Removable] = "record"
+
+    times: tuple[float, ...]
+    gains: tuple[float, ...]
+    origin: float
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no curve, or leaves no motion."""
+        rising = all(a < b for a, b in zip((0.0, *self.times), self.times, strict=False))
+        require(
+            self,
+            ("times", 1 <= len(self.times) <= 10000 and rising, "1 to 10000 numbers, more than 0, strictly increasing"),
+            ("times", all(time <= 1e9 for time in self.times), "at most 1e9 s"),
+            ("gains", len(self.gains) == len(self.times), "one for each time"),
+            ("gains", all(-0.9 < gain <= 10 for gain in self.gains), "more than -0.9, at most 10"),
+            ("origin", abs(self.origin) <= 1e3, "within 1000 m"),
+        )
+
+    def factor(self, t: FloatArray) -> FloatArray:
+        """Return ``1 + g``, shape (N,), at times `t`, shape (N,), seconds from the record's start."""
+        return 1.0 + np.interp(t, (0.0, *self.times), (0.0, *self.gains))
+
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the displacement with the changed sensitivity, shape (N,), metres."""
+        return self.origin + self.factor(around.t) * (signal - self.origin)
+
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the displacement with the sensitivity of the record's start, shape (N,), metres."""
+        return self.origin + (signal - self.origin) / self.factor(around.t)
+
+    @classmethod
+    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+        """Yield curves of one knot and of more.
+
+        Each has a column for the changing sensitivity and one for a shift, from which the origin follows. An origin
+        outside the record's displacements would turn any thermal drift into a gain drift: it is kept inside.
+        """
+        t, low, high = left.t - left.t[0], float(left.h.min()), float(left.h.max())
+        moved = left.h - 0.5 * (low + high)
+        for shares in KNOTS:
+            times = t[-1] * np.array(shares)
+            hats = np.column_stack([np.interp(t, (0.0, *times), (0.0, *row)) for row in np.eye(times.size)])
+            yield Candidate(np.column_stack([hats * moved[:, None], hats]), partial(cls._through, times, low, high))
+
+    @classmethod
+    def _through(cls, times: FloatArray, low: float, high: float, found: FloatArray) -> "GainDrift":
+        """Return the curve of gains ``a`` and shifts ``b``, shape (2 K,), of which ``b = -origin a`` fits best."""
+        gains, shifts = found.reshape(2, -1)
+        origin = 0.5 * (low + high) - float(gains @ shifts) / max(float(gains @ gains), 1e-300)
+        return cls(tuple(times.tolist()), tuple(gains.tolist()), min(max(origin, low), high))
+
+    def describe(self) -> str:
+        """Say how far, in which time, and when most of it."""
+        t = np.linspace(0.0, self.times[-1], 1001)
+        change = self.factor(t) - 1.0
+        largest = change[int(np.argmax(np.abs(change)))]
+        half = t[int(np.argmax(np.abs(change) >= 0.5 * abs(largest)))]
+        back = f", and is off by {change[-1] * 100:.2g} % at its end" if abs(change[-1] / (largest or 1)) < 0.9 else ""
+        return (
+            f"the sensitivity {'falls' if largest < 0 else 'rises'} by {abs(largest) * 100:.2g} % over "
+            f"{self.times[-1]:.3g} s of this record, half of it in the first {half:.3g} s{back}"
+        )
+
+    def follower(self) -> "GainFollower":
+        """Return the sensitivity of the record's end, sample by sample."""
+        return GainFollower(self.origin, 1.0 + self.gains[-1])
+
+
+class GainFollower:
+    """A constant factor on the displacement; there is nothing to remember."""
+
+    def __init__(self, origin: float, factor: float) -> None:
+        self._origin, self._factor = origin, factor
+
+    def start(self, x: float) -> None:
+        """Be at rest at `x` (m)."""
+
+    def forward(self, dt: float, x: float) -> float:
+        """Return the displacement (m) with the changed sensitivity."""
+        return self._origin + self._factor * (x - self._origin)
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the displacement (m) with the sensitivity of the record's start."""
+        return self._origin + (wanted - self._origin) / self._factor
+
+    def snapshot(self) -> tuple[()]:
+        """Return nothing."""
+        return ()
+
+    def restore(self, state: tuple[()]) -> None:
+        """Take over nothing."""

@@ -1,0 +1,270 @@
+"""The page and the files of a verification: errors on records that the model has not seen, pass or fail."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.diagnosis.verify import (
+    CAUSES,
+    TIMES_THE_FLOOR,
+    AxisVerification,
+    ErrorPart,
+    RecordVerification,
+    Tracking,
+    Verification,
+)
+from slpi_ros.errors import SlpiError
+from slpi_ros.io.atomic_file import all_or_nothing, make_folder
+from slpi_ros.io.schemas import validate
+from slpi_ros.reports import views
+from slpi_ros.reports.chart import (
+    AFTER,
+    BEFORE,
+    DESIRED,
+    DISPLACEMENT,
+    MEASURED,
+    NOISE,
+    TIME,
+    Chart,
+    Panel,
+    Quantity,
+    thin_line,
+)
+from slpi_ros.reports.chart import CAUSES as COLOURS
+from slpi_ros.reports.page import Page, Share
+from slpi_ros.reports.views import Curve, Motion
+
+FloatArray = NDArray[np.float64]
+
+DOCUMENT, PAGE = "verification.json", "report.html"
+TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
+COLOUR = {**dict(zip(CAUSES, (*COLOURS, AFTER), strict=False)), "model": BEFORE, "noise": NOISE}
+# Smaller shares of the tracking error are not told.
+_SMALLEST_SHARE = 0.01
+
+
+def make_room(folder: Path) -> None:
+    """Make the folder of a verification; call it before long work, so that the results can be written.
+
+    Raises
+    ------
+    SlpiError
+        If the files cannot be written there.
+    """
+    make_folder(folder)
+    for name in (DOCUMENT, PAGE):
+        if (folder / name).is_dir():
+            raise SlpiError(f"{folder / name}: cannot be written: a folder has that name; choose another place")
+
+
+def write_files(folder: Path, found: Verification) -> None:
+    """Write ``verification.json`` and ``report.html`` into `folder`, each whole or not at all.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if need be.
+    found : Verification
+
+    Raises
+    ------
+    SlpiError
+        If a file cannot be written.
+    """
+    make_room(folder)
+    with all_or_nothing(folder / DOCUMENT) as file:
+        file.write(format_verification(found))
+    page = Page("Verification of a model" + (f" of stage {found.hardware_id}" if found.hardware_id else ""))
+    page.contents(tuple(found.axes))
+    for name, axis in found.axes.items():
+        page.heading(f"Axis {name}", name)
+        page.verdict(name, _summary(name, axis), "good" if axis.passed else "bad", "pass" if axis.passed else "fail")
+        page.tiles(_figures(axis))
+        page.section("Errors by record")
+        page.table(*_records_table(axis))
+        page.lines([f"{record.error.name}: {line}" for record in axis.records for line in _notes(record)])
+        page.section("Errors by level, speed and region")
+        page.table(*_parts_table(axis))
+        for number, record in enumerate(axis.records):
+            _show_record(page, f"{name}-{number}", record)
+    page.write(folder / PAGE)
+
+
+def format_verification(found: Verification) -> str:
+    """Return the text of a verification document, ``msg_schemas/verification.schema.json``.
+
+    Raises
+    ------
+    ModelError
+        If it does not follow the schema.
+    """
+    document = found.to_document()
+    validate(document, "verification", "the new verification")
+    return json.dumps(document, allow_nan=False, indent=1)
+
+
+def describe_verification(found: Verification) -> list[str]:
+    """Return lines of text: for each axis pass or fail, and the errors by record, level, speed and region, nm."""
+    lines = []
+    for name, axis in found.axes.items():
+        told = [("pass: " if axis.passed else "fail: ") + _summary(name, axis).removeprefix(f"Axis {name}: ")]
+        for record in axis.records:
+            told += [f"{record.error.name}: {line}" for line in (_error(record), *_notes(record))]
+        told.append(f"{'error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}")
+        for part in (axis.overall, *axis.by_level, *axis.by_speed, *axis.by_region):
+            told.append(f"{part.name:<24}{part.samples:9}{part.rms * 1e9:9.1f}{part.maximum * 1e9:10.1f}")
+        lines += [f"axis {name}: {line}" for line in told]
+    return lines
+
+
+def _summary(name: str, axis: AxisVerification) -> str:
+    """Return the error and its limit in a sentence, and what to do where an axis fails."""
+    failed = [record for record in axis.records if not record.passed]
+    several = f" on the worst of {len(axis.records)} records" if len(axis.records) > 1 else ""
+    said = f"Axis {name}: {_error(axis.worst)}{several}."
+    if not failed:
+        moved = [record for record in axis.records if record.zero_moved]
+        return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")
+    return f"{said} 'slpi diagnose' looks for the cause, 'slpi refit' corrects the model."
+
+
+def _error(record: RecordVerification) -> str:
+    error = record.error
+    return (
+        f"measured - model is {_nm(error.rms)} rms, {_nm(error.maximum)} at most; {_nm(record.limit)} rms pass; "
+        f"noise floor {_nm(record.floor_rms)} rms"
+    )
+
+
+def _notes(record: RecordVerification) -> list[str]:
+    """Return what was assumed about a record's start, and what was found beside the error."""
+    start = (
+        "the start is unknown: the initial history and the offset are those that best explain the record"
+        if record.known_from is None
+        else f"the start is unknown: judged from {record.known_from:.4g} s on, when both ends of the voltage range had "
+        "been visited"
+    )
+    notes = [start]
+    if record.zero_moved:
+        notes.append(f"the zero has moved by {_um(record.offset)} µm, which does not count as an error")
+    if not record.passed:
+        notes.append(f"the displacement changes by {record.gain:+.2%} more than the model says")
+    if record.outside:
+        notes.append(f"{record.outside} voltages lie outside of what the model was identified on: extrapolated there")
+    if record.tracking:
+        notes += _tracking_notes(record.tracking)
+    return notes
+
+
+def _tracking_notes(tracking: Tracking) -> list[str]:
+    """Return how well a compensator did, and the causes of its error."""
+    error = tracking.error
+    told = sorted(tracking.shares.items(), key=lambda item: -item[1])
+    shares = [f"{cause} {share:.0%}" for cause, share in told if share >= _SMALLEST_SHARE]
+    notes = [
+        f"measured - desired is {_nm(error.rms)} rms, {_nm(error.maximum)} at most; of its mean square: "
+        f"{', '.join(shares) or 'nothing'}",
+        f"largest part, {tracking.blame}: {CAUSES[tracking.blame]}",
+    ]
+    notes += [f"the displacement follows {tracking.delay * 1e3:.3g} ms later"] if tracking.delay else []
+    notes += [f"effects: {', '.join(tracking.effects)}"] if tracking.effects else []
+    return notes
+
+
+def _figures(axis: AxisVerification) -> dict[str, str]:
+    worst = axis.worst
+    figures = {
+        "measured - model, rms": _nm(axis.overall.rms),
+        "maximum": _nm(axis.overall.maximum),
+        "limit of the rms": _nm(worst.limit),
+        "noise floor, rms": _nm(worst.floor_rms),
+        "held-out error of the model": _nm(axis.resolution),
+    }
+    tracked = [record.tracking.error.rms for record in axis.records if record.tracking]
+    return figures | ({"measured - desired, rms": _nm(max(tracked))} if tracked else {})
+
+
+def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[str]], None, str]:
+    header = (
+        "record", "", "samples", "rms (nm)", "maximum (nm)", "limit (nm)", "floor (nm)", "zero moved (µm)",
+    )  # fmt: skip
+    rows: list[Sequence[str]] = [
+        (
+            record.error.name,
+            "pass" if record.passed else "fail",
+            f"{record.error.samples:,}",
+            *(f"{x * 1e9:.1f}" for x in (record.error.rms, record.error.maximum, record.limit, record.floor_rms)),
+            _um(record.offset) if record.zero_moved else "no",
+        )
+        for record in axis.records
+    ]
+    caption = (
+        "Measured - model, free-run, without a constant offset for each record. The rms must be within the tolerance, "
+        f"else within {TIMES_THE_FLOOR:g} times the noise floor, but at least the model's held-out error. Floor: "
+        f"{axis.records[0].floor_source}."
+    )
+    return header, rows, None, caption
+
+
+def _parts_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[str] | str], int, str]:
+    floor = float(np.median([record.floor_rms for record in axis.records]))
+
+    def row(part: ErrorPart) -> list[str]:
+        times = f"{part.rms / floor:.2f}" if floor > 0.0 else ""
+        return [part.name, f"{part.samples:,}", f"{part.rms * 1e9:.1f}", times, f"{part.maximum * 1e9:.1f}"]
+
+    rows: list[Sequence[str] | str] = [row(axis.overall)]
+    groups = {"by loop level": axis.by_level, "by speed": axis.by_speed, "by region": axis.by_region}
+    for name, parts in groups.items():
+        rows += [name, *map(row, parts)]
+    return ("", "samples", "rms (nm)", "times the floor", "maximum (nm)"), rows, 0, f"All records; floor {_nm(floor)}."
+
+
+def _show_record(page: Page, name: str, record: RecordVerification) -> None:
+    """Add the charts of one record."""
+    t, v, y = record.t, record.v, record.measured
+    page.section(record.error.name)
+    if record.tracking:
+        _show_tracking(page, name, record.tracking)
+    motion = Motion.of(t, v)
+    models = [Curve("model", record.model, AFTER)]
+    over_time, said = views.over_time(t, y, models, record.floor_rms, fitted=record.judged)
+    not_judged = "" if record.judged.all() else f" Shaded: not judged, here called '{views.UNFITTED}'."
+    page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus and minus the floor.{not_judged} {said}")
+    over_voltage, said = views.over_voltage(v, y - record.model, motion, record.floor_rms, record.judged)
+    page.chart(f"{name}-residual", over_voltage, f"Over rising and falling voltage, and the histogram. {said}")
+    loops, said = views.loops(v, y, models, motion, record.judged)
+    beside = "Displacement over voltage; beside it displacement - the straight line through it."
+    page.chart(f"{name}-loops", loops, f"{beside} {said}")
+
+
+def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
+    """Add where the error of a compensated path comes from."""
+    page.subsection("Measured - desired displacement")
+    page.shares([Share(cause, max(share, 0.0), COLOUR[cause]) for cause, share in tracking.shares.items()])
+    page.lines(_tracking_notes(tracking))
+    page.definitions({cause: CAUSES[cause] for cause, share in tracking.shares.items() if share >= _SMALLEST_SHARE})
+    chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)
+    error = np.sum(list(tracking.parts.values()), axis=0)
+    t, desired = tracking.t, tracking.desired
+    kept = thin_line(desired, error)
+    chart.line(0, "measured", t[kept], (desired + error)[kept], MEASURED, width=2.6)
+    chart.line(0, "desired", t[kept], desired[kept], DESIRED, width=1.0)
+    chart.line(1, "measured - desired", t[kept], error[kept], MEASURED, width=1.2)
+    for cause, part in tracking.parts.items():
+        if part.any():
+            some = thin_line(part)
+            chart.line(1, cause, t[some], part[some], COLOUR[cause], width=1.0)
+    said = views.focus(chart, (1,), [error])
+    page.chart(f"{name}-tracking", chart, f"Desired and measured displacement, and the parts of the error. {said}")
+
+
+def _nm(metres: float) -> str:
+    return f"{metres * 1e9:.1f} nm"
+
+
+def _um(metres: float) -> str:
+    return f"{metres * 1e6:+.3f}"

@@ -1,0 +1,220 @@
+"""A model judged on records that it has not seen, and compensated paths."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bag_makers import joint_state, rosbags_bag
+from identification.records import calibration, record_of, rms, stage
+from reports.browser import Browser
+from reports.pages import parsed
+from test_cli import slpi
+
+import slpi_ros
+from slpi_ros.diagnosis.verify import CAUSES
+from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.excitation.drives import calibration_drive
+from slpi_ros.io.schemas import validate
+
+SEED, RATE = 2, 200.0
+# Voltages between which a stage was moved before a record; the last one leads to where the record begins.
+HISTORIES = ((), (0, 100, 0), (100,), (0, 100, 60), (0, 100, 0, 70, 30), (100, 20, 80))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return slpi_ros.identify(calibration(SEED)[0])
+
+
+def after(history, start=0.0):
+    """Return a stage that was driven through voltages and then to the start of a record."""
+    driven = stage(SEED)
+    if history:
+        turns = (*history, start)
+        v = np.interp(np.arange(100 * len(turns)) / 100, np.arange(len(turns)), turns)
+        driven.run(np.arange(v.size) / RATE, v)
+    return driven
+
+
+def unseen(history=(), gain=1.0, offset=0.0):
+    t, v = calibration_drive(0.0, 100.0, duration=12.0, rate=RATE, seed=7)
+    return record_of(t, v, gain * after(history, v[0]).run(t + 100.0, v)[1] + offset)
+
+
+def small_loops(history):
+    t = np.arange(2400) / RATE
+    v = 50.0 - 10.0 * np.cos(2.0 * np.pi * t) * np.exp(-t / 20.0)
+    return record_of(t, v, after(history, 40.0).run(t + 100.0, v)[1])
+
+
+def judged(record, model, **options):
+    found = slpi_ros.verify(record, model, **options)
+    validate(found.to_document(), "verification", "test")
+    return found.axes["x"].records[0]
+
+
+@pytest.mark.parametrize("history", HISTORIES)
+@pytest.mark.parametrize("record", [unseen, small_loops])
+def test_whatever_went_before_an_unchanged_stage_passes(record, history, model):
+    one = judged(record(history), model)
+    assert one.passed and not one.zero_moved
+    assert one.error.rms < 1.2 * 8e-9
+
+
+@pytest.mark.parametrize("offset", [-0.93e-6, 0.2e-6])
+def test_a_moved_zero_is_no_error_of_the_loops(offset, model):
+    one = judged(unseen((100, 20, 80), offset=offset), model)
+    assert one.passed and one.zero_moved
+    assert one.offset == pytest.approx(offset, abs=0.1 * abs(offset))
+
+
+@pytest.mark.parametrize("gain", [0.99, 1.02])
+def test_a_changed_gain_fails_and_is_no_moved_zero(gain, model):
+    one = judged(unseen(gain=gain), model)
+    assert not one.passed and not one.zero_moved
+    assert one.gain == pytest.approx(gain - 1.0, rel=0.2)
+    assert judged(unseen(gain=gain), model, tolerance=1e-6).passed
+
+
+def test_the_error_is_that_of_the_samples_judged(model):
+    record = unseen()
+    one = judged(record, model)
+    assert one.known_from == pytest.approx(float(record.t[one.judged][0]))
+    error = (record.displacement["x"] - one.model)[one.judged]
+    assert one.error.rms == pytest.approx(rms(error)) and one.error.maximum == pytest.approx(np.abs(error).max())
+    found = slpi_ros.verify([record, small_loops(())], model).axes["x"]
+    for parts in (found.by_level, found.by_speed, found.by_region):
+        total = sum(part.samples * part.rms**2 for part in parts)
+        assert np.sqrt(total / found.overall.samples) == pytest.approx(found.overall.rms)
+
+
+def test_a_coupled_axis_is_judged_with_the_motion_of_the_other(model):
+    t, v = calibration_drive(0.0, 100.0, duration=12.0, rate=RATE, seed=7)
+    other = 50.0 - 50.0 * np.cos(2.0 * np.pi * t / 3.1)
+    y, z = stage(SEED).run(t, v)[1], stage(SEED).run(t, other)[1]
+    record = replace(record_of(t, v, y + 0.01 * z), voltage={"x": v, "z": other}, displacement={"x": y, "z": z})
+    record = replace(record, displacement={"x": y + 0.01 * z, "z": z})
+    effect = slpi_ros.effects.cross_coupling.CrossCoupling({"z": 0.01})
+    axis = model.axes["x"]
+    coupled = replace(model, axes={"x": replace(axis, effects=(effect,)), "z": axis})
+    alone = replace(model, axes={"x": axis, "z": axis})
+    assert slpi_ros.verify(record, coupled, axes=["x"]).passed
+    assert not slpi_ros.verify(record, alone, axes=["x"]).passed
+
+
+def test_what_does_not_go_together_is_refused(model):
+    with pytest.raises(UsageError):
+        slpi_ros.verify(replace(unseen(), hardware_id="a"), replace(model, hardware_id="b"))
+    with pytest.raises(UsageError):
+        slpi_ros.verify(
+            replace(unseen(), voltage={"q": unseen().voltage["x"]}, displacement={"q": np.zeros(2401)}), model
+        )
+    for tolerance in (0.0, -1.0, np.nan):
+        with pytest.raises(UsageError):
+            slpi_ros.verify(unseen(), model, tolerance)
+    with pytest.raises(RecordError):
+        slpi_ros.verify(unseen(), model, desired=[{"x": np.full(len(unseen()), np.nan)}])
+
+
+def path(model):
+    t = np.arange(3000) / RATE
+    low, high = model.axes["x"].displacement_range
+    return t, low + (high - low) * (0.5 + 0.3 * np.sin(4.4 * t) * np.cos(0.69 * t))
+
+
+def tracked(model, history=(), limits=(0.0, 100.0), delay=0, gain=1.0, offset=0.0):
+    """Return how a path was followed by a stage with another history, limits, delay, gain or zero."""
+    t, desired = path(model)
+    v = np.clip(model.compensate(t, desired), *limits)
+    v = np.concatenate([np.full(delay, v[0]), v[: v.size - delay]])
+    y = gain * after(history, 0.0).run(t + 100.0, v)[1] + offset
+    return judged(record_of(t, v, y), model, desired=[{"x": desired}]).tracking
+
+
+@pytest.mark.parametrize(
+    "blame, cause",
+    [
+        ("noise", {}),
+        ("memory", {"history": (0, 100, 0)}),
+        ("memory", {"history": (0, 100, 30, 60)}),
+        ("limits", {"limits": (0.0, 60.0)}),
+        ("delay", {"delay": 8}),
+        ("model", {"gain": 1.02}),
+        ("zero", {"offset": -5e-7}),
+    ],
+)
+def test_what_is_left_of_a_compensated_path_is_blamed_on_its_cause(blame, cause, model):
+    tracking = tracked(model, **cause)
+    assert tracking.blame == blame and tracking.shares[blame] > 0.7
+    assert set(tracking.shares) == set(CAUSES) and sum(tracking.shares.values()) == pytest.approx(1.0)
+    if blame == "delay":
+        assert tracking.delay == pytest.approx(8 / RATE, rel=0.1)
+
+
+def test_parts_of_the_error_add_up(model):
+    tracking = tracked(model, (100, 20, 80), (0.0, 70.0), 2, 1.01, 1e-7)
+    error = np.sum(list(tracking.parts.values()), axis=0)
+    assert rms(error) == pytest.approx(tracking.error.rms)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, model):
+    """A model, a bag that passes, one that fails, and one of a path that was compensated from a wrong memory."""
+    folder = tmp_path_factory.mktemp("verify")
+    slpi_ros.save_model(model, folder / "model.json")
+    slpi_ros.io.bag_reader.write_bag(folder / "good", unseen((100,), offset=-0.93e-6))
+    slpi_ros.io.bag_reader.write_bag(folder / "bad", unseen(gain=1.02))
+    t, desired = path(model)
+    v = model.compensate(t, desired)
+    y = after((0, 100, 0)).run(t + 100.0, v)[1]
+    stamps = np.round(t * 1e9).astype(np.int64).tolist()
+    topics = {
+        "/desired_displacement": [
+            (s, joint_state(s, position=(d,), effort=())) for s, d in zip(stamps, desired, strict=True)
+        ],
+        "/stage_state": [
+            (s + 10**6, joint_state(s + 10**6, position=(m,), effort=(u,)))
+            for s, m, u in zip(stamps, y, v, strict=True)
+        ],
+    }
+    rosbags_bag(folder / "tracked", topics)
+    return folder
+
+
+def test_command_passes_fails_and_writes(folder, tmp_path):
+    done = slpi("verify", folder / "good", "--model", folder / "model.json", "-o", tmp_path / "out")
+    assert done.returncode == 0 and "-0.93" in done.stdout and not done.stderr
+    document = json.loads((tmp_path / "out" / "verification.json").read_text())
+    validate(document, "verification", "test")
+    assert document["passed"] and document["axes"]["x"]["records"][0]["zero_moved"]
+    assert parsed(tmp_path / "out" / "report.html").texts["verdict-x"].startswith("pass")
+    failed = slpi("verify", folder / "good", folder / "bad", "--model", folder / "model.json", "--json")
+    document = json.loads(failed.stdout)
+    assert failed.returncode == 1 and [one["passed"] for one in document["axes"]["x"]["records"]] == [True, False]
+    loose = ("--tolerance", "1.0")
+    assert slpi("verify", folder / "good", folder / "bad", "--model", folder / "model.json", *loose).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "options", [("--tolerance", "0"), ("--tolerance", "nan"), ("--axis", "x", "x"), ("--clock", "voltage")]
+)
+def test_wrong_usage_is_told_apart_from_failure(folder, options):
+    done = slpi("verify", folder / "good", "--model", folder / "model.json", *options)
+    assert done.returncode == 2 and not done.stdout and len(done.stderr.splitlines()) == 1
+
+
+def test_page_of_a_compensated_path_in_a_browser(folder, tmp_path):
+    done = slpi("verify", folder / "tracked", "--model", folder / "model.json", "-o", tmp_path / "out")
+    assert done.returncode == 0 and "memory" in done.stdout
+    tracking = json.loads((tmp_path / "out" / "verification.json").read_text())["axes"]["x"]["records"][0]["tracking"]
+    assert tracking["blame"] == "memory" and tracking["shares"]["memory"] > 0.7
+    page = tmp_path / "out" / "report.html"
+    browser = Browser(tmp_path / "profile")
+    try:
+        browser.open(page)
+        assert browser.run("document.querySelectorAll('.js-plotly-plot').length") == len(parsed(page).charts) == 4
+        assert not browser.complaints()
+        assert [url for url in browser.fetched() if not url.startswith(("data:", "blob:"))] == [page.as_uri()]
+    finally:
+        browser.close()

@@ -241,7 +241,7 @@ def basis_of(axis: AxisModel) -> tuple[Basis, FloatArray]:
         if not np.allclose(np.diff(shape.grid), np.diff(shape.grid).mean(), rtol=1e-6):
             raise UsageError("the model's vertices are not evenly spaced; identify the stage anew")
         return SurfaceBasis(shape.grid), np.concatenate(
-            [shape.surface[np.tril_indices(shape.grid.size, -1)], shape.rise]
+            [shape.everett[np.tril_indices(shape.grid.size, -1)], shape.rise]
         )
     raise UsageError(f"kind '{axis.kind}' cannot be updated; identify the stage anew")
 

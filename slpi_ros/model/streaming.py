@@ -16,7 +16,7 @@ from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.effects.rate_dependence import CoercivityFollower, RateDependence
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
-from slpi_ros.hysteresis.memory import Memory, MemoryState
+from slpi_ros.hysteresis.turning_points import Memory, MemoryState
 from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 
 FloatArray = NDArray[np.float64]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi_published import (
     KnownPath,
@@ -17,6 +16,7 @@ from slpi_ros.hysteresis.slpi_published import (
     UnidentifiedLoopWarning,
     separate,
 )
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.convex_fit import PLAY_OPERATORS
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.published_kinds import default_thresholds, fit_plays, least_iterations
@@ -200,7 +200,7 @@ def unseen_paths(known: Study, seed: int = 1) -> UnseenPaths:
         for loop in inner:
             span = float(np.ptp(v[loop.path]))
             place = loop.level, loop.direction, float(v[loop.vertex]), span
-            replaced += not known.closing.holds(known.closing.nearest(*place, 0), *place, 0)
+            replaced += not known.closing.matches(known.closing.nearest(*place, 0), *place, 0)
     return UnseenPaths(paths, {name: tuple(e) for name, e in errors.items()}, loops, replaced)
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.design_matrix import Walk
-from slpi_ros.identification.drive import hold_band, resting, smallest_turn, turning_points
+from slpi_ros.identification.drive import hold_band, resting, smallest_turn
 from slpi_ros.identification.signal_statistics import digit, noise
 from slpi_ros.reports.chart import (
     COLOURS,
@@ -94,7 +95,7 @@ class Motion:
         if v.size < _FEWEST_ARRIVALS or not np.ptp(v) > 0.0:
             return cls(np.zeros(v.size), t - t[:1], v.copy(), np.array([0, max(v.size - 1, 0)]))
         noise_rms = noise(v, t)
-        runs = turning_points(v, smallest_turn(v, noise_rms))
+        runs = reversals(v, smallest_turn(v, noise_rms))
         rests, _ = resting(t, v, hold_band(v, noise_rms, digit(v)))
         stops = np.unique(np.concatenate([[0], runs, _arrivals(v, runs), rests]))
         last = stops[np.searchsorted(stops, np.arange(v.size), side="right") - 1]

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from strategies import FAMILY_CASE, Case, cases, fractions, paths
 
 from slpi_ros.errors import UnreachableError, UsageError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.limits import Limits, RateLimiter
 from slpi_ros.model.streaming import TOLERATED_SHARE, StreamingInverse
 

@@ -88,7 +88,7 @@ class Chain:
         ----------
         own : ndarray, shape (N,), metres
             Before other axes come in.
-        around : Around
+        around : EffectContext
             Its `u` is not needed.
         inverse : callable
             The inverse hysteresis from its start: metres to volts.

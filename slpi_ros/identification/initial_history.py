@@ -379,7 +379,8 @@ def _changes(
         ]
     )
     chance = np.sqrt((PARTS - 1) * np.var(left_out, axis=0))
-    # The model itself is not known better than its own error.
-    uncertainty = np.hypot(chance, axis.quality.held_out_rms / BEYOND_CHANCE)
+    # The model itself is not known better than its own error; columns that are alike can share it in any proportion.
+    alike = np.sqrt(np.diag(np.linalg.inv(matrices.sum(axis=0) / error.size + 1e-9 * np.eye(scale.size))))
+    uncertainty = np.hypot(chance, alike * axis.quality.held_out_rms / BEYOND_CHANCE)
     left = float(np.sqrt(np.mean((error - columns @ whole) ** 2)))
     return (whole / scale)[:2], (uncertainty / scale)[:2], float(np.sqrt(np.mean(error**2))), left

@@ -76,7 +76,8 @@ def test_a_moved_zero_is_told_as_that(model, zero):
 
 
 def test_a_small_record_cannot_tell_a_moved_zero_from_another_history(model):
-    found = of(model, again([100.0, 40.0], 45.0 + 5.0 * np.sin(np.arange(800) * 0.05), zero=0.1e-6))
+    v = 45.0 + 5.0 * np.sin(np.arange(800) * 0.05)
+    found = of(model, again([100.0, 0.0, 70.0, 20.0, 60.0, 30.0], v, zero=0.1e-6))
     assert found.offset_uncertainty > 0.1e-6 and not found.zero_moved and not found.gain_changed
 
 

@@ -20,7 +20,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-latency bench-soak bench-trajectory bench-xy clean distclean FORCE
+.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-records bench-latency bench-soak bench-trajectory bench-xy clean distclean FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -29,6 +29,7 @@ help:
 	@echo 'make bench      build, then the benchmarks'
 	@echo 'make bench-robustness  spoiled records beside clean ones, 8 seeds, 2 minutes'
 	@echo 'make bench-diagnosis   hidden effects: named, missed, invented; about an hour'
+	@echo 'make bench-records     what is found on some measured records, judged on others; half an hour'
 	@echo 'make bench-latency  round trip through the compensator beside a bare echo node, 4 minutes'
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'
 	@echo 'make bench-trajectory  a trajectory of a million points: acceptance and deadlines'
@@ -52,7 +53,7 @@ test: build
 	$(VENV) -m ruff check .
 	$(VENV) -m ruff format --check .
 	$(VENV) -m mypy
-	$(IN_WORKSPACE) $(VENV) -m pytest -n 2 --dist loadfile
+	$(IN_WORKSPACE) $(VENV) -m pytest -n 2 --dist worksteal
 
 demo: build
 	$(IN_WORKSPACE) $(VENV) demo/run_demo.py
@@ -65,6 +66,9 @@ bench-robustness: build
 
 bench-diagnosis: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/diagnosis.py
+
+bench-records: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/records.py
 
 bench-latency: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/latency.py

@@ -27,13 +27,15 @@ from slpi_ros.identification.refit import refit
 from slpi_ros.identification.uncertainty import curve_uncertainty, require_known_uncertainty
 from slpi_ros.io import bag_reader as bags
 from slpi_ros.io import tables
+from slpi_ros.io.alignment import SeparateTopics
 from slpi_ros.io.atomic_file import make_folder
-from slpi_ros.io.column_choice import Wishes
+from slpi_ros.io.bag_writer import write_bag
+from slpi_ros.io.columns import ColumnOptions
 from slpi_ros.io.record import FloatArray, Record
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.document import load_model, save_model
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel, check_time, held_message
-from slpi_ros.model.streaming import Limits
 from slpi_ros.reports.text import describe_change, describe_model, describe_start
 
 # Where a bag holds voltage and displacement, if nothing else is said.
@@ -119,7 +121,10 @@ def _identify_options(command: Any) -> None:
 
 
 def _diagnose_options(command: Any) -> None:
-    command.add_argument("bag", metavar="BAG", help="rosbag2 folder, or a lone mcap or sqlite3 file")
+    command.add_argument(
+        "bags", metavar="BAG", nargs="+",
+        help="rosbag2 folder, or a lone mcap or sqlite3 file; several records of the stage prove a cause on each other",
+    )  # fmt: skip
     command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
     command.add_argument(
         "-o", "--output", metavar="DIR", required=True,
@@ -242,16 +247,16 @@ def _one_line(error: BaseException) -> str:
 
 
 def _import(options: argparse.Namespace) -> None:
-    wishes = Wishes(
+    columns = ColumnOptions(
         time=options.time,
         voltage=tuple(options.voltage),
         displacement=tuple(options.displacement),
         displacement_unit=options.displacement_unit,
         axes=tuple(options.axes),
     )
-    record, told = tables.import_told(options.table, wishes)
+    record, told = tables.import_with_summary(options.table, columns)
     record = replace(record, hardware_id=options.hardware_id)
-    bags.write_bag(options.output, record, storage=options.storage)
+    write_bag(options.output, record, storage=options.storage)
     print(f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s")
     print("\n".join(told))
 
@@ -289,7 +294,7 @@ def _identify(options: argparse.Namespace) -> None:
     print("\n".join([*told, *describe_model(model)]))
 
 
-def _topics(options: argparse.Namespace) -> str | bags.SeparateTopics:
+def _topics(options: argparse.Namespace) -> str | SeparateTopics:
     """Return where the bag holds voltage and displacement."""
     voltage, displacement = options.voltage_topic, options.displacement_topic
     if bool(voltage) != bool(displacement):
@@ -298,7 +303,7 @@ def _topics(options: argparse.Namespace) -> str | bags.SeparateTopics:
         raise UsageError("--topic does not go with --voltage-topic and --displacement-topic; give it, or both of them")
     if voltage:
         held = not options.voltage_measured
-        return bags.SeparateTopics(voltage, displacement, clock=options.clock or "displacement", held=held)
+        return SeparateTopics(voltage, displacement, clock=options.clock or "displacement", held=held)
     if options.clock or options.voltage_measured:
         raise UsageError("--clock and --voltage-measured are for --voltage-topic and --displacement-topic; give both")
     return TOPIC if options.topic is None else str(options.topic)
@@ -322,14 +327,14 @@ def _diagnose(options: argparse.Namespace) -> None:
     model = load_model(options.model)
     folder = Path(options.output)
     make_room(folder)
-    record = _with_other_axes(options, topics)
+    records = [_with_other_axes(bag, options, topics) for bag in options.bags]
     try:
-        axes = options.axis or [axis for axis in model.axes if axis in record.axes]
-        for axis in axes:
+        axes = options.axis or [axis for axis in model.axes if all(axis in record.axes for record in records)]
+        for record, axis in ((record, axis) for record in records for axis in axes):
             record.require_axis(axis)
             model.axis(axis)
             require_usable(findings(assess(record, axis)), f"{record.source}: axis '{axis}'")
-        diagnosis = diagnose(record, model, axes=axes, start=options.start, stop=options.stop)
+        diagnosis = diagnose(records, model, axes=axes, start=options.start, stop=options.stop)
     except UsageError as error:
         # That bag and model do not go together shows only once both have been read.
         raise ModelError(str(error)) from None
@@ -338,17 +343,17 @@ def _diagnose(options: argparse.Namespace) -> None:
     print(f"{folder / PAGE}: open it in a browser")
 
 
-def _with_other_axes(options: argparse.Namespace, topics: str | bags.SeparateTopics) -> Record:
+def _with_other_axes(bag: str, options: argparse.Namespace, topics: str | SeparateTopics) -> Record:
     """Return all axes of the bag: each may show on the others. Where that cannot be, only those asked for."""
-    if options.axis and isinstance(topics, bags.SeparateTopics):
+    if options.axis and isinstance(topics, SeparateTopics):
         # There the axes may have no names but those given.
-        return bags.read_bag(options.bag, topics, axes=options.axis)
+        return bags.read_bag(bag, topics, axes=options.axis)
     try:
-        return bags.read_bag(options.bag, topics)
+        return bags.read_bag(bag, topics)
     except RecordError:
         if not options.axis:
             raise
-        return bags.read_bag(options.bag, topics, axes=options.axis)
+        return bags.read_bag(bag, topics, axes=options.axis)
 
 
 def _verify(options: argparse.Namespace) -> int:
@@ -361,7 +366,7 @@ def _verify(options: argparse.Namespace) -> int:
     if options.output:
         make_room(Path(options.output))
     # The other axes may move those asked for; separate topics may have no names but those given.
-    axes = options.axis if isinstance(topics, bags.SeparateTopics) else None
+    axes = options.axis if isinstance(topics, SeparateTopics) else None
     records = bags.read_bags(options.bags, topics, axes=axes)
     desired = [
         bags.read_desired(bag, record, options.desired_topic) for bag, record in zip(options.bags, records, strict=True)

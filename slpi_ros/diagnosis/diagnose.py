@@ -1,52 +1,60 @@
-"""From a record and a model to what the model gets wrong, why, and the model that gets it right."""
+"""From records and a model to what the model gets wrong, why, and the model that gets it right."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slpi_ros.diagnosis.evidence import Evidence
-from slpi_ros.diagnosis.explanation import Explanation
-from slpi_ros.diagnosis.gather import driven_alike, evidence_of
-from slpi_ros.diagnosis.judge import Given, judged
-from slpi_ros.diagnosis.selection import Selection, counts, select
-from slpi_ros.diagnosis.structure import BIAS
-from slpi_ros.diagnosis.verdict import AxisDiagnosis, Diagnosis
+from slpi_ros.diagnosis.effect_parameters import EachRecord
+from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
+from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
+from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, Selection, counts, select
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
+from slpi_ros.identification.initial_history import histories
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
+from slpi_ros.identification.samples import Samples
 from slpi_ros.identification.signal_statistics import Floor, floor_of
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, StageModel, Start
+from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
 # Kinds that are fitted to the record together with effects. Of another kind is said that it is the wrong one where its
 # error is so many times that of the loop family.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
+# Effects that do the same wherever they are not told apart: one of them may stand for the other.
+SAME_ELSEWHERE = ({"delay", "lag"},)
+# Initial histories explain a record as well as the best one with so many times its error; a zero has moved when that is
+# so many times the error. The gain is compared on so many stretches, of so many samples at least.
+AS_WELL, ZERO, STRETCHES, FEWEST = 1.1, 4.0, 8, 50
 
 
 def diagnose(
-    record: Record,
+    record: Record | Sequence[Record],
     model: StageModel,
     *,
     axes: Sequence[str] | None = None,
     start: float | None = None,
     stop: float | None = None,
 ) -> Diagnosis:
-    """Find what a model gets wrong on a record, name the causes, and extend the model by them.
+    """Find what a model gets wrong on records, name the causes, and extend the model by them.
 
     Parameters
     ----------
-    record : Record
+    record : Record or sequence of Record
+        Of the same stage. Several share hysteresis and effects; initial history, constant, drift and hum are each
+        record's own, and each record is left out in turn.
     model : StageModel
         Of the same stage.
     axes : sequence of str, optional
-        All that record and model share by default.
+        All that records and model share by default.
     start, stop : float, seconds, optional
         Explain only samples with ``start <= t < stop``, t from the record's first stamp.
 
@@ -58,52 +66,74 @@ def diagnose(
     Raises
     ------
     UsageError
-        If record and model are not of one stage, or share no axis.
+        If records and model are not of one stage, or share no axis.
     RecordError, IdentificationError
-        If the record says too little.
+        If the records say too little.
     """
-    if model.hardware_id and record.hardware_id and model.hardware_id != record.hardware_id:
-        raise UsageError(
-            f"this model does not belong to this bag: it is of stage '{model.hardware_id}', {record.source} of "
-            f"'{record.hardware_id}'"
-        )
-    chosen = list(axes) if axes else [axis for axis in model.axes if axis in record.axes]
+    records = [record] if isinstance(record, Record) else list(record)
+    if not records:
+        raise UsageError("no record given; give at least one")
+    for each in records:
+        if model.hardware_id and each.hardware_id and model.hardware_id != each.hardware_id:
+            raise UsageError(
+                f"this model does not belong to this bag: it is of stage '{model.hardware_id}', {each.source} of "
+                f"'{each.hardware_id}'"
+            )
+    source = ", ".join(each.source for each in records)
+    common = [axis for axis in records[0].axes if all(axis in each.axes for each in records)]
+    chosen = list(axes) if axes else [axis for axis in model.axes if axis in common]
     if not chosen:
-        raise UsageError(
-            f"{record.source} holds axes {', '.join(record.axes)}, the model {', '.join(model.axes)}: none in common"
-        )
+        raise UsageError(f"{source} holds axes {', '.join(common)}, the model {', '.join(model.axes)}: none in common")
     found: dict[str, AxisDiagnosis] = {}
     extended = dict(model.axes)
     for axis in chosen:
         try:
             with threadpool_limits(1):
-                found[axis], extended[axis] = _diagnose_axis(record, axis, model.axis(axis), start, stop)
+                found[axis], extended[axis] = _diagnose_axis(records, axis, model.axis(axis), start, stop)
         except SlpiError as error:
-            where = f"{record.source}: axis '{axis}': "
+            where = f"{source}: axis '{axis}': "
             raise type(error)(where + str(error).removeprefix(where)) from None
     created = datetime.now(UTC).isoformat(timespec="seconds")
-    return Diagnosis(found, replace(model, axes=extended, created=created), record.source)
+    return Diagnosis(found, replace(model, axes=extended, created=created), source)
 
 
 def _diagnose_axis(
-    record: Record, axis: str, model: AxisModel, start: float | None, stop: float | None
+    records: Sequence[Record], axis: str, model: AxisModel, start: float | None, stop: float | None
 ) -> tuple[AxisDiagnosis, AxisModel]:
     report_progress(f"axis {axis}: fitting the hysteresis")
-    evidence = evidence_of(record, axis, model, start, stop)
-    base = Explanation(evidence, model.effects)
-    given, gain = _error_of(model, evidence, evidence.v, evidence.y)
+    evidence = evidence_of(records, axis, model, start, stop)
+    same = len(records) == 1 and model.quality.source == records[0].source
+    # What belongs to one record says nothing of another.
+    shared = [effect for effect in model.effects if same or effect.removable != "record"]
+    base = Explanation(evidence, shared)
     if model.kind in REFITTED:
-        selection = _selected(base, evidence_of(record, axis, None, start, stop) if model.kind == "pi" else None)
-        own = _require_own(model, base, selection.now)
-        before = base.held_out.rms
+        selection = _selected(base, evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None)
+        before = base.held_out.rms_of_records
     else:
         # Such a kind is not fitted anew here: the loop family shows what it gets wrong.
-        selection, before, own = select(base, None), given, given
-        if given > WRONG_KIND * base.held_out.rms:
+        selection, before = select(base, None), _given_rms(model, evidence)
+        if before > WRONG_KIND * base.held_out.rms:
             selection = replace(selection, structures=(BIAS, *selection.structures))
+    given = _given(model, selection)
     floor = _floor(selection.now)
-    found = judged(selection, floor, before, Given(given, gain, own), driven_alike(record, axis))
-    return found, _extended(model, selection.now, floor, record.source)
+    left_out = _ambiguous(selection)
+    refitted = given.changed or BIAS in selection.structures or len(left_out) < len(selection.named)
+    final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
+    extended = _extended(model, final, floor, ", ".join(part.source for part in evidence.parts)) if refitted else model
+    outcomes = _outcomes(model, selection.now, final if refitted else None)
+    found = judged(selection, floor, before, given, outcomes, left_out, driven_alike(records, axis))
+    return found, extended
+
+
+def _ambiguous(selection: Selection) -> list[str]:
+    """Return the effects that may be something else, which would do otherwise on other records."""
+    alone = one_speed(selection.now.evidence)
+    return [
+        named.name
+        for named in selection.named
+        if (alone and named.name in DYNAMIC)
+        or (named.alternatives and not any({named.name, *named.alternatives} <= same for same in SAME_ELSEWHERE))
+    ]
 
 
 def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
@@ -119,56 +149,161 @@ def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
 
 
 def _floor(now: Explanation) -> Floor:
-    evidence = now.evidence
-    residual = np.where(evidence.used, now.residual, np.nan)
-    floor = floor_of(evidence.t, evidence.v, evidence.y, residual)
-    return replace(floor, rms=min(floor.rms, now.held_out.rms))
+    """Return the floor of the record that repeats itself worst; no less than what rounding adds."""
+    floors = []
+    for part, rows in zip(now.evidence.parts, now.evidence.slices, strict=True):
+        residual = np.where(part.used, now.residual[rows], np.nan)
+        floors.append(floor_of(part.t, part.v, part.y, residual))
+    worst = max(floors, key=lambda floor: floor.rms)
+    return replace(worst, rms=min(max(worst.rms, now.evidence.rounding), now.held_out.rms))
 
 
-def _error_of(model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Return the error (m) of the given model, driven by `u` (V), against `y` (m), but for the one at rest.
+@dataclass(frozen=True)
+class _FreeRun:
+    """A model along a record, from the initial history that suits it best.
 
-    Beside it stands by which share `y` moves more. It starts as it was identified or as the record seems to, whichever
-    suits it better.
+    Parameters
+    ----------
+    errors : ndarray, shape (N,), metres
+        Measured - model.
+    rms : float, metres
+        Without their constant.
+    offsets : (float, float), metres
+        Least and largest constant by initial histories that explain the record as well.
     """
-    starts = [model.start]
-    if model.causal:
-        starts += [Start(float(u[0]), 0.0, history) for history in {evidence.history, model.start.history}]
-    return min(_error_from(start, model, evidence, u, y) for start in starts)
+
+    errors: FloatArray
+    rms: float
+    offsets: tuple[float, float]
+
+    @property
+    def offset(self) -> float:
+        """The constant nearest to none, metres."""
+        return min(self.offsets, key=abs)
+
+    @property
+    def moved(self) -> float:
+        """By how much (m) the zero has moved, whatever went before the record; 0 where that may be all of it."""
+        return 0.0 if self.offsets[0] <= 0.0 <= self.offsets[1] else self.offset
 
 
-def _error_from(
-    start: Start, model: AxisModel, evidence: Evidence, u: FloatArray, y: FloatArray
-) -> tuple[float, float]:
-    simulated = replace(model, start=start).simulate(evidence.t, u)[evidence.used]
-    errors, moved = simulated - y[evidence.used], simulated - simulated.mean()
-    gain = float(moved @ -errors / max(float(moved @ moved), 1e-300))
-    return float(np.sqrt(np.mean((errors - np.median(errors)) ** 2))), gain
+def _free_run(model: AxisModel, part: Part) -> _FreeRun:
+    """Let a model run along a record from every initial history that may have been."""
+    errors = [part.y - replace(model, start=start).simulate(part.t, part.v) for start in _starts(model, part)]
+    chosen = _known(part)
+    rms = np.array([np.std(each[part.used]) for each in errors])
+    as_well = [each for each in errors if np.std(each[chosen]) <= AS_WELL * min(np.std(one[chosen]) for one in errors)]
+    offsets = [float(np.median(each[chosen])) for each in as_well]
+    best = int(np.argmin(rms))
+    return _FreeRun(errors[best], float(rms[best]), (min(offsets), max(offsets)))
 
 
-def _require_own(model: AxisModel, base: Explanation, now: Explanation) -> float:
-    """Refuse a model that has nothing to do with the record, whatever effects there are; return its error (m)."""
-    span = max(float(np.ptp(now.evidence.y[now.evidence.used])), float(np.ptp(model.displacement_range)))
+def _known(part: Part) -> NDArray[np.bool_]:
+    """Return which samples do not depend on the initial history, but for a constant; all used where these are few."""
+    known = part.used & part.wiped
+    return known if np.count_nonzero(known) >= FEWEST else part.used
+
+
+def _starts(model: AxisModel, part: Part) -> list[Start]:
+    """Return starts for several initial histories, each where the model says that it leads."""
+    if not model.causal:
+        return [model.start]
+    v0, (low, high) = float(part.v[0]), model.voltage_range
+    ends = np.array([min(low, v0), max(high, v0)])
+    whole = Samples(np.append(v0, ends), np.zeros(3), np.ones(3, dtype=bool))
+    # Whatever went before, a sweep over the whole range ends at one displacement.
+    swept = model.memory().forward_array(ends)[-1]
+    found = [model.start] if model.start.voltage == v0 else []
+    for history in dict.fromkeys((part.history, model.start.history, *histories(whole))):
+        way = replace(model, start=Start(v0, 0.0, history)).memory().forward_array(ends)[-1]
+        found.append(Start(v0, float(swept - way), history))
+    return found
+
+
+def _given_rms(model: AxisModel, evidence: Evidence) -> float:
+    """Return the error (m) of the given model, without the constant of each record."""
+    return float(np.sqrt(np.mean([_free_run(model, part).rms ** 2 for part in evidence.parts])))
+
+
+def _given(model: AxisModel, selection: Selection) -> Given:
+    """Compare the given model with the records, and refuse one that has nothing to do with them."""
+    evidence = selection.now.evidence
     bare = replace(model, effects=())
-    error = min(_error_of(bare, one.evidence, one.u, one.target)[0] for one in (base, now))
-    require_own(error, base.held_out.rms, span)
-    return error
+    compared = [_compared(bare, one) for one in (selection.base, selection.now)]
+    best = min(compared, key=lambda one: one.hysteresis_rms)
+    motion = float(np.ptp(evidence.y[evidence.used]))
+    if model.kind in REFITTED:
+        span = max(motion, float(np.ptp(model.displacement_range)))
+        require_own(best.hysteresis_rms, best.refitted_rms, span)
+    runs = [_free_run(model, part) for part in evidence.parts]
+    rms = float(np.sqrt(np.mean([run.rms**2 for run in runs])))
+    zero = float(np.median([run.moved for run in runs]))
+    moved = abs(zero) > ZERO * max(rms, CHANGED * motion)
+    return replace(best, rms=rms, zero_moved=zero if moved else None, motion=motion)
+
+
+def _compared(bare: AxisModel, one: Explanation) -> Given:
+    """Compare the hysteresis of the given model with what effects leave for one to explain."""
+    errors, refitted, gains, deviations = [], [], [], []
+    for part, rows in zip(one.evidence.parts, one.evidence.slices, strict=True):
+        chosen = _known(part)
+        target = (one.target - one.settling)[rows][chosen]
+        starts = _starts(bare, part)
+        tried = [replace(bare, start=start).simulate(part.t, one.u[rows])[chosen] for start in starts]
+        h = min(tried, key=lambda h: float(np.std(target - h)))
+        errors.append(np.var(target - h))
+        refitted.append(np.var(one.residual[rows][chosen]))
+        gain, deviation = _gain(h, target)
+        gains.append(gain)
+        deviations.append(deviation)
+    weights = 1.0 / np.maximum(np.square(deviations), 1e-300)
+    return Given(
+        rms=0.0,
+        hysteresis_rms=float(np.sqrt(np.mean(errors))),
+        refitted_rms=float(np.sqrt(np.mean(refitted))),
+        gain=float(weights @ gains / weights.sum()),
+        gain_deviation=float(weights.sum() ** -0.5),
+        zero_moved=None,
+        motion=0.0,
+    )
+
+
+def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:
+    """Return by which share a displacement moves more than `h` (m), and its standard deviation, from stretches."""
+    moved, missed = h - h.mean(), target - h
+    whole = float(moved @ missed / max(float(moved @ moved), 1e-300))
+    left = missed - missed.mean() - whole * moved
+    parts = [
+        float(a @ b) for a, b in zip(np.array_split(moved, STRETCHES), np.array_split(left, STRETCHES), strict=True)
+    ]
+    return whole, float(np.sqrt(np.sum(np.square(parts))) / max(float(moved @ moved), 1e-300))
+
+
+def _outcomes(model: AxisModel, now: Explanation, final: Explanation | None) -> tuple[RecordOutcome, ...]:
+    """Return what became of each record; without `final` the model stays as it is."""
+    left_out = np.sqrt(now.held_out.records).tolist() or [None]
+    outcomes = []
+    for part, rows, other in zip(now.evidence.parts, now.evidence.slices, left_out, strict=True):
+        run = _free_run(model, part)
+        after = float(np.std(final.residual[rows][part.used])) if final else run.rms
+        outcomes.append(RecordOutcome(part.source, run.offset, run.rms, after, other))
+    return tuple(outcomes)
 
 
 def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> AxisModel:
-    """Return the model with the effects found, its hysteresis fitted together with them."""
-    evidence = now.evidence
-    hysteresis, at_start = now.hysteresis()
+    """Return the model with the effects found, its hysteresis fitted together with them, as the first record starts."""
+    evidence, first = now.evidence, now.evidence.parts[0]
+    hysteresis, starts = now.hysteresis()
     y, errors = evidence.y[evidence.used], now.residual[evidence.used]
     voltage = evidence.v[evidence.used]
     extended = replace(
         model,
         kind="pi" if isinstance(evidence.basis, PlayBasis) else "slpi",
         hysteresis=hysteresis,
-        start=Start(float(evidence.v[0]), at_start, evidence.history),
+        start=Start(float(first.v[0]), starts[0], first.history),
         voltage_range=(float(voltage.min()), float(voltage.max())),
         displacement_range=(float(y.min()), float(y.max())),
-        effects=tuple(now.with_uncertainty()),
+        effects=tuple(effect for effect in now.with_uncertainty() if not isinstance(effect, EachRecord)),
         quality=replace(
             model.quality,
             rms=float(np.sqrt(np.mean(errors**2))),

@@ -1,26 +1,36 @@
 """The competition: every effect tries to explain what is left, and the best one stays, if its gain is beyond chance."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.diagnosis.explanation import Explanation
-from slpi_ros.diagnosis.gather import one_speed
-from slpi_ros.diagnosis.joint import Score
-from slpi_ros.diagnosis.parameters import free
-from slpi_ros.diagnosis.structure import BIAS, STRUCTURES
+from slpi_ros.diagnosis.effect_parameters import EachRecord, free
+from slpi_ros.diagnosis.joint_fit import Explanation, Score
+from slpi_ros.diagnosis.prepare import Evidence, drive_frequency, one_speed
 from slpi_ros.effects.base import Candidate, Effect, usual_step
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.gain_drift import GainDrift
+from slpi_ros.effects.hum import Hum
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.registry import EFFECTS
+from slpi_ros.effects.saturation import STILL, Saturation, outward_steps
+from slpi_ros.effects.sensor_periodic import SensorPeriodic
+from slpi_ros.effects.thermal_drift import ThermalDrift
 from slpi_ros.errors import ModelError
+from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.identification.progress import report_progress
 
 FloatArray = NDArray[np.float64]
 
+# What a kind of model gets wrong that the loop family gets right.
+BIAS = "loops that depend on bias"
+# What the loop family gets wrong.
+NOT_CLOSING, LEVEL = "loops that do not close", "loops that depend on level"
+# Ways (share of the voltage range) over which a material without return-point memory may forget.
+FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
 # An effect must lower the held-out error by this share of it.
 LEAST_GAIN = 0.05
 # No more effects than this: a record does not carry more.
@@ -41,6 +51,15 @@ DYNAMIC = {"delay", "lag", "rate_dependence", "creep"}
 # What shifts the displacement against the voltage.
 SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
 STEPS = 5
+# Of other records none may be off by more than so many times what it was without an effect.
+NO_WORSE = 1.05
+# A shift by less than this share of a sample is how commands are held.
+HELD = 0.6
+# Warmth takes time (s), and moves a stage by no more than this share of its motion in a second.
+DRIFT_TAKES, DRIFT_RATE = 10.0, 2e-3
+# Rounding errors (their rms) repeat with every digit, that is sqrt(12) times as far; what is left of a record is
+# rounding when it is no more than so many times that.
+ROUNDING_PERIOD, ROUNDING_LEFT = 1.3 * 12**0.5, 1.3
 # An error below this share of the displacement range is rounding: no sensor shows more.
 FINEST = 1e-6
 
@@ -60,63 +79,144 @@ class Contender:
     explanation: Explanation
 
     @property
+    def effect(self) -> Effect:
+        """The effect itself."""
+        return next(effect for effect in self.explanation.effects if effect.name == self.name)
+
+    @property
     def score(self) -> Score:
         """Held-out score with it."""
         return self.explanation.held_out
 
     @property
+    def rms(self) -> float:
+        """Held-out error (m) that it competes with."""
+        return held_out_error(self.name, self.score)
+
+    @property
     def parameters(self) -> int:
         """Number of its parameters that were fitted."""
-        return next(free(effect).size for effect in self.explanation.effects if effect.name == self.name)
+        return free(self.effect).size
+
+    def counts_beside(self, now: Explanation) -> bool:
+        """Return whether it gains enough over what has been found so far."""
+        return counts(now.held_out, self.score, own=is_own(self.name))
+
+
+def is_own(name: str) -> bool:
+    """Return whether an effect is each record's own."""
+    return bool(EFFECTS[name].removable == "record")
+
+
+def held_out_error(name: str, score: Score) -> float:
+    """Return the held-out error (m) that counts for an effect: on other records, if it is not each record's own."""
+    return score.rms if is_own(name) else score.rms_of_records
 
 
 def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[Contender]:
-    """Return the effects, of those with the given names, that explain something of what is left; the best one first."""
+    """Return the effects, of those with the given names, that explain something of what is left; the best one first.
+
+    Effects that every record shares come before those that are each record's own, where both count.
+    """
     taken = {effect.name for effect in now.effects}
     screened = {name: best for name in names if name not in taken and (best := _screened(name, now))}
     error = now.held_out.rms
-    most = max((error - rms for rms, _ in screened.values()), default=0.0)
+    most = max((error - score.rms for score, _ in screened.values()), default=0.0)
     least = max(WORTH_TRYING * most, LEAST_SCREENED * error)
     found = [
         Contender(name, now.adding(effect).refined(STEPS))
-        for name, (rms, effect) in screened.items()
-        if error - rms > least
+        for name, (score, effect) in screened.items()
+        if error - score.rms > least
     ]
-    return sorted((one for one in found if not _within_a_sample(one)), key=lambda contender: contender.score.rms)
+    sound = [one for one in found if plausible(one.effect, one.explanation)]
+    several = len(now.evidence.parts) > 1
+
+    def rank(one: Contender) -> tuple[bool, float]:
+        return several and (is_own(one.name) or not one.counts_beside(now)), one.score.rms
+
+    return sorted(sound, key=rank)
 
 
-def _within_a_sample(contender: Contender) -> bool:
-    """Return whether a shift beside another effect of the same kind is shorter than a sample.
+def plausible(effect: Effect, now: Explanation) -> bool:
+    """Return whether an effect is what its name says, and not something else in its shape."""
+    if isinstance(effect, EachRecord):
+        return all(plausible(part, now) for part in effect.parts)
+    evidence, motion = now.evidence, float(np.ptp(now.y[now.used]))
+    match effect:
+        case Delay() | Lag():
+            # How a command is held between samples does as much as a shift by less than that.
+            shift = effect.seconds if isinstance(effect, Delay) else effect.time_constant
+            others = {other.name for other in now.effects} & SHIFTING - {effect.name}
+            return not others or abs(shift) > HELD * usual_step(evidence.t)
+        case ThermalDrift():
+            pairs = zip(np.diff(effect.values).tolist(), np.diff(effect.times).tolist(), strict=True)
+            return effect.times[-1] >= DRIFT_TAKES and all(abs(dy) <= DRIFT_RATE * motion * dt for dy, dt in pairs)
+        case GainDrift():
+            return effect.times[-1] >= DRIFT_TAKES
+        case Saturation():
+            return _stands_still(effect, now)
+        case Hum():
+            return not _is_harmonic(effect.frequency, evidence)
+        case SensorPeriodic():
+            return bool(effect.period > ROUNDING_PERIOD * evidence.rounding)
+    return True
 
-    How a command is held between samples does as much.
-    """
-    effects = {effect.name: effect for effect in contender.explanation.effects}
-    shift = effects[contender.name]
-    if not isinstance(shift, Delay | Lag) or not effects.keys() & SHIFTING - {contender.name}:
-        return False
-    seconds = shift.seconds if isinstance(shift, Delay) else shift.time_constant
-    return abs(seconds) < usual_step(contender.explanation.t)
+
+def _stands_still(effect: Saturation, now: Explanation) -> bool:
+    """Return whether the stage stands still beyond the limits, where the voltage goes on."""
+    middle, dv, dy = outward_steps(now.evidence.v, now.y, now.used)
+    inside = (middle > effect.lower) & (middle < effect.upper)
+    usual = float(dv[inside] @ dy[inside] / max(float(dv[inside] @ dv[inside]), 1e-300))
+    for beyond in (middle >= effect.upper, middle <= effect.lower):
+        if beyond.any() and float(dv[beyond] @ dy[beyond]) > STILL * usual * float(dv[beyond] @ dv[beyond]):
+            return False
+    return True
 
 
-def _screened(name: str, now: Explanation) -> tuple[float, Effect] | None:
-    """Return the linear form of an effect that does best, and the held-out error (m) with it.
+def _is_harmonic(frequency: float, evidence: Evidence) -> bool:
+    """Return whether a frequency (Hz) is a multiple of the only one that drives a record, as far as that can tell."""
+    for k, part in enumerate(evidence.parts):
+        drive = drive_frequency(evidence.of_record(k))
+        if drive and abs(frequency / drive - round(frequency / drive)) * drive < 2.0 / float(part.t[-1]):
+            return True
+    return False
+
+
+def _screened(name: str, now: Explanation) -> tuple[Score, Effect] | None:
+    """Return the linear form of an effect that does best, and its score.
 
     A simpler form that does as well, as far as the record can tell, stands for it: what is more than that goes astray
     where the record ends.
     """
-    tried = [scored for form in EFFECTS[name].fit(now) if (scored := _scored(form, now))]
+    tried = [scored for form in _forms(name, now) if (scored := _scored(form, now))]
     if not tried:
         return None
-    best = min(tried, key=lambda one: one[0].rms)
+    best = min(tried, key=lambda one: held_out_error(name, one[0]))
     equal = [one for one in tried if one is best or chance_of_gain(one[0], best[0]) > ALIKE]
-    score, effect = min(equal, key=lambda one: (free(one[1]).size, one[0].rms))
-    return score.rms, effect
+    return min(equal, key=lambda one: (free(one[1]).size, held_out_error(name, one[0])))
+
+
+def _forms(name: str, now: Explanation) -> Iterator[Candidate | Effect]:
+    """Yield what an effect may be; one of every record where it is each record's own."""
+    records = len(now.evidence.parts)
+    if not is_own(name) or records == 1:
+        yield from EFFECTS[name].fit(now)
+        return
+    for forms in zip(*(EFFECTS[name].fit(now.of_record(k)) for k in range(records)), strict=False):
+        yield Candidate(now.evidence.each([form.columns for form in forms]), partial(_each, forms))  # type: ignore[arg-type]
+
+
+def _each(forms: Sequence[Candidate], gains: FloatArray) -> EachRecord | None:
+    own = np.split(gains, np.cumsum([form.columns.shape[1] for form in forms[:-1]]))
+    parts = [form.effect(part) for form, part in zip(forms, own, strict=True)]
+    found = tuple(part for part in parts if part is not None)
+    return EachRecord(found) if len(found) == len(parts) else None
 
 
 def _scored(form: Candidate | Effect, now: Explanation) -> tuple[Score, Effect] | None:
     if not isinstance(form, Candidate):
         return now.adding(form).held_out, form
-    score = now.score(form.columns, positive=form.positive)
+    score = now.score(form)
     try:
         effect = form.effect(score.gains[-(form.positive or form.columns.shape[1]) :])
     except ModelError:
@@ -143,26 +243,42 @@ def _signs(blocks: int) -> FloatArray:
 
 
 def gain(before: Score, after: Score) -> float:
-    """Return the share of the held-out error that is gone."""
+    """Return the share of the held-out error on blocks that is gone."""
     return 1.0 - after.rms / before.rms
 
 
-def counts(before: Score, after: Score) -> bool:
-    """Return whether a gain is large enough, and beyond chance."""
-    return gain(before, after) >= LEAST_GAIN and chance_of_gain(before, after) <= CHANCE
+def carries_over(before: Score, after: Score) -> bool:
+    """Return whether what was found on some records lowers the error on the others; True for one record."""
+    if not before.records.size:
+        return True
+    ratio = np.sqrt(after.records / np.maximum(before.records, TINY))
+    return bool(ratio.max() <= NO_WORSE and after.rms_of_records <= (1.0 - LEAST_GAIN) * before.rms_of_records)
+
+
+def counts(before: Score, after: Score, *, own: bool = True) -> bool:
+    """Return whether a gain is large enough, beyond chance, and, but for what is each record's own, carries over."""
+    if not (gain(before, after) >= LEAST_GAIN and chance_of_gain(before, after) <= CHANCE):
+        return False
+    return own or carries_over(before, after)
 
 
 def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) -> bool:
     """Return whether another effect explains as much as the best one, as far as the record can tell.
 
     At one drive frequency what depends on time and what depends on rate cannot be told apart: a better fit says only
-    which of them bends the loops in a more suitable way.
+    which of them bends the loops in a more suitable way. Shifts by less than a sample look the same.
     """
     explained, by_other = before.rms**2 - best.score.rms**2, before.rms**2 - other.score.rms**2
-    inseparable = one_speed and {best.name, other.name} <= DYNAMIC
-    if inseparable:
+    if one_speed and {best.name, other.name} <= DYNAMIC:
         return by_other >= ALTERNATIVE_AT_ONE_SPEED * explained
+    if {best.name, other.name} == {"delay", "lag"} and _shift(best.effect) < usual_step(best.explanation.t):
+        return by_other >= ALTERNATIVE * explained
     return by_other >= ALTERNATIVE * explained and chance_of_gain(other.score, best.score) > ALIKE
+
+
+def _shift(effect: Effect) -> float:
+    """Return by how much (s) a delay or lag shifts the displacement."""
+    return abs(effect.seconds) if isinstance(effect, Delay) else getattr(effect, "time_constant", np.inf)
 
 
 @dataclass(frozen=True)
@@ -199,12 +315,15 @@ class Selection:
         Effects in the order of their gain, each added to those before it.
     structures : tuple of str
         What is wrong with the hysteresis itself, of `STRUCTURES`.
+    dropped : tuple of str
+        Effects that explain the records they were found on and make others worse.
     """
 
     base: Explanation
     now: Explanation
     named: tuple[Named, ...]
     structures: tuple[str, ...]
+    dropped: tuple[str, ...]
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
@@ -221,7 +340,8 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
     rivals: dict[str, list[Contender]] = {}
-    finest = FINEST * float(np.ptp(now.evidence.y[now.evidence.used]))
+    dropped: set[str] = set()
+    finest = max(FINEST * float(np.ptp(now.y[now.used])), ROUNDING_LEFT * now.evidence.rounding)
     while len(rivals) < MOST_EFFECTS and now.held_out.rms > finest:
         report_progress(f"{len(now.effects)} effects found, {now.held_out.rms * 1e9:.3g} nm left, trying others")
         found = contenders(now)
@@ -229,19 +349,25 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
         if structure and (not found or _beats(with_structure.held_out, found[0].score)):
             now, structures = with_structure, (*structures, structure)
             continue
-        if not found or not counts(now.held_out, found[0].score):
+        dropped |= {one.name for one in found if counts(now.held_out, one.score) and not one.counts_beside(now)}
+        if not found or not found[0].counts_beside(now):
             break
         best = _simplest(found, now)
         rivals[best.name] = [other for other in found if other is not best]
         now = _without_needless(best.explanation.smoothed(), set(rivals) - {best.name})
     now = _without_needless(now.bare(), set(rivals))
-    return Selection(base, now, _named(start, now, rivals), structures)
+    named = _named(start, now, rivals)
+    return Selection(base, now, named, structures, tuple(sorted(dropped - {one.name for one in named})))
 
 
 def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
     """Return the effect with the fewest parameters of those that explain as much as the best one."""
     alone = one_speed(now.evidence)
-    equal = [other for other in found if other is found[0] or alike(found[0], other, now.held_out, one_speed=alone)]
+    equal = [
+        other
+        for other in found
+        if other is found[0] or (other.counts_beside(now) and alike(found[0], other, now.held_out, one_speed=alone))
+    ]
     return min(equal, key=lambda contender: (contender.parameters, contender.score.rms))
 
 
@@ -249,7 +375,7 @@ def _without_needless(now: Explanation, names: Collection[str]) -> Explanation:
     """Return it without those of the named effects that the others make needless."""
     for name in [effect.name for effect in now.effects if effect.name in names]:
         without = now.without(name)
-        if not counts(without.held_out, now.held_out):
+        if not counts(without.held_out, now.held_out, own=is_own(name)):
             now = without
     return now
 
@@ -294,8 +420,47 @@ def _in_its_place(
         if rival.name not in present:
             effect = next(effect for effect in rival.explanation.effects if effect.name == rival.name)
             tried.append(Contender(rival.name, rest.adding(effect).refined(STEPS)))
-    tried.sort(key=lambda contender: contender.score.rms)
+    tried.sort(key=lambda contender: contender.rms)
     alone = one_speed(now.evidence)
     best = Contender(name, now)
-    alternatives = tuple(other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone))
-    return alternatives, (tried[0].name, tried[0].score.rms) if tried else None
+    alternatives = [other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone)]
+    inseparable = [other.name for other in tried if {name, other.name} <= DYNAMIC]
+    if alone and name in DYNAMIC and not alternatives:
+        # A better fit at one frequency says only which of them bends the loops in a more suitable way.
+        alternatives = inseparable[:1] or [one for one in ("rate_dependence", "creep") if one != name][:1]
+    return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None
+
+
+def _do_not_close(now: Explanation) -> FloatArray:
+    """Return what forgets with the way, not at turning points: Duhem operators, such as Bouc and Wen's.
+
+    Each follows ``dz = dv - z |dv| / w`` for a way ``w``; at whatever speed.
+    """
+    span = float(np.ptp(now.evidence.v))
+    columns = [
+        np.concatenate([_duhem(part.v, share * span) for part in now.evidence.parts]) for share in FORGETS_WITHIN
+    ]
+    return np.column_stack(columns) / span * float(np.ptp(now.h))
+
+
+def _duhem(v: FloatArray, way: float) -> FloatArray:
+    z, state = np.empty_like(v), 0.0
+    for start, stop in monotone_runs(v):
+        gone = np.abs(v[start:stop] - v[max(start - 1, 0)])
+        limit = way * np.sign(v[stop - 1] - v[max(start - 1, 0)])
+        z[start:stop] = limit + (state - limit) * np.exp(-gone / way)
+        state = float(z[stop - 1])
+    return z
+
+
+def _bent(now: Explanation) -> FloatArray:
+    """Return what bends the displacement: then loops between the same turns differ with the level they hang on."""
+    x = now.h - now.h.mean()
+    x = x / np.abs(x).max()
+    return np.column_stack([x**2, x**3]) * float(np.ptp(now.h))
+
+
+STRUCTURES: Mapping[str, Callable[[Explanation], FloatArray]] = {
+    NOT_CLOSING: _do_not_close,
+    LEVEL: _bent,
+}

@@ -1,9 +1,10 @@
-"""How an effect looks for itself in what a model leaves: forms of it, linear in a few gains, for a fit to judge."""
+"""What every effect is: its verbs, what it may look at, its candidates for a fit, and checks of its parameters."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from functools import wraps
 from math import isfinite
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
 import scipy.fft
@@ -16,6 +17,8 @@ FloatArray = NDArray[np.float64]
 Side = Literal["voltage", "displacement"]
 # When an effect can be undone: sample by sample; where the whole path is known; on the record's clock only; never.
 Removable = Literal["always", "path", "record", "never"]
+# Neighbours of a spectrum's peak that belong to it, on either side.
+LINE_WIDTH = 12
 
 
 @dataclass(frozen=True)
@@ -32,12 +35,39 @@ class EffectContext:
         Displacement (m) half-way between the two branches of the largest loop, at voltages (V).
     others : mapping of axis name to ndarray, shape (N,), metres
         Motion of the other axes from their start, before coupling.
+    records : tuple of EffectContext
+        Of each record, where signals hold several records, one behind the other; empty for one.
     """
 
     t: FloatArray
     u: FloatArray | None = None
     middle: Callable[[FloatArray], FloatArray] | None = None
     others: Mapping[str, FloatArray] = field(default_factory=dict)
+    records: "tuple[EffectContext, ...]" = ()
+
+    def split(self, signal: NDArray[Any]) -> list[NDArray[Any]]:
+        """Return the parts of a signal, shape (N, ..), that belong to each record."""
+        return (
+            np.split(signal, np.cumsum([record.t.size for record in self.records[:-1]])) if self.records else [signal]
+        )
+
+
+Effected = TypeVar("Effected")
+
+
+def by_record(
+    apply: Callable[[Effected, FloatArray, EffectContext], FloatArray],
+) -> Callable[[Effected, FloatArray, EffectContext], FloatArray]:
+    """Let an effect that remembers begin anew with every record."""
+
+    @wraps(apply)
+    def applied(effect: Effected, signal: FloatArray, around: EffectContext) -> FloatArray:
+        if not around.records:
+            return apply(effect, signal, around)
+        parts = zip(around.split(signal), around.records, strict=True)
+        return np.concatenate([apply(effect, part, record) for part, record in parts])
+
+    return applied
 
 
 class Follower(Protocol):
@@ -100,10 +130,6 @@ class Effect(Protocol):
         """Return what follows it sample by sample; None: nothing can be done so."""
 
 
-# Neighbours of a spectrum's peak that belong to it, on either side.
-LINE_WIDTH = 12
-
-
 @dataclass(frozen=True)
 class Candidate:
     """One form of an effect.
@@ -116,11 +142,14 @@ class Candidate:
         Returns the effect for gains of shape (k,), or None where they make none.
     positive : int
         Number of the last columns whose gains may not be negative; `effect` is given those alone, if there are any.
+    starting : int
+        Number of the first columns that tell how a record began; their gains are each record's own.
     """
 
     columns: FloatArray
     effect: Callable[[FloatArray], Effect | None]
     positive: int = 0
+    starting: int = 0
 
 
 class ResidualView(Protocol):
@@ -167,6 +196,11 @@ def usual_step(t: FloatArray) -> float:
     return float(np.median(np.diff(t)))
 
 
+def longest(around: EffectContext) -> float:
+    """Return the duration (s) of the longest record."""
+    return max(float(t[-1] - t[0]) for t in around.split(around.t))
+
+
 def wave(phase: FloatArray) -> FloatArray:
     """Return the two columns, shape (N, 2), whose sum is any sine of that phase (rad); see `amplitude_and_phase`."""
     return np.column_stack([np.sin(phase), np.cos(phase)])
@@ -193,12 +227,15 @@ def strongest_lines(
 
 def rhythms(left: ResidualView, count: int, lowest: float) -> list[float]:
     """Return the frequencies (Hz), from `lowest` on, that are strongest in what is left."""
-    dt = usual_step(left.t)
-    grid = np.arange(left.t[0], left.t[-1], dt)
-    even = np.interp(grid, left.t, np.where(left.used, left.residual, 0.0)) * np.hanning(grid.size)
-    size = 4 * scipy.fft.next_fast_len(grid.size)
+    dt, around = usual_step(left.t), left.around
+    size = 4 * scipy.fft.next_fast_len(round(longest(around) / dt) + 1)
     frequency = np.fft.rfftfreq(size, dt)
-    power = np.where(frequency >= lowest, np.abs(np.fft.rfft(even, size)) ** 2, 0.0)
+    power = np.zeros(frequency.size)
+    residual = np.where(left.used, left.residual, 0.0)
+    for t, own in zip(around.split(left.t), around.split(residual), strict=True):
+        grid = np.arange(t[0], t[-1], dt)
+        power += np.abs(np.fft.rfft(np.interp(grid, t, own) * np.hanning(grid.size), size)) ** 2
+    power[frequency < lowest] = 0.0
     return strongest_lines(power, frequency, count)
 
 

@@ -16,6 +16,8 @@ from slpi_ros.effects.base import (
     Removable,
     ResidualView,
     Side,
+    by_record,
+    longest,
     require,
     usual_step,
 )
@@ -28,6 +30,9 @@ LARGEST, SOON, LARGEST_SOON = 0.15, 1.0, 0.12
 # Relaxations that are looked for: so many single ones; several at once, up to a share of the record. With less than a
 # share of the largest one they are left out.
 SINGLE, SEVERAL, LEAST_SHARE = 7, ((2, 0.1), (2, 0.5), (3, 0.3), (4, 0.7)), 0.02
+# The logarithmic law, every decade alike: relaxations of equal gain, so many in each decade, from the longer of these
+# times (s) and so many samples, to these shares of the longest record; so few relaxations are no law.
+LAW_PER_DECADE, LAW_FROM, LAW_SAMPLES, LAW_TO, LAW_FEWEST = 2, (0.0, FASTEST), 3.0, (0.3, 3.0), 4
 # What settles within this share of the record may have begun before it; of what is slower nobody knows.
 SOON_SETTLED = 0.025
 
@@ -66,6 +71,7 @@ class Creep:
             ("gains", sum(self.gains) <= 10, "at most 10 in sum"),
         )
 
+    @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with creep, shape (N,), metres."""
         grid = Uniform.over(around.t)
@@ -94,19 +100,34 @@ class Creep:
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield single relaxations from quick to slow, and several at once."""
-        longest = float(left.t[-1] - left.t[0])
-        shortest = max(10 * usual_step(left.t), FASTEST)
-        if not shortest < 0.5 * longest:
-            return
-        single = [np.array([tau]) for tau in np.geomspace(shortest, 0.5 * longest, SINGLE)]
-        several = [np.geomspace(shortest, share * longest, count) for count, share in SEVERAL]
-        for taus in (*single, *several):
-            creeping = [cls((tau,), (1.0,)).apply(left.h, left.around) - left.h for tau in taus.tolist()]
-            columns = np.column_stack([settling(taus.tolist(), left.t, left.used), *creeping])
-            yield Candidate(columns, partial(cls._times, taus), positive=taus.size)
+        step, most = usual_step(left.t), longest(left.around)
+        shortest = max(10 * step, FASTEST)
+        if shortest < 0.5 * most:
+            single = [np.array([tau]) for tau in np.geomspace(shortest, 0.5 * most, SINGLE)]
+            several = [np.geomspace(shortest, share * most, count) for count, share in SEVERAL]
+            for taus in (*single, *several):
+                starting = settling(taus.tolist(), left.around, left.used)
+                columns = np.column_stack([starting, *cls._creeping(taus, left)])
+                yield Candidate(columns, partial(cls._each, taus), taus.size, starting.shape[1])
+        for fast, slow in ((fast, slow) for fast in LAW_FROM for slow in LAW_TO):
+            first, last = max(fast, LAW_SAMPLES * step), slow * most
+            if last > 10 * first:
+                taus = np.geomspace(first, last, max(LAW_FEWEST, 1 + round(LAW_PER_DECADE * np.log10(last / first))))
+                starting = settling(taus.tolist(), left.around, left.used)
+                columns = np.column_stack([starting, np.sum(cls._creeping(taus, left), axis=0)])
+                yield Candidate(columns, partial(cls._law, taus), 1, starting.shape[1])
 
     @classmethod
-    def _times(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":
+    def _creeping(cls, taus: FloatArray, left: ResidualView) -> list[FloatArray]:
+        return [cls((tau,), (1.0,)).apply(left.h, left.around) - left.h for tau in taus.tolist()]
+
+    @classmethod
+    def _law(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":
+        each = (float(gains[0]),) * taus.size
+        return cls(tuple(taus.tolist()), each) if gains[0] > 0.0 and plausible(taus.tolist(), each) == each else None
+
+    @classmethod
+    def _each(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":
         seen = gains > LEAST_SHARE * gains.max()
         if not gains.max() > 0.0:
             return None
@@ -194,9 +215,23 @@ def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[
     return tuple(gain * share if tau < SOON else gain for tau, gain in zip(time_constants, gains, strict=True))
 
 
-def settling(time_constants: Sequence[float], t: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-    """Return how creep from before a record may settle in it, shape (N, k): a column for each that soon ends."""
+def settling(time_constants: Sequence[float], around: EffectContext, used: NDArray[np.bool_]) -> FloatArray:
+    """Return how creep from before each record may settle in it, shape (N, k): a column for each that soon ends.
+
+    Where it follows the logarithmic law there is one column, as after one move before the record.
+    """
+    whole = []
+    for own in range(max(len(around.records), 1)):
+        for column in _settling_of(time_constants, around.split(around.t)[own], around.split(used)[own]):
+            parts = [np.zeros_like(t) for t in around.split(around.t)]
+            parts[own] = column
+            whole.append(np.concatenate(parts))
+    return np.column_stack([np.empty((around.t.size, 0)), *whole])
+
+
+def _settling_of(time_constants: Sequence[float], t: FloatArray, used: NDArray[np.bool_]) -> list[FloatArray]:
     times = t[used]
     since = np.maximum(t - times[0], 0.0)
-    soon = [np.exp(-since / tau) for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]
-    return np.column_stack([np.empty((t.size, 0)), *soon])
+    if len(time_constants) >= LAW_FEWEST:
+        return [np.sum([np.exp(-since / tau) for tau in time_constants], axis=0)]
+    return [np.exp(-since / tau) for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]

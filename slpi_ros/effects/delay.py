@@ -14,6 +14,7 @@ from slpi_ros.effects.base import (
     Removable,
     ResidualView,
     Side,
+    by_record,
     require,
     usual_step,
 )
@@ -41,6 +42,7 @@ class Delay:
         """Refuse what is no delay."""
         require(self, ("seconds", abs(self.seconds) <= 100, "from -100 to 100 s"))
 
+    @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Shift the signal, shape (N,), to later; the first value is held before."""
         return np.interp(around.t - self.seconds, around.t, signal) if signal.size else signal.copy()

@@ -15,6 +15,7 @@ from slpi_ros.effects.base import (
     Removable,
     ResidualView,
     Side,
+    by_record,
     require,
     usual_step,
 )
@@ -46,6 +47,7 @@ class Lag:
         """Refuse what is no lag."""
         require(self, ("time_constant", 0 < self.time_constant <= 1e4, "more than 0 s, at most 10000 s"))
 
+    @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the lagged voltage, shape (N,), volts; exact where the command is linear between samples."""
         grid = Uniform.over(around.t)

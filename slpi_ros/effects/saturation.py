@@ -6,6 +6,7 @@ from math import inf, isinf, isnan
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slpi_ros.effects.base import EffectContext, FloatArray, Removable, ResidualView, Side, require_rules
 
@@ -51,12 +52,8 @@ class Saturation:
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator["Saturation"]:
         """Yield limits where the displacement stands still although the voltage goes on."""
-        v, low, width = left.u, float(left.u.min()), float(np.ptp(left.u)) / BINS
-        # Increments over a few samples stand out of the noise.
-        every = max(1, round(width / 4 / max(float(np.mean(np.abs(np.diff(v)))), 1e-12)))
-        both = left.used[every:] & left.used[:-every]
-        dv, dy = (v[every:] - v[:-every])[both], (left.y[every:] - left.y[:-every])[both]
-        middle = 0.5 * (v[every:] + v[:-every])[both]
+        low, width = float(left.u.min()), float(np.ptp(left.u)) / BINS
+        middle, dv, dy = outward_steps(left.u, left.y, left.used)
         place = np.clip(((middle - low) / width).astype(np.int64), 0, BINS - 1)
         moved = np.bincount(place, dv**2, BINS)
         gain = np.bincount(place, dv * dy, BINS) / np.maximum(moved, 1e-300)
@@ -77,6 +74,25 @@ class Saturation:
     def follower(self) -> "SaturationFollower":
         """Return the limits sample by sample."""
         return SaturationFollower(self.lower, self.upper)
+
+
+def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return steps away from the middle of the voltage's range: a stage that is clipped stands still there.
+
+    Returns
+    -------
+    middle, dv : ndarray, shape (M,), volts
+        Where each step is, and how far it goes.
+    dy : ndarray, shape (M,), metres
+        How far the stage goes.
+    """
+    low, high = float(v.min()), float(v.max())
+    # Steps over a few samples stand out of the noise.
+    every = max(1, round((high - low) / BINS / 4 / max(float(np.mean(np.abs(np.diff(v)))), 1e-12)))
+    middle, dv, dy = 0.5 * (v[every:] + v[:-every]), v[every:] - v[:-every], y[every:] - y[:-every]
+    outward = (dv > 0) == (middle > 0.5 * (low + high))
+    chosen = used[every:] & used[:-every] & outward & (dv != 0.0)
+    return middle[chosen], dv[chosen], dy[chosen]
 
 
 class SaturationFollower:

@@ -16,7 +16,7 @@ from slpi_ros.effects.base import Effect
 from slpi_ros.effects.chain import loop_middle
 from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.identification.samples import FEWEST, Samples
-from slpi_ros.model.stage_model import AxisModel, Start
+from slpi_ros.model.axis_model import AxisModel, Start
 
 FloatArray = NDArray[np.float64]
 

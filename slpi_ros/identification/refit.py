@@ -25,7 +25,8 @@ from slpi_ros.identification.initial_history import Match, lasting_effects, matc
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, StageModel, Start
+from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
@@ -240,7 +241,7 @@ def basis_of(axis: AxisModel) -> tuple[Basis, FloatArray]:
         if not np.allclose(np.diff(shape.grid), np.diff(shape.grid).mean(), rtol=1e-6):
             raise UsageError("the model's vertices are not evenly spaced; identify the stage anew")
         return SurfaceBasis(shape.grid), np.concatenate(
-            [shape.surface[np.tril_indices(shape.grid.size, -1)], shape.rise]
+            [shape.everett[np.tril_indices(shape.grid.size, -1)], shape.rise]
         )
     raise UsageError(f"kind '{axis.kind}' cannot be updated; identify the stage anew")
 

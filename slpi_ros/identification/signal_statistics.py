@@ -15,8 +15,8 @@ from scipy.signal import savgol_filter
 from scipy.special import ndtri
 
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.hysteresis.reversals import without_small_reversals
-from slpi_ros.identification.drive import hold_band, resting, smallest_turn, turning_points
+from slpi_ros.hysteresis.reversals import reversals, without_small_reversals
+from slpi_ros.identification.drive import hold_band, resting, smallest_turn
 
 
 @dataclass(frozen=True)
@@ -497,7 +497,7 @@ def _repeats(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[Float
     what it has done before the turn before does not matter.
     """
     span = float(np.ptp(v))
-    ends = turning_points(v, smallest_turn(v, noise(v, t)))
+    ends = reversals(v, smallest_turn(v, noise(v, t)))
     # Each move: the turn before it, its own, and where it goes.
     turns = np.column_stack([v[ends[:-2]], v[ends[1:-1]], v[ends[2:]]])
     for move in range(1, len(turns), max(1, len(turns) // _ENOUGH_PIECES)):

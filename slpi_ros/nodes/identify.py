@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.fit import KINDS
-from slpi_ros.io.bag_watch import PATIENCE, BagWatch
+from slpi_ros.io.bag_files import PATIENCE, BagWatch
 from slpi_ros.model.document import parse_model, save_model
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, run

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.diagnosis.verdict import AMBIGUOUS, NAMED, NOTHING_FOUND, AxisDiagnosis, Diagnosis, NamedEffect, Traces
+from slpi_ros.diagnosis.result import AMBIGUOUS, NAMED, NOTHING_FOUND, AxisDiagnosis, Diagnosis, NamedEffect, Traces
 from slpi_ros.effects.registry import to_document
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
@@ -46,9 +46,10 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
     page.contents(tuple(diagnosis.axes))
     for name, found in diagnosis.axes.items():
         page.heading(f"Axis {name}", name)
-        page.verdict(name, f"Axis {name}: {found.summary}", _mood(found), found.verdict)
+        page.verdict(name, f"Axis {name}: {found.summary}", _severity(found), found.verdict)
         page.tiles(_figures(found))
         _show_causes(page, found)
+        _show_records(page, found)
         if found.next_experiment:
             page.section("Next step")
             page.text(found.next_experiment)
@@ -58,7 +59,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
     return path
 
 
-def _mood(found: AxisDiagnosis) -> Severity:
+def _severity(found: AxisDiagnosis) -> Severity:
     if found.verdict == NOTHING_FOUND:
         return "good"
     if found.verdict == NAMED:
@@ -86,6 +87,18 @@ def _show_causes(page: Page, found: AxisDiagnosis) -> None:
         page.subsection(named.name)
         page.definitions(_cause(named))
     page.table(("Model", "error, rms (nm)", "times the floor", "gain"), *_steps(found))
+
+
+def _show_records(page: Page, found: AxisDiagnosis) -> None:
+    """Add the table of records, where there are several."""
+    if len(found.records) > 1:
+        page.section("Record by record")
+        rows = [
+            [each.source, *(_nm(rms) for rms in (each.before_rms, each.after_rms)), _nm(each.left_out_rms or 0.0)]
+            for each in found.records
+        ]
+        caption = "Errors, rms, without the constant of each record; left out: by a fit to the other records."
+        page.table(("Record", "given model", "extended model", "left out"), rows, None, caption)
 
 
 def _shares(found: AxisDiagnosis) -> list[Share]:

@@ -5,7 +5,7 @@ import pytest
 from effects.cases import EVERY, coercivities
 from hypothesis import given
 
-from slpi_ros.diagnosis.parameters import FREE, bounded, free, moved, names, steps
+from slpi_ros.diagnosis.effect_parameters import FREE, bounded, free, moved, names, steps
 from slpi_ros.effects.registry import EFFECTS
 
 T, V = np.linspace(0, 10, 1001), np.linspace(0, 100, 1001)

@@ -1,15 +1,15 @@
 """The parameters of an effect that a fit may change, as one vector."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import isfinite
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import Effect, usual_step
-from slpi_ros.effects.creep import FASTEST, Creep, plausible
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, Removable, ResidualView, Side, usual_step
+from slpi_ros.effects.creep import FASTEST, LAW_FEWEST, Creep, plausible
 from slpi_ros.effects.rate_dependence import RateDependence
 
 FloatArray = NDArray[np.float64]
@@ -61,8 +61,65 @@ def _free_fields(effect: Effect) -> tuple[str, ...]:
     return FREE[effect.name]
 
 
+@dataclass(frozen=True)
+class EachRecord:
+    """An effect that every record has of its own, such as drift or hum.
+
+    Parameters
+    ----------
+    parts : tuple of Effect
+        One for each record.
+    """
+
+    parts: tuple[Effect, ...]
+    removable: ClassVar[Removable] = "record"
+    side: ClassVar[Side] = "displacement"
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.parts[0].name
+
+    @property
+    def uncertainty(self) -> Mapping[str, float]:
+        """That of the first record's."""
+        return self.parts[0].uncertainty
+
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return what becomes of a signal, shape (N,), metres, of all records."""
+        records = zip(self.parts, around.split(signal), around.records, strict=True)
+        return np.concatenate([part.apply(own, record) for part, own, record in records])
+
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the signal, shape (N,), metres, that becomes the given one."""
+        records = zip(self.parts, around.split(signal), around.records, strict=True)
+        return np.concatenate([part.invert(own, record) for part, own, record in records])
+
+    def describe(self) -> str:
+        """Say what it is in each record."""
+        return "; ".join(f"record {k}: {part.describe()}" for k, part in enumerate(self.parts, 1))
+
+    @classmethod
+    def fit(cls, left: ResidualView) -> Iterator[Candidate | Effect]:
+        """Yield nothing: its parts look for themselves."""
+        yield from ()
+
+    def follower(self) -> None:
+        """Return None: it belongs to the records' clocks."""
+        return
+
+
+def _is_law(effect: Effect) -> bool:
+    """Return whether it is a creep by the logarithmic law: all its relaxations have one gain."""
+    return isinstance(effect, Creep) and len(effect.gains) >= LAW_FEWEST and len(set(effect.gains)) == 1
+
+
 def _items(effect: Effect) -> list[tuple[str, float]]:
     """Return name and value of each free parameter: that of the field, with place or axis where there are several."""
+    if isinstance(effect, EachRecord):
+        return [(f"{name}", value) for part in effect.parts for name, value in _items(part)]
+    if isinstance(effect, Creep) and _is_law(effect):
+        return [("gains", effect.gains[0])]
     found: list[tuple[str, float]] = []
     for name in _free_fields(effect):
         value = getattr(effect, name)
@@ -87,7 +144,15 @@ def free(effect: Effect) -> FloatArray:
 
 def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect:
     """Return the effect with other free parameters, kept where they make sense; `longest`: of time constants, s."""
+    if isinstance(effect, EachRecord):
+        own = np.split(values, np.cumsum([free(part).size for part in effect.parts[:-1]]))
+        return EachRecord(tuple(moved(part, some, longest) for part, some in zip(effect.parts, own, strict=True)))
     left = values.tolist()
+    if isinstance(effect, Creep) and _is_law(effect):
+        gain = max(left[0], 0.0)
+        return replace(
+            effect, gains=(min(plausible(effect.time_constants, (gain,) * len(effect.gains))),) * len(effect.gains)
+        )
     changed: dict[str, Any] = {}
     for name in _free_fields(effect):
         value = getattr(effect, name)
@@ -106,6 +171,8 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
 
 def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
     """Return a small step of each free parameter, shape (k,), SI, for derivatives."""
+    if isinstance(effect, EachRecord):
+        return np.concatenate([steps(part, t, v) for part in effect.parts])
     dt = usual_step(t)
     small = {
         "seconds": 0.05 * dt,
@@ -116,7 +183,7 @@ def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
     }
     found = []
     for name, value in _items(effect):
-        scale = {"hum": 1e-3 / float(t[-1] - t[0]), "sensor_periodic": 1e-5 * abs(value)}
+        scale = {"hum": 1e-3 / float(np.ptp(t)), "sensor_periodic": 1e-5 * abs(value)}
         if name in ("frequency", "period") and effect.name in scale:
             found.append(scale[effect.name])
         elif name.partition(".")[0] in ("gains", "widening"):
@@ -137,3 +204,11 @@ def bounded(effect: Effect, change: FloatArray) -> FloatArray:
         elif name == "phase":
             limit[k] = LARGEST_STEP
     return np.clip(change, -limit, limit)
+
+
+def certain(effect: Effect, spread: Sequence[float]) -> Effect:
+    """Return the effect with the standard deviations of its free parameters, in their order."""
+    left = list(spread)
+    if isinstance(effect, EachRecord):
+        return EachRecord(tuple(certain(part, [left.pop(0) for _ in free(part)]) for part in effect.parts))
+    return replace(effect, uncertainty=dict(zip(names(effect), left, strict=True)))  # type: ignore[type-var]

@@ -1,0 +1,631 @@
+"""The hysteresis of one axis with effects around it, fitted to records together and scored on what is left out.
+
+The hysteresis is linear in its parameters ``x``, and so is an effect in its gains ``g``, or in a small change of its
+parameters: ``y = A x + J g``. With the hysteresis eliminated once for every fold (Frisch-Waugh), trying other columns
+``J`` takes a few products with sparse matrices; so hundreds of them can compete.
+
+Left out are blocks of every record, and where there are several, each record in turn: the hysteresis is fitted to the
+others, and of that one nothing is estimated but how it began and its constant.
+"""
+
+import operator
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial, reduce
+from typing import TypeVar
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, steps
+from slpi_ros.diagnosis.prepare import Evidence
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
+from slpi_ros.effects.chain import reaching
+from slpi_ros.effects.creep import Creep, settling
+from slpi_ros.effects.registry import in_order
+from slpi_ros.errors import ModelError
+from slpi_ros.hysteresis.kinds import Hysteresis
+from slpi_ros.identification.convex_fit import SMOOTHNESS
+from slpi_ros.identification.least_squares import FOLDS, Problem, blocked_folds
+from slpi_ros.identification.samples import Samples
+
+FloatArray = NDArray[np.float64]
+Factor = tuple[FloatArray, bool]
+Summed = TypeVar("Summed", FloatArray, "_Equations")
+
+# What effects add is found in turns with the hysteresis, until a turn changes it by less than this share of the error.
+MOST_TURNS, SETTLED = 15, 0.02
+# Voltages at which the middle of the largest loop is found.
+LEVELS = 60
+# Steps towards the best parameters end when they gain less than this share of the error.
+ENOUGH = 1e-3
+# Time constants are no longer than so many times the longest record.
+SLOWEST = 10.0
+# Of a step, where all of it is too much.
+SHARES = (1.0, 0.4, 0.1)
+# Keeps the gains definite where columns are alike, relative to the columns' own size.
+ALIKE = 1e-9
+# Share of the record that is its beginning.
+BEGINNING = 0.08
+# Of more samples every so manieth is fitted and judged, from all that effects and memory do to every one of them.
+MOST_ROWS = 20_000
+# Blocks of a fold are told apart when scores are compared.
+BLOCKS = 40
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well columns and hysteresis together predict what is left out of the fit.
+
+    Parameters
+    ----------
+    losses : ndarray, shape (blocks,), m^2
+        Mean square of the errors of each block.
+    gains : ndarray, shape (k,)
+        Of the columns, fitted to all blocks.
+    records : ndarray, shape (records,), m^2
+        Mean square of the errors of each record, its constant apart, by a fit to the others; empty for one record.
+    """
+
+    losses: FloatArray
+    gains: FloatArray
+    records: FloatArray
+
+    @property
+    def rms(self) -> float:
+        """Held-out error on blocks, metres."""
+        return float(np.sqrt(np.mean(self.losses)))
+
+    @property
+    def rms_of_records(self) -> float:
+        """Held-out error on records, metres; on blocks where there is one record."""
+        return float(np.sqrt(np.mean(self.records))) if self.records.size else self.rms
+
+
+class Joint:
+    """The normal equations of one axis's hysteresis, ready for columns to be put beside it.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    u : ndarray, shape (N,), volts
+        What drives the hysteresis.
+    """
+
+    def __init__(self, evidence: Evidence, u: FloatArray) -> None:
+        self.problem, self.evidence = evidence.problem(u), evidence
+        problem, smoothness, design = self.problem, evidence.smoothness, self.problem.design
+        self._groups = _groups(problem, evidence)
+        self._local = [design.local[rows] for rows in self._groups]
+        self._pick = [design.pick[rows] for rows in self._groups]
+        self._at_turns = design.at_turns
+        grams = [self._gram(local, pick) for local, pick in zip(self._local, self._pick, strict=True)]
+        counts = np.array([rows.size for rows in self._groups])
+
+        def factor(chosen: Sequence[int]) -> Factor:
+            matrix = _sum([grams[group] for group in chosen])
+            return _factor(matrix + problem.penalty(smoothness, float(counts[list(chosen)].sum())))
+
+        everything = range(len(grams))
+        self._fold_groups = [list(everything)[fold :: FOLDS + 1] for fold in range(1, FOLDS + 1)]
+        self._record_groups = [
+            list(everything)[k * (FOLDS + 1) : (k + 1) * (FOLDS + 1)] for k in range(len(evidence.parts))
+        ]
+        if len(evidence.parts) == 1:
+            self._record_groups = []
+        # What is left out, and the factor of the rest.
+        self._folds = [(left, _rest(everything, left)) for left in self._fold_groups]
+        self._records = [(left, _rest(everything, left)) for left in self._record_groups]
+        self._fold_factors = [factor(rest) for _, rest in self._folds]
+        self._record_factors = [factor(rest) for _, rest in self._records]
+        self._factor = factor(everything)
+
+    @cached_property
+    def blocks(self) -> list[NDArray[np.int64]]:
+        """Rows of the blocks that are left out, in the order of time."""
+        left_out = [self._groups[group] for left in self._fold_groups for group in left]
+        return np.array_split(np.sort(np.concatenate(left_out)), BLOCKS)
+
+    def _gram(self, local: sp.csr_array, pick: sp.csr_array) -> FloatArray:
+        at_turns = self._at_turns
+        mixed = (local.T @ pick) @ at_turns
+        gram: FloatArray = (local.T @ local).toarray() + mixed + mixed.T + at_turns.T @ ((pick.T @ pick) @ at_turns)
+        return gram
+
+    def padded(self, signals: FloatArray) -> FloatArray:
+        """Return signals, shape (N, ..), metres, on the rows of the problem, in units of its scale."""
+        whole = np.zeros((self.problem.y.size, *signals.shape[1:]))
+        whole[self.evidence.rows] = signals / self.problem.scale
+        return whole
+
+    def _grouped(self, signals: FloatArray) -> list[FloatArray]:
+        padded = self.padded(signals)
+        return [padded[rows] for rows in self._groups]
+
+    def _project(self, groups: list[FloatArray]) -> list[FloatArray]:
+        """Return ``A' J`` of each group of rows, shape (p, k)."""
+        parts = zip(groups, self._local, self._pick, strict=True)
+        return [local.T @ part + self._at_turns.T @ (pick.T @ part) for part, local, pick in parts]
+
+    def predict(self, x: FloatArray) -> FloatArray:
+        """Return what the hysteresis gives for parameters `x`, shape (N,), metres."""
+        return self.problem.design.predict(x)[self.evidence.rows] * self.problem.scale
+
+    def score(self, y: FloatArray, columns: FloatArray, *, positive: int = 0, starting: Sequence[int] = ()) -> Score:
+        """Score hysteresis and columns on what is left out.
+
+        Parameters
+        ----------
+        y : ndarray, shape (N,), metres
+            What they are to explain.
+        columns : ndarray, shape (N, k), metres
+        positive : int
+            Number of the last columns whose gains may not be negative.
+        starting : sequence of int
+            Columns that tell how a record began: with its constant they are fitted to a record that is left out.
+        """
+        sums = _Sums.of(self, y, columns)
+        errors = np.full(self.problem.y.size, np.nan)
+        for (left, rest), factor in zip(self._folds, self._fold_factors, strict=True):
+            x, gains = sums.of_groups(rest).solve(factor, positive=positive)
+            for group in left:
+                errors[self._groups[group]] = self._errors(sums, group, x, gains)
+        losses = np.array([float(np.mean(errors[rows] ** 2)) for rows in self.blocks])
+        gains = sums.of_groups(range(len(self._groups))).solve(self._factor, positive=positive)[1]
+        square = self.problem.scale**2
+        left_out = np.array([self._left_out(sums, k, gains, starting) for k in range(len(self._records))])
+        return Score(losses * square, gains, left_out * square)
+
+    def _left_out(self, sums: "_Sums", k: int, gains: FloatArray, starting: Sequence[int]) -> float:
+        """Return the mean square of the errors of a record by a hysteresis fitted to the others.
+
+        The gains of the columns are those of all records: one record at one speed does not tell them.
+        """
+        left, rest = self._records[k]
+        equations = sums.of_groups(rest)
+        vector = equations.a_y - equations.a_j @ gains
+        x = scipy.linalg.cho_solve(self._record_factors[k], vector, check_finite=False)
+        missed = np.concatenate([self._errors(sums, group, x, gains) for group in left])
+        began = np.concatenate([sums.columns[group][:, starting] for group in left])
+        own = np.column_stack([np.ones(missed.size), began[:, began.any(axis=0)]])
+        return float(np.mean((missed - own @ np.linalg.lstsq(own, missed, rcond=None)[0]) ** 2))
+
+    def _errors(self, sums: "_Sums", group: int, x: FloatArray, gains: FloatArray) -> FloatArray:
+        predicted = self._local[group] @ x + self._pick[group] @ (self._at_turns @ x)
+        errors: FloatArray = predicted + sums.columns[group] @ gains - sums.y[group]
+        return errors
+
+    def fit(self, y: FloatArray, columns: FloatArray | None = None) -> "Fit":
+        """Fit hysteresis and columns, as in `score`, to all samples."""
+        equations = _Sums.of(self, y, columns).of_groups(range(len(self._groups)))
+        x, gains = equations.solve(self._factor, positive=0)
+        return Fit(x, gains, equations.precision(self._factor) * self.problem.scale**2)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Hysteresis and columns fitted together.
+
+    Parameters
+    ----------
+    x : ndarray, shape (p,)
+        Of the hysteresis, in units of the problem's scale; branches may fall a little.
+    gains : ndarray, shape (k,)
+    precision : ndarray, shape (k, k), m^2
+        Inverse covariance of the gains for errors of 1 m, one sample independent of the other.
+    """
+
+    x: FloatArray
+    gains: FloatArray
+    precision: FloatArray
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """``A'J``, ``A'y``, ``J'J`` and ``J'y``."""
+
+    a_j: FloatArray
+    a_y: FloatArray
+    j_j: FloatArray
+    j_y: FloatArray
+
+    def __add__(self, other: "_Equations") -> "_Equations":
+        return _Equations(self.a_j + other.a_j, self.a_y + other.a_y, self.j_j + other.j_j, self.j_y + other.j_y)
+
+    def precision(self, factor: Factor) -> FloatArray:
+        """Return what is left of ``J'J`` beside the hysteresis."""
+        left: FloatArray = self.j_j - self.a_j.T @ scipy.linalg.cho_solve(factor, self.a_j, check_finite=False)
+        return left
+
+    def solve(self, factor: Factor, *, positive: int) -> tuple[FloatArray, FloatArray]:
+        """Return the parameters of the hysteresis, shape (p,), and the gains, shape (k,)."""
+        alone = scipy.linalg.cho_solve(factor, self.a_y, check_finite=False)
+        if not self.j_y.size:
+            return alone, np.empty(0)
+        beside = scipy.linalg.cho_solve(factor, self.a_j, check_finite=False)
+        matrix = self.j_j - self.a_j.T @ beside
+        size = np.sqrt(np.maximum(np.diag(self.j_j), 1e-300))
+        matrix = matrix / np.outer(size, size) + ALIKE * np.eye(size.size)
+        vector = (self.j_y - self.a_j.T @ alone) / size
+        if positive:
+            # With M = R' R the bounded minimum of g' M g / 2 - b' g is that of |R g - R^-T b|.
+            root = scipy.linalg.cholesky(matrix)
+            wanted = scipy.linalg.solve_triangular(root, vector, trans="T")
+            lower = np.repeat([-np.inf, 0.0], [size.size - positive, positive])
+            gains = lsq_linear(root, wanted, (lower, np.full(size.size, np.inf))).x / size
+        else:
+            gains = scipy.linalg.solve(matrix, vector, assume_a="pos") / size
+        return alone - beside @ gains, gains
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """The equations of every group of rows."""
+
+    columns: list[FloatArray]
+    y: list[FloatArray]
+    groups: list[_Equations]
+
+    @classmethod
+    def of(cls, joint: Joint, y: FloatArray, columns: FloatArray | None) -> "_Sums":
+        j = joint._grouped(np.empty((y.size, 0)) if columns is None else columns)
+        own_y = joint._grouped(y[:, None])
+        a_j, a_y = joint._project(j), joint._project(own_y)
+        groups = [
+            _Equations(of_j, of_y[:, 0], part.T @ part, part.T @ part_y[:, 0])
+            for of_j, of_y, part, part_y in zip(a_j, a_y, j, own_y, strict=True)
+        ]
+        return cls(j, [part[:, 0] for part in own_y], groups)
+
+    def of_groups(self, chosen: Sequence[int]) -> _Equations:
+        return _sum([self.groups[group] for group in chosen])
+
+
+def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
+    """Return of each record the rows that are always fitted, then those of each fold.
+
+    The beginning is never left out: what settles there from before the record shows nowhere else.
+    """
+    walk = problem.design.walk
+    # While it has not moved yet the memory does not matter: what shows there comes from outside.
+    judged = (problem.judged & ~walk.first_rise) | (walk.direction == 0)
+    groups = []
+    for rows in evidence.slices:
+        fitted = evidence.rows[rows][problem.weights[evidence.rows[rows]] > 0]
+        fitted = fitted[:: -(-problem.count // MOST_ROWS)]
+        settled = int(fitted[int(BEGINNING * fitted.size)]) if fitted.size else 0
+        allowed = np.zeros(problem.y.size, dtype=bool)
+        allowed[fitted] = judged[fitted]
+        folds = [fold[fold >= settled] for fold in blocked_folds(allowed)]
+        always = np.setdiff1d(fitted, np.concatenate(folds), assume_unique=True)
+        groups += [always, *folds]
+    return groups
+
+
+def _rest(everything: Sequence[int], left: Sequence[int]) -> list[int]:
+    return [group for group in everything if group not in left]
+
+
+def _factor(matrix: FloatArray) -> Factor:
+    factor: Factor = scipy.linalg.cho_factor(matrix, check_finite=False)
+    return factor
+
+
+def _sum(parts: Sequence[Summed]) -> Summed:
+    return reduce(operator.add, parts)
+
+
+class Explanation:
+    """Effects in the order of the signal chain, and the hysteresis that goes with them.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    effects : sequence of Effect
+    like : Explanation, optional
+        Of the same evidence; its equations serve again where the same voltage drives the hysteresis.
+
+    Attributes
+    ----------
+    u : ndarray, shape (N,), volts
+        What drives the hysteresis.
+    added : ndarray, shape (N,), metres
+        What the effects add behind the hysteresis, or lead round it.
+    settling : ndarray, shape (N,), metres
+        What still goes on at the start of the record from moves before it.
+    """
+
+    def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
+        self.evidence, self.effects = evidence, in_order(effects)
+        self.u, self._aside = reaching(self.effects, evidence.v, evidence.around)
+        same = (
+            like is not None
+            and like.evidence.parts is evidence.parts
+            and like.evidence.smoothness == evidence.smoothness
+        )
+        self.joint: Joint = like.joint if like and same and np.array_equal(like.u, self.u) else Joint(evidence, self.u)
+        self.added = self._aside
+        starting = settling(self._relaxations, evidence.around, evidence.used)
+        self._before = np.column_stack([starting, evidence.beside])
+        self._starting = range(starting.shape[1])
+        self._fit()
+        if any(effect.side == "displacement" for effect in self.effects):
+            for _ in range(MOST_TURNS):
+                h, before = self.joint.predict(self._x), self.added
+                self.added = self._behind(self.effects, h + self._aside, self.u) - h
+                self._fit()
+                if np.ptp(self.added - before) < SETTLED * np.std(self.target - h):
+                    break
+
+    def _fit(self) -> None:
+        fit = self.joint.fit(self.target, self._before)
+        self._x, self.settling = fit.x, self._before @ fit.gains
+        self._loops = [cache(partial(self._loop, fit.x, k)) for k in range(len(self.evidence.parts))]
+
+    @property
+    def _relaxations(self) -> list[float]:
+        return [tau for effect in self.effects if isinstance(effect, Creep) for tau in effect.time_constants]
+
+    @property
+    def t(self) -> FloatArray:
+        """Time, shape (N,), seconds."""
+        return self.evidence.t
+
+    @property
+    def y(self) -> FloatArray:
+        """Measured displacement, shape (N,), metres."""
+        return self.evidence.y
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Samples that count, shape (N,)."""
+        return self.evidence.used
+
+    @property
+    def others(self) -> Mapping[str, FloatArray]:
+        """Motion of the other axes from their start, shape (N,), metres."""
+        return self.evidence.others
+
+    @property
+    def target(self) -> FloatArray:
+        """What the hysteresis is to explain, shape (N,), metres."""
+        return self.evidence.y - self.added
+
+    @cached_property
+    def h(self) -> FloatArray:
+        """What the hysteresis gives, shape (N,), metres."""
+        return self.joint.predict(self._x)
+
+    @property
+    def predicted(self) -> FloatArray:
+        """What hysteresis and effects give, shape (N,), metres."""
+        return self.h + self.added + self.settling
+
+    @property
+    def residual(self) -> FloatArray:
+        """What they leave of the measured displacement, shape (N,), metres."""
+        return self.evidence.y - self.predicted
+
+    @property
+    def around(self) -> EffectContext:
+        """What effects may look at."""
+        return self._around(self.u)
+
+    def _around(self, u: FloatArray) -> EffectContext:
+        around = self.evidence.around
+        records = tuple(
+            replace(record, u=u[rows], middle=self._middle(k))
+            for k, (rows, record) in enumerate(zip(self.evidence.slices, around.records, strict=True))
+        )
+        return replace(around, u=u, middle=self._middle(0), records=records)
+
+    def of_record(self, k: int) -> "RecordLeft":
+        """Return what is left of one record."""
+        rows, around = self.evidence.slices[k], self.around.records[k]
+        t, u, h, y, residual = (x[rows] for x in (self.t, self.u, self.h, self.y, self.residual))
+        return RecordLeft(t, u, h, y, self.used[rows], residual, around)
+
+    def _behind(self, effects: Sequence[Effect], h: FloatArray, u: FloatArray) -> FloatArray:
+        """Return the displacement, shape (N,), metres, that effects make of what the hysteresis gives, `h`."""
+        around = self._around(u)
+        for effect in effects:
+            if effect.side == "displacement":
+                h = effect.apply(h, around)
+        return h
+
+    def _middle(self, k: int) -> Callable[[FloatArray], FloatArray]:
+        """Return what gives the displacement (m) of a record half-way between the branches of the largest loop.
+
+        It is a function of voltages (V).
+        """
+        return lambda u: np.asarray(np.interp(u, *self._loops[k]()), dtype=np.float64)
+
+    def _loop(self, x: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
+        """Return voltages (V) and the middle of the largest loop there (m), for parameters `x`."""
+        evidence, part, first = self.evidence, self.evidence.parts[k], self.evidence.slices[k].start
+        levels = np.linspace(float(self.u.min()), float(self.u.max()), LEVELS)
+        path = np.concatenate([self.u[first : first + 1], levels, levels[::-1], levels])
+        whole = Samples(path, path, np.ones(path.size, dtype=bool)).after(part.history)
+        y = evidence.response([whole], x[: evidence.basis.size + 1])[len(part.history) :] * self.joint.problem.scale
+        falling, rising = y[1 + LEVELS : 1 + 2 * LEVELS][::-1], y[1 + 2 * LEVELS :]
+        return levels, 0.5 * (falling + rising) + float(self.joint.predict(x)[first]) - y[0]
+
+    def respond(self, u: FloatArray) -> FloatArray:
+        """Return what the hysteresis gives (m) for another voltage `u`, shape (N,), volts."""
+        response = self.evidence.response(self.evidence.samples(u), self._x)[self.evidence.rows]
+        return response * self.joint.problem.scale
+
+    @cached_property
+    def tangents(self) -> FloatArray:
+        """How the prediction changes with each free parameter of the effects, shape (N, k), metres."""
+        columns = []
+        for place, effect in enumerate(self.effects):
+            values = free(effect)
+            for k, step in enumerate(steps(effect, self.evidence.t, self.evidence.v)):
+                changed = values.copy()
+                changed[k] += step
+                effects = [*self.effects[:place], moved(effect, changed), *self.effects[place + 1 :]]
+                columns.append((self._whole(effects) - self.predicted) / step)
+        return np.column_stack([np.empty((self.evidence.t.size, 0)), *columns])
+
+    def _whole(self, effects: Sequence[Effect]) -> FloatArray:
+        """Return the prediction, shape (N,), metres, of the same hysteresis with other effects."""
+        u, reversible_bypass = reaching(effects, self.evidence.v, self.evidence.around)
+        h = self.h if np.array_equal(u, self.u) else self.respond(u)
+        return self.settling + self._behind(effects, h + reversible_bypass, u)
+
+    def prediction_without(self, name: str) -> FloatArray:
+        """Return what it would give, shape (N,), metres, if one of its effects were not there and all else as it is."""
+        return self._whole([effect for effect in self.effects if effect.name != name])
+
+    def score(self, candidate: Candidate) -> Score:
+        """Score it with a candidate beside it, all effects refitted."""
+        first = self._before.shape[1] + self.tangents.shape[1]
+        starting = [*self._starting, *range(first, first + candidate.starting)]
+        beside = np.column_stack([self._before, self.tangents, candidate.columns])
+        return self.joint.score(self.target, beside, positive=candidate.positive, starting=starting)
+
+    @cached_property
+    def held_out(self) -> Score:
+        """Its own score."""
+        beside = np.column_stack([self._before, self.tangents])
+        return self.joint.score(self.target, beside, starting=self._starting)
+
+    @property
+    def objective(self) -> float:
+        """Mean square (m^2) of what is left, and what its roughness costs the hysteresis."""
+        used, problem = self.used, self.joint.problem
+        rough = float(self._x @ problem.penalty(self.evidence.smoothness, problem.count) @ self._x) / problem.count
+        return float(np.mean(self.residual[used] ** 2)) + rough * problem.scale**2
+
+    def refined(self, times: int) -> "Explanation":
+        """Return it with the parameters of all effects fitted together with the hysteresis (Gauss-Newton)."""
+        best = self
+        for _ in range(times if self.effects else 0):
+            better = best._step()
+            gain = 1.0 - better.objective / best.objective
+            best = better
+            if gain < ENOUGH:
+                break
+        return best
+
+    def _step(self) -> "Explanation":
+        """Return it after one step, shortened until it gains; itself where none does."""
+        columns = np.column_stack([self._before, self.tangents])
+        change = self.joint.fit(self.target, columns).gains[self._before.shape[1] :]
+        for share in SHARES:
+            try:
+                effects = self._stepped(share * change)
+            except ModelError:
+                # Too far: no effect has such parameters.
+                continue
+            stepped = Explanation(self.evidence, effects, self)
+            if stepped.objective < self.objective:
+                return stepped
+        return self
+
+    def _stepped(self, change: FloatArray) -> list[Effect]:
+        effects, first = [], 0
+        limit = SLOWEST * longest(self.evidence.around)
+        for effect in self.effects:
+            values = free(effect)
+            step = change[first : first + values.size]
+            first += values.size
+            effects.append(moved(effect, values + bounded(effect, step), limit))
+        return effects
+
+    def hysteresis(self) -> tuple[Hysteresis, tuple[float, ...]]:
+        """Return the model with every branch rising, and the displacement at the start of each record, metres."""
+        problem = replace(self.joint.problem, y=self.joint.padded(self.target - self.settling))
+        x = problem.solve(self.evidence.smoothness)
+        h = problem.design.predict(x)[self.evidence.rows] * problem.scale
+        starts = tuple(float(h[rows.start]) for rows in self.evidence.slices)
+        return problem.basis.shape(x[: problem.basis.size + 1] * problem.scale, problem.gain), starts
+
+    def with_uncertainty(self) -> list[Effect]:
+        """Return the effects with the standard deviations of their free parameters.
+
+        Errors of neighbouring samples are alike, so that there are fewer independent ones than samples.
+        """
+        if not self.effects:
+            return []
+        columns = np.column_stack([self.tangents, self._before])
+        precision = self.joint.fit(self.target, columns).precision
+        errors = self.residual[self.evidence.used]
+        size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
+        inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
+        spread = np.sqrt(np.maximum(np.diag(inverse), 0.0) * np.mean(errors**2) * alike_in_a_row(errors)).tolist()
+        effects = []
+        for effect in self.effects:
+            effects.append(certain(effect, [spread.pop(0) for _ in free(effect)]))
+        return effects
+
+    def smoothed(self) -> "Explanation":
+        """Return it with the hysteresis as smooth as blocks left out say, now that effects no longer disturb it."""
+        problem = self.joint.problem
+        scores = replace(problem, y=self.joint.padded(self.target)).scores(SMOOTHNESS)
+        best = SMOOTHNESS[int(np.argmin(scores))]
+        if best == self.evidence.smoothness:
+            return self
+        return Explanation(replace(self.evidence, smoothness=best), self.effects).refined(2)
+
+    def adding(self, effect: Effect) -> "Explanation":
+        """Return it with one more effect."""
+        return Explanation(self.evidence, [*self.effects, effect], self)
+
+    def only(self, names: Collection[str]) -> "Explanation":
+        """Return it with those of its effects that are named, fitted anew."""
+        return Explanation(self.evidence, [effect for effect in self.effects if effect.name in names], self).refined(2)
+
+    def without(self, name: str) -> "Explanation":
+        """Return it without an effect, the others fitted anew."""
+        return self.only([effect.name for effect in self.effects if effect.name != name])
+
+    def beside(self, columns: FloatArray) -> "Explanation":
+        """Return it with `columns`, shape (N, k), beside the hysteresis, whatever their gains."""
+        evidence = replace(self.evidence, beside=np.column_stack([self.evidence.beside, columns]))
+        return Explanation(evidence, self.effects, self)
+
+    def bare(self) -> "Explanation":
+        """Return it without anything beside the hysteresis but effects, those fitted anew."""
+        if not self.evidence.beside.shape[1]:
+            return self
+        evidence = replace(self.evidence, beside=self.evidence.beside[:, :0])
+        return Explanation(evidence, self.effects, self).smoothed().refined(2)
+
+
+@dataclass(frozen=True)
+class RecordLeft:
+    """What is left of one record, for effects that belong to it alone; as `slpi_ros.effects.base.ResidualView`."""
+
+    t: FloatArray
+    u: FloatArray
+    h: FloatArray
+    y: FloatArray
+    used: NDArray[np.bool_]
+    residual: FloatArray
+    around: EffectContext
+
+    @property
+    def others(self) -> Mapping[str, FloatArray]:
+        """Motion of the other axes from their start, shape (N,), metres."""
+        return self.around.others
+
+    def respond(self, u: FloatArray) -> FloatArray:
+        """Refuse: an effect of one record alone does not act on the voltage."""
+        raise NotImplementedError
+
+
+def alike_in_a_row(errors: FloatArray) -> float:
+    """Return how many errors in a row tell no more than one, from their correlation up to where it first vanishes."""
+    errors = errors - errors.mean()
+    power = np.abs(np.fft.rfft(errors, 2 * errors.size)) ** 2
+    correlation = np.fft.irfft(power)[: errors.size]
+    if not correlation[0] > 0.0:
+        return 1.0
+    correlation = correlation / correlation[0]
+    positive = int(np.argmax(correlation <= 0.0)) or correlation.size
+    return float(max(1.0, 2.0 * correlation[:positive].sum() - 1.0))

@@ -1,0 +1,486 @@
+"""What a diagnosis says: figures and sentences, for the page and for the document."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.diagnosis.effect_parameters import EachRecord
+from slpi_ros.diagnosis.joint_fit import Explanation, Score
+from slpi_ros.diagnosis.prepare import Evidence, one_speed
+from slpi_ros.diagnosis.selection import (
+    BIAS,
+    LEVEL,
+    NOT_CLOSING,
+    Named,
+    Selection,
+    chance_of_gain,
+    held_out_error,
+    is_own,
+)
+from slpi_ros.effects.base import Effect
+from slpi_ros.effects.registry import to_document as effect_document
+from slpi_ros.excitation.effects import for_effect
+from slpi_ros.identification.signal_statistics import Floor
+from slpi_ros.model.stage_model import StageModel
+
+FloatArray = NDArray[np.float64]
+
+# Which drive separates effects that a record leaves open: the first pair that is among them decides.
+SEPARATES = (
+    ({"lag", "delay"}, "lag"),
+    ({"lag", "rate_dependence"}, "rate_dependence"),
+    ({"delay", "rate_dependence"}, "rate_dependence"),
+    ({"gain_drift", "thermal_drift"}, "gain_drift"),
+    ({"creep", "thermal_drift"}, "thermal_drift"),
+    ({"creep", "lag"}, "creep"),
+    ({"creep", "delay"}, "creep"),
+    ({"creep", "rate_dependence"}, "creep"),
+    ({"resonance", "lag"}, "resonance"),
+    ({"resonance", "delay"}, "resonance"),
+)
+OTHER_FREQUENCIES = "This record has one drive frequency; other frequencies tell these apart. "
+UP_TO_DATE = "`slpi refit` with this record brings the model up to date; no other one is needed for that."
+ANOTHER_HYSTERESIS = {
+    NOT_CLOSING: "No model with return-point memory can follow loops that do not close: compensate with "
+    "feedback, and record the drive of `slpi excite --for creep` to see whether they close where time is left.",
+    LEVEL: "Loops between the same two voltages differ with the level they hang on, which no "
+    "model here can follow: identify on drives like those to be compensated, or compensate with feedback.",
+    BIAS: "The shape of the loops depends on the bias voltage, which the kind of the given "
+    "model cannot follow: identify this record with kind 'slpi'; no new one is needed.",
+}
+# The given model is out of date when its error is so many times that of one fitted to the record.
+STALE = 1.5
+# Below this share of its motion (excess rms), or of its gain, a stage has not changed; its gain is told apart from none
+# at so many standard deviations, and its zero when it moved by so many times the error.
+CHANGED, LEAST_CHANGE, CERTAIN = 1e-3, 3e-3, 5.0
+# What is left is more than the floor when it is this many times as much.
+ABOVE_FLOOR = 1.5
+# No hysteresis model resolves better than this share of the displacement range, even where there is no noise.
+RESOLUTION = 2e-4
+
+SCHEMA = "slpi_ros/diagnosis/1"
+NAMED, AMBIGUOUS, UNEXPLAINED, NOTHING_FOUND = "named", "ambiguous", "unexplained", "nothing_found"
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """An effect that explains part of the error.
+
+    Parameters
+    ----------
+    effect : Effect
+        With its parameters, and their standard deviations.
+    gain_percent : float
+        By how much it lowers the held-out rms error, added to the effects before it.
+    share_of_residual : float
+        Share of the mean square error before any effect, held out, that it explains, 0..1.
+    p_value : float
+        How often chance would gain as much.
+    alternatives : tuple of str
+        Effects that would do in its place: the record does not tell them apart.
+    evidence : str
+        One sentence with numbers.
+    """
+
+    effect: Effect
+    gain_percent: float
+    share_of_residual: float
+    p_value: float
+    alternatives: tuple[str, ...]
+    evidence: str
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.name
+
+
+@dataclass(frozen=True)
+class Traces:
+    """One axis over the record, for plots.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,), seconds
+        From the first stamp.
+    voltage : ndarray, shape (N,), volts
+    measured, before, after : ndarray, shape (N,), metres
+        Measured displacement; that of the hysteresis alone, and with effects.
+    contributions : mapping of effect name to ndarray, shape (N,), metres
+        What each effect does to the displacement.
+    """
+
+    t: FloatArray
+    voltage: FloatArray
+    measured: FloatArray
+    before: FloatArray
+    after: FloatArray
+    contributions: Mapping[str, FloatArray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RecordOutcome:
+    """What became of one record.
+
+    Parameters
+    ----------
+    source : str
+    offset : float, metres
+        By how much the zero has moved against the given model.
+    before_rms, after_rms : float, metres
+        Error of the given model and of the extended one, free-run, each without its constant.
+    left_out_rms : float or None, metres
+        Error of hysteresis and effects that were fitted to the other records; None where there is one record.
+    """
+
+    source: str
+    offset: float
+    before_rms: float
+    after_rms: float
+    left_out_rms: float | None
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the record's part of the diagnosis document."""
+        return {
+            "source": self.source,
+            "offset_m": self.offset,
+            "before_rms_m": self.before_rms,
+            "after_rms_m": self.after_rms,
+            "left_out_rms_m": self.left_out_rms,
+        }
+
+
+@dataclass(frozen=True)
+class AxisDiagnosis:
+    """What one axis's model gets wrong, and why.
+
+    Parameters
+    ----------
+    verdict : str
+        `NAMED`, `AMBIGUOUS`, `UNEXPLAINED` or `NOTHING_FOUND`.
+    summary : str
+        The same in a sentence or two.
+    floor_rms : float, metres
+        What no model can explain.
+    floor_source : str
+        Where that was seen.
+    given_rms : float, metres
+        Error of the given model as it is, free-run, without the constant of each record.
+    before_rms, after_rms : float, metres
+        Held-out error, free-run: of the hysteresis fitted to the records, and of hysteresis and effects; on blocks left
+        out, and where there are several records, on records left out.
+    effects : tuple of NamedEffect
+        In the order of gain.
+    next_experiment : str or None
+        What to record, or to do, next.
+    traces : Traces
+        Of the first record.
+    records : tuple of RecordOutcome
+        One for each record.
+    dropped : tuple of str
+        Effects that were found on some records and make others worse.
+    """
+
+    verdict: str
+    summary: str
+    floor_rms: float
+    floor_source: str
+    given_rms: float
+    before_rms: float
+    after_rms: float
+    effects: tuple[NamedEffect, ...]
+    next_experiment: str | None
+    traces: Traces
+    records: tuple[RecordOutcome, ...] = ()
+    dropped: tuple[str, ...] = ()
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the axis's part of the diagnosis document."""
+        return {
+            "verdict": self.verdict,
+            "summary": self.summary,
+            "floor_rms_m": self.floor_rms,
+            "floor_source": self.floor_source,
+            "given_rms_m": self.given_rms,
+            "before_rms_m": self.before_rms,
+            "after_rms_m": self.after_rms,
+            "effects": [
+                {
+                    **effect_document(named.effect),
+                    "gain_percent": named.gain_percent,
+                    "share_of_residual": named.share_of_residual,
+                    "p_value": named.p_value,
+                    "alternatives": list(named.alternatives),
+                    "evidence": named.evidence,
+                }
+                for named in self.effects
+            ],
+            "next_experiment": self.next_experiment,
+            "records": [record.to_document() for record in self.records],
+            "dropped": list(self.dropped),
+        }
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a model gets wrong on a record.
+
+    Parameters
+    ----------
+    axes : mapping of axis name to AxisDiagnosis
+    extended : StageModel
+        The model with the effects found, hysteresis and effects fitted together.
+    source : str
+        The record.
+    """
+
+    axes: Mapping[str, AxisDiagnosis]
+    extended: StageModel
+    source: str = ""
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the diagnosis document, ``msg_schemas/diagnosis.schema.json``."""
+        return {
+            "schema": SCHEMA,
+            "source": self.source,
+            "axes": {axis: found.to_document() for axis, found in self.axes.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Given:
+    """How well the given model does as it is.
+
+    Parameters
+    ----------
+    rms : float, metres
+        Its error, free-run, without the constant of each record.
+    hysteresis_rms, refitted_rms : float, metres
+        The same of its hysteresis, once the initial history no longer matters, with the effects that were found if
+        that is less; and of a hysteresis fitted to the same samples.
+    gain, gain_deviation : float
+        By which share the stage moves more than its hysteresis says, and its standard deviation.
+    zero_moved : float or None, metres
+        By how much the zero has moved; None where the records do not tell it from the initial history.
+    motion : float, metres
+        How far the stage moved.
+    """
+
+    rms: float
+    hysteresis_rms: float
+    refitted_rms: float
+    gain: float
+    gain_deviation: float
+    zero_moved: float | None
+    motion: float
+
+    @property
+    def changed(self) -> bool:
+        """Whether its loops are wrong where those of one fitted to the records are not."""
+        excess = np.sqrt(max(self.hysteresis_rms**2 - self.refitted_rms**2, 0.0))
+        clear = self.hysteresis_rms > STALE * self.refitted_rms and excess > CHANGED * self.motion
+        return bool(clear or (abs(self.gain) > LEAST_CHANGE and abs(self.gain) > CERTAIN * self.gain_deviation))
+
+
+def judged(
+    selection: Selection,
+    floor: Floor,
+    before_rms: float,
+    given: Given,
+    records: tuple[RecordOutcome, ...],
+    left_out_of_model: Sequence[str],
+    driven_alike: Sequence[str],
+) -> AxisDiagnosis:
+    """Return what is to be said of one axis.
+
+    Parameters
+    ----------
+    selection : Selection
+    floor : Floor
+        Of the records.
+    before_rms : float, metres
+        Error before any effect, held out.
+    given : Given
+        Of the given model.
+    records : tuple of RecordOutcome
+    left_out_of_model : sequence of str
+        Effects that were found and are not in the extended model.
+    driven_alike : sequence of str
+        Axes that have the drive of this one.
+    """
+    base, now = selection.base, selection.now
+    effects = _named_effects(selection)
+    verdict = _verdict(selection, effects, floor, left_out_of_model)
+    return AxisDiagnosis(
+        verdict=verdict,
+        summary=_of_given(given, selection, before_rms)
+        + _summary(verdict, selection, effects, floor, before_rms)
+        + _not_in_model(left_out_of_model, selection.dropped)
+        + _cannot_tell(driven_alike),
+        floor_rms=floor.rms,
+        floor_source=floor.source,
+        given_rms=given.rms,
+        before_rms=before_rms,
+        after_rms=now.held_out.rms_of_records,
+        effects=effects,
+        next_experiment=_next(verdict, selection, effects, stale=_stale(given, selection)),
+        traces=_traces(base, now),
+        records=records,
+        dropped=selection.dropped,
+    )
+
+
+def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
+    fitted = {effect.name: effect for effect in selection.now.with_uncertainty()}
+    return tuple(_named_effect(fitted[named.name], named, selection) for named in selection.named)
+
+
+def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEffect:
+    chance = chance_of_gain(named.before, named.after)
+    whole, before, after = (
+        held_out_error(named.name, score) for score in (selection.base.held_out, named.before, named.after)
+    )
+    return NamedEffect(
+        effect=effect.parts[0] if isinstance(effect, EachRecord) else effect,
+        gain_percent=100.0 * (1.0 - after / before),
+        share_of_residual=float(np.clip((before**2 - after**2) / whole**2, 0.0, 1.0)),
+        p_value=chance,
+        alternatives=named.alternatives,
+        evidence=_evidence(effect, named, chance, selection.now.held_out),
+    )
+
+
+def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) -> str:
+    sentence = effect.describe()
+    before, after, end = (1e9 * held_out_error(named.name, score) for score in (named.before, named.after, in_the_end))
+    on = "records" if named.after.records.size and not is_own(named.name) else "blocks"
+    gained = (
+        f"with it the error on {on} left out falls from {before:.3g} to {after:.3g} nm rms "
+        f"(chance gains as much in {100 * chance:.2g} % of cases)"
+    )
+    if not named.runner_up:
+        return f"{sentence}; {gained}, and no other effect comes near"
+    other, rms = named.runner_up
+    instead = f"with {other} in its place {rms * 1e9:.3g} nm are left in the end, not {end:.3g}"
+    return f"{sentence}; {gained}; {instead}"
+
+
+def _resolved(selection: Selection) -> float:
+    """Return the error (m) below which no hysteresis model comes."""
+    evidence = selection.now.evidence
+    return RESOLUTION * float(np.ptp(evidence.y[evidence.used]))
+
+
+def _left(selection: Selection, floor: Floor) -> bool:
+    """Return whether more is left than noise and the model's resolution."""
+    return selection.now.held_out.rms > max(ABOVE_FLOOR * floor.rms, _resolved(selection))
+
+
+def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor, left_out: Sequence[str]) -> str:
+    if effects:
+        return AMBIGUOUS if left_out or any(named.alternatives for named in effects) else NAMED
+    wrong_kind = BIAS in selection.structures
+    return UNEXPLAINED if wrong_kind or _left(selection, floor) else NOTHING_FOUND
+
+
+def _stale(given: Given, selection: Selection) -> bool:
+    """Return whether the given model is wrong where one of its kind, fitted to the records, is not."""
+    return BIAS not in selection.structures and given.changed
+
+
+def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
+    error, anew = given.rms * 1e9, before_rms * 1e9
+    moved = ""
+    if given.zero_moved is not None:
+        moved = f"The zero has moved by {given.zero_moved * 1e6:+.3g} um. "
+    if _stale(given, selection):
+        return (
+            f"The given model is off by {error:.3g} nm rms, one fitted to the record by {anew:.3g} nm: the stage has "
+            f"changed since, its gain by {100 * given.gain:+.2g} %. {moved}"
+        )
+    if moved:
+        same = 100.0 * max(abs(given.gain), given.hysteresis_rms / given.motion)
+        return f"{moved}The loops are the same within {same:.1g} %. "
+    return f"The given model is off by {error:.3g} nm rms on this record. " if BIAS in selection.structures else ""
+
+
+def _not_in_model(left_out: Sequence[str], dropped: Sequence[str]) -> str:
+    said = ""
+    if left_out:
+        said += f" The extended model does without {', '.join(left_out)}: these data do not say what that is elsewhere."
+    if dropped:
+        said += f" Dropped, as other records get worse with what one record shows of it: {', '.join(dropped)}."
+    return said
+
+
+def _summary(
+    verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor, before_rms: float
+) -> str:
+    before, after = before_rms * 1e9, selection.now.held_out.rms_of_records * 1e9
+    left = f"{after:.3g} nm rms are left, the floor of the record is {floor.rms * 1e9:.3g} nm"
+    found = ", then ".join(
+        f"{named.name}, which takes away {named.gain_percent:.0f} % of {'the rest' if place else 'the error'}"
+        for place, named in enumerate(effects)
+    )
+    if verdict == NOTHING_FOUND:
+        return f"No effect found: {left}."
+    structure = f"The hysteresis itself is wrong: {', '.join(selection.structures)}. " if selection.structures else ""
+    if verdict == UNEXPLAINED:
+        if BIAS in selection.structures:
+            return f"{structure}None of the known effects is needed: with loops that depend on bias {left}."
+        return f"{structure}None of the known effects explains the error: {left}."
+    others = ""
+    if verdict == AMBIGUOUS:
+        open_ones = (named for named in effects if named.alternatives)
+        others = "".join(f" The record cannot tell {one.name} from {', '.join(one.alternatives)}." for one in open_ones)
+    return f"{structure}Found: {found}.{others} The held-out error falls from {before:.3g} nm; {left}."
+
+
+def _cannot_tell(driven_alike: Sequence[str]) -> str:
+    if not driven_alike:
+        return ""
+    return f" Axis {', '.join(driven_alike)} has the same drive: whether it couples into this one cannot be told."
+
+
+def _next(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], *, stale: bool) -> str | None:
+    steps = [UP_TO_DATE] if stale else []
+    steps += [] if verdict == NOTHING_FOUND else [_of_structure(structure) for structure in selection.structures]
+    if verdict == AMBIGUOUS:
+        first = next(named for named in effects if named.alternatives)
+        steps.append(_separating((first.name, *first.alternatives), selection.now.evidence))
+    if verdict == UNEXPLAINED and not steps:
+        steps.append(_more_loops(selection.now.evidence))
+    return " ".join(steps) or None
+
+
+def _traces(base: Explanation, now: Explanation) -> Traces:
+    evidence, seen = now.evidence, np.flatnonzero(now.evidence.parts[0].seen)
+    parts = {effect.name: now.predicted - now.prediction_without(effect.name) for effect in now.effects}
+    t, v, y, before, after = (x[seen] for x in (evidence.t, evidence.v, evidence.y, base.predicted, now.predicted))
+    return Traces(t, v, y, before, after, {name: part[seen] for name, part in parts.items()})
+
+
+def _more_loops(evidence: Evidence) -> str:
+    """Return the record that shows most, in a sentence."""
+    return f"Record `{_command(evidence)}`, which visits loops of every size at several speeds, and diagnose that."
+
+
+def _separating(names: Sequence[str], evidence: Evidence) -> str:
+    """Return the experiment that separates effects, the likeliest first, in sentences."""
+    chosen = next((drive for pair, drive in SEPARATES if pair <= set(names)), names[0])
+    axes = " --axis OTHER THIS" if chosen == "cross_coupling" else ""
+    other = OTHER_FREQUENCIES if one_speed(evidence) else ""
+    return f"{other}Record `{_command(evidence)} --for {chosen}{axes}`. {for_effect(chosen).why}"
+
+
+def _command(evidence: Evidence) -> str:
+    low, high = float(evidence.v.min()), float(evidence.v.max())
+    return f"slpi excite -o drive.csv --voltage-min {low:.4g} --voltage-max {high:.4g}"
+
+
+def _of_structure(structure: str) -> str:
+    """Return what to do where the hysteresis itself is wrong, in a sentence."""
+    return ANOTHER_HYSTERESIS[structure]

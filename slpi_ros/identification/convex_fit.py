@@ -87,7 +87,7 @@ def fit_linear(
 
     Warns
     -----
-    BeginningWarning
+    InitialHistoryWarning
         If the beginning of a record does not agree with the rest.
     """
     chosen = choose(samples, bases, smoothness, share=share)

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
-from slpi_ros.identification import convex_fit as linear
-from slpi_ros.identification import published_kinds as separated
+from slpi_ros.identification.convex_fit import fit_family, fit_multi_slope, fit_plays
 from slpi_ros.identification.least_squares import Fitted, noise_rms
 from slpi_ros.identification.progress import report_progress
-from slpi_ros.identification.published_kinds import fit_amplitude_scaled
+from slpi_ros.identification.published_kinds import fit_amplitude_scaled, fit_at_rest, fit_primed
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, FitQuality
@@ -22,10 +21,10 @@ from slpi_ros.model.stage_model import StageModel
 FloatArray = NDArray[np.float64]
 
 FITS: dict[str, Callable[[Sequence[Samples]], Fitted]] = {
-    "slpi": linear.fit_family,
-    "slpi-published": separated.fit_primed,
-    "pi": linear.fit_plays,
-    "mpi": linear.fit_multi_slope,
+    "slpi": fit_family,
+    "slpi-published": fit_primed,
+    "pi": fit_plays,
+    "mpi": fit_multi_slope,
     "smpi": fit_amplitude_scaled,
 }
 KINDS = tuple(FITS)
@@ -102,7 +101,7 @@ def fit_of(kind: str, *, loops_at_rest: bool) -> Callable[[Sequence[Samples]], F
         raise UsageError(f"unknown kind '{kind}'; this version identifies {', '.join(KINDS)}")
     if loops_at_rest and kind != "slpi-published":
         raise UsageError(f"loops at rest are a matter of kind 'slpi-published', not of '{kind}'; leave that out")
-    return separated.fit_at_rest if loops_at_rest else FITS[kind]
+    return fit_at_rest if loops_at_rest else FITS[kind]
 
 
 def _one_stage(records: Sequence[Record]) -> str:

@@ -370,16 +370,34 @@ def _changes(
     part = np.arange(error.size) * PARTS // error.size
     matrices = np.array([columns[part == k].T @ columns[part == k] for k in range(PARTS)])
     vectors = np.array([columns[part == k].T @ error[part == k] for k in range(PARTS)])
-    ridge = 1e-9 * error.size * np.eye(scale.size)
-    whole = np.linalg.solve(matrices.sum(axis=0) + ridge, vectors.sum(axis=0))
-    left_out = np.array(
-        [
-            np.linalg.solve(matrices.sum(axis=0) - matrices[k] + ridge, vectors.sum(axis=0) - vectors[k])
-            for k in range(PARTS)
-        ]
-    )
+    own_error, rest = axis.quality.held_out_rms, np.array([0, 2, 3])
+    both = _solved(matrices, vectors, own_error, error.size)
+    alone = _solved(matrices[:, rest][:, :, rest], vectors[:, rest], own_error, error.size)
+    changes, uncertainty = both[0] / scale, both[1] / scale
+    if abs(changes[1]) <= BEYOND_CHANCE * uncertainty[1]:
+        # Small loops hardly tell gain from width: where the width need not have changed, it has not.
+        changes[0], uncertainty[0] = alone[0][0] / scale[0], alone[1][0] / scale[0]
+    left = float(np.sqrt(np.mean((error - columns @ both[0]) ** 2)))
+    return changes[:2], uncertainty[:2], float(np.sqrt(np.mean(error**2))), left
+
+
+def _solved(matrices: FloatArray, vectors: FloatArray, own_error: float, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the solution of normal equations that are sums over parts, and its standard deviations.
+
+    Parameters
+    ----------
+    matrices, vectors : ndarray, shapes (PARTS, c, c) and (PARTS, c)
+        Of columns with a mean square of 1.
+    own_error : float, metres
+        Of the model.
+    count : int
+        Samples.
+    """
+    ridge = 1e-9 * count * np.eye(matrices.shape[1])
+    matrix, vector = matrices.sum(axis=0) + ridge, vectors.sum(axis=0)
+    whole = np.linalg.solve(matrix, vector)
+    left_out = [np.linalg.solve(matrix - own, vector - part) for own, part in zip(matrices, vectors, strict=True)]
     chance = np.sqrt((PARTS - 1) * np.var(left_out, axis=0))
-    # The model itself is not known better than its own error.
-    uncertainty = np.hypot(chance, axis.quality.held_out_rms / BEYOND_CHANCE)
-    left = float(np.sqrt(np.mean((error - columns @ whole) ** 2)))
-    return (whole / scale)[:2], (uncertainty / scale)[:2], float(np.sqrt(np.mean(error**2))), left
+    # The model itself is not known better than its own error; columns that are alike can share it in any proportion.
+    alike = np.sqrt(np.diag(np.linalg.inv(matrix / count)))
+    return whole, np.hypot(chance, alike * own_error / BEYOND_CHANCE)

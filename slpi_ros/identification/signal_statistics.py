@@ -586,9 +586,8 @@ def _without(x: FloatArray, *columns: FloatArray) -> FloatArray:
 
 # A commanded voltage has less noise than the first share of its range; what looks like more than the other one is none.
 LEAST_NOISE, MOST_NOISE = 1e-4, 5e-3
-# Orders of the differences in which noise is all that is left, and readings that are enough to tell it from.
+# Orders of the differences in which noise is all that is left.
 _ORDERS = (3, 4, 5, 6)
-_ENOUGH_VOLTAGES = 100_000
 # Samples over which a parabola may take the place of the readings: as many as it fits.
 _WINDOWS = (5, 9, 17, 33, 65, 129)
 # Reversals up to so many standard deviations are still noise.
@@ -602,7 +601,7 @@ def voltage_noise(t: FloatArray, v: FloatArray) -> float:
     """
     if v.size <= max(_ORDERS):
         return 0.0
-    part = v[:_ENOUGH_VOLTAGES]
+    part = v[:_ENOUGH]
     estimates = [noise(v, t)]
     for order in _ORDERS:
         # The squares of the binomial coefficients of a difference add up to another one.

@@ -62,7 +62,11 @@ def describe_change(axis: str, change: AxisChange) -> list[str]:
     """Return lines of text on what a refit changed in one axis, in nm."""
     found = change.match
     same = max(abs(found.gain_change), found.gain_uncertainty)
-    zero = f"the zero has moved by {found.offset * 1e6:+.3g} um since" if found.zero_moved else ""
+    zero = (
+        f"the zero has moved by {found.offset * 1e6:+.3g} (+- {found.offset_uncertainty * 1e6:.2g}) um since"
+        if found.zero_moved
+        else ""
+    )
     if change.drifted:
         verdict = f"the stage has changed{f' and {zero}' if zero else ''}"
     elif zero:

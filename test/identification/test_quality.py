@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from identification.records import record_of, stage
+from identification.records import calibration, record_of, stage
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
@@ -326,3 +326,30 @@ def test_findings_on_measured_records(measured_data):
         assert picma.displacement.noise == pytest.approx(0.072e-6, rel=0.1)
         assert picma.displacement.digit == pytest.approx(1.933e-9, rel=1e-3)
         assert picma.displacement.spikes == picma.displacement.stale == 0
+
+
+def test_late_stamps_are_no_missing_samples():
+    """One stamp in five comes most of a period late; the next ones are in time again."""
+    record, _ = calibration(seed=1)
+    late = np.random.default_rng(3).random(len(record)) < 0.2
+    stamps = record.time_ns + (late * 4_500_000).astype(np.int64)
+    found = assess(replace(record, time_ns=stamps), "x").clock
+    assert found.lost == 0
+    kept = np.random.default_rng(4).random(len(record)) > 0.05
+    kept[[0, -1]] = True
+    part = replace(
+        record,
+        time_ns=stamps[kept],
+        voltage={"x": record.voltage["x"][kept]},
+        displacement={"x": record.displacement["x"][kept]},
+    )
+    assert assess(part, "x").clock.lost == pytest.approx(np.count_nonzero(~kept), rel=0.15)
+
+
+def test_a_growing_sine_has_more_than_one_speed():
+    t = np.arange(4000) / 200.0
+    v = 50.0 - 45.0 * (t / t[-1]) * np.cos(2.0 * np.pi * t)
+    found = assess(record_of(t, v, 2e-7 * v + 5e-9 * np.random.default_rng(1).standard_normal(t.size)), "x")
+    slowest, fastest = found.drive.speed_range
+    assert fastest > 150.0 and slowest < 30.0
+    assert not any(finding.text.startswith("one speed") for finding in findings(found))

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from identification.records import calibration
 
 from slpi_ros.identification import signal_statistics as readings
+from slpi_ros.identification.record_quality import assess
+from slpi_ros.identification.signal_statistics import mixed_readings
+from slpi_ros.io.tables import import_table
 
 
 @given(st.floats(1e-12, 1e3), st.floats(-5, 5), st.integers(3, 12), st.integers(0, 2**32 - 1))
@@ -55,3 +59,36 @@ def test_repeats(values, seed):
     assert repeats.length.tolist() == [length for _, length, _ in expected]
     np.testing.assert_array_equal(repeats.spans(other), [span for _, _, span in expected])
     assert repeats.readings == sum(length - 1 for _, length, _ in expected)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_readings_mixed_with_the_one_beside_them_are_found(side):
+    random = np.random.default_rng(5)
+    v = 50.0 + 50.0 * np.abs(np.arange(6000) % 100 / 50.0 - 1.0)
+    y = 0.2e-6 * v + 10e-9 * random.standard_normal(v.size)
+    bad = np.flatnonzero(random.random(v.size) < 0.1)
+    share = random.uniform(0.0, 1.0, bad.size)
+    beside = np.clip(bad + side, 0, v.size - 1)
+    mixed = y.copy()
+    mixed[bad] += share * (y[beside] - y[bad])
+    found = mixed_readings(mixed, v)
+    # Near turns, and where hardly anything is mixed in, they are not to be told.
+    assert 0.6 * bad.size < found.size < 1.1 * bad.size
+    assert np.isin(found, bad).mean() > 0.97
+
+
+def test_clean_and_noisy_readings_are_not_mixed():
+    for seed in range(4):
+        record, _ = calibration(seed=seed)
+        for every in (1, 4, 8):
+            v, y = record.voltage["x"][::every], record.displacement["x"][::every]
+            assert not mixed_readings(y, v).size
+            outliers = y + 1e-7 * (np.random.default_rng(seed).random(y.size) < 0.05)
+            assert not mixed_readings(outliers, v).size
+
+
+def test_share_of_mixed_readings_of_a_measured_record(measured_data):
+    record = import_table(measured_data / "afm_cycles.csv")
+    quality = assess(record, "x").displacement
+    assert quality.mixed / len(record) == pytest.approx(0.11, abs=0.02)
+    assert quality.mixed_size == pytest.approx(0.39e-6, rel=0.1)

@@ -344,9 +344,10 @@ class Controller:
 
     def _axes_of(self, names: Sequence[str], count: int, now_ns: int) -> list[Axis]:
         """Return the named axes; RejectedError unless they take `count` desired displacements now."""
-        self._require_ready()
-        if self.mode is Mode.TRAJECTORY:
-            raise RejectedError(rejection.FOLLOWING, f"{self.doing(now_ns)}; wait, or cancel it with an empty one")
+        if self.mode is not Mode.STREAMING or self.model is None:
+            self._require_ready()
+            if self.mode is Mode.TRAJECTORY:
+                raise RejectedError(rejection.FOLLOWING, f"{self.doing(now_ns)}; wait, or cancel it with an empty one")
         if count != len(names):
             raise RejectedError(rejection.LENGTH, f"{len(names)} axes but {count} displacements; send one for each")
         return self._named(names)

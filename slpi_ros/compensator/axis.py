@@ -225,9 +225,11 @@ class Axis:
         v = stream.move(dt, y)
         if self._feedback is not None:
             v = self._correct(ahead, dt, y, v, now_ns)
-        missed = stream.missed
-        self.held = missed and stream.held
-        self.slewing = missed and not self.held
+        if stream.missed:
+            self.held = stream.held
+            self.slewing = not self.held
+        else:
+            self.held = self.slewing = False
         self.given_ns = now_ns
         self.start_memory = None
         return v

@@ -300,14 +300,16 @@ class Controller:
             self._let_go(axes, now_ns)
             self.mode = Mode.STREAMING
         aheads = [axis.stamps.accept(stamp_ns) if stamp_ns else axis.stamps.arrive(arrival_ns) for axis in axes]
-        for axis in axes:
-            axis.point_ns = None
         held, slewing = self._move(axes, names, displacements, aheads, now_ns)
         counts.accepted += 1
-        counts.held_at_limit += held
-        counts.slew_limited += slewing
-        counts.gaps += max(aheads) > self._jump
-        counts.time_jumps += min(aheads) < 0.0
+        if held or slewing:
+            counts.held_at_limit += held
+            counts.slew_limited += slewing
+        for ahead in aheads:
+            if not 0.0 <= ahead <= self._jump:
+                counts.gaps += max(aheads) > self._jump
+                counts.time_jumps += min(aheads) < 0.0
+                break
         return held
 
     def measure(self, names: Sequence[str], displacements: Sequence[float], now_ns: int) -> list[Axis]:
@@ -342,9 +344,10 @@ class Controller:
 
     def _axes_of(self, names: Sequence[str], count: int, now_ns: int) -> list[Axis]:
         """Return the named axes; RejectedError unless they take `count` desired displacements now."""
-        self._require_ready()
-        if self.mode is Mode.TRAJECTORY:
-            raise RejectedError(rejection.FOLLOWING, f"{self.doing(now_ns)}; wait, or cancel it with an empty one")
+        if self.mode is not Mode.STREAMING or self.model is None:
+            self._require_ready()
+            if self.mode is Mode.TRAJECTORY:
+                raise RejectedError(rejection.FOLLOWING, f"{self.doing(now_ns)}; wait, or cancel it with an empty one")
         if count != len(names):
             raise RejectedError(rejection.LENGTH, f"{len(names)} axes but {count} displacements; send one for each")
         return self._named(names)
@@ -404,7 +407,8 @@ class Controller:
                 held, began = True, began or not was_held
             elif axis.slewing:
                 slewing = True
-        self.counts.excursions += began
+        if began:
+            self.counts.excursions += 1
         self.watchdog.commanded = True
         self.watchdog.feed(now_ns)
         return held, slewing

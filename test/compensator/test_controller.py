@@ -158,10 +158,10 @@ def test_a_new_model_takes_over_where_the_voltage_is(slew):
 
 def refused_models():
     good = axis_model()
-    yield "has no axis 'x'", {"y": good}
-    yield "outside the voltage +limits", {"x": replace(good, voltage_range=(200.0, 300.0))}
-    yield "none that a stage can take", {"x": replace(good, displacement_range=(0.0, 1e6))}
-    yield "none that a stage can be given", {"x": replace(good, start=Start(5e6, 0.0))}
+    yield "'x'", {"y": good}
+    yield r"200\b.*\b300\b", {"x": replace(good, voltage_range=(200.0, 300.0))}
+    yield "displacement", {"x": replace(good, displacement_range=(0.0, 1e6))}
+    yield "voltage", {"x": replace(good, start=Start(5e6, 0.0))}
 
 
 @pytest.mark.parametrize(("why", "axes"), list(refused_models()))
@@ -183,10 +183,10 @@ def test_limits_change_while_it_runs_unless_they_leave_the_stage_outside():
     assert snapshots(made) == before
     update(made, START_NS + 10**9, ["x"], [9e-6])
     assert made.voltages[0] == 70.0
-    with pytest.raises(UsageError, match="move it inside first"):
+    with pytest.raises(UsageError, match=r"\b60\b"):
         made.use_limits([Limits(0.0, 60.0)])
     made.cleanup()
-    with pytest.raises(UsageError, match="move it inside first"):
+    with pytest.raises(UsageError, match=r"\b60\b"):
         made.use_limits([Limits(0.0, 60.0)])
 
 

@@ -141,7 +141,7 @@ def _verify_options(command: Any) -> None:
     command.add_argument(
         "--tolerance", metavar="UM", type=float,
         help="the largest rms error that passes, micrometres; default: three times the record's noise floor, but at "
-        "least the model's own held-out error",
+        "least 0.02 % of the stroke",
     )  # fmt: skip
     command.add_argument("-o", "--output", metavar="DIR", help="folder of verification.json and report.html")
     command.add_argument("--json", action="store_true", help="print the document instead of its summary")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.diagnose import diagnose
+from slpi_ros.diagnosis.result import RESOLUTION
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
 from slpi_ros.identification.cross_validation import (
@@ -307,8 +308,8 @@ def verify(
     model : StageModel
         Of the same stage.
     tolerance : float, metres, optional
-        The largest rms error that passes; by default three times the record's noise floor, or the error that the model
-        had on data held out when it was identified, if that is more.
+        The largest rms error that passes; by default three times the record's noise floor, but at least the share
+        `RESOLUTION` of the stroke, below which no hysteresis model comes.
     axes : sequence of str, optional
         All that records and model share by default.
     desired : sequence of mapping of axis name to ndarray, shape (N,), metres, or None, optional
@@ -440,6 +441,12 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
     )
 
 
+def _default_limit(axis: AxisModel, floor: float) -> float:
+    """Return the largest rms error (m) that passes over a noise floor (m)."""
+    low, high = axis.displacement_range
+    return max(TIMES_THE_FLOOR * floor, RESOLUTION * (high - low))
+
+
 def _judge(run: _Run, axis: AxisModel, source: str, tolerance: float | None) -> RecordVerification:
     samples, judged, found = run.samples, run.judged, run.found
     floor = floor_of(run.t[judged], samples.v[judged], samples.y[judged])
@@ -447,7 +454,7 @@ def _judge(run: _Run, axis: AxisModel, source: str, tolerance: float | None) -> 
     margin = 1e-6 * (high - low)
     return RecordVerification(
         error=ErrorPart.of(source, (samples.y - run.simulated)[judged]),
-        limit=max(TIMES_THE_FLOOR * floor.rms, axis.quality.held_out_rms) if tolerance is None else tolerance,
+        limit=_default_limit(axis, floor.rms) if tolerance is None else tolerance,
         floor_rms=floor.rms,
         floor_source=floor.source,
         known_from=float(run.t[judged][0]) if samples.fitted[~judged].any() or not found.known_from else None,
@@ -572,7 +579,7 @@ def _at_limit(v: FloatArray, command: FloatArray) -> Mask:
 
 def _effects(one: RecordVerification, record: Record, model: StageModel, name: str) -> tuple[tuple[str, ...], float]:
     """Diagnose a record that the model does not describe: return what is named, and its share of the residual."""
-    if one.error.rms <= max(TIMES_THE_FLOOR * one.floor_rms, model.axis(name).quality.held_out_rms):
+    if one.error.rms <= _default_limit(model.axis(name), one.floor_rms):
         return (), 0.0
     try:
         found = diagnose(record, model, axes=[name]).axes[name].effects

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from effects.cases import BY_NAME, numbers
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, PI_CASE, axis_model, two_axes
 
@@ -54,7 +54,11 @@ def with_effects(*effects, axis=X):
 @given(st.sets(st.sampled_from(EXACT)).flatmap(lambda names: st.tuples(*map(BY_NAME.get, sorted(names)))))
 def test_compensate_undoes_simulate_exactly(effects):
     model = StageModel({"x": with_effects(*effects)})
-    v = model.compensate(T, path())
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        v = model.compensate(T, path())
+    # A sensitivity that falls far may put a part of the path out of reach.
+    assume(not any(issubclass(warning.category, HeldAtLimitWarning) for warning in told))
     np.testing.assert_allclose(model.simulate(T, v), path(), rtol=0, atol=1e-8 * SPAN)
 
 

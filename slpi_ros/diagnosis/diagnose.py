@@ -211,10 +211,10 @@ def _starts(model: AxisModel, part: Part) -> list[Start]:
     ends = np.array([min(low, v0), max(high, v0)])
     whole = Samples(np.append(v0, ends), np.zeros(3), np.ones(3, dtype=bool))
     # Whatever went before, a sweep over the whole range ends at one displacement.
-    swept = model.memory().forward_array(ends)[-1]
+    swept = model.memory("start").forward_array(ends)[-1]
     found = [model.start] if model.start.voltage == v0 else []
     for history in dict.fromkeys((part.history, model.start.history, *histories(whole))):
-        way = replace(model, start=Start(v0, 0.0, history)).memory().forward_array(ends)[-1]
+        way = replace(model, start=Start(v0, 0.0, history)).memory("start").forward_array(ends)[-1]
         found.append(Start(v0, float(swept - way), history))
     return found
 

@@ -437,10 +437,10 @@ def _starts(axis: AxisModel, samples: Samples) -> list[Start]:
     ends = np.array([min(low, v0), max(high, v0)])
     whole = Samples(np.append(v0, ends), np.zeros(3), np.ones(3, dtype=bool))
     # Whatever went before, a sweep over the whole range ends at one displacement.
-    swept = axis.memory().forward_array(ends)[-1]
+    swept = axis.memory("start").forward_array(ends)[-1]
     found = []
     for history in dict.fromkeys((*histories(whole), axis.start.history)):
-        way = replace(axis, start=Start(v0, 0.0, history)).memory().forward_array(ends)[-1]
+        way = replace(axis, start=Start(v0, 0.0, history)).memory("start").forward_array(ends)[-1]
         found.append(Start(v0, float(swept - way), history))
     return found
 

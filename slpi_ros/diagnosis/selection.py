@@ -387,7 +387,7 @@ def _best_structure(now: Explanation, taken: tuple[str, ...]) -> tuple[str | Non
     for name, columns in STRUCTURES.items():
         if name not in taken:
             allowing = now.beside(columns(now))
-            if counts(now.held_out, allowing.held_out) and allowing.held_out.rms < best[1].held_out.rms:
+            if counts(now.held_out, allowing.held_out, own=False) and allowing.held_out.rms < best[1].held_out.rms:
                 best = name, allowing
     return best
 

@@ -11,7 +11,7 @@ from hidden import Hidden, Truth, calibration_of, hide
 from hidden.size import beyond_hysteresis
 
 import slpi_ros
-from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.bag_writer import write_bag
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.loop_family import LoopFamily
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.hysteresis.shape import Shape
+from slpi_ros.hysteresis.turning_points import Memory, Shape
 
 FloatArray = NDArray[np.float64]
 SPAN = 100.0
@@ -83,7 +82,7 @@ def batch() -> None:
     """Print times of the batch paths beside numpy.interp."""
     family = loop_family()
     print("batch, 1,000,000 samples, ms            forward  inverse  numpy.interp   share of its speed")
-    knots, values = family.grid, family.surface[:, 0]
+    knots, values = family.grid, family.everett[:, 0]
     for turns in (20, 200, 2000, 20000):
         v = (
             SPAN

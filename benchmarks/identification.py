@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import slpi_ros
-from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.bag_writer import write_bag
 
 # Samples, and seconds of the drive.
 USUAL = ((12_000, 60.0), (120_000, 120.0), (1_000_000, 100.0))

@@ -23,7 +23,8 @@ from std_msgs.msg import Float64MultiArray
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.model.stage_model import StageModel, Start
+from slpi_ros.model.axis_model import Start
+from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import make_executor
 from slpi_ros.papers.compound import RATE, RECORD, RECORD_SAMPLES, WARM_UP, path, tune
 from slpi_ros.papers.mpi_study import COMPOUND_MEAN, TABLE_6, triangle_record

@@ -45,7 +45,7 @@ def executable(name: str, **parameters: str | float | bool) -> Iterator[subproce
 
 
 class Operator(Node):
-    """Sends voltages or wishes at a steady rate and listens to the stage."""
+    """Publishes voltages or desired displacements at a steady rate and keeps the answers of the stage."""
 
     def __init__(self) -> None:
         super().__init__("operator")
@@ -71,9 +71,9 @@ class Operator(Node):
 
     def follow(self, displacements: Sequence[float], rate: float) -> FloatArray:
         """Wish for displacements (m) one after the other; return as `drive` does."""
-        return self._send([JointState(name=["x"], position=[y]) for y in displacements], self._wish, rate)
+        return self._send([JointState(name=["x"], position=[y]) for y in displacements], self._publish_desired, rate)
 
-    def _wish(self, message: JointState) -> None:
+    def _publish_desired(self, message: JointState) -> None:
         message.header.stamp = self.get_clock().now().to_msg()
         self.desired.publish(message)
 

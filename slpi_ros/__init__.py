@@ -14,11 +14,12 @@ from slpi_ros.identification.fit import identify
 from slpi_ros.identification.record_quality import assess, findings
 from slpi_ros.identification.refit import refit
 from slpi_ros.io.record import Record
+from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.document import load_model, save_model
-from slpi_ros.model.stage_model import AxisModel, HeldAtLimitWarning, StageModel
+from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
 
 if TYPE_CHECKING:
-    from slpi_ros.io.bag_reader import SeparateTopics
+    from slpi_ros.io.alignment import SeparateTopics
 
 __all__ = [
     "AxisModel",
@@ -47,7 +48,7 @@ def read_bag(
     ----------
     path : path-like
         A rosbag2 folder, or a lone mcap or sqlite3 file.
-    topic : str or slpi_ros.io.bag_reader.SeparateTopics
+    topic : str or slpi_ros.io.alignment.SeparateTopics
         A topic of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts; or one topic of each.
     axes : sequence of str, optional
         The axes to read; all by default.

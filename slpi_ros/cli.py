@@ -27,13 +27,15 @@ from slpi_ros.identification.refit import refit
 from slpi_ros.identification.uncertainty import curve_uncertainty, require_known_uncertainty
 from slpi_ros.io import bag_reader as bags
 from slpi_ros.io import tables
+from slpi_ros.io.alignment import SeparateTopics
 from slpi_ros.io.atomic_file import make_folder
-from slpi_ros.io.column_choice import Wishes
+from slpi_ros.io.bag_writer import write_bag
+from slpi_ros.io.columns import ColumnOptions
 from slpi_ros.io.record import FloatArray, Record
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.document import load_model, save_model
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel, check_time, held_message
-from slpi_ros.model.streaming import Limits
 from slpi_ros.reports.text import describe_change, describe_model, describe_start
 
 # Where a bag holds voltage and displacement, if nothing else is said.
@@ -245,16 +247,16 @@ def _one_line(error: BaseException) -> str:
 
 
 def _import(options: argparse.Namespace) -> None:
-    wishes = Wishes(
+    columns = ColumnOptions(
         time=options.time,
         voltage=tuple(options.voltage),
         displacement=tuple(options.displacement),
         displacement_unit=options.displacement_unit,
         axes=tuple(options.axes),
     )
-    record, told = tables.import_told(options.table, wishes)
+    record, told = tables.import_with_summary(options.table, columns)
     record = replace(record, hardware_id=options.hardware_id)
-    bags.write_bag(options.output, record, storage=options.storage)
+    write_bag(options.output, record, storage=options.storage)
     print(f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s")
     print("\n".join(told))
 
@@ -292,7 +294,7 @@ def _identify(options: argparse.Namespace) -> None:
     print("\n".join([*told, *describe_model(model)]))
 
 
-def _topics(options: argparse.Namespace) -> str | bags.SeparateTopics:
+def _topics(options: argparse.Namespace) -> str | SeparateTopics:
     """Return where the bag holds voltage and displacement."""
     voltage, displacement = options.voltage_topic, options.displacement_topic
     if bool(voltage) != bool(displacement):
@@ -301,7 +303,7 @@ def _topics(options: argparse.Namespace) -> str | bags.SeparateTopics:
         raise UsageError("--topic does not go with --voltage-topic and --displacement-topic; give it, or both of them")
     if voltage:
         held = not options.voltage_measured
-        return bags.SeparateTopics(voltage, displacement, clock=options.clock or "displacement", held=held)
+        return SeparateTopics(voltage, displacement, clock=options.clock or "displacement", held=held)
     if options.clock or options.voltage_measured:
         raise UsageError("--clock and --voltage-measured are for --voltage-topic and --displacement-topic; give both")
     return TOPIC if options.topic is None else str(options.topic)
@@ -341,9 +343,9 @@ def _diagnose(options: argparse.Namespace) -> None:
     print(f"{folder / PAGE}: open it in a browser")
 
 
-def _with_other_axes(bag: str, options: argparse.Namespace, topics: str | bags.SeparateTopics) -> Record:
+def _with_other_axes(bag: str, options: argparse.Namespace, topics: str | SeparateTopics) -> Record:
     """Return all axes of the bag: each may show on the others. Where that cannot be, only those asked for."""
-    if options.axis and isinstance(topics, bags.SeparateTopics):
+    if options.axis and isinstance(topics, SeparateTopics):
         # There the axes may have no names but those given.
         return bags.read_bag(bag, topics, axes=options.axis)
     try:
@@ -364,7 +366,7 @@ def _verify(options: argparse.Namespace) -> int:
     if options.output:
         make_room(Path(options.output))
     # The other axes may move those asked for; separate topics may have no names but those given.
-    axes = options.axis if isinstance(topics, bags.SeparateTopics) else None
+    axes = options.axis if isinstance(topics, SeparateTopics) else None
     records = bags.read_bags(options.bags, topics, axes=axes)
     desired = [
         bags.read_desired(bag, record, options.desired_topic) for bag, record in zip(options.bags, records, strict=True)

@@ -14,20 +14,24 @@ from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.kinds import Hysteresis, to_document
 from slpi_ros.hysteresis.loop_family import LoopFamily
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
+from slpi_ros.hysteresis.turning_points import Memory
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
 # Drawing a model and a path takes a while; on a slow machine that is no mistake.
+EXAMPLES = int(os.environ.get("HYPOTHESIS_EXAMPLES", "100"))
 settings.register_profile(
     "models",
     settings.default,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
-    max_examples=int(os.environ.get("HYPOTHESIS_EXAMPLES", "100")),
+    max_examples=EXAMPLES,
 )
 settings.load_profile("models")
+# For a property that runs several times: once for each way, start or kind.
+repeated = settings(max_examples=max(EXAMPLES // 2, 1))
 
 KINDS = ("pi", "slpi")
 # Displacement per volt: metres on a real stage, and micrometres, as the papers have it.
@@ -61,8 +65,8 @@ class Case:
             cells = np.diff(shape.grid)
             rows, columns = np.tril_indices(cells.size)
             slopes = np.concatenate([
-                (np.diff(shape.surface, axis=0)[rows, columns]) / cells[rows],
-                (-np.diff(shape.surface, axis=1)[rows + 1, columns]) / cells[columns],
+                (np.diff(shape.everett, axis=0)[rows, columns]) / cells[rows],
+                (-np.diff(shape.everett, axis=1)[rows + 1, columns]) / cells[columns],
                 np.diff(shape.rise) / cells,
                 [shape.edge_gain],
             ])  # fmt: skip
@@ -74,7 +78,7 @@ class Case:
         shape = self.shape
         if isinstance(shape, PrandtlIshlinskii):
             return float(shape.weights @ np.maximum(self.width - 2 * shape.thresholds, 0))
-        return float(shape.surface[-1, 0])
+        return float(shape.everett[-1, 0])
 
     def displacements(self, v: FloatArray) -> FloatArray:
         """Turn a path of voltages into one of displacements that the model reaches somewhere."""
@@ -99,7 +103,7 @@ def prandtl_ishlinskii(draw: st.DrawFn) -> PrandtlIshlinskii:
 
 @st.composite
 def loop_families(draw: st.DrawFn) -> LoopFamily:
-    """Draw a surface of branches on a grid that need not be uniform nor start at 0."""
+    """Draw an Everett function on a grid that need not be uniform nor start at 0."""
     unit = draw(st.sampled_from(UNITS))
     first = draw(st.sampled_from((0.0, -40.0, 20.0)) | fractions(-150, 150))
     if draw(st.booleans()):
@@ -110,13 +114,13 @@ def loop_families(draw: st.DrawFn) -> LoopFamily:
     n = grid.size
     steps = draw(st.lists(fractions(0.1, 1), min_size=7, max_size=7))
     cells = np.diff(grid)
-    surface = np.zeros((n, n))
+    everett = np.zeros((n, n))
     for i in range(1, n):
         for j in range(i - 1, -1, -1):
             step = unit * steps[(3 * i + 5 * j) % 7] * min(cells[i - 1], cells[j])
-            surface[i, j] = max(surface[i - 1, j], surface[i, j + 1]) + step
+            everett[i, j] = max(everett[i - 1, j], everett[i, j + 1]) + step
     rise = np.cumsum([0.0, *(cells * unit * steps[: n - 1])]) + unit * draw(fractions(-50, 50))
-    return LoopFamily(grid, surface, rise, unit * draw(fractions(0.2, 1)))
+    return LoopFamily(grid, everett, rise, unit * draw(fractions(0.2, 1)))
 
 
 @st.composite

@@ -9,7 +9,7 @@ import pytest
 from identification.records import calibration, stage
 
 import slpi_ros
-from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.tables import read_table, write_table
 
 

@@ -18,7 +18,7 @@ from benchmarks.hidden import hide
 from slpi_ros.cli import main
 from slpi_ros.diagnosis.result import AMBIGUOUS, AxisDiagnosis, Diagnosis, NamedEffect, Traces
 from slpi_ros.effects.lag import Lag
-from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
 
 SCHEMA = Path(__file__).resolve().parents[1] / "msg_schemas" / "diagnosis.schema.json"
@@ -337,7 +337,7 @@ def test_the_page_of_an_identification_tells_errors_left_out_and_findings_of_the
     page = (tmp_path / "page" / "report.html").read_text()
     found = next(line for line in said.splitlines() if " samples in " in line).removeprefix("axis x: ok   ")
     assert code == 0 and "on blocks left out" in said
-    assert found in page and "error on blocks left out, rms" in page and "repeatability floor" in page
+    assert found in page and "held-out error, rms" in page and "repeatability floor" in page
 
 
 def test_a_report_that_cannot_be_written_is_told_before_the_fit(slpi, folder, tmp_path, monkeypatch):

@@ -1,11 +1,16 @@
-"""Feedforward and PID feedback together (second paper, Fig. 12), sample by sample: what corrects an axis."""
+"""Feedback of one axis: feedforward and PID together (second paper, Fig. 12), and how far the model is off."""
 
 from array import array
 from dataclasses import dataclass, fields
 from math import exp, expm1, inf, isfinite, sqrt
 
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.model.streaming import Limits, RateLimiter, StreamingInverse
+from slpi_ros.model.limits import Limits, RateLimiter
+
+# Measurements that the residuals are kept of.
+WINDOW = 500
+# Fewer than these say nothing.
+ENOUGH = 50
 
 
 @dataclass(frozen=True)
@@ -49,17 +54,29 @@ class Feedback:
     The integral grows only as far as the voltage can follow (conditional integration): unlike back-calculation, this
     forgets nothing it has learnt while the voltage is on its way, slew limited, to a distant feedforward.
 
+    `step` does what `correct` and `hold` do, with the last measurement that `measure` was told: it acts once, and only
+    while it is fresh. What counts is how far it was from what was desired when it came: what is desired now, nobody can
+    have measured yet.
+
     Parameters
     ----------
     gains : PidGains
     limits : Limits
-        Of the total voltage. They may be replaced at any time; a voltage outside new ones goes inside at once.
+        Of the total voltage. They may be replaced at any time; a voltage outside of them goes inside as `RateLimiter`
+        lets it, here as everywhere: as fast as slew and acceleration allow, and no faster.
     voltage : float, volts
-        What the axis has at the start; brought inside the limits.
+        What the axis has at the start.
     release_time : float, seconds
         inf: the offset, or the correction of a disabled feedback, stays.
     longest_gap : float, seconds
         A longer gap between samples counts as this long where time is integrated: integral and fading.
+
+    Attributes
+    ----------
+    pace : RateLimiter
+        Of the total voltage.
+    acting : bool
+        Whether the last `step` had a measurement to act on.
 
     Raises
     ------
@@ -82,14 +99,15 @@ class Feedback:
             raise UsageError(f"release_time is {release_time} s; give a positive one")
         if not 0.0 < longest_gap < inf:
             raise UsageError(f"longest_gap is {longest_gap} s; give a positive, finite one")
-        self.limits = limits
+        self.pace = RateLimiter(limits)
+        self.acting = False
         self._gains = gains
         self._release_time = release_time
         self._longest_gap = longest_gap
         self._enabled = False
         self._taking_over = False
         self._t = -inf
-        self._voltage = min(max(voltage, limits.lower), limits.upper)
+        self._voltage = self._goal = voltage
         self._correction = 0.0
         self._integral = 0.0
         self._offset = 0.0
@@ -97,6 +115,18 @@ class Feedback:
         self._measured = 0.0
         self._error = 0.0
         self._rate = 0.0
+        # What `measure` was told last, when, and what was desired then.
+        self._latest: tuple[float, int, float | None] | None = None
+        self._desired: float | None = None
+
+    @property
+    def limits(self) -> Limits:
+        """Limits of the total voltage."""
+        return self.pace.limits
+
+    @limits.setter
+    def limits(self, limits: Limits) -> None:
+        self.pace.limits = limits
 
     @property
     def enabled(self) -> bool:
@@ -174,13 +204,13 @@ class Feedback:
         direct = self._direct(self._gains, error, rate)
         if not isfinite(direct):
             raise UsageError(f"desired {desired} m, measured {measured} m gives no finite voltage; hold the sample")
-        reach = self._reach(t)
         if self._enabled:
+            reach = self.pace.reach(self._voltage, self._dt(t))
             integral, offset = self._next_integral_and_offset(elapsed, error, direct, feedforward, reach)
-            self._give(t, feedforward, direct + offset + integral, reach)
+            self._give(t, feedforward, direct + offset + integral)
             self._integral, self._offset, self._taking_over = integral, offset, False
         else:
-            self._give(t, feedforward, self._without_measurement(t), reach)
+            self._give(t, feedforward, self._without_measurement(t))
         self._error, self._rate = error, rate
         if elapsed > 0.0:
             self._measured_at, self._measured = t, measured
@@ -195,8 +225,39 @@ class Feedback:
             If time (s) runs backwards, or something is not finite; nothing has moved then.
         """
         self._check(t, feedforward)
-        self._give(t, feedforward, self._without_measurement(t), self._reach(t))
+        self._give(t, feedforward, self._without_measurement(t))
         return self._voltage
+
+    def measure(self, displacement: float, now_ns: int) -> None:
+        """Note a measurement (m) that came at `now_ns` (ns, a clock that never jumps), for the next `step`."""
+        self._latest = displacement, now_ns, self._desired
+
+    def step(self, dt: float, desired: float, feedforward: float, now_ns: int, timeout: float) -> float:
+        """Return the voltage (V) for a sample, corrected by the last measurement while that is fresh.
+
+        Parameters
+        ----------
+        dt : float, seconds
+            Since the last sample.
+        desired : float, metres
+        feedforward : float, volts
+        now_ns : int, nanoseconds
+            On the clock of `measure`.
+        timeout : float, seconds
+            An older measurement does not act; the correction stays.
+        """
+        t = self._t + dt if self._t > -inf else 0.0
+        latest, self._latest = self._latest, None
+        self.acting = latest is not None and (now_ns - latest[1]) * 1e-9 <= timeout
+        self._desired = desired
+        if latest and self.acting:
+            aim = desired if latest[2] is None else latest[2]
+            try:
+                return self.correct(t, aim, latest[0], feedforward)
+            except SlpiError:
+                # A measurement beyond reason is none.
+                self.acting = False
+        return self.hold(t, feedforward)
 
     def _check(self, t: float, feedforward: float) -> None:
         if not (isfinite(t) and isfinite(feedforward)):
@@ -237,25 +298,21 @@ class Feedback:
             return self._correction
         return self._correction * exp(-min(t - self._t, self._longest_gap) / self._release_time)
 
-    def _reach(self, t: float) -> tuple[float, float]:
-        """Return the lowest and highest voltage that may be given at `t`."""
-        lower, upper, slew = self.limits.lower, self.limits.upper, self.limits.slew
-        if slew == inf:
-            return lower, upper
-        # At the first sample no time has passed yet: the voltage stays and catches up from there.
-        way = slew * (t - self._t) if self._t > -inf else 0.0
-        # Outside the limits after they were replaced: inside at once, however far.
-        return min(max(self._voltage - way, lower), upper), max(min(self._voltage + way, upper), lower)
+    def _dt(self, t: float) -> float:
+        """Return the time (s) since the last sample; at the first one none has passed, and the voltage stays."""
+        return t - self._t if self._t > -inf else 0.0
 
-    def _give(self, t: float, feedforward: float, correction: float, reach: tuple[float, float]) -> None:
+    def _give(self, t: float, feedforward: float, correction: float) -> None:
         """Move to the voltage nearest to `feedforward` and `correction` together."""
         wanted = feedforward + correction
         if not isfinite(wanted):
             raise UsageError(f"feedforward {feedforward} V, correction {correction} V is not finite; check the gains")
-        self._t = t
-        self._voltage = min(max(wanted, reach[0]), reach[1])
+        limits = self.pace.limits
+        goal = limits.clip(wanted)
+        self._voltage = self.pace.step(self._voltage, goal, self._dt(t), self._goal)
+        self._t, self._goal = t, goal
         # Else a correction that no voltage ever showed would have to fade before one that did.
-        self._correction = part_within(correction, self.limits.lower - feedforward, self.limits.upper - feedforward)
+        self._correction = part_within(correction, limits.lower - feedforward, limits.upper - feedforward)
 
 
 def part_within(step: float, low: float, high: float) -> float:
@@ -263,15 +320,9 @@ def part_within(step: float, low: float, high: float) -> float:
     return min(max(step, min(low, 0.0)), max(high, 0.0))
 
 
-# Measurements that the health looks back on.
-WINDOW = 500
-# Fewer than these say nothing.
-ENOUGH = 50
-
-
 @dataclass(frozen=True)
 class Drift:
-    """What the health says.
+    """How far measurements are off the model.
 
     Parameters
     ----------
@@ -332,7 +383,7 @@ class ResidualWindow:
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What the closed loop of one axis is told.
+    """Settings of the feedback of one axis.
 
     Parameters
     ----------
@@ -346,136 +397,3 @@ class LoopSettings:
     enabled: bool
     gains: PidGains
     timeout: float
-
-
-class ClosedLoop:
-    """Feedback of one axis, and the model that follows the voltage it is really given.
-
-    The inverse model's own memory follows the desired path, as if there were no correction: noise of the sensor must
-    not turn it.
-
-    Parameters
-    ----------
-    settings : LoopSettings
-    limits : Limits
-        Of the voltage in total.
-    applied : AxisStream
-        In its present state; owned by the loop from here on, which drives it.
-
-    Attributes
-    ----------
-    applied : AxisStream
-    pace : Pace
-        Of the voltage in total.
-    """
-
-    def __init__(self, settings: LoopSettings, limits: Limits, applied: StreamingInverse) -> None:
-        self.applied = applied
-        self.residuals = ResidualWindow(applied.uncoupled_displacement)
-        self._settings = settings
-        self.pace = RateLimiter(limits)
-        self.pace.go_on(applied.pace)
-        self._t, self._wanted = 0.0, applied.voltage
-        self._desired: float | None
-        self._aim: float | None
-        self._start()
-
-    @property
-    def voltage(self) -> float:
-        """Present voltage in total, volts."""
-        return self.applied.voltage
-
-    @property
-    def correction(self) -> float:
-        """Part of the present voltage that comes from the feedback, volts."""
-        return self._feedback.correction
-
-    @property
-    def acting(self) -> bool:
-        """Whether the last sample had a measurement to act on."""
-        return self._acting
-
-    def swap(self, limits: Limits, applied: StreamingInverse) -> None:
-        """Go on with another model; the correction stays."""
-        self.limit(limits)
-        self.applied = applied
-        self.residuals.forget(applied.uncoupled_displacement)
-
-    def settle(self, pace: RateLimiter) -> None:
-        """Start anew where the axis is, going on at a pace, without a correction."""
-        self.pace.go_on(pace)
-        self._start()
-        self.residuals.forget(self.applied.uncoupled_displacement)
-
-    def retune(self, settings: LoopSettings) -> None:
-        """Go on with other settings, without a jump."""
-        self._settings = settings
-        try:
-            self._feedback.retune(settings.gains)
-        except SlpiError:
-            # The last measurement was beyond reason, which other gains did not show.
-            self._feedback.forget()
-            self._feedback.retune(settings.gains)
-        if settings.enabled:
-            self._feedback.enable()
-        else:
-            self._feedback.disable()
-
-    def limit(self, limits: Limits) -> None:
-        """Go on within other limits."""
-        self._feedback.limits = self.pace.limits = limits
-
-    def measure(self, displacement: float, now: float) -> None:
-        """Note a finite measurement (m) that came at `now` (s): it shows what became of the last sample."""
-        self._measured, self._measured_at, self._aim = displacement, now, self._desired
-        self.residuals.measure(displacement)
-
-    def correct(self, dt: float, desired: float, feedforward: float, now: float) -> float:
-        """Return the voltage in total (V).
-
-        A measurement acts once, and only while it is fresh; without one the correction stays. What counts is how far it
-        was from what was desired when it came: what is desired now, nobody can have measured yet.
-
-        Parameters
-        ----------
-        dt : float, seconds
-            Since the last sample.
-        desired : float, metres
-        feedforward : float, volts
-        now : float, seconds
-            On the clock of `measure`.
-        """
-        self._t += dt
-        before = self.applied.voltage
-        self._acting = now - self._measured_at <= self._settings.timeout
-        v = wanted = self._give(desired if self._aim is None else self._aim, feedforward)
-        if self.pace.limits.acceleration < inf:
-            v = self.pace.step(before, wanted, dt, self._wanted)
-        self._wanted, self._desired = wanted, desired
-        self._measured_at = -inf
-        self.residuals.expect(self.applied.drive(v, dt))
-        return v
-
-    def drive(self, voltage: float, dt: float) -> None:
-        """Go to a voltage (V), `dt` (s) after the last one, whatever is desired or measured."""
-        self.residuals.expect(self.applied.drive(voltage, dt))
-
-    def _start(self) -> None:
-        """Forget corrections and measurements."""
-        voltage = self.applied.voltage
-        self._t, self._wanted = 0.0, voltage
-        self._desired = self._aim = None
-        self._measured, self._measured_at, self._acting = 0.0, -inf, False
-        self._feedback = Feedback(self._settings.gains, self.pace.limits, voltage)
-        self._feedback.hold(0.0, voltage)
-        if self._settings.enabled:
-            self._feedback.enable()
-
-    def _give(self, desired: float, feedforward: float) -> float:
-        if self._acting:
-            try:
-                return self._feedback.correct(self._t, desired, self._measured, feedforward)
-            except SlpiError:
-                # A measurement beyond reason is none.
-                self._acting = False
-        return self._feedback.hold(self._t, feedforward)

@@ -5,13 +5,15 @@ from dataclasses import replace
 from math import inf
 
 from slpi_ros.errors import ModelError, UsageError
-from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.hysteresis.shape import FAR
-from slpi_ros.model.stage_model import AxisModel
-from slpi_ros.model.streaming import TOLERATED_SHARE, Limits, StreamingInverse
+from slpi_ros.hysteresis.turning_points import FAR, Memory
+from slpi_ros.model.axis_model import AxisModel, StartMemory
+from slpi_ros.model.limits import Limits
+from slpi_ros.model.streaming import TOLERATED_SHARE, StreamingInverse
 
 
-def take_over(axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = ()) -> StreamingInverse:
+def take_over(
+    axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = (), start_memory: StartMemory = "end"
+) -> StreamingInverse:
     """Return a stream of a new model.
 
     Parameters
@@ -19,9 +21,11 @@ def take_over(axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float
     axis : AxisModel
     limits : Limits
         Of the node; the stream keeps to what is within them and the identified voltages.
-    went_through : sequence of float, volts
-        Where the drive turned, oldest first, and last its present voltage. The new memory goes through them from its
-        own start. Empty: nothing is known, and the model's start stands.
+    reversal_voltages : sequence of float, volts
+        Where the drive turned, oldest first, and last its present voltage. The new memory goes through them from the
+        model's start. Empty: they are not known, and the memory is the one that `start_memory` names.
+    start_memory : str
+        See `AxisModel.initial`.
 
     Raises
     ------
@@ -36,11 +40,11 @@ def take_over(axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float
         )
     allowed = limits.within(axis.voltage_range)
     try_out(axis, allowed)
-    memory = axis.memory()
     if not reversal_voltages:
-        return axis.stream_from(memory, allowed)
+        return axis.stream_from(axis.memory(start_memory), allowed)
     present = reversal_voltages[-1]
     require_near(present, allowed)
+    memory = axis.memory("start")
     replay(memory, reversal_voltages)
     # No jump: a voltage just outside goes inside with the next samples, as fast as it may.
     stream = axis.stream_from(memory, including(allowed, present))
@@ -48,14 +52,13 @@ def take_over(axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float
     return stream
 
 
-def go_on(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> tuple[Limits, StreamingInverse]:
-    """Return a stream of a new model where another one has been, and `allowed`, wide enough for it."""
-    memory = axis.memory()
+def go_on(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> StreamingInverse:
+    """Return a stream of a new model where another one has been; its limits are wide enough for its voltage."""
+    memory = axis.memory("start")
     replay(memory, turning_voltages(before.memory))
-    limits = including(allowed, before.voltage)
-    stream = axis.stream_from(memory, including(limits, memory.voltage))
+    stream = axis.stream_from(memory, including(including(allowed, before.voltage), memory.voltage))
     stream.resume(before)
-    return limits, stream
+    return stream
 
 
 def turning_voltages(memory: Memory) -> tuple[float, ...]:
@@ -78,7 +81,7 @@ def replay(memory: Memory, voltages: Sequence[float]) -> None:
 
 
 def try_out(axis: AxisModel, allowed: Limits) -> None:
-    """Ask for both ends of what commands may ask for, at both voltage limits: none may find a surprise later.
+    """Ask for both ends of what commands may ask for, at both voltage limits, before a command does.
 
     Raises
     ------
@@ -87,7 +90,9 @@ def try_out(axis: AxisModel, allowed: Limits) -> None:
     """
     low, high = axis.displacement_range
     margin = TOLERATED_SHARE * (high - low) * (1.0 - 1e-9)
-    stream = StreamingInverse(axis.memory(), axis.displacement_range, replace(allowed, slew=inf, acceleration=inf))
+    stream = StreamingInverse(
+        axis.memory("start"), axis.displacement_range, replace(allowed, slew=inf, acceleration=inf)
+    )
     for v in (allowed.upper, allowed.lower):
         for y in (low - margin, high + margin) * 2:
             stream.memory.forward(v)
@@ -96,7 +101,7 @@ def try_out(axis: AxisModel, allowed: Limits) -> None:
 
 
 def require_near(present: float, allowed: Limits) -> None:
-    """Refuse a model that was identified far from the present voltage (V): what it says there is made up.
+    """Refuse a model that was identified far from the present voltage (V), where it only extrapolates.
 
     Raises
     ------

@@ -14,10 +14,10 @@ from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.streaming import Limits
 
-# Nobody knows where the stage has been; being wiped; wiped since; kept over a restart.
+# As the model says, but not verified; being wiped; wiped since; kept over a restart.
 ASSUMED, RESETTING, KNOWN, RESTORED = "assumed", "resetting", "known", "restored"
 # A drive may miss either end of the identified voltages by this share of their span: measured ends are noisy.
 TOLERATED_SHARE = 0.01
@@ -32,14 +32,17 @@ class MemoryConfidence:
     state : str
         `ASSUMED`, `RESETTING`, `KNOWN` or `RESTORED`.
     doubt : str
-        Why it is assumed, where there is more to say than that nobody knows.
+        Why it is assumed, where there is more to say than that nothing has verified it.
     spanned : (float, float), volts
         Lowest and highest voltage of the drive that made it known.
+    contradicted : bool
+        Whether a measured displacement fits none of the memories that were considered.
     """
 
     state: str = ASSUMED
     doubt: str = ""
     spanned: tuple[float, float] = (0.0, 0.0)
+    contradicted: bool = False
 
     def over(self, identified: tuple[float, float]) -> "MemoryConfidence":
         """Return what it is worth for a model identified on these voltages (V).
@@ -131,6 +134,7 @@ def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tu
 SCHEMA = "slpi_ros/saved_memory/1"
 # Characters; a memory of many axes has a few thousand.
 LONGEST = 1_000_000
+INTERRUPTED = "the reset was interrupted"
 CRASHED = "restored from before a crash: the last voltage is right, turns just before may be missing; reset it"
 
 
@@ -140,7 +144,7 @@ class SavedAxis:
 
     Parameters
     ----------
-    went_through : tuple of float, volts
+    reversal_voltages : tuple of float, volts
         Where the drive turned, oldest first, and last its voltage.
     certain : bool
         Whether the memory was known.
@@ -152,8 +156,8 @@ class SavedAxis:
     certain: bool
     doubt: str = ""
 
-    def trust(self, identified: tuple[float, float]) -> MemoryConfidence:
-        """Return what the memory is worth to the model that it was saved with, identified on these voltages (V)."""
+    def confidence(self, identified: tuple[float, float]) -> MemoryConfidence:
+        """Return how far it is to be trusted with its model, identified on these voltages (V)."""
         if self.certain and not self.doubt:
             return MemoryConfidence(RESTORED, spanned=identified)
         return MemoryConfidence(doubt=self.doubt)
@@ -265,6 +269,69 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
         last = read_last_voltages(_beside(path), _mark(text), len(axes)) or saved
         axes = {name: axis.after_crash(v) for (name, axis), v in zip(axes.items(), last, strict=True)}
     return SavedMemory(document["model"], document["complete"], axes)
+
+
+class MemoryFile:
+    """Keeps the memory of a stage in a file, and beside it the voltages given since.
+
+    Parameters
+    ----------
+    path : str
+        "": no file; all methods do nothing then.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._saved: SavedMemory | None = None
+        self._last: LastVoltages | None = None
+
+    def find(self, model: StageModel, names: Sequence[str], limits: Sequence[Limits]) -> Mapping[str, SavedAxis] | None:
+        """Return where the axes were when the node last ended; None where there is no file.
+
+        Raises
+        ------
+        ModelError
+            If the file cannot be read, or does not belong to this model, these axes and limits.
+        """
+        saved = load_memory(self._path) if self._path else None
+        if saved is None:
+            return None
+        saved.require_fit(model, names, limits)
+        return saved.axes
+
+    def save(self, model: StageModel | None, axes: Mapping[str, SavedAxis], complete: bool) -> None:
+        """Write the memory, if it has changed; `complete`: nothing will move until the node has ended.
+
+        Raises
+        ------
+        ModelError
+            If the file cannot be written.
+        """
+        if not self._path or model is None:
+            return
+        memory = SavedMemory(model_id(model), complete, axes)
+        if memory == self._saved:
+            return
+        mark = save_memory(memory, self._path)
+        self._saved = memory
+        if self._last and complete:
+            self._last.discard()
+            self._last = None
+        elif self._last:
+            self._last.mark = mark
+        elif not complete:
+            self._last = last_voltages(self._path, mark)
+
+    def note(self, voltages: bytes) -> None:
+        """Note what has just been given, for a life after a crash; called for each command.
+
+        Raises
+        ------
+        ModelError
+            If the file cannot be written.
+        """
+        if self._last:
+            self._last.note(voltages)
 
 
 def _mark(text: str) -> int:

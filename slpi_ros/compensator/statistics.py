@@ -1,4 +1,4 @@
-"""What became of the messages of a compensator."""
+"""Counts of the messages of a compensator, and how long they took."""
 
 from array import array
 from dataclasses import dataclass, field, replace
@@ -31,6 +31,8 @@ class Counts:
         Measured displacements of axes that were not used.
     trajectories, trajectories_rejected : int
         Those that were sent, and those of them that could not be followed.
+    points_held, points_slewing : int
+        Points of trajectories, as `held_at_limit` and `slew_limited`.
     """
 
     received: int = 0
@@ -44,6 +46,8 @@ class Counts:
     measured_by_cause: dict[str, int] = field(default_factory=lambda: dict.fromkeys(MEASURED_CAUSES, 0))
     trajectories: int = 0
     trajectories_rejected: int = 0
+    points_held: int = 0
+    points_slewing: int = 0
 
     @property
     def rejected(self) -> int:

@@ -1,4 +1,8 @@
-"""What the stamps of a stream of samples mean."""
+"""What is accepted: which axes, displacements and stamps a message may hold, and why it is rejected otherwise.
+
+One rule for all kinds of messages: a message is accepted as a whole, or rejected as a whole with a `RejectedError`
+that says why; nothing has moved then.
+"""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -30,7 +34,13 @@ MEASURED_CAUSES = (NOT_FINITE, OUT_OF_RANGE)
 
 
 class RejectedError(SlpiError):
-    """A message was rejected as a whole, and nothing has moved; `cause` is one of `CAUSES`."""
+    """A message was rejected as a whole, and nothing has moved.
+
+    Attributes
+    ----------
+    cause : str
+        One of `CAUSES`.
+    """
 
     def __init__(self, cause: str, message: str) -> None:
         super().__init__(message)
@@ -55,7 +65,7 @@ def require_names(names: Sequence[str], axes: Collection[str]) -> None:
 
 
 def implausible(y: float, accepted: tuple[float, float], kind: str) -> RejectedError:
-    """Return why the displacement `y` (m), outside of those accepted (m), is none; `kind`: "desired" or "measured"."""
+    """Return the rejection of a displacement `y` (m) outside of `accepted` (m); `kind`: "desired" or "measured"."""
     if isfinite(y):
         return RejectedError(OUT_OF_RANGE, refusal(y, accepted, kind))
     return RejectedError(NOT_FINITE, f"{kind} displacement is {y} m; send finite ones only")
@@ -63,7 +73,7 @@ def implausible(y: float, accepted: tuple[float, float], kind: str) -> RejectedE
 
 @dataclass(frozen=True)
 class TimeRules:
-    """What stamps may do.
+    """How stamps are judged.
 
     Parameters
     ----------
@@ -78,7 +88,7 @@ class TimeRules:
 
 
 class Stamps:
-    """The stamps of one axis: whole nanoseconds, in order, or of a clock that was set.
+    """The stamps of the samples of one axis, whole nanoseconds.
 
     Parameters
     ----------
@@ -92,7 +102,7 @@ class Stamps:
     def __init__(self, jump_ns: int = SECOND_NS) -> None:
         self.jump_ns = jump_ns
         self._last_ns: int | None = None
-        # Seconds that have passed without a stamp; None: stamps tell.
+        # Seconds that have passed since the present voltage was given without a stamp; None: it had one.
         self._restarted: float | None = None
 
     def check(self, stamp_ns: int) -> None:
@@ -132,5 +142,5 @@ class Stamps:
         return self.accept(now_ns)
 
     def restart(self, elapsed: float = 0.0) -> None:
-        """Let the next stamp come `elapsed` (s) after the voltage; what is older than the last one stays late."""
+        """Take the next stamp for `elapsed` (s) after the present voltage; stamps older than the last one stay late."""
         self._restarted = elapsed

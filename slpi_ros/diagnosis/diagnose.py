@@ -23,7 +23,8 @@ from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.samples import Samples
 from slpi_ros.identification.signal_statistics import Floor, floor_of
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, StageModel, Start
+from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 

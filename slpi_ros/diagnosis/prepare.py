@@ -22,7 +22,7 @@ from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.identification.signal_statistics import digit
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel
+from slpi_ros.model.axis_model import AxisModel
 
 FloatArray = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """The model against records that it has not seen, and what is left of a compensated path's error.
 
 What happened before a record began is unknown: an initial history and a constant offset are estimated for each record,
-and nothing else. Where the record visits both ends of its voltage range, only what comes after that is judged.
+and nothing else. Judged is what comes when the initial history adds nothing but a constant, if that ever comes.
 """
 
 import warnings
@@ -22,11 +22,12 @@ from slpi_ros.identification.cross_validation import (
     speed_classes,
     speeds,
 )
-from slpi_ros.identification.initial_history import histories
-from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.initial_history import Match, match
+from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.identification.signal_statistics import floor_of
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, StageModel, Start
+from slpi_ros.model.axis_model import START_MEMORIES, AxisModel
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -35,8 +36,8 @@ Mask = NDArray[np.bool_]
 SCHEMA = "slpi_ros/verification/1"
 # Without a tolerance an error passes up to so many times the noise floor.
 TIMES_THE_FLOOR = 3.0
-# Initial histories whose errors differ by less than this factor explain a record equally well.
-EQUALLY_WELL = 1.1
+# A shift in time must make the model agree with the desired displacement better by this factor.
+BETTER = 1.1
 # A change of gain is all that there is when it leaves less than this share of the error.
 MOSTLY = 0.5
 # Tables are made from about so many samples.
@@ -138,16 +139,18 @@ class RecordVerification:
     floor_source : str
         Where that was seen.
     known_from : float or None, seconds
-        From when on the record makes its memory known, so that it is judged; None: never, the initial history is
-        estimated and everything is judged.
+        From when on the initial history adds nothing but a constant: judged from there. None: never; everything is
+        judged, from the estimated history.
     history : tuple of float, volts
         The initial history that best explains the record, as in `slpi_ros.model.stage_model.Start`.
     offset : float, metres
-        Measured - model, constant; by how much the zero has moved, as far as no initial history explains it.
+        By how much the zero has moved.
+    offset_uncertainty : float, metres
+        What an unknown initial history can hide, and chance.
     zero_moved : bool
-        Whether the offset is more than the model is known to.
-    gain : float
-        By which share the measured displacement moves more than the model.
+        Whether the offset is more than that.
+    gain, width : float
+        By which share the outermost loop is higher and wider than that of the model.
     outside : int
         Samples whose voltage lies outside of what the model was identified on.
     t, v, measured, model : ndarray, shape (N,), seconds, volts and metres
@@ -164,8 +167,10 @@ class RecordVerification:
     known_from: float | None
     history: tuple[float, ...]
     offset: float
+    offset_uncertainty: float
     zero_moved: bool
     gain: float
+    width: float
     outside: int
     t: FloatArray
     v: FloatArray
@@ -198,8 +203,10 @@ class RecordVerification:
             "start": "estimated" if self.known_from is None else "known",
             "known_from_s": self.known_from,
             "offset_m": self.offset,
+            "offset_uncertainty_m": self.offset_uncertainty,
             "zero_moved": self.zero_moved,
             "gain_change": self.gain,
+            "width_change": self.width,
             "outside_samples": self.outside,
             "tracking": None if self.tracking is None else self.tracking.to_document(),
         }
@@ -354,19 +361,20 @@ def verify(
 
 @dataclass(frozen=True)
 class _Run:
-    """One axis of a record, the model free-run along it, and what initial histories say of its offset.
+    """One axis of a record, and the model free-run along it from the initial history that explains the record best.
 
-    `simulated` starts from `start`; `assumed` is what the model says from its own start. Offsets (m) are those of all
-    initial histories that explain the record equally well.
+    `constant` (m) is what no initial history explains: `offset` and what a change of gain adds. `assumed` is the model
+    from each memory that a compensator may have assumed.
     """
 
     t: FloatArray
     samples: Samples
     judged: Mask
-    start: Start
+    found: Match
     simulated: FloatArray
-    assumed: FloatArray
-    offsets: tuple[float, float]
+    assumed: tuple[FloatArray, ...]
+    offset: float
+    constant: float
 
 
 def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[str, _Run]:
@@ -386,9 +394,10 @@ def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[s
         with warnings.catch_warnings():
             # The figures say what comes of loops that were never identified.
             warnings.simplefilter("ignore", UnidentifiedLoopWarning)
-            runs[name] = _best_start(axis, t, samples)
-            own = replace(axis, start=runs[name].start).uncoupled_displacement(t, samples.v)
-        motions[name] = t, own - runs[name].start.displacement
+            runs[name] = _run(axis, t, samples)
+            start = runs[name].found.start
+            own = replace(axis, start=start).uncoupled_displacement(t, samples.v)
+        motions[name] = t, own - start.displacement
     coupled = {}
     for name in names:
         run, axis = runs[name], model.axis(name)
@@ -397,96 +406,64 @@ def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[s
             alone = {other: np.zeros_like(run.t) for other in others}
             zero = np.zeros_like(run.t)
             moved = axis.seen(run.t, zero, others) - axis.seen(run.t, zero, alone)
-            run = replace(run, simulated=run.simulated + moved, assumed=run.assumed + moved)
+            simulated = run.simulated + moved
+            simulated += np.median((run.samples.y - simulated)[run.judged])
+            run = replace(run, simulated=simulated, assumed=tuple(each + moved for each in run.assumed))
         coupled[name] = run
     return coupled
 
 
-def _best_start(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
-    """Choose the initial history that explains the record best, of equal ones that with the least offset."""
-    starts = _starts(axis, samples)
-    simulated = [replace(axis, start=start).simulate(t, samples.v) for start in starts]
-    errors, judged = [samples.y - one for one in simulated], samples.judged
-    best = _explaining(errors, samples.fitted)[0]
-    # What is judged may suit more of them: which one it was only shows before the voltage has been to both ends.
-    offsets = [float(np.median(errors[k][judged])) for k in (best, *_explaining(errors, judged))]
+def _run(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
+    """Simulate an axis along a record from the initial history that explains it best."""
+    # What belongs to one record is not expected of another one.
+    axis = replace(axis, effects=tuple(effect for effect in axis.effects if effect.removable != "record"))
+    found = match(axis, samples, t)
+    simulated = replace(axis, start=found.start).simulate(t, samples.v)
+    after = samples.fitted & (np.arange(t.size) >= found.known_from)
+    judged = after if np.count_nonzero(after) >= FEWEST else samples.fitted
+    # Of a stage that moves more, the place where the model starts stays.
+    by_gain = 0.0
+    if found.gain_changed and found.rms_explained < MOSTLY * found.rms:
+        by_gain = found.gain_change * float(simulated[judged].mean() - axis.start.displacement)
+    offset = found.offset - by_gain
+    moved = abs(offset) > found.offset_uncertainty
+    starts = [axis.initial(memory) for memory in START_MEMORIES] if axis.causal else [axis.start]
     return _Run(
         t=t,
         samples=samples,
         judged=judged,
-        start=starts[best],
-        simulated=simulated[best],
-        assumed=axis.simulate(t, samples.v),
-        offsets=(min(offsets), max(offsets)),
+        found=found,
+        simulated=simulated + float(np.median((samples.y - simulated)[judged])),
+        assumed=tuple(replace(axis, start=start).simulate(t, samples.v) for start in starts),
+        offset=offset,
+        constant=by_gain + (offset if moved else 0.0),
     )
-
-
-def _explaining(errors: Sequence[FloatArray], chosen: Mask) -> IntArray:
-    """Return which errors, shape (N,) each, are about the smallest but for their offset; the least offset first."""
-    offsets = np.array([np.median(error[chosen]) for error in errors])
-    scores = np.array([_rms(error[chosen] - o) for error, o in zip(errors, offsets.tolist(), strict=True)])
-    alike = np.flatnonzero(scores <= EQUALLY_WELL * scores.min())
-    return alike[np.argsort(np.abs(offsets[alike]), kind="stable")]
-
-
-def _starts(axis: AxisModel, samples: Samples) -> list[Start]:
-    """Return starts with the histories that may have gone before, each where the model says that it leads."""
-    v0, (low, high) = float(samples.v[0]), axis.voltage_range
-    if not axis.causal:
-        return [Start(v0, axis.start.displacement)]
-    ends = np.array([min(low, v0), max(high, v0)])
-    whole = Samples(np.append(v0, ends), np.zeros(3), np.ones(3, dtype=bool))
-    # Whatever went before, a sweep over the whole range ends at one displacement.
-    swept = axis.memory("start").forward_array(ends)[-1]
-    found = []
-    for history in dict.fromkeys((*histories(whole), axis.start.history)):
-        way = replace(axis, start=Start(v0, 0.0, history)).memory("start").forward_array(ends)[-1]
-        found.append(Start(v0, float(swept - way), history))
-    return found
 
 
 def _judge(run: _Run, axis: AxisModel, source: str, tolerance: float | None) -> RecordVerification:
-    samples, judged = run.samples, run.judged
-    offset = float(np.median((samples.y - run.simulated)[judged]))
-    error = (samples.y - run.simulated - offset)[judged]
+    samples, judged, found = run.samples, run.judged, run.found
     floor = floor_of(run.t[judged], samples.v[judged], samples.y[judged])
-    limit = max(TIMES_THE_FLOOR * floor.rms, axis.quality.held_out_rms)
-    gain, by_gain = _gain(run, axis)
-    low, high = (x - by_gain for x in run.offsets)
-    least = 0.0 if low - limit <= 0.0 <= high + limit else min(low, high, key=abs)
-    v_low, v_high = axis.voltage_range
-    margin = 1e-6 * (v_high - v_low)
+    low, high = axis.voltage_range
+    margin = 1e-6 * (high - low)
     return RecordVerification(
-        error=ErrorPart.of(source, error),
-        limit=limit if tolerance is None else tolerance,
+        error=ErrorPart.of(source, (samples.y - run.simulated)[judged]),
+        limit=max(TIMES_THE_FLOOR * floor.rms, axis.quality.held_out_rms) if tolerance is None else tolerance,
         floor_rms=floor.rms,
         floor_source=floor.source,
-        known_from=float(run.t[judged][0]) if samples.mostly_wiped else None,
-        history=run.start.history,
-        offset=least or offset - by_gain,
-        zero_moved=least != 0.0,
-        gain=gain,
-        outside=int(np.count_nonzero((samples.v < v_low - margin) | (samples.v > v_high + margin))),
+        known_from=float(run.t[judged][0]) if samples.fitted[~judged].any() or not found.known_from else None,
+        history=found.start.history,
+        offset=run.offset,
+        offset_uncertainty=found.offset_uncertainty,
+        zero_moved=bool(abs(run.offset) > found.offset_uncertainty),
+        gain=found.gain_change,
+        width=found.width_change,
+        outside=int(np.count_nonzero((samples.v < low - margin) | (samples.v > high + margin))),
         t=run.t,
         v=samples.v,
         measured=np.where(samples.fitted, samples.y, np.nan),
-        model=run.simulated + offset,
+        model=run.simulated,
         judged=judged,
     )
-
-
-def _gain(run: _Run, axis: AxisModel) -> tuple[float, float]:
-    """Return by which share the stage moves more than the model, and the constant (m) that this adds.
-
-    Of a stage that moves more, the place where the model starts stays. Where a gain does not explain most of the error,
-    it adds nothing.
-    """
-    simulated, error = run.simulated[run.judged], (run.samples.y - run.simulated)[run.judged]
-    error = error - np.median(error)
-    moved = simulated - simulated.mean()
-    gain = float(moved @ error / max(float(moved @ moved), 1e-300))
-    explained = _rms(error - gain * moved) < MOSTLY * _rms(error)
-    return gain, gain * float(simulated.mean() - axis.start.displacement) if explained else 0.0
 
 
 def _summary(records: Sequence[RecordVerification], resolution: float) -> AxisVerification:
@@ -526,8 +503,8 @@ def _tracking(
 ) -> Tracking:
     """Take the error measured - desired apart.
 
-    With the model ``m`` from the initial history that explains the record, ``a`` from the model's own start, which the
-    compensator assumes, and the desired ``d`` (``d'``: as late as the stage follows)::
+    With the model ``m`` from the initial history that explains the record, ``a`` from the memory that the
+    compensator seems to have assumed, and the desired ``d`` (``d'``: as late as the stage follows)::
 
         y - d = (y - offset - m) + offset + (m - a) + (a - d') + (d' - d)
                  model, noise      zero     memory    command    delay
@@ -539,16 +516,15 @@ def _tracking(
         raise RecordError(f"{record.source}: axis '{name}': no desired displacement while it was measured; record both")
     t, v, y, d = run.t[at], run.samples.v[at], run.samples.y[at], d[at]
     offset = one.offset if one.zero_moved else 0.0
-    found = float(np.median((run.samples.y - run.simulated)[run.judged]))
-    # An initial history explains a constant as far as those that suit the record as well do; a gain comes first.
-    estimated = run.simulated[at] + found - float(np.clip(_gain(run, model.axis(name))[1], *run.offsets))
-    delay = _delay(t, d, run.assumed[at])
+    estimated = run.simulated[at] - run.constant
+    assumed = min((each[at] for each in run.assumed), key=lambda each: _rms(each - d))
+    delay = _delay(t, d, assumed)
     late = np.interp(t - delay, t, d)
-    command = run.assumed[at] - late
+    command = assumed - late
     limited = _at_limit(v, command)
     parts = {
         "zero": np.full(t.size, offset),
-        "memory": estimated - run.assumed[at],
+        "memory": estimated - assumed,
         "limits": np.where(limited, command, 0.0),
         "delay": late - d,
         "command": np.where(limited, 0.0, command),
@@ -578,7 +554,7 @@ def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
     shifts = np.linspace(0.0, longest, DELAY_STEPS + 1)
     misses = [_rms(model - np.interp(t - shift, t, desired)) for shift in shifts.tolist()]
     best = int(np.argmin(misses))
-    return float(shifts[best]) if misses[best] < misses[0] / EQUALLY_WELL else 0.0
+    return float(shifts[best]) if misses[best] < misses[0] / BETTER else 0.0
 
 
 def _at_limit(v: FloatArray, command: FloatArray) -> Mask:

@@ -1,4 +1,4 @@
-"""How an effect looks for itself in what a model leaves: forms of it, linear in a few gains, for a fit to judge."""
+"""What every effect is: its verbs, what it may look at, its candidates for a fit, and checks of its parameters."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
@@ -17,6 +17,8 @@ FloatArray = NDArray[np.float64]
 Side = Literal["voltage", "displacement"]
 # When an effect can be undone: sample by sample; where the whole path is known; on the record's clock only; never.
 Removable = Literal["always", "path", "record", "never"]
+# Neighbours of a spectrum's peak that belong to it, on either side.
+LINE_WIDTH = 12
 
 
 @dataclass(frozen=True)
@@ -126,10 +128,6 @@ class Effect(Protocol):
 
     def follower(self) -> Follower | None:
         """Return what follows it sample by sample; None: nothing can be done so."""
-
-
-# Neighbours of a spectrum's peak that belong to it, on either side.
-LINE_WIDTH = 12
 
 
 @dataclass(frozen=True)

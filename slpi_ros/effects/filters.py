@@ -1,4 +1,4 @@
-"""A lightly damped second-order mode, exact where its input is linear between samples (first-order hold)."""
+"""Linear filters over one step or an even grid: first-order hold of a lag, second-order mode, resampling."""
 
 from dataclasses import dataclass
 from math import cos, exp, expm1, sin, sqrt
@@ -7,8 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+FloatArray = NDArray[np.float64]
+
 # Below this ratio of step to time constant, series keep the digits that differences lose.
 _SMALL = 1e-3
+# Stamps that stray by less than this share of a step are even.
+EVEN = 0.01
+# The grid has at most so many points for each sample.
+FINEST = 4
 
 
 class Hold(NamedTuple):
@@ -25,9 +31,6 @@ def hold(dt: float, time_constant: float) -> Hold:
     moved = -expm1(-x)
     now = x / 2 - x**2 / 6 + x**3 / 24 - x**4 / 120 if x < _SMALL else 1 - moved / x
     return Hold(now, moved - now, exp(-x))
-
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -75,12 +78,6 @@ class Mode:
         denominator = np.array([1.0, -total, product])
         # Rounding must not change what the mode makes of a rest.
         return numerator * (denominator.sum() / numerator.sum()), denominator
-
-
-# Stamps that stray by less than this share of a step are even.
-EVEN = 0.01
-# The grid has at most so many points for each sample.
-FINEST = 4
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,8 @@ def reversible(v: FloatArray, gains: Sequence[float]) -> FloatArray:
 class CoercivityFollower:
     """The play sample by sample.
 
-    The command that a wish asks for depends on its own rate: taken from the commands, that would run away. The inverse
-    takes the rate from the voltage that comes out; where that rests, from a command inside the play.
+    The command for a desired displacement depends on its own rate: taken from the commands, that would run away. The
+    inverse takes the rate from the voltage that comes out; where that rests, from a command inside the play.
 
     Parameters
     ----------
@@ -132,8 +132,8 @@ RateState = tuple[float | None, float, float, float | None, float, float, float]
 class RateFollower:
     """Rate dependence sample by sample; it looks at the voltage too.
 
-    The voltage that a wish asks for depends on its own rate: taken from the voltages, that would run away. The inverse
-    therefore takes the rate from the wishes, and only slowly learns how the two compare.
+    The voltage for a desired displacement depends on its own rate: taken from the voltages, that would run away. The
+    inverse therefore takes the rate from the desired displacements, and only slowly learns how the two compare.
 
     Parameters
     ----------
@@ -156,8 +156,8 @@ class RateFollower:
     def start(self, x: float) -> None:
         """Be at rest at `x` (m); the next voltage is the one it rests at."""
         self._u: float | None = None
-        self._rate = self._direction = self._wish_rate = self._volts = self._metres = 0.0
-        self._wish: float | None = x
+        self._rate = self._direction = self._desired_rate = self._volts = self._metres = 0.0
+        self._desired: float | None = x
         self._asked: float | None = None
 
     def drive(self, dt: float, u: float) -> None:
@@ -167,7 +167,7 @@ class RateFollower:
             self._rate += SMOOTHING * (way / dt - self._rate)
             self._compare(dt, way)
         if self._asked is not None or dt > 0.0:
-            self._wish, self._asked = self._asked, None
+            self._desired, self._asked = self._asked, None
         self._direction = self._turned(way)
         self._u = u
 
@@ -181,20 +181,22 @@ class RateFollower:
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the displacement (m) of the loops at rest for one of the wider loops (m)."""
         self._asked = wanted
-        if self._u is None or self._wish is None or dt <= 0.0:
+        if self._u is None or self._desired is None or dt <= 0.0:
             return wanted
-        rate = (self._wish_rate + SMOOTHING * ((wanted - self._wish) / dt - self._wish_rate)) * self._volts_per_metre()
+        rate = (
+            self._desired_rate + SMOOTHING * ((wanted - self._desired) / dt - self._desired_rate)
+        ) * self._volts_per_metre()
         speed, middle = self._speed(rate), self._middle(self._u + rate * dt)
         back = wanted + speed * (self._widening * middle + self._backlash * self._turned(rate * dt))
         return back / (1 + speed * self._widening)
 
     def snapshot(self) -> RateState:
-        """Return voltage, rate, direction, and what is known of the wishes."""
-        return self._u, self._rate, self._direction, self._wish, self._wish_rate, self._volts, self._metres
+        """Return voltage, rate, direction, and what is known of the desired displacements."""
+        return self._u, self._rate, self._direction, self._desired, self._desired_rate, self._volts, self._metres
 
     def restore(self, state: RateState) -> None:
         """Take over a state from `snapshot`."""
-        self._u, self._rate, self._direction, self._wish, self._wish_rate, self._volts, self._metres = state
+        self._u, self._rate, self._direction, self._desired, self._desired_rate, self._volts, self._metres = state
         self._asked = None
 
     def _turned(self, way: float) -> float:
@@ -208,12 +210,12 @@ class RateFollower:
         return float((abs(rate) / self._reference_rate) ** self._exponent)
 
     def _compare(self, dt: float, way: float) -> None:
-        """Note the last wish, and how its rate compares with that of the voltage."""
-        if self._asked is None or self._wish is None:
-            self._wish_rate = 0.0
+        """Note the last desired displacement, and how its rate compares with that of the voltage."""
+        if self._asked is None or self._desired is None:
+            self._desired_rate = 0.0
             return
-        went = self._asked - self._wish
-        self._wish_rate += SMOOTHING * (went / dt - self._wish_rate)
+        went = self._asked - self._desired
+        self._desired_rate += SMOOTHING * (went / dt - self._desired_rate)
         kept = exp(-dt / COMPARISON)
         self._volts = kept * self._volts + abs(way)
         self._metres = kept * self._metres + abs(went)

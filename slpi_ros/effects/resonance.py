@@ -51,7 +51,7 @@ class Unringing:
 
     @classmethod
     def of(cls, mode: Mode, spacing: float, preview: float = 0.0) -> "Unringing":
-        """Return the taps for a spacing (s), where the wish is known a `preview` (s) ahead."""
+        """Return the taps for a spacing (s), where the desired displacement is known a `preview` (s) ahead."""
         zeros = (1.0, 0.0, 0.0)
         if spacing * mode.omega < WIDEST:
             total, product = mode.ringing(spacing)
@@ -78,8 +78,8 @@ class ResonanceFollower:
         self._input = self._position = x
         self._velocity = 0.0
         self._asked: float | None = None
-        # Age (s) and value (m) of the wishes so far, the latest last; before the oldest the wish was at rest.
-        self._wishes: deque[tuple[float, float]] = deque([(0.0, x)])
+        # Age (s) and value (m) of the desired displacements so far, the latest last; before the oldest it was at rest.
+        self._desired: deque[tuple[float, float]] = deque([(0.0, x)])
         self._now = 0.0
 
     def forward(self, dt: float, x: float) -> float:
@@ -105,8 +105,8 @@ class ResonanceFollower:
         taps, spacing = self._unringing.taps, self._unringing.spacing
         later, value, at = self._now + dt, wanted, self._now + dt - spacing
         needed, k = taps[0] * wanted, 1
-        # From the latest wish to the oldest; between them they are taken as linear.
-        for earlier, before in reversed(self._wishes):
+        # From the latest one to the oldest; between them they are taken as linear.
+        for earlier, before in reversed(self._desired):
             while at >= earlier:
                 share = (at - earlier) / (later - earlier) if later > earlier else 0.0
                 needed += taps[k] * (before + (value - before) * share)
@@ -118,28 +118,28 @@ class ResonanceFollower:
         return needed + sum(taps[k:]) * value
 
     def snapshot(self) -> tuple[float | tuple[float, ...], ...]:
-        """Return input, position, velocity, and the wishes by age."""
-        ages = tuple(self._now - t for t, _ in self._wishes)
-        return self._input, self._position, self._velocity, ages, tuple(y for _, y in self._wishes)
+        """Return input, position, velocity, and the desired displacements by age."""
+        ages = tuple(self._now - t for t, _ in self._desired)
+        return self._input, self._position, self._velocity, ages, tuple(y for _, y in self._desired)
 
     def restore(self, state: tuple[float | tuple[float, ...], ...]) -> None:
         """Take over a state from `snapshot`."""
-        self._input, self._position, self._velocity, ages, wishes = state  # type: ignore[assignment]
+        self._input, self._position, self._velocity, ages, desired = state  # type: ignore[assignment]
         self._now = 0.0
-        self._wishes = deque((-age, y) for age, y in zip(ages, wishes, strict=True))  # type: ignore[arg-type]
+        self._desired = deque((-age, y) for age, y in zip(ages, desired, strict=True))  # type: ignore[arg-type]
         self._asked = None
 
     def _remember(self, dt: float) -> None:
-        """Keep the last wish, as long as a tap may ask for it; where there was none, the place counts."""
+        """Keep the last desired displacement as long as a tap needs it; the position where none was given."""
         self._now += dt
-        wishes = self._wishes
+        desired = self._desired
         if dt <= 0.0:
-            wishes.pop()
-        wishes.append((self._now, self._position if self._asked is None else self._asked))
+            desired.pop()
+        desired.append((self._now, self._position if self._asked is None else self._asked))
         self._asked = None
         oldest = self._now - 4 * max(self._shortest.spacing, dt)
-        while len(wishes) > 2 and wishes[1][0] <= oldest:
-            wishes.popleft()
+        while len(desired) > 2 and desired[1][0] <= oldest:
+            desired.popleft()
 
 
 # Modes that are looked for: from this frequency (Hz) to this share of the sampling rate, at so many lines.
@@ -152,7 +152,7 @@ class Resonance:
     """A second-order mode, ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``.
 
     The exact inverse of the sampled mode is unstable. This one places zeros on the mode's poles, which ends the ringing
-    after every turn, follows ramps without error, and is a sum of a few old wishes: bounded.
+    after every turn, follows ramps without error, and is a sum of a few earlier desired displacements: bounded.
 
     Parameters
     ----------
@@ -196,12 +196,12 @@ class Resonance:
             return signal.copy()
         between = max(1, round(Unringing.shortest(self.mode) / grid.dt))
         taps = Unringing.of(self.mode, between * grid.dt, preview=between * grid.dt).taps
-        wished, left = grid.on(signal), (len(taps) - 2) * between
-        padded = np.pad(wished, (left, 0), mode="edge")
+        desired, left = grid.on(signal), (len(taps) - 2) * between
+        padded = np.pad(desired, (left, 0), mode="edge")
         # The path goes on at its end as it came.
         padded = np.pad(padded, (0, between), mode="reflect", reflect_type="odd")
-        parts = (tap * padded[left + (1 - k) * between :][: wished.size] for k, tap in enumerate(taps))
-        return grid.off(sum(parts, np.zeros_like(wished)))
+        parts = (tap * padded[left + (1 - k) * between :][: desired.size] for k, tap in enumerate(taps))
+        return grid.off(sum(parts, np.zeros_like(desired)))
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:

@@ -26,9 +26,10 @@ NESTS = (0.3, 0.7)
 def calibration(room: Room, rng: np.random.Generator) -> Path:
     """Visit the Preisach plane evenly, at several speeds and with holds.
 
-    Full loops, fast and slow, wipe the memory. Then come reversal curves: rising ones from minima spread over the
-    range, falling ones from maxima spread over it, in random order, so that what drifts is not taken for what depends
-    on voltage; then loops within loops. The longer the drive, the more of each.
+    A sweep over the whole range comes first, so that the record knows its memory whatever was before. Then come
+    reversal curves: rising ones from minima spread over the range, falling ones from maxima spread over it, in random
+    order, so that what drifts is not taken for what depends on voltage; then loops within loops. The longer the drive,
+    the more of each.
 
     Parameters
     ----------
@@ -54,15 +55,28 @@ def calibration(room: Room, rng: np.random.Generator) -> Path:
     return planned(levels)
 
 
+def sweep(room: Room) -> Path:
+    """Go over the whole range once, from the low end up and down again: whatever was before is forgotten then."""
+    plan = _Plan(room, np.random.default_rng(0))
+    plan.sweep()
+    return plan.path
+
+
 class _Plan:
     def __init__(self, room: Room, rng: np.random.Generator) -> None:
         self._room, self._rng = room, rng
         self._speeds: Iterator[float] = cycle(SPEEDS)
-        self._path = Path()
+        self.path = Path()
+
+    def sweep(self) -> None:
+        """Rest, rise, rest, fall, rest."""
+        self._rise_and_fall()
+        self._rest()
 
     def of(self, levels: int) -> Path:
-        self._rest()
-        self._wipe()
+        # Whatever moved the stage before is forgotten after the fall; the rise from rest is seen only once.
+        self._rise_and_fall()
+        self._move(1.0, FAST)
         for minimum in self._spread(levels):
             self._through(minimum, 1.0)
         self._through(0.0)
@@ -75,14 +89,13 @@ class _Plan:
                 self._rest()
             self._through(0.0)
         self._rest()
-        return self._path
+        return self.path
 
-    def _wipe(self) -> None:
-        # The first rise from rest is seen only once: slowly, for many samples.
+    def _rise_and_fall(self) -> None:
+        self._rest()
         self._move(1.0, SLOW)
         self._rest()
         self._move(0.0, FAST)
-        self._move(1.0, FAST)
 
     def _nest(self, centre: float, loops: int) -> None:
         for span in 1.0 - (np.arange(loops) + 0.5) / loops:
@@ -97,10 +110,10 @@ class _Plan:
             self._move(share, next(self._speeds))
 
     def _move(self, share: float, speed: float) -> None:
-        span = abs(share - self._path.at)
+        span = abs(share - self.path.at)
         seconds = max(span, SHORTEST) / (PACE * speed)
         # Where the slew limit is low, corners are gentle anyway, and a straight move is the quicker one.
-        self._path.to(share, seconds, straight=seconds < self._room.quickest(span))
+        self.path.to(share, seconds, straight=seconds < self._room.quickest(span))
 
     def _rest(self) -> None:
-        self._path.hold(HOLD * self._room.duration)
+        self.path.hold(HOLD * self._room.duration)

@@ -7,16 +7,19 @@ from typing import NamedTuple
 import numpy as np
 
 from slpi_ros.errors import UsageError
-from slpi_ros.excitation.calibration import PACE, calibration
+from slpi_ros.excitation.calibration import PACE, calibration, sweep
 from slpi_ros.excitation.effects import EFFECTS, for_effect
 from slpi_ros.excitation.legs import FEWEST_STEPS, FloatArray, Path, Room
 
-CALIBRATION = "calibration"
-DRIVES = (CALIBRATION, *EFFECTS)
-_WHY_CALIBRATION = (
-    "Full loops that wipe the memory, reversal curves from both ends and loops within loops, at several speeds and "
-    "with holds: they visit all that a path may visit."
-)
+CALIBRATION, SWEEP = "calibration", "sweep"
+DRIVES = (CALIBRATION, SWEEP, *EFFECTS)
+# What a drive that is not made for one effect is good for.
+_WHY = {
+    CALIBRATION: "A sweep over the whole range that makes the memory known, reversal curves from both ends and loops "
+    "within loops, at several speeds and with holds: they visit all that a path may visit.",
+    SWEEP: "Once over the whole range, up and down: whatever moved the stage before is forgotten, and its memory is "
+    "known.",
+}
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ def excite(
     seed : int
         The same seed gives the same drive.
     drive : str
-        One of `DRIVES`: ``calibration``, or the effect that is to be separated from others.
+        One of `DRIVES`: ``calibration``, ``sweep``, or the effect that is to be separated from others.
 
     Returns
     -------
@@ -140,7 +143,13 @@ def _turn(room: Room, rest: float, drive: str, rng: np.random.Generator) -> Floa
     if start:
         path.to(0.0, approach)
     within = replace(room, duration=room.duration - 2 * approach)
-    inner = calibration(within, rng) if drive == CALIBRATION else for_effect(drive).path(within)
+    match drive:
+        case "calibration":
+            inner = calibration(within, rng)
+        case "sweep":
+            inner = sweep(within)
+        case _:
+            inner = for_effect(drive).path(within)
     path.legs += inner.legs
     if start:
         path.to(start, approach)
@@ -152,8 +161,9 @@ def _check(axes: Sequence[str], drive: str) -> None:
         raise UsageError(f"drive: axes are {list(axes)}; name at least one, each by a name of its own")
     if drive not in DRIVES:
         raise UsageError(f"no drive '{drive}'; choose one of {', '.join(DRIVES)}")
-    if drive != CALIBRATION and len(axes) < for_effect(drive).least_axes:
-        raise UsageError(f"drive '{drive}': it takes {for_effect(drive).least_axes} axes, not {len(axes)}; name them")
+    least = 1 if drive in _WHY else for_effect(drive).least_axes
+    if len(axes) < least:
+        raise UsageError(f"drive '{drive}': it takes {least} axes, not {len(axes)}; name them")
 
 
 def _each(name: str, given: float | Sequence[float], axes: Sequence[str]) -> list[float]:
@@ -171,7 +181,7 @@ def _generator(seed: int, number: int) -> np.random.Generator:
 
 
 def _why(drive: str) -> str:
-    return _WHY_CALIBRATION if drive == CALIBRATION else for_effect(drive).why
+    return _WHY[drive] if drive in _WHY else for_effect(drive).why
 
 
 class Playback:

@@ -1,4 +1,4 @@
-"""On which branch does each sample of a voltage lie? The stack moves alike for all models; this tells how."""
+"""Find the branch on which each sample of a voltage lies: the stack of turning points moves alike for all models."""
 
 from typing import NamedTuple
 
@@ -6,11 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.reversals import monotone_runs
-from slpi_ros.hysteresis.shape import END, Curve
-from slpi_ros.hysteresis.stack import TurningPoints
+from slpi_ros.hysteresis.turning_points import END, Curve, Memory
 
 FloatArray = NDArray[np.float64]
-
 
 # What `Piece.origin` says of branches that started before the first sample.
 AT_REST, LONG_FALL = -1, -2
@@ -51,9 +49,9 @@ def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> list[
     v : ndarray, shape (N,), volts
         The axis rests at the first value, which may be repeated.
     symmetric_rest : bool
-        As in `slpi_ros.hysteresis.shape.Shape`.
+        As in `slpi_ros.hysteresis.turning_points.Shape`.
     primed : bool
-        As in `slpi_ros.hysteresis.stack.TurningPoints`.
+        As in `slpi_ros.hysteresis.turning_points.Memory`.
 
     Returns
     -------
@@ -62,16 +60,16 @@ def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> list[
     """
     if not v.size:
         return []
-    memory = TurningPoints(_Straight(symmetric_rest), float(v[0]), float(v[0]), primed=primed)
+    memory = Memory(_Straight(symmetric_rest), float(v[0]), float(v[0]), primed=primed)
     origins = [LONG_FALL] if primed else []
     pieces: list[Piece] = []
     for start, stop in monotone_runs(v):
         if not start:
             continue
-        for begin, end in memory.pieces(v, start, stop, 0):
+        for begin, end in memory.split_at_closures(v, start, stop, 0):
             if memory.depth > len(origins):
                 origins.append(start - 1)
             del origins[memory.depth :]
             pieces.append(Piece(begin, end, memory.direction, origins[-1] if origins else AT_REST))
-            memory.arrive(float(v[end - 1]), float(v[end - 1]))
+            memory.advance_to(float(v[end - 1]), float(v[end - 1]))
     return pieces

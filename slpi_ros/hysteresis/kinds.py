@@ -1,4 +1,4 @@
-"""The hysteresis models by name: how each is written in a model document and read back."""
+"""The kinds of hysteresis models by name, and their parameters in a model document."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +11,7 @@ from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
 
-# Shapes on the engine: causal. The others need the whole path in advance.
+# Causal models are shapes on the engine; path models need the whole path in advance.
 CausalModel = LoopFamily | PrandtlIshlinskii | MultiSlope
 PathModel = SeparatedLoops | AmplitudeScaled
 Hysteresis = CausalModel | PathModel
@@ -26,14 +26,14 @@ DESCRIPTIONS = {
 
 
 def to_document(model: Hysteresis) -> dict[str, Any]:
-    """Return the parameters of a model, SI units, as they stand in a model document."""
+    """Return the parameters of a model, SI units, for a model document."""
     match model:
         case PrandtlIshlinskii():
             return _plays_document(model)
         case LoopFamily():
             return {
                 "grid_V": model.grid.tolist(),
-                "surface_m": [row[: i + 1].tolist() for i, row in enumerate(model.surface)],
+                "surface_m": [row[: i + 1].tolist() for i, row in enumerate(model.everett)],
                 "first_rise_m": model.rise.tolist(),
                 "edge_gain_m_per_V": model.edge_gain,
             }
@@ -54,7 +54,7 @@ def to_document(model: Hysteresis) -> dict[str, Any]:
 
 
 def from_document(kind: str, parameters: Mapping[str, Any]) -> Hysteresis:
-    """Build the model of `kind` from the parameters of a valid model document.
+    """Build a model from the parameters of a valid model document.
 
     Raises
     ------
@@ -90,10 +90,10 @@ def _family_from(parameters: Mapping[str, Any]) -> LoopFamily:
         raise ModelError(
             f"surface_m: row i must hold i + 1 values, one row for each of the {grid.size} vertices of grid_V"
         )
-    surface = np.zeros((grid.size, grid.size))
+    everett = np.zeros((grid.size, grid.size))
     for i, row in enumerate(rows):
-        surface[i, : i + 1] = row
-    return LoopFamily(grid, surface, np.array(parameters["first_rise_m"]), parameters["edge_gain_m_per_V"])
+        everett[i, : i + 1] = row
+    return LoopFamily(grid, everett, np.array(parameters["first_rise_m"]), parameters["edge_gain_m_per_V"])
 
 
 def _multi_slope_from(parameters: Mapping[str, Any]) -> MultiSlope:

@@ -1,6 +1,6 @@
 """The SLPI loop family: one Prandtl-Ishlinskii model per loop vertex, interpolated between vertices.
 
-All branches are cut from one surface ``E(alpha, beta)``, ``beta <= alpha``: the displacement between the turning
+All branches come from one Everett function ``E(alpha, beta)``, ``beta <= alpha``: the displacement between the turning
 points ``alpha`` and ``beta``. A falling branch from ``alpha`` is ``y_a - E(alpha, v)``, a rising one from ``beta`` is
 ``y_a + E(v, beta)``, so every loop closes. At a grid vertex the branch is a classical PI model with thresholds at the
 grid's spacing; between vertices it is interpolated.
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.shape import END, FAR, Curve
+from slpi_ros.hysteresis.turning_points import END, FAR, Curve
 
 FloatArray = NDArray[np.float64]
 # A vertex (V, counted in the direction of its branches), the knots of the branch from it, and how they change with
@@ -24,15 +24,14 @@ Gap = tuple[float, FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class LoopFamily:
-    """The surface of branches, and the curve of the first rise.
+    """An Everett function on a grid of voltages, and the curve of the first rise.
 
     Parameters
     ----------
     grid : ndarray, shape (n,), volts
         Vertices, strictly increasing, n >= 2.
-    surface : ndarray, shape (n, n), metres
-        ``surface[i, j] = E(grid[i], grid[j])`` for ``j < i``; zero on the diagonal;
-        what lies above the diagonal is not used.
+    everett : ndarray, shape (n, n), metres
+        ``everett[i, j] = E(grid[i], grid[j])`` for ``j < i``; zero on the diagonal; above the diagonal not used.
         Strictly increasing with ``i`` and strictly decreasing with ``j``.
     rise : ndarray, shape (n,), metres
         Displacement of the first rise at the grid's vertices, strictly increasing; its offset does not matter.
@@ -46,7 +45,7 @@ class LoopFamily:
     """
 
     grid: FloatArray
-    surface: FloatArray
+    everett: FloatArray
     rise: FloatArray
     edge_gain: float
     symmetric_rest: bool = field(default=False, init=False)
@@ -55,24 +54,27 @@ class LoopFamily:
     _gaps: dict[int, list[Gap]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the surface and lay its rows and columns out in the order in which branches run through them."""
-        for name in ("grid", "surface", "rise"):
+        """Check the arrays and prepare the knots of the branches from every vertex."""
+        for name in ("grid", "everett", "rise"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         n = self.grid.size
-        if n < 2 or self.grid.shape != (n,) or self.surface.shape != (n, n) or self.rise.shape != (n,):
+        if n < 2 or self.grid.shape != (n,) or self.everett.shape != (n, n) or self.rise.shape != (n,):
             raise ModelError(
-                f"loop family: {n} vertices, surface {self.surface.shape}, first rise {self.rise.shape}; "
-                "the surface must be square and as long as the grid"
+                f"loop family: {n} vertices, Everett function {self.everett.shape}, first rise {self.rise.shape}; "
+                "the Everett function must be square and as long as the grid"
             )
-        if np.any(np.diag(self.surface) != 0.0):
-            raise ModelError("loop family: the diagonal of the surface must be zero: no voltage lies between there")
-        triangle = np.where(np.tri(n, dtype=bool), self.surface, 0.0)
+        if np.any(np.diag(self.everett) != 0.0):
+            raise ModelError("loop family: the diagonal of the Everett function must be zero")
+        triangle = np.where(np.tri(n, dtype=bool), self.everett, 0.0)
         below, beside = np.tri(n - 1, dtype=bool), np.diff(triangle, axis=1)[1:]
         up, down = np.diff(triangle, axis=0)[:, :-1][below], -beside[below]
         steps = (np.diff(self.grid), np.diff(self.rise), up, down, np.array([self.edge_gain], dtype=np.float64))
         if not all(np.isfinite(step).all() and np.min(step) > 0 for step in steps):
-            raise ModelError("loop family: grid, first rise and every row and column of the surface must rise strictly")
-        object.__setattr__(self, "surface", triangle)
+            raise ModelError(
+                "loop family: grid, first rise, edge gain and every row and column of the Everett function must be "
+                "finite and rise strictly"
+            )
+        object.__setattr__(self, "everett", triangle)
         object.__setattr__(self, "_vertices", self.grid.tolist())
         rows, columns = [triangle[i, i::-1] for i in range(n)], [triangle[j:, j] for j in range(n)]
         top = self._edge(self.grid[-1] - self.grid[::-1], rows[-1])
@@ -86,7 +88,7 @@ class LoopFamily:
         return np.array([np.append(u, u[-1] + END), np.append(f, f[-1] + END * self.edge_gain)])
 
     def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return the branch that starts at `v_turn` (V): a row or a column of the surface, interpolated.
+        """Return the branch that starts at `v_turn` (V): a row or a column of the Everett function, interpolated.
 
         Beyond the grid the displacement between two turning points depends only on how far apart they are, as for the
         classical PI model: loops there are like those at the grid's end. A fall from far away, which wipes the memory,

@@ -1,7 +1,10 @@
-"""The simplified multi-slope (SMPI) model: the MPI model of one amplitude, scaled to that of each cycle.
+"""The multi-slope (MPI) model, and the simplified one (SMPI) that scales it to the amplitude of each cycle.
 
-MPI paper, 3: ``y = (X_p / X_p120) sum_k w_k f_k``, ``X_p`` being the peak displacement of a cycle. For the peak to come
-out as ``X_p``, the base model must be driven to its own amplitude::
+`MultiSlope` is a sum of the generalized play operators of the MPI paper, Eq. 2, with one set of weights for one
+amplitude ``V_p``; its branches are shapes on the engine.
+
+`AmplitudeScaled` scales it (MPI paper, 3): ``y = (X_p / X_p120) sum_k w_k f_k``, ``X_p`` being the peak displacement of
+a cycle. For the peak to come out as ``X_p``, the base model must be driven to its own amplitude::
 
     y(u) = X_p(V_p) / X_p(V_base) * Y_base(u V_base / V_p)
 
@@ -19,9 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from slpi_ros.errors import ModelError, UsageError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.hysteresis.shape import END, FAR, Curve
+from slpi_ros.hysteresis.turning_points import END, FAR, Curve, Memory
 
 FloatArray = NDArray[np.float64]
 
@@ -29,6 +31,10 @@ FloatArray = NDArray[np.float64]
 STEEP, GENTLE, AMPLITUDE_SHARE, THRESHOLD_SHARE = 1.2, 0.8, 0.2, 0.6
 # The amplitude that the paper gives more operators, volts; a measured one is never exact.
 FULL_AMPLITUDE, NEAR_FULL = 120.0, 0.5
+# Below this share of the base amplitude (in displacement: of the peak line there) a path is back at the low end.
+BACK = 0.01
+
+Volts = TypeVar("Volts", float, FloatArray)
 
 
 def thresholds_for(amplitude: float) -> FloatArray:
@@ -43,7 +49,7 @@ def rising_envelope(u: ArrayLike, thresholds: ArrayLike) -> FloatArray:
 
 
 def falling_envelope(u: ArrayLike, thresholds: ArrayLike, amplitude: float) -> FloatArray:
-    """Return what an operator follows downwards, volts: the inner minimum of Eq. 2, nowhere below the rising envelope.
+    """Return the inner minimum of Eq. 2, what an operator follows downwards; not below the rising envelope.
 
     Its slope is 1 below ``u = -5 r``, 1.2 up to ``0.5 V_p + 1.5 r``, 0.8 up to ``V_p + 8 r``, and 1 beyond.
 
@@ -52,6 +58,10 @@ def falling_envelope(u: ArrayLike, thresholds: ArrayLike, amplitude: float) -> F
     u, thresholds : array_like, volts
         Broadcast.
     amplitude : float, volts
+
+    Returns
+    -------
+    ndarray, broadcast shape, volts
     """
     u, r = np.asarray(u, dtype=np.float64), np.asarray(thresholds, dtype=np.float64)
     gentle = GENTLE * u + AMPLITUDE_SHARE * amplitude + THRESHOLD_SHARE * r
@@ -116,7 +126,7 @@ class MultiSlope:
         object.__setattr__(self, "_bends", np.concatenate([-5.0 * r, half + 1.5 * r, self.amplitude + 8.0 * r]))
 
     def stroke(self, upper: float, lower: float) -> float:
-        """Return ``E(alpha, beta)``, the displacement (m) between two turning points (V)."""
+        """Return the Everett function ``E(upper, lower)``, the displacement (m) between two turning points (V)."""
         rising = rising_envelope(upper - self.origin, self._r)
         falling = falling_envelope(lower - self.origin, self._r, self.amplitude)
         return float(self._w @ np.maximum(0.0, rising - falling))
@@ -151,12 +161,6 @@ class MultiSlope:
         # Rounding must not make a branch fall.
         f = np.maximum.accumulate(f)
         return Curve.of(np.array([np.append(u, u[-1] + END), np.append(f, f[-1] + END * self._w.sum())]))
-
-
-Volts = TypeVar("Volts", float, FloatArray)
-
-# Below this share of the base amplitude (in displacement: of the peak line there) a path is back at the low end.
-BACK = 0.01
 
 
 def cycles(x: FloatArray, back: float) -> list[tuple[int, int]]:
@@ -281,7 +285,7 @@ class KnownPath:
 
     @property
     def _least_amplitude(self) -> float:
-        """What stays below it is no cycle of its own (V)."""
+        """Smallest amplitude of a cycle (V); what stays below it belongs to a neighbouring cycle."""
         return BACK * self.model.base.amplitude
 
     def _displacement_of_origin(self, y: FloatArray) -> float:
@@ -318,15 +322,15 @@ class _Cycle:
         self._v_rest, self._y_start = self._of_base(v_start), y_start
 
     def stroke(self, v: float) -> float:
-        """Displacement (m) between the voltage `v` and the peak."""
+        """Return the displacement (m) between the voltage `v` (V) and the peak."""
         return self._scale * self._base.stroke(self._base.origin + self._base.amplitude, self._of_base(v))
 
     def forward(self, v: FloatArray) -> FloatArray:
-        """Return the displacements of the voltages `v` of the cycle."""
+        """Return the displacements (m) for the voltages `v` (V) of the cycle."""
         return self._y_start + self._scale * Memory(self._base, self._v_rest).forward_array(self._of_base(v))
 
     def inverse(self, y: FloatArray, lower: float, upper: float) -> tuple[FloatArray, float]:
-        """Return the voltages for the displacements `y` of the cycle, and the displacement reached at its end."""
+        """Return the voltages (V) for the displacements `y` (m), and the displacement reached at the end."""
         memory = Memory(self._base, self._v_rest)
         limits = self._of_base(lower), self._of_base(upper)
         of_base = memory.inverse_array((y - self._y_start) / self._scale, *limits)
@@ -334,5 +338,5 @@ class _Cycle:
         return np.clip(v, lower, upper), self._y_start + self._scale * memory.displacement
 
     def _of_base(self, v: Volts) -> Volts:
-        """Return voltages of the cycle as those of the base model."""
+        """Convert voltages of the cycle to those of the base model."""
         return self._base.origin + (v - self._base.origin) * self._stretch

@@ -12,14 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError, RecordError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.reversals import count_before, monotone_runs, require_finite, without_small_reversals
+from slpi_ros.hysteresis.turning_points import Memory
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+# Column ``sp`` of a separated record.
 NO_VERTEX, SUSPECTED, TRUE_VERTEX = 0, 1, 2
+# A loop of a path counts as identified when level and direction are the same, and vertex and span within this share
+# of the outer loop's span: a path of displacements turns at slightly other places than the path of voltages did.
+SAME_LOOP = 0.2
+# A path starts where the axis rests if it starts as near as this (share of the outer loop's span).
+NEAR_START = 0.01
+# How far away a loop of another level, or of the other direction, is (share of the outer loop's span). More for two
+# levels than for one would be wrong: how levels count depends on how a record is cut.
+OTHER_LOOP = 0.5
+
+
+class UnidentifiedLoopWarning(UserWarning):
+    """A path holds loops that were not identified; the nearest identified ones are used for them."""
 
 
 @dataclass(frozen=True)
@@ -94,19 +107,6 @@ class Separation:
         return np.column_stack(columns).astype(np.float64)
 
 
-class _Marks:
-    """What the judging process writes down on its way."""
-
-    def __init__(self, count: int) -> None:
-        self.phase = np.ones(count, dtype=np.int64)
-        self.level = np.zeros(count, dtype=np.int64)
-        self.vertex = np.full(count, NO_VERTEX)
-
-    def write(self, start: int, stop: int, phase: int, level: int) -> None:
-        self.phase[start:stop] = phase
-        self.level[start:stop] = level
-
-
 def separate(voltage: FloatArray, displacement: FloatArray | None = None, *, dead_band: float = 0.0) -> Separation:
     """Separate a record into single loops.
 
@@ -137,34 +137,38 @@ def separate(voltage: FloatArray, displacement: FloatArray | None = None, *, dea
         raise RecordError(f"{v.shape} voltages and {d.shape} displacements; give as many of each, at least one")
     require_finite(v)
     v = without_small_reversals(v, dead_band)
-    marks = _Marks(v.size)
-    closed, suspects = _judge(v, marks)
+    phase, level, vertex = np.ones(v.size, np.int64), np.zeros(v.size, np.int64), np.full(v.size, NO_VERTEX)
+    closed, suspects = _judge(v, phase, level, vertex)
     resting = monotone_runs(v)[0][1]
     falls_first = bool(suspects) and suspects[0] < resting
-    marks.vertex[0] = TRUE_VERTEX
-    loops = _loops(closed, suspects, falls_first, marks.phase)
-    return Separation(v, d, marks.phase, marks.level, marks.vertex, loops)
+    vertex[0] = TRUE_VERTEX
+    return Separation(v, d, phase, level, vertex, _loops(closed, suspects, falls_first, phase))
 
 
-def _judge(v: FloatArray, marks: _Marks) -> tuple[list[tuple[int, int]], list[int]]:
-    """Find the closed loops, each as its vertex and the sample that closes it, and the vertices still suspected."""
+def _judge(
+    v: FloatArray, phase: IntArray, level: IntArray, vertex: IntArray
+) -> tuple[list[tuple[int, int]], list[int]]:
+    """Find the closed loops, each as its vertex and the sample that closes it, and the vertices still suspected.
+
+    The columns `phase`, `level` and `vertex` of the `Separation` are filled in.
+    """
     suspects: list[int] = []
     closed: list[tuple[int, int]] = []
-    phase = 1
+    now = 1
     for start, stop in monotone_runs(v)[1:]:
         direction = 1 if v[stop - 1] > v[start - 1] else -1
-        if direction != phase:
-            phase = direction
+        if direction != now:
+            now = direction
             suspects.append(start - 1)
-            marks.vertex[start - 1] = SUSPECTED
-            marks.write(start - 1, start, phase, len(suspects))
+            vertex[start - 1] = SUSPECTED
+            phase[start - 1], level[start - 1] = now, len(suspects)
         while start < stop:
             cut = stop
             if len(suspects) > 1:
-                cut = start + count_before(v[start:stop], phase, float(v[suspects[-2]]))
-            marks.write(start, cut, phase, len(suspects))
+                cut = start + count_before(v[start:stop], now, float(v[suspects[-2]]))
+            phase[start:cut], level[start:cut] = now, len(suspects)
             if cut < stop:
-                marks.vertex[suspects[-2]] = TRUE_VERTEX
+                vertex[suspects[-2]] = TRUE_VERTEX
                 closed.append((suspects[-2], cut))
                 del suspects[-2:]
             start = cut
@@ -172,7 +176,7 @@ def _judge(v: FloatArray, marks: _Marks) -> tuple[list[tuple[int, int]], list[in
 
 
 def _loops(closed: list[tuple[int, int]], suspects: list[int], falls_first: bool, phase: IntArray) -> tuple[Loop, ...]:
-    """Hand every sample to the innermost loop around it."""
+    """Assign every sample to the innermost loop around it."""
     # The first vertex still suspected is the outer loop's own turn, and every second one from there that of an open
     # loop. A record that falls at first suspects its very start too.
     opened = [(vertex, phase.size) for vertex in suspects[2 if falls_first else 1 :: 2]]
@@ -198,20 +202,6 @@ def _loops(closed: list[tuple[int, int]], suspects: list[int], falls_first: bool
         )
         for number, (vertex, end) in enumerate(spans, 1)
     )
-
-
-# A loop of a path counts as identified when level and direction are the same, and vertex and span within this share
-# of the outer loop's span: a path of displacements turns at slightly other places than the path of voltages did.
-SAME_LOOP = 0.2
-# A path starts where the axis rests if it starts as near as this (share of the outer loop's span).
-NEAR_START = 0.01
-# How far away a loop of another level, or of the other direction, is (share of the outer loop's span). More for two
-# levels than for one would be wrong: how levels count depends on how a record is cut.
-OTHER = 0.5
-
-
-class UnidentifiedLoopWarning(UserWarning):
-    """A path holds loops that were never identified; the nearest ones stand in for them."""
 
 
 @dataclass(frozen=True)
@@ -297,7 +287,7 @@ class SeparatedLoops:
                 raise ModelError(f"published SLPI: loop {number} has no linear weight and so no inverse")
 
     def along(self, voltage: float, displacement: float) -> "KnownPath":
-        """Return what moves along paths known in advance, each from rest at `voltage` (V) and `displacement` (m)."""
+        """Return the model on paths known in advance, each from rest at `voltage` (V) and `displacement` (m)."""
         return KnownPath(self, (voltage, displacement))
 
     @property
@@ -321,19 +311,21 @@ class SeparatedLoops:
 
         def distance(loop: SingleLoop) -> float:
             apart = abs(loop.vertex[coordinate] - vertex) + abs(loop.span[coordinate] - span)
-            return OTHER * ((loop.level != level) + (loop.direction != direction)) + apart / scale
+            return OTHER_LOOP * ((loop.level != level) + (loop.direction != direction)) + apart / scale
 
         return min(self.loops, key=distance)
 
-    def holds(self, loop: SingleLoop, level: int, direction: int, vertex: float, span: float, coordinate: int) -> bool:
-        """Whether `loop` is the very loop that the other parameters (as in `nearest`) describe."""
+    def matches(
+        self, loop: SingleLoop, level: int, direction: int, vertex: float, span: float, coordinate: int
+    ) -> bool:
+        """Whether `loop` is the loop that the other parameters (as in `nearest`) describe."""
         tolerance = SAME_LOOP * self.outer_span[coordinate]
         apart = max(abs(loop.vertex[coordinate] - vertex), abs(loop.span[coordinate] - span))
         return (loop.level, loop.direction) == (level, direction) and apart <= tolerance
 
 
 class KnownPath:
-    """Moves along a path that is known from beginning to end.
+    """The published SLPI model on paths that are known from beginning to end.
 
     Parameters
     ----------
@@ -384,7 +376,7 @@ class KnownPath:
             drive = loop.direction * (path[loop.samples] - path[loop.vertex])
             place = loop.level, loop.direction, float(path[loop.vertex]), float(np.max(np.abs(drive), initial=0.0))
             model, vertex = self._model.nearest(*place, coordinate), answer[loop.vertex]
-            if self._model.holds(model, *place, coordinate):
+            if self._model.matches(model, *place, coordinate):
                 vertex += model.offset[1 - coordinate]
             elif loop.level:
                 replaced.append((loop, place))
@@ -392,15 +384,16 @@ class KnownPath:
             move = memory.inverse_array if coordinate else memory.forward_array
             answer[loop.samples] = vertex + loop.direction * move(drive)
         if replaced:
-            warnings.warn(_say(*replaced[0], len(replaced), coordinate), UnidentifiedLoopWarning, stacklevel=4)
+            warnings.warn(_unidentified(*replaced[0], len(replaced), coordinate), UnidentifiedLoopWarning, stacklevel=4)
         return answer[1:]
 
 
-def _say(loop: Loop, place: tuple[int, int, float, float], count: int, coordinate: int) -> str:
+def _unidentified(loop: Loop, place: tuple[int, int, float, float], count: int, coordinate: int) -> str:
+    """Describe the loops of a path that were not identified, and the first of them."""
     unit, factor = ("V", 1.0) if coordinate == 0 else ("um", 1e6)
     level, _, vertex, span = place
     return (
-        f"{count} loop{'s' if count > 1 else ''} of the path never identified; the nearest by level, vertex and span "
-        f"stand in; first at sample {max(loop.vertex - 1, 0)}: level {level}, vertex {vertex * factor:.5g} {unit}, "
+        f"{count} loop{'s' if count > 1 else ''} of the path not identified; the nearest by level, vertex and span "
+        f"used instead; first at sample {max(loop.vertex - 1, 0)}: level {level}, vertex {vertex * factor:.5g} {unit}, "
         f"span {span * factor:.5g} {unit}"
     )

@@ -34,7 +34,7 @@ class Basis(Protocol):
 
     @property
     def symmetric_rest(self) -> bool:
-        """As in `slpi_ros.hysteresis.shape.Shape`."""
+        """As in `slpi_ros.hysteresis.turning_points.Shape`."""
 
     def branch_part(self, walk: Walk) -> sp.csr_array:
         """Return what each sample's branch adds, shape (N, size)."""

@@ -12,7 +12,7 @@ from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Fitted, Prob
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import MultiSlopeBasis
 from slpi_ros.identification.samples import Samples
-from slpi_ros.model.stage_model import Start
+from slpi_ros.model.axis_model import Start
 
 FloatArray = NDArray[np.float64]
 

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+from slpi_ros.hysteresis.reversals import reversals
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -13,7 +15,7 @@ IntArray = NDArray[np.int64]
 _CELLS = 10
 # Runs of nearly one swing are compared, and speeds that differ by less than this factor are one.
 _SWING_FACTOR = 1.6
-_SPEED_FACTOR = 1.5
+SPEED_FACTOR = 1.5
 # Anything shorter is a turn; creep shows from here on.
 _SHORTEST_HOLD = 0.5
 # Turns smaller than this share of the range say nothing about loops; larger ones than that are never noise.
@@ -27,7 +29,7 @@ class Runs:
     Parameters
     ----------
     ends : ndarray of int, shape (M + 1,)
-        Samples at which they begin and end: the turning points, and the first and the last sample if they are none.
+        Samples at which they begin and end, as from `reversals`.
     swing : ndarray, shape (M,), volts
         How far each goes, with its sign.
     duration : ndarray, shape (M,), seconds
@@ -40,7 +42,7 @@ class Runs:
     @classmethod
     def of(cls, t: FloatArray, v: FloatArray, dead_band: float) -> "Runs":
         """Cut a voltage, shape (N,), at its turns; smaller ones than the dead band (V) do not count."""
-        ends = turning_points(v, dead_band)
+        ends = reversals(v, dead_band)
         return cls(ends, np.diff(v[ends]), np.diff(t[ends]))
 
     @property
@@ -57,54 +59,27 @@ class Runs:
         for size in np.unique(np.round(np.log(swing) / np.log(_SWING_FACTOR))).tolist():
             alike = np.abs(np.log(swing) / np.log(_SWING_FACTOR) - size) < 0.5
             found = _distinct(np.sort(speed[alike]))
-            if len(found) > len(best):
+            # Of equally varied sizes the largest.
+            if len(found) >= max(len(best), 1):
                 best = found
         return best
+
+    @property
+    def speed_range(self) -> tuple[float, float]:
+        """Speeds (V/s) of the slowest and the fastest stretch; zeros where none takes time."""
+        timed = (self.duration > 0.0) & (self.swing != 0.0)
+        speed = np.abs(self.swing[timed]) / self.duration[timed]
+        return (float(speed.min()), float(speed.max())) if speed.size else (0.0, 0.0)
 
 
 def _distinct(speeds: FloatArray) -> tuple[float, ...]:
     """Return one of each group of sorted speeds, of those that come at least twice."""
     result: list[float] = []
-    for group in np.split(speeds, np.flatnonzero(speeds[1:] > speeds[:-1] * np.sqrt(_SPEED_FACTOR)) + 1):
+    for group in np.split(speeds, np.flatnonzero(speeds[1:] > speeds[:-1] * np.sqrt(SPEED_FACTOR)) + 1):
         middle = float(np.median(group))
-        if group.size > 1 and (not result or middle > _SPEED_FACTOR * result[-1]):
+        if group.size > 1 and (not result or middle > SPEED_FACTOR * result[-1]):
             result.append(middle)
     return tuple(result)
-
-
-def turning_points(v: FloatArray, dead_band: float) -> IntArray:
-    """Return the samples between which `v`, shape (N,), goes one way, but for reversals within `dead_band` (V).
-
-    The smallest swings are taken out, with both their ends, until only larger ones are left. At the ends of a record
-    there may be such a small one; it is left out.
-    """
-    kept = _extremes(v)
-    while True:
-        swing = np.abs(np.diff(v[kept]))
-        small = swing <= dead_band
-        if not small.any():
-            return kept
-        smallest = small & (swing < np.append(np.inf, swing[:-1])) & (swing <= np.append(swing[1:], np.inf))
-        smallest[[0, -1]] = False
-        if smallest.any():
-            gone = np.append(smallest, False) | np.append(False, smallest)
-            kept = kept[~gone]
-        elif small.all():
-            return np.array([0, v.size - 1])
-        else:
-            kept = kept[int(small[0]) : kept.size - int(small[-1])]
-        kept = kept[_extremes(v[kept])]
-
-
-def _extremes(v: FloatArray) -> IntArray:
-    """Return the first, the last and all samples at which the direction changes; of level stretches the last."""
-    # Small integers: of a long record there may be no room for more.
-    way = (v[1:] > v[:-1]).astype(np.int8) - (v[1:] < v[:-1]).astype(np.int8)
-    moves = np.flatnonzero(way)
-    if not moves.size:
-        return np.array([0, v.size - 1])
-    way = way[moves]
-    return np.concatenate([[0], moves[1:][way[1:] != way[:-1]], [v.size - 1]])
 
 
 def covered(v: FloatArray, runs: Runs) -> float:

@@ -16,7 +16,8 @@ from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import fit_amplitude_scaled
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel
+from slpi_ros.model.axis_model import AxisModel, FitQuality
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 

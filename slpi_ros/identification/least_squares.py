@@ -15,7 +15,7 @@ from slpi_ros.identification.bases import Basis
 from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.samples import Samples
-from slpi_ros.model.stage_model import Start
+from slpi_ros.model.axis_model import Start
 
 FloatArray = NDArray[np.float64]
 

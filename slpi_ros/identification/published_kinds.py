@@ -33,7 +33,7 @@ from slpi_ros.identification.bases import LEAST_GAIN, OperatorWeights
 from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, RIDGE, Fitted, Problem, held_out_errors, solve_qp
 from slpi_ros.identification.samples import FEWEST, NEVER_TURNS, Samples, only_one
-from slpi_ros.model.stage_model import Start
+from slpi_ros.model.axis_model import Start
 
 FloatArray = NDArray[np.float64]
 

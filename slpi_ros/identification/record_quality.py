@@ -1,15 +1,17 @@
 """What a record is worth, before any fit: its clock, its signals, its drive."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from slpi_ros.errors import IdentificationError
 from slpi_ros.identification import drive
 from slpi_ros.identification import signal_statistics as readings
+from slpi_ros.identification.drive import SPEED_FACTOR
 from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, part_of, select_samples
 from slpi_ros.io.record import Record
 
@@ -17,6 +19,8 @@ FloatArray = NDArray[np.float64]
 
 # Steps in time that are longer than this many periods: samples are missing; a whole gap.
 _LOST, _GAP = 1.5, 5.0
+# Samples within which the stamps that follow a late one catch up.
+_CATCHES_UP = 51
 # A voltage is smooth only up to this share of its range: what computed it may be made of pieces.
 _LEAST_SPIKE = 0.001
 
@@ -79,6 +83,10 @@ class SignalQuality:
         Single readings that repeat an earlier one, though the other signal moves.
     spikes : int
         Single readings that stand out otherwise.
+    mixed : int
+        Readings that come early or late, or mix two: on the way to the next or the one before.
+    mixed_size : float
+        How far these are off at most.
     """
 
     low: float
@@ -91,6 +99,8 @@ class SignalQuality:
     clipped: int
     stale: int
     spikes: int
+    mixed: int = 0
+    mixed_size: float = 0.0
 
     @property
     def range(self) -> float:
@@ -112,6 +122,8 @@ class DriveQuality:
         Samples from one turn to the next, in the middle of all.
     speeds : tuple of float, V/s
         At which swings of one size were run through.
+    speed_range : (float, float), V/s
+        The slowest and the fastest move from turn to turn, of any size.
     holds : tuple of float, seconds
         How long the voltage rested, each time that it did.
     begins_at_end : bool
@@ -124,6 +136,7 @@ class DriveQuality:
     covered: float
     samples_per_run: float
     speeds: tuple[float, ...]
+    speed_range: tuple[float, float]
     holds: tuple[float, ...]
     begins_at_end: bool
     wiped: float | None
@@ -196,20 +209,31 @@ def assess(record: Record, axis: str, *, start: float | None = None, stop: float
 def _clock(t: FloatArray, v: FloatArray, still: float) -> ClockQuality:
     steps = np.diff(t)
     period = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 0.0
-    lost = steps > _LOST * period
+    late = steps > _LOST * period
     gaps = np.flatnonzero(steps > _GAP * period)
-    regular = steps[~lost & (steps > 0.0)]
+    regular = steps[~late & (steps > 0.0)]
     return ClockQuality(
         samples=t.size,
         duration=float(t[-1] - t[0]),
         period=period,
         jitter=float(np.std(regular)) if regular.size else 0.0,
-        lost=int(np.sum(np.rint(steps[lost] / period) - 1.0)) if period else 0,
+        lost=_missing(steps / period) if period else 0,
         gaps=int(gaps.size),
         longest_gap=float(steps.max(initial=0.0)),
         duplicates=int(np.count_nonzero(steps == 0.0)),
         unseen=int(np.count_nonzero(np.abs(v[gaps + 1] - v[gaps]) > still)),
     )
+
+
+def _missing(steps: FloatArray) -> int:
+    """Return how many samples are missing, from the steps between stamps in periods, shape (N - 1,).
+
+    After a late stamp the next ones come early, and nothing is missing: only a delay that stays counts.
+    """
+    behind = np.cumsum(np.maximum(steps, 0.0) - 1.0)
+    stays = minimum_filter1d(behind, _CATCHES_UP, origin=-((_CATCHES_UP - 1) // 2), mode="nearest")
+    rises = np.rint(np.diff(stays, prepend=0.0))
+    return int(rises[rises > 0.0].sum())
 
 
 def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality, SignalQuality]:
@@ -227,10 +251,13 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     off_y = readings.lone_outliers(y, v, gain, max(noise_y, digit_y), noise_v)
     # Of two that stand out at once it is the driver that jumped, and the other one followed.
     off_y = np.setdiff1d(off_y, off_v)
-    return (
-        _signal(v, missing[0], noise_v, digit_v, stopped, off_v),
-        _signal(y, missing[1], noise_y, digit_y, frozen, off_y),
-    )
+    mixed = readings.mixed_readings(y, v)
+    displacement = _signal(y, missing[1], noise_y, digit_y, frozen, off_y, mixed)
+    if mixed.size:
+        # By so much does the displacement go on between the readings around it.
+        ways = np.abs(y[np.minimum(mixed + 1, y.size - 1)] - y[np.maximum(mixed - 1, 0)]) / 2.0
+        displacement = replace(displacement, mixed=int(mixed.size), mixed_size=float(np.median(ways)))
+    return _signal(v, missing[0], noise_v, digit_v, stopped, off_v), displacement
 
 
 def _signal(
@@ -240,12 +267,13 @@ def _signal(
     digit: float,
     repeats: readings.Repeats,
     outliers: NDArray[np.int64],
+    explained: NDArray[np.int64] | tuple[()] = (),
 ) -> SignalQuality:
     low, high = float(x.min()), float(x.max())
     several = repeats.where(repeats.length > 2)
     single = repeats.where(repeats.length == 2)
     ends = several.where(np.isin(x[several.first], (low, high)))
-    stale = np.union1d(readings.stale(x, outliers, noise), single.first + 1)
+    stale = np.setdiff1d(np.union1d(readings.stale(x, outliers, noise), single.first + 1), explained)
     return SignalQuality(
         low=low,
         high=high,
@@ -256,7 +284,7 @@ def _signal(
         longest_stuck=int(several.length.max(initial=0)),
         clipped=ends.readings,
         stale=int(stale.size),
-        spikes=int(np.setdiff1d(outliers, stale).size),
+        spikes=int(np.setdiff1d(np.setdiff1d(outliers, stale), explained).size),
     )
 
 
@@ -268,6 +296,7 @@ def _drive(t: FloatArray, v: FloatArray, voltage: SignalQuality, wiped: float | 
         covered=drive.covered(v, runs),
         samples_per_run=float(np.median(np.diff(runs.ends))),
         speeds=runs.speeds,
+        speed_range=runs.speed_range,
         holds=tuple(drive.holds(t, v, drive.hold_band(v, voltage.noise, voltage.digit)).tolist()),
         begins_at_end=bool(min(v[0] - v.min(), v.max() - v[0]) <= near),
         wiped=wiped,
@@ -393,6 +422,10 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
         text = f"{name} stuck for {_of(stuck, samples)}, up to {signal.longest_stuck} in a row"
         slow = ": the sensor is slower than the record" if stuck > 0.5 * samples else ""
         yield Finding("warn", f"{text}{slow}; where noise should tell them apart they are not fitted")
+    if signal.mixed:
+        text = f"{name} early, late or mixed with the reading beside it in {_of(signal.mixed, samples)}"
+        size = f"off by up to {signal.mixed_size * 1e6:.3g} um"
+        yield Finding("warn", f"{text}, {size}: the link delivers old or mixed values; they are not fitted")
     if signal.stale:
         text = f"{name} stale, a reading of before, in {_of(signal.stale, samples)}"
         yield Finding("warn" if signal.stale > _OUTLIERS * samples else "ok", text)
@@ -431,11 +464,15 @@ def _memory(drive: DriveQuality) -> Finding:
 
 
 def _speeds_and_holds(drive: DriveQuality) -> str:
+    slowest, fastest = drive.speed_range
+    lacking = ["lag", "delay", "rate dependence"]
     match drive.speeds:
         case ():
-            text, lacking = "no two moves alike to compare speeds", ["lag", "delay", "rate dependence"]
-        case (speed,):
-            text, lacking = f"one speed, {speed:.3g} V/s", ["lag", "delay", "rate dependence"]
+            text = "no two moves alike to compare speeds"
+        case (speed,) if fastest <= SPEED_FACTOR * slowest:
+            text = f"one speed, {speed:.3g} V/s"
+        case (_,):
+            text = f"moves from {slowest:.3g} to {fastest:.3g} V/s, those of one size at one speed"
         case (slow, *_, fast):
             text, lacking = f"{len(drive.speeds)} speeds from {slow:.3g} to {fast:.3g} V/s", []
     if drive.holds:

@@ -21,11 +21,12 @@ from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
 from slpi_ros.identification.convex_fit import FIT_SAMPLES
-from slpi_ros.identification.initial_history import choose_start
+from slpi_ros.identification.initial_history import Match, lasting_effects, match
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
-from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, StageModel, Start
+from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
@@ -49,15 +50,19 @@ class AxisChange:
     Parameters
     ----------
     error_before, error_after : float, metres
-        rms error on the new record, free-run, of the old and of the new model.
+        rms error on the new record, free-run, of the old and of the new model, each from the initial history that suits
+        it best and in the record's own zero.
     repeatability : float, metres
         What the old model's error was on blocks left out, or the noise of the sensor if that is more.
     drifted : bool
-        Whether the old model is wrong beyond what it was known to be.
+        Whether the gain, the width or the shape of the loops has changed: neither the initial history nor the zero,
+        a lag or a slow drift explain what the old model gets wrong.
     gain : float
         Relative change of the outermost loop's height.
     largest : float, metres
         Largest change of a branch.
+    match : Match
+        The old model against the new record: moved zero, changes of gain and width, and how surely they are known.
     """
 
     error_before: float
@@ -66,6 +71,7 @@ class AxisChange:
     drifted: bool
     gain: float
     largest: float
+    match: Match
 
 
 def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, AxisChange]]:
@@ -106,7 +112,9 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
         try:
             samples = select_samples(record, name, None, None)
             with threadpool_limits(1):
-                axes[name], changes[name] = _refit_axis(model.axes[name], samples, record.source)
+                bare = replace(model.axes[name], effects=())
+                new, changes[name] = _refit_axis(bare, samples, record.source)
+            axes[name] = replace(new, effects=model.axes[name].effects)
         except SlpiError as error:
             raise type(error)(where + str(error).removeprefix(where)) from None
     return replace(model, axes=axes, created=datetime.now(UTC).isoformat(timespec="seconds")), changes
@@ -116,6 +124,9 @@ def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -
     """Return the record as it were if the stage had hysteresis alone."""
     if not any(model.axes[axis].effects for axis in shared):
         return record
+    # A drift or hum of the old record is none of the new one.
+    axes = {name: replace(axis, effects=lasting_effects(axis)) for name, axis in model.axes.items()}
+    model = replace(model, axes=axes)
     t, voltage, displacement = record.t, dict(record.voltage), dict(record.displacement)
     known = {axis: _held(record.voltage[axis]) for axis in shared}
     simulated = model.simulate(t, known)
@@ -145,27 +156,31 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
             "identify the stage anew"
         )
     recorded, samples = samples.v, samples.thinned(FIT_SAMPLES)
-    beginning = choose_start(samples, lambda candidate: Problem.pose([candidate], basis))
-    samples = beginning.of(samples)
+    found = match(old, samples)
+    # Where the initial history matters it is not fitted, unless nothing else is left.
+    settled = samples.only(found.known & (np.arange(samples.v.size) >= found.known_from))
+    samples = settled if np.count_nonzero(settled.fitted) >= FEWEST else samples.only(found.known)
+    history = found.start.history
+    samples = samples.after(history)
     problem = Problem.pose([samples], basis).reweighted()
-    old_errors = problem.errors(_solved(problem, x_old / problem.scale))
-    repeatability = max(old.quality.held_out_rms, noise_rms(old_errors))
+    repeatability = max(old.quality.held_out_rms, noise_rms(found.residual[np.isfinite(found.residual)]))
     anew = problem.residual()[problem.weights > 0] * problem.scale
-    require_own(_rms(old_errors), _rms(anew), max(samples.spread[1], float(np.ptp(old.displacement_range))))
-    drifted = _rms(old_errors) > BEYOND_REPEATABILITY * repeatability
+    require_own(found.rms, _rms(anew), max(samples.spread[1], float(np.ptp(old.displacement_range))))
+    otherwise = found.rms_explained > BEYOND_REPEATABILITY * repeatability
+    drifted = found.gain_changed or found.width_changed or otherwise
     x = _solved(problem, x_old / problem.scale, *(CHANGED if drifted else UNCHANGED))
     errors = problem.errors(x)
     x_new = x[: basis.size + 1] * problem.scale
     largest = int(np.argmax(np.abs(x_old)))
     change = AxisChange(
-        error_before=_rms(old_errors),
+        error_before=found.rms,
         error_after=_rms(errors),
         repeatability=repeatability,
         drifted=drifted,
         gain=float(x_new[largest] / x_old[largest] - 1.0),
         largest=float(np.max(np.abs(x_new[:-1] - x_old))),
+        match=found,
     )
-    history = beginning.history
     at_start = float(problem.design.predict(x)[len(history)] * problem.scale)
     start = Start(float(samples.v[len(history)]), at_start, history)
     hysteresis = basis.shape(x_new, problem.gain)
@@ -226,7 +241,7 @@ def basis_of(axis: AxisModel) -> tuple[Basis, FloatArray]:
         if not np.allclose(np.diff(shape.grid), np.diff(shape.grid).mean(), rtol=1e-6):
             raise UsageError("the model's vertices are not evenly spaced; identify the stage anew")
         return SurfaceBasis(shape.grid), np.concatenate(
-            [shape.surface[np.tril_indices(shape.grid.size, -1)], shape.rise]
+            [shape.everett[np.tril_indices(shape.grid.size, -1)], shape.rise]
         )
     raise UsageError(f"kind '{axis.kind}' cannot be updated; identify the stage anew")
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.reversals import monotone_runs
-from slpi_ros.identification.signal_statistics import stuck, without_noise
+from slpi_ros.identification.signal_statistics import mixed_readings, stuck, without_noise
 from slpi_ros.io.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -160,12 +160,13 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     if count < fitted.size:
         y = np.where(fitted, y, 0.0)
     _require_motion(v, y, fitted, where)
-    # A sensor that hangs says nothing, as one that is silent.
-    if count == fitted.size:
-        fitted[stuck(y, v)] = False
-    else:
-        known = np.flatnonzero(fitted)
-        fitted[known[stuck(y[known], v[known])]] = False
+    # A sensor that hangs says nothing, as one that is silent; a reading mixed with another says something wrong.
+    for bad in (stuck, mixed_readings):
+        if fitted.all():
+            fitted[bad(y, v)] = False
+        else:
+            known = np.flatnonzero(fitted)
+            fitted[known[bad(y[known], v[known])]] = False
     return Samples(without_noise(t if driven.all() else t[driven], v), y, fitted)
 
 

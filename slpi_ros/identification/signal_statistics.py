@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from scipy.signal import savgol_filter
 from scipy.special import ndtri
 
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.hysteresis.reversals import without_small_reversals
-from slpi_ros.identification.drive import hold_band, resting, smallest_turn, turning_points
+from slpi_ros.hysteresis.reversals import reversals, without_small_reversals
+from slpi_ros.identification.drive import hold_band, resting, smallest_turn
 
 
 @dataclass(frozen=True)
@@ -326,6 +327,75 @@ def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArr
     return outliers[:0] if by_chance else outliers[earlier]
 
 
+# A reading is compared with so many on either side.
+_BESIDE = 3
+# Readings are found to be mixed with the next or the one before where more than this share of them lie off by more than
+# half of the way to it, so many times as many as on the other side, and where noise leaves that to be seen.
+_MIXED_SHARE, _MIXED_TIMES, _MIXED_NOISE = 0.02, 5.0, 0.12
+# One of them lies off by this share of that way at least, and of so many robust standard deviations.
+_MIXED_LEAST, _MIXED_DEVIATIONS = 0.2, 4.0
+# Hardly any lies farther off than the next reading.
+_MIXED_MOST = 1.3
+
+
+def mixed_readings(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
+    """Return the readings of a displacement that come early or late, or mix two.
+
+    Such a reading lies between its own place and that of the next one, or of the one before, as from a link that
+    delivers an old value or parts of two. They all lie off to one side: noise and outliers do not.
+
+    Parameters
+    ----------
+    y, v : ndarray, shape (N,), metres and volts
+        Displacement and voltage.
+
+    Returns
+    -------
+    ndarray of int, shape (M,)
+        Empty where readings do not differ so by more than chance.
+    """
+    off, known = _off_in_readings(y[:_ENOUGH], v[:_ENOUGH])
+    count = np.count_nonzero(known)
+    if count < FEWEST:
+        return np.empty(0, np.int64)
+    deviation = 1.4826 * float(np.median(np.abs(off[known])))
+    early, late, far = (np.count_nonzero(at) for at in (off > 0.5, off < -0.5, np.abs(off) > _MIXED_MOST))
+    many, few = max(early, late), min(early, late)
+    if deviation > _MIXED_NOISE or many < max(_MIXED_SHARE * count, _MIXED_TIMES * few) or far > 0.1 * many:
+        return np.empty(0, np.int64)
+    side = 1.0 if early > late else -1.0
+    least = max(_MIXED_LEAST, _MIXED_DEVIATIONS * deviation)
+    found = []
+    for start in range(0, y.size, _ENOUGH):
+        first = max(start - _RINGING, 0)
+        here = slice(first, start + _ENOUGH + _RINGING)
+        at = first + np.flatnonzero(side * _off_in_readings(y[here], v[here])[0] > least)
+        found.append(at[(at >= start) & (at < start + _ENOUGH)])
+    return np.concatenate(found)
+
+
+def _off_in_readings(y: FloatArray, v: FloatArray) -> tuple[FloatArray, Mask]:
+    """Return how far each reading, shape (N,), is ahead on its way, in steps from one to the next, and where known."""
+    width = 2 * _BESIDE + 1
+    off, known = np.zeros(y.size), np.zeros(y.size, dtype=bool)
+    if y.size < 2 * width:
+        return off, known
+    y_beside, v_beside = sliding_window_view(y, width), sliding_window_view(v, width)
+    steps = np.diff(v_beside, axis=1)
+    one_way = (steps > 0.0).all(axis=1) | (steps < 0.0).all(axis=1)
+    at = np.flatnonzero(one_way)
+    y_beside, steps = y_beside[at], steps[at]
+    gain = np.median(np.diff(y_beside, axis=1) / steps, axis=1)
+    line = np.median(y_beside - gain[:, None] * (v_beside[at] - v[at + _BESIDE][:, None]), axis=1)
+    way = gain * np.median(steps, axis=1)
+    moves = way != 0.0
+    off[at[moves] + _BESIDE] = ((y[at + _BESIDE] - line) / np.where(moves, way, 1.0))[moves]
+    known[at[moves] + _BESIDE] = True
+    # A branch bends, so that all readings of a part of it lie beside the line.
+    off[known] -= median_filter(off, 2 * width + 1)[known]
+    return off, known
+
+
 _FEWEST_READINGS = 5
 # Fewer differences than this do not tell their rms to 10 %.
 FEWEST = 100
@@ -427,7 +497,7 @@ def _repeats(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[Float
     what it has done before the turn before does not matter.
     """
     span = float(np.ptp(v))
-    ends = turning_points(v, smallest_turn(v, noise(v, t)))
+    ends = reversals(v, smallest_turn(v, noise(v, t)))
     # Each move: the turn before it, its own, and where it goes.
     turns = np.column_stack([v[ends[:-2]], v[ends[1:-1]], v[ends[2:]]])
     for move in range(1, len(turns), max(1, len(turns) // _ENOUGH_PIECES)):

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.io.record import FloatArray, Record
-from slpi_ros.io.signals import Signals
 
 TimeArray = NDArray[np.int64]
 
@@ -19,6 +18,37 @@ TimeArray = NDArray[np.int64]
 _GAP = 10.0
 # Names for columns that no message names.
 _AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Signals:
+    """A topic, decoded.
+
+    Parameters
+    ----------
+    logged : ndarray of int64, shape (N,), nanoseconds
+        Times of recording, in ascending order.
+    stamp : ndarray of int64, shape (N,), nanoseconds, or None
+        Header stamps; None where no message is stamped.
+    frame_id : str
+        The first one that is not empty.
+    fields : mapping of field to mapping of name to ndarray, shape (N,)
+        ``position``, ``effort``, ``data`` or ``vector``, in it ``x`` or what the messages name. NaN where a message
+        does not hold it. Names are in the order in which the messages first give them.
+    named : bool
+        Whether the messages give names; else they are ``0``, ``1``, ...
+    """
+
+    logged: NDArray[np.int64]
+    stamp: NDArray[np.int64] | None
+    frame_id: str
+    fields: Mapping[str, Mapping[str, FloatArray]]
+    named: bool
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names that the messages give, or numbers of the columns."""
+        return tuple(next(iter(self.fields.values())))
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,14 @@
-"""Bags in and out: the stage's recordings as rosbag2 folders or lone files, mcap or sqlite3, compressed or not.
+"""Recordings of a stage from bags: rosbag2 folders or lone files, mcap or sqlite3, compressed or not.
 
-Only this module and ``bag_writer`` import rosbags, and no rosbags exception leaves them. Of reading, rosbags does what
-takes little time: it finds the files and the topics of a bag. It handles messages one by one, which takes long.
+Only this module and ``bag_writer`` import rosbags, and no rosbags exception leaves them. rosbags finds the files and
+topics of a bag; their messages are decoded a whole block at once where all in it are alike.
 """
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,29 +17,11 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
 
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.io.alignment import SeparateTopics, combine, held_at
+from slpi_ros.io.alignment import SeparateTopics, Signals, combine, held_at
 from slpi_ros.io.bag_files import absolute_name, locate, match_topic, translated, unpacked
 from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
-from slpi_ros.io.bag_writer import STORAGES, BagWriter, typestore
-from slpi_ros.io.messages import (
-    JOINT_STATE,
-    MESSAGE_TYPES,
-    JointStateBlock,
-    encode_joint_states,
-)
-from slpi_ros.io.record import Record
-from slpi_ros.io.signals import Signals, decode_signals
-
-__all__ = [
-    "JOINT_STATE",
-    "STORAGES",
-    "BagWriter",
-    "SeparateTopics",
-    "read_bag",
-    "read_bags",
-    "read_desired",
-    "write_bag",
-]
+from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, SECOND_NS, Message, read_message
+from slpi_ros.io.record import FloatArray, Record
 
 _Path = str | os.PathLike[str]
 
@@ -158,36 +141,6 @@ def read_desired(path: _Path, record: Record, topic: str | None = None) -> dict[
     return held_at(desired, record, f"{path}, topic '{topic or DESIRED}'")
 
 
-def write_bag(path: _Path, record: Record, *, storage: str = "mcap", topic: str = "/stage_state") -> None:
-    """Write a record as a new rosbag2 folder that ``read_bag`` reads back without loss.
-
-    Parameters
-    ----------
-    path : path
-        The folder to make.
-    record : Record
-        What to write; its hardware id becomes the messages' ``frame_id``.
-    storage : {"mcap", "sqlite3"}
-        File format.
-    topic : str
-        Name of the topic.
-
-    Raises
-    ------
-    RecordError
-        If the path exists, or cannot be written.
-    """
-    displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
-    voltage = np.column_stack([record.voltage[axis] for axis in record.axes])
-    block = JointStateBlock(record.time_ns, displacement, voltage)
-    messages = encode_joint_states(block, record.axes, record.hardware_id)
-    # readers sort by log time: where stamps run backwards, the order of the record must survive
-    logged = np.maximum.accumulate(record.time_ns)
-    with BagWriter(path, storage=storage, topic=topic) as bag:
-        for stamp, message in zip(logged.tolist(), messages, strict=True):
-            bag.write_raw(stamp, message)
-
-
 class _Bag:
     """A bag that is open for reading; its files stay unpacked until the end of ``with``."""
 
@@ -196,7 +149,7 @@ class _Bag:
         self._path = path
         self._topics: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
-        self._files: list[tuple[Path, Path]] = []
+        self._storages: list[tuple[Any, Path]] = []
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -219,7 +172,7 @@ class _Bag:
             self._counts[connection.topic] += connection.msgcount
         # A folder has a storage for each of its files, unpacked where it was compressed; a lone file is one.
         storages = getattr(reader.storage, "storages", [reader.storage])
-        self._files += [(storage.path, source) for storage in storages]
+        self._storages += [(storage, source) for storage in storages]
 
     def holds(self, topic: str) -> bool:
         """Return whether there is a message on a topic, named in full or by its last parts."""
@@ -230,28 +183,16 @@ class _Bag:
         """Return what the messages of a topic hold, which is of one of the types."""
         name = match_topic(self._topics, topic, tuple(msgtypes), self._path)
         with translated(self._path):
-            msgtype = self._topics[name]
-            signals = decode_signals(self._blocks(name), msgtype, _deserialiser(msgtype), self._counts[name])
+            signals = decode_signals(self._blocks(name), self._topics[name], self._counts[name])
         if signals is None:
             raise RecordError(f"{self._path}: no message on topic '{topic}'; was the stage's driver running?")
         return signals
 
     def _blocks(self, topic: str) -> Iterator[MessageBlock]:
-        for file, source in self._files:
+        for storage, source in self._storages:
             with translated(source):
-                yield from (read_mcap if file.suffix == ".mcap" else read_sqlite)(file, topic)
-
-
-def _deserialiser(msgtype: str) -> Callable[[bytes], Any]:
-    """Return a function from a message to an object; a short message makes it raise."""
-    # not Typestore.deserialize_cdr: it refuses the garbage that rclpy's serialize_message leaves at the end
-    definition = typestore().get_msgdef(msgtype)
-
-    def deserialise(message: bytes) -> Any:
-        decode = definition.deserialize_cdr_le if message[1] & 1 else definition.deserialize_cdr_be
-        return decode(message[4:], 0, definition.cls, typestore())[0]
-
-    return deserialise
+                is_mcap = storage.path.suffix == ".mcap"
+                yield from read_mcap(storage.path, topic) if is_mcap else read_sqlite(storage, topic)
 
 
 def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tuple[str, ...]:
@@ -270,3 +211,112 @@ def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tupl
                     f"the measured metres, effort[] the applied volts; else read other axes, of {names}"
                 )
     return chosen
+
+
+def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int = 0) -> Signals | None:
+    """Decode the messages of a topic, a whole block at once where all in it are alike.
+
+    Parameters
+    ----------
+    blocks : iterable of MessageBlock
+        Each is let go as soon as it is decoded.
+    msgtype : str
+        One of `MESSAGE_TYPES`.
+    expected : int
+        About how many messages there are in all.
+
+    Returns
+    -------
+    Signals or None
+        None where there is no message.
+    """
+    columns, frame_id = _Columns(expected), ""
+    for block in blocks:
+        part = _decode(block, msgtype)
+        columns.append(part.columns)
+        frame_id = frame_id or part.frame_id
+    if not columns.count:
+        return None
+    arrays = columns.arrays()
+    logged, stamp = arrays[_LOGGED], arrays[_STAMP]
+    if (logged[1:] < logged[:-1]).any():
+        order = np.argsort(logged, kind="stable")
+        arrays = {key: array[order] for key, array in arrays.items()}
+        logged, stamp = arrays[_LOGGED], arrays[_STAMP]
+    kind = MESSAGE_TYPES[msgtype]
+    fields: dict[str, dict[str, FloatArray]] = {field: {} for field in kind.fields}
+    for (field, name), array in arrays.items():
+        if field:
+            fields[field][name] = array
+    return Signals(logged, stamp if stamp.any() else None, frame_id, fields, kind.named)
+
+
+# Columns are found by field and name; the times have no field.
+_Key = tuple[str, str]
+_LOGGED, _STAMP = ("", "logged"), ("", "stamp")
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A block, decoded: columns of shape (n,)."""
+
+    frame_id: str
+    columns: Mapping[_Key, NDArray[Any]]
+
+
+class _Columns:
+    """Columns that grow by parts; of a long recording there is no room for two copies."""
+
+    def __init__(self, expected: int) -> None:
+        self.count = 0
+        self._room = expected
+        self._arrays: dict[_Key, NDArray[Any]] = {}
+
+    def append(self, part: Mapping[_Key, NDArray[Any]]) -> None:
+        start, self.count = self.count, self.count + part[_LOGGED].size
+        if self.count > self._room:
+            self._room = 2 * self.count
+            self._arrays = {key: np.resize(array[:start], self._room) for key, array in self._arrays.items()}
+        for key in [key for key in part if key not in self._arrays]:
+            self._arrays[key] = np.empty(self._room, part[key].dtype)
+            if start:
+                self._arrays[key][:start] = np.nan
+        for key, array in self._arrays.items():
+            array[start : self.count] = part.get(key, np.nan)
+
+    def arrays(self) -> dict[_Key, NDArray[Any]]:
+        return {key: array[: self.count] for key, array in self._arrays.items()}
+
+
+def _decode(block: MessageBlock, msgtype: str) -> _Part:
+    if not isinstance(block.messages, list):
+        first = read_message(block.messages[0].tobytes(), msgtype)
+        rows = first.layout.decode(block.messages) if first.is_regular() else None
+        if rows is not None:
+            return _alike(block, first, rows)
+    return _each(block, msgtype, [read_message(message, msgtype) for message in block.each()])
+
+
+def _alike(block: MessageBlock, first: Message, rows: NDArray[np.void]) -> _Part:
+    """Take the columns out of messages that all have the layout of the first one."""
+    stamp = np.zeros(rows.size, np.int64)
+    if "sec" in first.layout.fields:
+        stamp = rows["sec"].astype(np.int64) * SECOND_NS + rows["nanosec"]
+    columns = {_LOGGED: block.logged, _STAMP: stamp}
+    for field in first.values:
+        columns |= {(field, name): rows[field][:, place] for place, name in enumerate(first.names)}
+    return _Part(first.frame_id, columns)
+
+
+def _each(block: MessageBlock, msgtype: str, messages: Sequence[Message]) -> _Part:
+    """Match every message's numbers to their columns by name."""
+    stamp = np.array([message.stamp_ns for message in messages], np.int64)
+    columns: dict[_Key, NDArray[Any]] = {_LOGGED: block.logged, _STAMP: stamp}
+    for name in dict.fromkeys(name for message in messages for name in message.names):
+        columns |= {(field, name): np.full(len(messages), np.nan) for field in MESSAGE_TYPES[msgtype].fields}
+    for row, message in enumerate(messages):
+        for field, numbers in message.values.items():
+            # zip ends with the shorter one: what is behind the end of an array has no value
+            for name, number in zip(message.names, numbers, strict=False):
+                columns[field, name][row] = number
+    return _Part(next((message.frame_id for message in messages if message.frame_id), ""), columns)

@@ -1,16 +1,16 @@
-"""Messages of one topic from an MCAP file, a chunk at a time and without touching each of them.
+"""Raw messages of one topic from an MCAP or SQLite file, as blocks.
 
-The format: https://mcap.dev/spec. A file is a row of records; most are chunks, which hold records in turn, and behind
-each chunk stand indexes of its messages. Chunks without the wanted topic are passed over.
+MCAP files are read a chunk at a time, without touching single messages: ten times as fast as by rosbags. Format:
+https://mcap.dev/spec. A file is a sequence of records; most are chunks, which hold records in turn, and behind each
+chunk stand indexes of its messages. Chunks without the wanted topic are skipped. SQLite files are read by rosbags.
 """
 
-import sqlite3
 import struct
 import sys
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,7 +27,7 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 @dataclass(frozen=True)
 class MessageBlock:
-    """Some messages of a topic.
+    """Consecutive messages of a topic.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class MessageBlock:
         return cls(times, list(messages))
 
     def each(self) -> list[bytes]:
-        """Return the messages one by one."""
+        """Return the single messages."""
         if isinstance(self.messages, list):
             return self.messages
         return [row.tobytes() for row in self.messages]
@@ -281,19 +281,13 @@ def _rows(data: ByteArray, starts: NDArray[np.int64], length: int) -> ByteArray:
     return rows
 
 
-# In the order of writing: going through the index of times would jump about in the file.
-_MESSAGES = """
-SELECT timestamp, data FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE name = ?) ORDER BY id
-"""
-
-
-def read_sqlite(path: Path, topic: str) -> Iterator[MessageBlock]:
-    """Yield the messages of a topic, in the order in which they were written.
+def read_sqlite(storage: Any, topic: str) -> Iterator[MessageBlock]:
+    """Yield the messages of a topic in the order of their recording.
 
     Parameters
     ----------
-    path : Path
-        A complete file.
+    storage : rosbags.rosbag2.storage_sqlite3.Sqlite3Reader
+        Open.
     topic : str
         Full name.
 
@@ -302,7 +296,7 @@ def read_sqlite(path: Path, topic: str) -> Iterator[MessageBlock]:
     Exception
         Of any kind where the file is damaged.
     """
-    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as connection:
-        rows = connection.execute(_MESSAGES, (topic,))
-        while block := rows.fetchmany(BLOCK):
-            yield MessageBlock.of([logged for logged, _ in block], [message for _, message in block])
+    connections = [connection for connection in storage.connections if connection.topic == topic]
+    messages = storage.messages(connections) if connections else iter(())
+    while block := list(islice(messages, BLOCK)):
+        yield MessageBlock.of([logged for _, logged, _ in block], [message for _, _, message in block])

@@ -21,6 +21,7 @@ from rosbags.typesys import Stores, TypesysError, get_typestore
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_files import absolute_name, one_line, partial_path
 from slpi_ros.io.messages import JOINT_STATE, JointStateBlock, encode_joint_states
+from slpi_ros.io.record import Record
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 
@@ -206,6 +207,38 @@ class BagWriter:
         return RecordError(
             f"{self.path}: cannot be written ({one_line(error)}); free some space or choose another place"
         )
+
+
+def write_bag(
+    path: str | os.PathLike[str], record: Record, *, storage: str = "mcap", topic: str = "/stage_state"
+) -> None:
+    """Write a record as a new rosbag2 folder that `slpi_ros.read_bag` reads back without loss.
+
+    Parameters
+    ----------
+    path : path
+        The folder to make.
+    record : Record
+        What to write; its hardware id becomes the messages' ``frame_id``.
+    storage : {"mcap", "sqlite3"}
+        File format.
+    topic : str
+        Name of the topic.
+
+    Raises
+    ------
+    RecordError
+        If the path exists, or cannot be written.
+    """
+    displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
+    voltage = np.column_stack([record.voltage[axis] for axis in record.axes])
+    block = JointStateBlock(record.time_ns, displacement, voltage)
+    messages = encode_joint_states(block, record.axes, record.hardware_id)
+    # readers sort by log time: where stamps run backwards, the order of the record must survive
+    logged = np.maximum.accumulate(record.time_ns)
+    with BagWriter(path, storage=storage, topic=topic) as bag:
+        for stamp, message in zip(logged.tolist(), messages, strict=True):
+            bag.write_raw(stamp, message)
 
 
 @cache

@@ -1,12 +1,15 @@
-"""CDR, the wire format of ROS 2: many messages of one layout as one structured array.
+"""CDR, the serialisation of ROS 2: single messages, and many messages of one layout as one structured array.
 
-Messages whose strings and array lengths do not change differ only in their numbers, which stay at fixed offsets.
-Decoding a whole recording that way is many times faster than message by message.
+Messages whose strings and array lengths are the same differ only in their numbers, which stay at fixed offsets, so a
+whole recording is decoded by one comparison and one view.
+
+Reference: OMG, Common Data Representation (DDS-XTypes 1.3, section 7.4). A value of n bytes is aligned to n bytes,
+counted from behind the encapsulation of four bytes.
 """
 
 import struct
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,22 +18,24 @@ from numpy.typing import NDArray
 
 ByteArray = NDArray[np.uint8]
 
-# "plain CDR, little-endian" and two bytes of options; alignment counts from behind them.
-_ENCAPSULATION = b"\x00\x01\x00\x00"
+ENCAPSULATION = 4
+# Plain CDR, which every DDS of ROS 2 sends; the second byte tells the byte order. Two bytes of options follow.
+BYTE_ORDERS = {b"\0\0": ">", b"\0\1": "<"}
+_DTYPES = {"i": "i4", "I": "u4"}
 
 
 @dataclass(frozen=True)
 class CdrLayout:
-    """Where everything is in messages of one layout.
+    """Offsets of the numbers in messages of one layout.
 
     Parameters
     ----------
     template : ndarray of uint8, shape (M,)
-        A whole message with zeros for its numbers.
+        One such message.
     fixed : ndarray of bool, shape (M,)
-        The bytes that are the same in every such message: no numbers, and no padding, which holds garbage.
+        The bytes that are the same in every such message: no numbers, and no padding, which is undefined.
     fields : mapping of str to (dtype, int)
-        NumPy type and first byte of what is not fixed.
+        NumPy type and offset of the named numbers.
     """
 
     template: ByteArray
@@ -43,7 +48,7 @@ class CdrLayout:
         Parameters
         ----------
         rows : ndarray of uint8, shape (N, L)
-            Serialised messages; what follows the message proper is ignored, as some writers append garbage.
+            Serialised messages; bytes behind the message proper are ignored, as some writers append garbage.
 
         Returns
         -------
@@ -67,82 +72,25 @@ class CdrLayout:
         )
 
 
-class CdrBuilder:
-    """Appends values to a message and remembers which bytes are fixed."""
-
-    def __init__(self) -> None:
-        self._data = bytearray(_ENCAPSULATION)
-        self._fixed = bytearray(b"\x01\x01\x00\x00")
-        self._fields: dict[str, tuple[Any, int]] = {}
-
-    def layout(self) -> CdrLayout:
-        """Return the layout of what has been appended."""
-        template = np.frombuffer(bytes(self._data), np.uint8)
-        return CdrLayout(template, np.frombuffer(bytes(self._fixed), np.uint8).astype(bool), dict(self._fields))
-
-    def count(self, number: int) -> None:
-        """Append a fixed unsigned integer of 32 bits: the length of an array, most often."""
-        self._append(struct.pack("<I", number), 4, fixed=True)
-
-    def string(self, text: str) -> None:
-        """Append a fixed string."""
-        data = text.encode() + b"\0"
-        self.count(len(data))
-        self._append(data, 1, fixed=True)
-
-    def integer(self, name: str, kind: str) -> None:
-        """Append an integer of 32 bits that varies."""
-        self._fields[name] = (kind, self._append(bytes(4), 4, fixed=False))
-
-    def header(self, frame_id: str) -> None:
-        """Append a ``std_msgs/Header`` whose stamp varies."""
-        self.integer("sec", "<i4")
-        self.integer("nanosec", "<u4")
-        self.string(frame_id)
-
-    def doubles(self, name: str, number: int) -> None:
-        """Append so many doubles that vary."""
-        # nothing is no double: no alignment for what does not come
-        offset = self._append(bytes(8 * number), 8 if number else 1, fixed=False)
-        self._fields[name] = (("<f8", (number,)), offset)
-
-    def sequence(self, name: str, number: int) -> None:
-        """Append an array of doubles that vary, with its fixed length before it."""
-        self.count(number)
-        self.doubles(name, number)
-
-    def _append(self, data: bytes, align: int, fixed: bool) -> int:
-        gap = (len(_ENCAPSULATION) - len(self._data)) % align
-        start = len(self._data) + gap
-        self._data += bytes(gap) + data
-        self._fixed += bytes(gap) + bytes([fixed]) * len(data)
-        return start
-
-
-# Alignment counts from behind the encapsulation.
-ENCAPSULATION = 4
-# Plain CDR, which every DDS of ROS 2 sends; the second byte tells the order of bytes.
-BYTE_ORDERS = {b"\0\0": ">", b"\0\1": "<"}
-
-
-class Reader:
-    """Reads the parts of a serialized message one by one; struct.error where it is cut off.
+class CdrReader:
+    """Reads a serialised message value by value and records its layout.
 
     Parameters
     ----------
     data : bytes
+        With its encapsulation.
 
     Attributes
     ----------
     order : str
-        Of bytes, as the module ``struct`` writes it.
+        Byte order, as the module ``struct`` writes it.
     at : int
-        Where the next part begins, but for its alignment.
+        Offset behind what has been read, bytes.
 
     Raises
     ------
     struct.error
-        If it is not plain CDR.
+        If it is not plain CDR, or, by any method, where it is cut off.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -151,46 +99,88 @@ class Reader:
             raise struct.error("not plain CDR")
         self.order, self.data, self.at = order, data, ENCAPSULATION
         self._format = [order, "2s2x"]
+        self._fixed = [(0, 2)]
+        self._fields: dict[str, tuple[Any, int]] = {}
 
-    def layout(self) -> struct.Struct:
-        """Return what reads all that has been read so far at once: its encapsulation first, and texts with lengths."""
+    def struct(self) -> struct.Struct:
+        """Return what unpacks all that has been read: the encapsulation's kind, then every value in order."""
         return struct.Struct("".join(self._format))
 
-    def number(self, kind: str = "I") -> int:
-        """Read an integer of 32 bits."""
+    def layout(self) -> CdrLayout:
+        """Return the layout of what has been read; values without a name are fixed."""
+        fixed = np.zeros(self.at, bool)
+        for begin, end in self._fixed:
+            fixed[begin:end] = True
+        return CdrLayout(np.frombuffer(self.data, np.uint8, self.at), fixed, dict(self._fields))
+
+    def integer(self, kind: str = "I", name: str = "") -> int:
+        """Read an integer of 32 bits, signed (``i``) or not (``I``)."""
         self._align(4)
         (value,) = struct.unpack_from(self.order + kind, self.data, self.at)
-        self._passed(4, kind)
+        self._pass(4, kind, name, self.order + _DTYPES[kind])
         return int(value)
 
     def string(self) -> str:
-        """Read a text; UnicodeDecodeError if it is none."""
-        size = self.number()
+        """Read a string; UnicodeDecodeError if it is not UTF-8."""
+        size = self.integer()
         text = self.data[self.at : self.at + size]
         if len(text) != size:
-            raise struct.error("a text is cut off")
-        self._passed(size, f"{size}s")
+            raise struct.error("a string is cut off")
+        self._pass(size, f"{size}s")
         return text.rstrip(b"\0").decode()
 
-    def doubles(self) -> tuple[int, int]:
-        """Skip an array of doubles; return how many there are, and where they begin."""
-        count = self.number()
-        if count:
+    def strings(self) -> tuple[str, ...]:
+        """Read a sequence of strings."""
+        return tuple(self.string() for _ in range(self.integer()))
+
+    def doubles(self, name: str = "", count: int | None = None) -> tuple[int, int]:
+        """Skip `count` doubles, or a sequence that tells its own length; return how many, and their offset."""
+        number = self.integer() if count is None else count
+        if number:
             self._align(8)
         begin = self.at
-        self._passed(8 * count, f"{count}d")
-        return count, begin
+        if begin + 8 * number > len(self.data):
+            raise struct.error("an array is cut off")
+        self._pass(8 * number, f"{number}d", name, (self.order + "f8", (number,)))
+        return number, begin
+
+    def array(self, name: str) -> NDArray[np.float64]:
+        """Return the doubles that were read under this name, shape (n,)."""
+        (dtype, (count,)), offset = self._fields[name]
+        return np.frombuffer(self.data, dtype, count, offset).astype(np.float64)
 
     def _align(self, size: int) -> None:
         gap = -(self.at - ENCAPSULATION) % size
-        self._passed(gap, f"{gap}x")
+        self.at += gap
+        self._format.append(f"{gap}x")
 
-    def _passed(self, size: int, kind: str) -> None:
+    def _pass(self, size: int, kind: str, name: str = "", dtype: Any = None) -> None:
+        if name:
+            self._fields[name] = (dtype, self.at)
+        else:
+            self._fixed.append((self.at, self.at + size))
         self.at += size
         self._format.append(kind)
 
 
+def serialise(*values: int | str | Sequence[float]) -> bytes:
+    """Return a little-endian message: integers as 32 bits without sign, strings, and sequences of doubles."""
+    data = bytearray(b"\0\1\0\0")
+    for value in values:
+        if isinstance(value, str):
+            text = value.encode() + b"\0"
+            part = struct.pack("<I", len(text)) + text
+        elif isinstance(value, int):
+            part = struct.pack("<I", value)
+        else:
+            part = struct.pack("<I", len(value))
+        data += bytes(-(len(data) - ENCAPSULATION) % 4) + part
+        if not isinstance(value, int | str) and value:
+            data += bytes(-(len(data) - ENCAPSULATION) % 8) + struct.pack(f"<{len(value)}d", *value)
+    return bytes(data)
+
+
 def multiarray_header(count: int) -> bytes:
-    """Return what stands before the doubles, in this machine's order of bytes, of a Float64MultiArray of so many."""
+    """Return the CDR header of a Float64MultiArray with `count` doubles, in this machine's byte order."""
     # No dimensions, no offset; then the doubles begin at a multiple of eight.
     return struct.pack("=2B2x3I4x", 0, sys.byteorder == "little", 0, 0, count)

@@ -1,15 +1,16 @@
-"""What the name of a column says: its unit, however it is written, and its axis."""
+"""The columns of a table: unit and axis from a name, however it is written, and the choice among them."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 from slpi_ros.errors import RecordError, UsageError
 
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """What a column can hold.
+    """A physical quantity that a column can hold.
 
     Parameters
     ----------
@@ -19,7 +20,7 @@ class Quantity:
         Unit where nothing says it.
     units : mapping of str to float
         Known units and their size in SI.
-    words : tuple of str
+    prefixes : tuple of str
         How names of its columns begin, in lower case.
     others : frozenset of str
         Endings of names that are units too, but none of this quantity, in lower case.
@@ -28,7 +29,7 @@ class Quantity:
     name: str
     default: str
     units: Mapping[str, float]
-    words: tuple[str, ...]
+    prefixes: tuple[str, ...]
     others: frozenset[str]
 
     def unit(self, text: str) -> str:
@@ -36,9 +37,9 @@ class Quantity:
         plain = text.strip().replace("µ", "u").replace("μ", "u")
         if plain in self.units:
             return plain
-        if plain.casefold() in _SPELT:
-            spelt = _SPELT[plain.casefold()]
-            return spelt if spelt in self.units else ""
+        if plain.casefold() in _SPELLED:
+            spelled = _SPELLED[plain.casefold()]
+            return spelled if spelled in self.units else ""
         # Nm is no length; and MV may be meant as either
         one_case = plain in (plain.lower(), plain.upper()) and plain != "MV"
         return next((unit for unit in self.units if one_case and unit.casefold() == plain.casefold()), "")
@@ -90,7 +91,7 @@ DISPLACEMENT = Quantity(
 )
 QUANTITIES = (TIME, VOLTAGE, DISPLACEMENT)
 
-_SPELT = {
+_SPELLED = {
     **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
     **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"),
     **dict.fromkeys(("usec", "microsecond", "microseconds"), "us"),
@@ -106,7 +107,7 @@ _SPELT = {
 
 _INDEX_OF_A_MATRIX = re.compile(r"\((?:\d+,:|:,\d+)\)$")
 _BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]")
-_SPOKEN = re.compile(r"(?:\s+in\s+|\s*/\s+|\s+/\s*)(\S+)\s*$")
+_SEPARATED = re.compile(r"(?:\s+in\s+|\s*/\s+|\s+/\s*)(\S+)\s*$")
 _PARTS = re.compile(r"[^\s_.,-]+")
 
 
@@ -119,13 +120,13 @@ class Column:
     name : str
         As in the table.
     axis : str
-        What its name holds beside the quantity and the unit; ``x`` if nothing.
+        What its name holds besides the quantity and the unit; ``x`` if nothing.
     unit : str
         Unit of its values.
     scale : float
         Size of the unit in SI.
     assumed : bool
-        Whether neither the name nor an option says the unit.
+        Whether neither the name nor an option gives the unit.
     """
 
     name: str
@@ -135,8 +136,8 @@ class Column:
     assumed: bool
 
 
-def named(name: str, quantity: Quantity, *, told: str | None = None, source: str = "table") -> Column:
-    """Return what the name of a column says; units as in ``x_nm``, ``x (nm)``, ``x [nm]``, ``x in nm``, ``x / nm``.
+def parse_column(name: str, quantity: Quantity, *, given_unit: str | None = None, source: str = "table") -> Column:
+    """Parse the name of a column; units as in ``x_nm``, ``x (nm)``, ``x [nm]``, ``x in nm``, ``x / nm``.
 
     Parameters
     ----------
@@ -144,7 +145,7 @@ def named(name: str, quantity: Quantity, *, told: str | None = None, source: str
         Name of the column.
     quantity : Quantity
         What it holds.
-    told : str, optional
+    given_unit : str, optional
         Unit by option, for a name without one.
     source : str
         The table, for messages.
@@ -163,12 +164,12 @@ def named(name: str, quantity: Quantity, *, told: str | None = None, source: str
             f"{source}: column '{name}': '{written}' is no unit of {quantity.name} known here; choose another column, "
             f"or convert the values and rename it (units: {', '.join(quantity.units)})"
         )
-    if told and unit and quantity.unit(told) != unit:
+    if given_unit and unit and quantity.unit(given_unit) != unit:
         raise UsageError(
-            f"{source}: column '{name}' is in {unit} by its name, but --{quantity.name}-unit says {told}; "
+            f"{source}: column '{name}' is in {unit} by its name, but --{quantity.name}-unit says {given_unit}; "
             "leave the option out or rename the column"
         )
-    known = unit or quantity.unit(told or "")
+    known = unit or quantity.unit(given_unit or "")
     size = known or quantity.default
     return Column(name, _axis(stem), size, quantity.units[size], assumed=not known)
 
@@ -190,7 +191,7 @@ def axis_of(name: str, quantity: Quantity) -> str:
 
 def begins(name: str, quantity: Quantity) -> bool:
     """Return whether a name begins with a word for the quantity."""
-    return name.lower().startswith(quantity.words)
+    return name.lower().startswith(quantity.prefixes)
 
 
 def _split(name: str, quantity: Quantity) -> tuple[str, str]:
@@ -211,8 +212,8 @@ def _written_units(name: str, quantity: Quantity) -> Iterator[tuple[int, int, st
 
     brackets = [(*found.span(), found.group(1).strip()) for found in _BRACKETS.finditer(name)]
     yield from (found for found in reversed(brackets) if is_any(found[2]))
-    if (spoken := _SPOKEN.search(name)) and not brackets:
-        yield (*spoken.span(), spoken.group(1))
+    if (separated := _SEPARATED.search(name)) and not brackets:
+        yield (*separated.span(), separated.group(1))
     yield from (found for found in brackets if found[2] and found[1] == len(name.rstrip()))
     parts = [(*found.span(), found.group()) for found in _PARTS.finditer(name)]
     for number in range(len(parts) - 1, 0, -1):
@@ -223,7 +224,7 @@ def _written_units(name: str, quantity: Quantity) -> Iterator[tuple[int, int, st
 
 
 def _axis(stem: str) -> str:
-    for word in (word for quantity in QUANTITIES for word in quantity.words):
+    for word in (word for quantity in QUANTITIES for word in quantity.prefixes):
         if stem.lstrip().lower().startswith(word):
             stem = stem.lstrip()[len(word) :]
             break
@@ -232,3 +233,165 @@ def _axis(stem: str) -> str:
     if re.fullmatch(r"[(\[][^()\[\]]*[)\]]", axis) and not _INDEX_OF_A_MATRIX.search(axis):
         axis = axis[1:-1]
     return " ".join(axis.split()) or "x"
+
+
+def match_column(name: str, columns: Sequence[str]) -> str:
+    """Return the name of the only column that matches but for case, unless the name itself is a column."""
+    alike = [column for column in columns if column.casefold() == name.casefold()]
+    return alike[0] if len(alike) == 1 and name not in columns else name
+
+
+def joined(names: Sequence[str]) -> str:
+    """Return names for a message: at most 200 printable characters."""
+    text = ", ".join(names)
+    return printable(text[:200]) + ("..." if len(text) > 200 else "")
+
+
+def printable(text: str) -> str:
+    """Replace control characters, which would spoil a terminal."""
+    return "".join(c if c.isprintable() or c == "\N{NO-BREAK SPACE}" else "?" for c in text)
+
+
+@dataclass(frozen=True)
+class ColumnOptions:
+    """The options of `slpi_ros.io.tables.import_table`; all may be left out."""
+
+    time: str | None = None
+    voltage: tuple[str, ...] = ()
+    displacement: tuple[str, ...] = ()
+    displacement_unit: str | None = None
+    axes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ColumnChoice:
+    """The columns of a record.
+
+    Parameters
+    ----------
+    time : Column
+        Time.
+    voltage, displacement : mapping of axis name to Column
+        Of the same axes.
+    """
+
+    time: Column
+    voltage: Mapping[str, Column]
+    displacement: Mapping[str, Column]
+
+    def columns(self) -> tuple[Column, ...]:
+        """Return all columns."""
+        return (self.time, *self.displacement.values(), *self.voltage.values())
+
+
+def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) -> ColumnChoice:
+    """Choose the columns of a record by option, else by name.
+
+    Parameters
+    ----------
+    names : sequence of str
+        All columns of the table.
+    options : ColumnOptions
+        The caller's choice.
+    source : str
+        The table, for messages.
+
+    Raises
+    ------
+    RecordError
+        If there is none, their number does not match, or a name says a unit that is not known.
+    UsageError
+        If an option is wrong, contradicts a name, or gives one column two roles.
+    """
+    given_unit = options.displacement_unit
+    if given_unit is not None and not DISPLACEMENT.unit(given_unit):
+        raise UsageError(f"no displacement unit '{given_unit}'; choose {', '.join(DISPLACEMENT.units)}")
+    time = parse_column(
+        match_column(options.time, names) if options.time else _time_column(names, source), TIME, source=source
+    )
+    moved_names = [match_column(name, names) for name in options.displacement] or _displacement_columns(names, source)
+    moved = [parse_column(name, DISPLACEMENT, given_unit=given_unit, source=source) for name in moved_names]
+    driven_names = [match_column(name, names) for name in options.voltage] or _voltage_columns(
+        names, time, moved, source
+    )
+    driven = _one_for_each(moved, [parse_column(name, VOLTAGE, source=source) for name in driven_names], source)
+    axes = _axis_names(moved, options.axes, source)
+    _require_one_role(time, moved, driven, source)
+    return ColumnChoice(time, dict(zip(axes, driven, strict=True)), dict(zip(axes, moved, strict=True)))
+
+
+def _time_column(names: Sequence[str], source: str) -> str:
+    found = [n for n in names if begins(n, TIME) or (unit_in(n, TIME) and axis_of(n, TIME).casefold() == "t")]
+    with_unit = [name for name in found if unit_in(name, TIME)]
+    if not found:
+        _missing(names, source, TIME)
+    return "time_s" if "time_s" in found else (with_unit or found)[0]
+
+
+def _displacement_columns(names: Sequence[str], source: str) -> list[str]:
+    for word in DISPLACEMENT.prefixes:
+        if found := [name for name in names if name.lower().startswith(word)]:
+            return found
+    lengths = [name for name in names if unit_in(name, DISPLACEMENT)]
+    driven = {axis_of(name, VOLTAGE).casefold() for name in names if unit_in(name, VOLTAGE)}
+    for axes in (driven, {"x", "y", "z"}):
+        if found := [name for name in lengths if axis_of(name, DISPLACEMENT).casefold() in axes]:
+            return found
+    _missing(names, source, DISPLACEMENT)
+
+
+def _voltage_columns(names: Sequence[str], time: Column, moved: Sequence[Column], source: str) -> list[str]:
+    """Return the columns of voltage: where names tell one for each axis, these; else all."""
+    taken = {time.name, *(column.name for column in moved)}
+    found = [n for n in names if n not in taken and (begins(n, VOLTAGE) or unit_in(n, VOLTAGE))]
+    if not found:
+        _missing(names, source, VOLTAGE)
+    of_axes = [[n for n in found if axis_of(n, VOLTAGE).casefold() == m.axis.casefold()] for m in moved]
+    return [names[0] for names in of_axes] if all(len(names) == 1 for names in of_axes) else found
+
+
+def _missing(names: Sequence[str], source: str, quantity: Quantity) -> NoReturn:
+    option = quantity.name
+    raise RecordError(
+        f"{source}: no {option} column; there is {joined(names)}; name one of them (--{option} or {option}=)"
+    )
+
+
+def _one_for_each(moved: Sequence[Column], driven: Sequence[Column], source: str) -> list[Column]:
+    """Return one voltage column for each displacement column."""
+    if len(driven) == 1:
+        return [*driven] * len(moved)
+    if len(driven) != len(moved):
+        raise RecordError(
+            f"{source}: {len(driven)} voltage columns ({_column_names(driven)}) for {len(moved)} of displacement "
+            f"({_column_names(moved)}); name one voltage for all or one for each (--voltage or voltage=)"
+        )
+    return [*driven]
+
+
+def _axis_names(moved: Sequence[Column], axes: Sequence[str], source: str) -> tuple[str, ...]:
+    """Return one name for each displacement column, no two alike."""
+    names = tuple(axes) or tuple(column.axis for column in moved)
+    if len(names) != len(moved):
+        raise UsageError(f"{source}: {len(names)} axes for the displacement columns {_column_names(moved)}")
+    if len(set(names)) < len(names):
+        raise RecordError(
+            f"{source}: displacement columns {_column_names(moved)} are axes {', '.join(names)}, two of them the "
+            "same; choose the columns (--displacement or displacement=)"
+        )
+    return names
+
+
+def _require_one_role(time: Column, moved: Sequence[Column], driven: Iterable[Column], source: str) -> None:
+    """Refuse a column that is more than one thing; only a voltage may be that of several axes."""
+    names = [time.name, *(column.name for column in moved), *{column.name for column in driven}]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(
+                f"{source}: column '{name}' twice; time, each displacement and voltage need columns of their own "
+                "(--time, --displacement, --voltage)"
+            )
+
+
+def _column_names(columns: Sequence[Column]) -> str:
+    return ", ".join(column.name for column in columns)

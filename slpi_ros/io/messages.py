@@ -1,21 +1,47 @@
-"""A JointTrajectory as it comes over the wire, decoded at once: a million points as objects would take many seconds.
-
-CDR, the wire format of ROS 2: points that hold equally many numbers each differ only in the numbers, at fixed offsets.
-"""
+"""The messages this package reads or writes as bytes: JointState, JointTrajectory, and what bags may hold instead."""
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError
-from slpi_ros.io.cdr import ENCAPSULATION, CdrBuilder, CdrLayout, Reader
+from slpi_ros.io.cdr import ENCAPSULATION, CdrLayout, CdrReader, serialise
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
+SECOND_NS = 1_000_000_000
+# header stamps count seconds in int32
+_STAMP_END = 2**31 * SECOND_NS
+
+
+def _read_joint_state(reader: CdrReader) -> tuple[str, ...]:
+    names = reader.strings()
+    for field in ("position", "velocity", "effort"):
+        reader.doubles(field)
+    return names
+
+
+def _read_number(reader: CdrReader) -> tuple[str, ...]:
+    reader.doubles("data", 1)
+    return ("0",)
+
+
+def _read_array(reader: CdrReader) -> tuple[str, ...]:
+    for _ in range(reader.integer()):
+        reader.string()
+        reader.integer()
+        reader.integer()
+    reader.integer()
+    count, _ = reader.doubles("data")
+    return tuple(map(str, range(count)))
+
+
+def _read_vector(reader: CdrReader) -> tuple[str, ...]:
+    reader.doubles("vector", 3)
+    return ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -25,105 +51,79 @@ class MessageType:
     Parameters
     ----------
     stamped : bool
-        Whether it has a header.
+        Whether it begins with a header.
     named : bool
         Whether it names what its numbers belong to; else they are numbered.
     fields : tuple of str
         Those that hold its numbers.
-    names : callable
-        From a message to one name for each column.
-    values : callable
-        From a message to its numbers, field by field; one that is shorter than the names lacks the last of them.
-    layout : callable
-        From a message to the layout of all that are like it, with the same fields; None where it has no regular one.
+    read : callable
+        Reads all behind the header and returns one name for each column.
     """
 
     stamped: bool
     named: bool
     fields: tuple[str, ...]
-    names: Callable[[Any], tuple[str, ...]]
-    values: Callable[[Any], Mapping[str, Sequence[float]]]
-    layout: Callable[[Any], CdrLayout | None]
-
-
-def _joint_state_layout(message: Any) -> CdrLayout | None:
-    names = tuple(message.name)
-    if not len(set(names)) == len(names) == len(message.position) == len(message.effort) > 0:
-        return None
-    return joint_state_layout(names, message.header.frame_id, len(message.velocity))
-
-
-def _number_layout(_: Any) -> CdrLayout:
-    builder = CdrBuilder()
-    builder.doubles("data", 1)
-    return builder.layout()
-
-
-def _array_layout(message: Any) -> CdrLayout | None:
-    if not len(message.data):
-        return None
-    builder = CdrBuilder()
-    builder.count(len(message.layout.dim))
-    for dimension in message.layout.dim:
-        builder.string(dimension.label)
-        builder.count(dimension.size)
-        builder.count(dimension.stride)
-    builder.count(message.layout.data_offset)
-    builder.sequence("data", len(message.data))
-    return builder.layout()
-
-
-def _vector_layout(message: Any) -> CdrLayout:
-    builder = CdrBuilder()
-    builder.header(message.header.frame_id)
-    builder.doubles("vector", 3)
-    return builder.layout()
+    read: Callable[[CdrReader], tuple[str, ...]]
 
 
 MESSAGE_TYPES = {
-    JOINT_STATE: MessageType(
-        stamped=True,
-        named=True,
-        fields=("position", "effort"),
-        names=lambda message: tuple(message.name),
-        values=lambda message: {"position": message.position, "effort": message.effort},
-        layout=_joint_state_layout,
-    ),
-    "std_msgs/msg/Float64": MessageType(
-        stamped=False,
-        named=False,
-        fields=("data",),
-        names=lambda _: ("0",),
-        values=lambda message: {"data": (message.data,)},
-        layout=_number_layout,
-    ),
-    "std_msgs/msg/Float64MultiArray": MessageType(
-        stamped=False,
-        named=False,
-        fields=("data",),
-        names=lambda message: tuple(str(column) for column in range(len(message.data))),
-        values=lambda message: {"data": message.data},
-        layout=_array_layout,
-    ),
-    "geometry_msgs/msg/Vector3Stamped": MessageType(
-        stamped=True,
-        named=True,
-        fields=("vector",),
-        names=lambda _: ("x", "y", "z"),
-        values=lambda message: {"vector": (message.vector.x, message.vector.y, message.vector.z)},
-        layout=_vector_layout,
-    ),
+    JOINT_STATE: MessageType(True, True, ("position", "effort"), _read_joint_state),
+    "std_msgs/msg/Float64": MessageType(False, False, ("data",), _read_number),
+    "std_msgs/msg/Float64MultiArray": MessageType(False, False, ("data",), _read_array),
+    "geometry_msgs/msg/Vector3Stamped": MessageType(True, True, ("vector",), _read_vector),
 }
 
-SECOND_NS = 1_000_000_000
 
-# header stamps count seconds in int32
-_STAMP_END = 2**31 * SECOND_NS
+@dataclass(frozen=True)
+class Message:
+    """One message, decoded.
+
+    Parameters
+    ----------
+    stamp_ns : int, nanoseconds
+        Header stamp; 0 where there is no header.
+    frame_id : str
+        As in the header.
+    names : tuple of str, length K
+        One for each column.
+    values : mapping of field to ndarray, shape (n,)
+        ``position`` (m), ``effort`` (V), ``data`` or ``vector``; without the last columns where shorter than `names`.
+    layout : CdrLayout
+        Of all messages with the same strings and lengths.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    names: tuple[str, ...]
+    values: Mapping[str, NDArray[np.float64]]
+    layout: CdrLayout
+
+    def is_regular(self) -> bool:
+        """Return whether every name occurs once and every field has a number for each."""
+        count = len(set(self.names))
+        return count > 0 and all(len(self.names) == count == values.size for values in self.values.values())
+
+
+def read_message(data: bytes, msgtype: str) -> Message:
+    """Decode a serialised message of one of the `MESSAGE_TYPES`.
+
+    Raises
+    ------
+    struct.error, UnicodeDecodeError
+        If it is not one.
+    """
+    kind, reader = MESSAGE_TYPES[msgtype], CdrReader(data)
+    stamp_ns, frame_id = 0, ""
+    if kind.stamped:
+        stamp_ns = reader.integer("i", "sec") * SECOND_NS + reader.integer("I", "nanosec")
+        frame_id = reader.string()
+    names = kind.read(reader)
+    return Message(stamp_ns, frame_id, names, {field: reader.array(field) for field in kind.fields}, reader.layout())
 
 
 @dataclass(frozen=True)
 class JointStateBlock:
-    """Many messages of one layout.
+    """Many JointStates of the same joints.
 
     Parameters
     ----------
@@ -140,44 +140,13 @@ class JointStateBlock:
     effort: NDArray[np.float64]
 
 
-@lru_cache(maxsize=64)
-def joint_state_layout(names: tuple[str, ...], frame_id: str = "", velocities: int = 0) -> CdrLayout:
-    """Return the layout of messages with these names.
-
-    Parameters
-    ----------
-    names : tuple of str, length K
-        Joint names, each with one position and one effort.
-    frame_id : str
-        As in the header.
-    velocities : int
-        Length of the array ``velocity``, which is not read.
-
-    Returns
-    -------
-    CdrLayout
-        Shared between callers: do not write to its arrays.
-    """
-    if not names:
-        raise RecordError("a stage_state message needs at least one axis name")
-    builder = CdrBuilder()
-    builder.header(frame_id)
-    builder.count(len(names))
-    for name in names:
-        builder.string(name)
-    builder.sequence("position", len(names))
-    builder.sequence("velocity", velocities)
-    builder.sequence("effort", len(names))
-    return builder.layout()
-
-
 def encode_joint_states(block: JointStateBlock, names: tuple[str, ...], frame_id: str = "") -> list[bytes]:
     """Return one serialised message for each stamp.
 
     Parameters
     ----------
     block : JointStateBlock
-        What they hold.
+        Stamps, positions and efforts.
     names : tuple of str, length K
         Joint names.
     frame_id : str
@@ -186,66 +155,68 @@ def encode_joint_states(block: JointStateBlock, names: tuple[str, ...], frame_id
     Raises
     ------
     RecordError
-        If a stamp does not fit into a header: before 1970 or after 2038.
+        If there is no name, or a stamp does not fit into a header: before 1970 or after 2038.
     """
+    if not names:
+        raise RecordError("a stage_state message needs at least one axis name")
     unfit = (block.stamp_ns < 0) | (block.stamp_ns >= _STAMP_END)
     if unfit.any():
         raise RecordError(
             f"sample {int(unfit.argmax())}: time {block.stamp_ns[unfit][0] / SECOND_NS:g} s does not "
             "fit into a message stamp (0 to 2^31 s); shift the time axis"
         )
-    layout = joint_state_layout(names, frame_id)
-    size = layout.template.size
-    data = np.tile(layout.template, block.stamp_ns.size)
-    fields = data.view(layout.dtype(size))
+    zeros = (0.0,) * len(names)
+    template = serialise(0, 0, frame_id, len(names), *names, zeros, (), zeros)
+    data = np.tile(np.frombuffer(template, np.uint8), block.stamp_ns.size)
+    fields = data.view(read_message(template, JOINT_STATE).layout.dtype(len(template)))
     fields["sec"], fields["nanosec"] = np.divmod(block.stamp_ns, SECOND_NS)
     fields["position"], fields["effort"] = block.position, block.effort
     stream = data.tobytes()
-    return [stream[start : start + size] for start in range(0, len(stream), size)]
+    return [stream[start : start + len(template)] for start in range(0, len(stream), len(template))]
 
 
-# Encapsulation, seconds, nanoseconds: what stands before the names.
+# Encapsulation, seconds, nanoseconds: the values before the names.
 FIRST = 3
 
 
 class JointStates:
-    """Reads the JointStates of one topic; those that are laid out as the one before with one look."""
+    """Reads the JointStates of one topic; a message with the layout of the one before takes one ``unpack``."""
 
     def __init__(self) -> None:
-        self._layout = struct.Struct("2s2x")
+        self._struct = struct.Struct("2s2x")
         self._kind = b""
         self._fixed: tuple[Any, ...] = ()
         self._fixed_end = FIRST
         self._names: tuple[str, ...] = ()
 
     def read(self, data: bytes) -> tuple[int, tuple[str, ...], Sequence[float]] | None:
-        """Return stamp (ns), names and positions of a serialized message; None where they cannot be read."""
+        """Return stamp (ns), names and positions of a serialised message; None where they cannot be read."""
         try:
-            told = self._layout.unpack_from(data)
-            known = told[FIRST : self._fixed_end] == self._fixed and told[0] == self._kind
+            values = self._struct.unpack_from(data)
+            known = values[FIRST : self._fixed_end] == self._fixed and values[0] == self._kind
         except struct.error:
             known = False
         if not known:
             try:
-                told = self._learn(data)
+                values = self._learn(data)
             except (struct.error, UnicodeDecodeError, MemoryError):
                 return None
-        return told[1] * SECOND_NS + told[2], self._names, told[self._fixed_end :]
+        return values[1] * SECOND_NS + values[2], self._names, values[self._fixed_end :]
 
     def _learn(self, data: bytes) -> tuple[Any, ...]:
-        """Read a message part by part, and remember where they are."""
-        reader = Reader(data)
-        reader.number("i")
-        reader.number()
+        """Read a message value by value and keep its layout, up to the positions."""
+        reader = CdrReader(data)
+        reader.integer("i")
+        reader.integer()
         reader.string()
-        names = tuple(reader.string() for _ in range(reader.number()))
+        names = reader.strings()
         count, _ = reader.doubles()
-        layout = reader.layout()
-        told = layout.unpack_from(data)
-        self._fixed_end = len(told) - count
-        self._layout, self._names = layout, names
-        self._kind, self._fixed = told[0], told[FIRST : self._fixed_end]
-        return told
+        unpacker = reader.struct()
+        values = unpacker.unpack_from(data)
+        self._fixed_end = len(values) - count
+        self._struct, self._names = unpacker, names
+        self._kind, self._fixed = values[0], values[FIRST : self._fixed_end]
+        return values
 
 
 # positions, velocities, accelerations, effort
@@ -256,7 +227,7 @@ SMALLEST_POINT = 24
 
 @dataclass(frozen=True)
 class TrajectoryArrays:
-    """What a JointTrajectory says.
+    """The contents of a JointTrajectory.
 
     Parameters
     ----------
@@ -274,8 +245,8 @@ class TrajectoryArrays:
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """Where the parts of a point are, relative to its begin."""
+class _PointLayout:
+    """Offsets within a point, bytes from where it begins."""
 
     counts: tuple[int, ...]
     count_offsets: tuple[int, ...]
@@ -284,21 +255,24 @@ class _Layout:
     size: int
 
     @classmethod
-    def read(cls, reader: Reader) -> "_Layout":
+    def read(cls, reader: CdrReader) -> "_PointLayout":
         begin, counts, offsets, places = reader.at, [], [], []
         for _ in range(SEQUENCES):
             offsets.append(reader.at + -(reader.at - ENCAPSULATION) % 4 - begin)
             count, place = reader.doubles()
             counts.append(count)
             places.append(place - begin)
-        reader.number("i")
+        reader.integer("i")
         time = reader.at - 4 - begin
-        reader.number()
+        reader.integer()
         return cls(tuple(counts), tuple(offsets), places[0], time, reader.at - begin)
 
 
 def decode_trajectory(data: bytes) -> TrajectoryArrays | None:
-    """Return what a serialized JointTrajectory says; None where its points are not alike, or it is none."""
+    """Decode a serialised JointTrajectory; None where its points differ in layout, or it is none.
+
+    A million points as objects would take many seconds; points that hold equally many numbers are one array.
+    """
     try:
         return _decode(data)
     except (struct.error, UnicodeDecodeError, IndexError, ValueError, TypeError, MemoryError):
@@ -306,24 +280,24 @@ def decode_trajectory(data: bytes) -> TrajectoryArrays | None:
 
 
 def _decode(data: bytes) -> TrajectoryArrays | None:
-    reader = Reader(data)
-    start_ns = reader.number("i") * SECOND_NS + reader.number()
+    reader = CdrReader(data)
+    start_ns = reader.integer("i") * SECOND_NS + reader.integer()
     reader.string()
-    names = tuple(reader.string() for _ in range(reader.number()))
-    points = reader.number()
+    names = reader.strings()
+    points = reader.integer()
     if points * SMALLEST_POINT > len(data):
         return None
     times, positions = np.empty(points, np.int64), np.empty((points, len(names)), order="F")
-    # Only the first point may begin elsewhere relative to the alignment of doubles.
+    # The first point alone may begin at another remainder of eight bytes than those behind it.
     done = 0
     while done < points:
-        begin, layout = reader.at, _Layout.read(reader)
+        begin, layout = reader.at, _PointLayout.read(reader)
         if layout.counts[0] != len(names):
             return None
         alike = 1 if done == 0 else points - done
         if begin + alike * layout.size > len(data):
             return None
-        block = _Block(data, reader.order, begin, alike, layout)
+        block = _Points(data, reader.order, begin, alike, layout)
         if not block.is_alike():
             return None
         times[done : done + alike] = block.times()
@@ -333,14 +307,14 @@ def _decode(data: bytes) -> TrajectoryArrays | None:
 
 
 @dataclass(frozen=True)
-class _Block:
-    """Points of one layout, one after the other."""
+class _Points:
+    """Adjacent points of one layout."""
 
     data: bytes
     order: str
     begin: int
     points: int
-    layout: _Layout
+    layout: _PointLayout
 
     def column(self, kind: str, offset: int, width: int = 1) -> NDArray[Any]:
         dtype = np.dtype(self.order + kind)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 
 from slpi_ros.errors import RecordError
-from slpi_ros.io.columns import is_unit
+from slpi_ros.io.columns import is_unit, joined, printable
 from slpi_ros.io.record import FloatArray
 
 # the comma last: in tables with another separator it may be the decimal mark
@@ -51,7 +51,7 @@ class CsvTable:
 
     def listing(self) -> str:
         """Return the names of the columns for a message."""
-        return listed(self.columns)
+        return joined(self.columns)
 
     def read(self, wanted: Sequence[str]) -> dict[str, FloatArray]:
         """Return the wanted columns as numbers, each of shape (N,), N >= 2; an empty cell is NaN.
@@ -169,7 +169,7 @@ def load_csv(path: Path) -> CsvTable:
         )
     if all(_is_number(name) for name in header.columns):
         raise RecordError(f"{path}: numbers in the first line; put the names of the columns above them")
-    columns = tuple(_without_control_characters(name) for name in header.columns)
+    columns = tuple(printable(name) for name in header.columns)
     return CsvTable(path, columns, text[header.end :], header.separator, header.line)
 
 
@@ -258,22 +258,6 @@ def _are_numbers(cells: Sequence[str], names: Sequence[str]) -> bool:
     return len(cells) == len(names) and (numbers > 1 or numbers == sum(map(bool, cells)) > 0)
 
 
-def called(name: str, columns: Sequence[str]) -> str:
-    """Return the column of a name, else the only one of that name in other case, else the name itself."""
-    alike = [column for column in columns if column.casefold() == name.casefold()]
-    return alike[0] if len(alike) == 1 and name not in columns else name
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names for a message, not too many and without what would spoil a terminal."""
-    text = ", ".join(names)
-    return _without_control_characters(text[:200]) + ("..." if len(text) > 200 else "")
-
-
-def _without_control_characters(text: str) -> str:
-    return "".join(c if c.isprintable() or c == "\N{NO-BREAK SPACE}" else "?" for c in text)
-
-
 def _is_number(text: str) -> bool:
     try:
         float(text.replace(",", "."))
@@ -302,7 +286,7 @@ class MatTable:
 
     def listing(self) -> str:
         """Return the names of the columns for a message."""
-        return listed(self.columns)
+        return joined(self.columns)
 
     def read(self, wanted: Sequence[str]) -> dict[str, FloatArray]:
         """Return the wanted columns, each of shape (N,), N >= 2.
@@ -345,7 +329,7 @@ def load_mat(path: Path) -> MatTable:
     """
     columns: list[str] = []
     others = []
-    for name, shape, kind in _listed(path):
+    for name, shape, kind in _joined(path):
         if kind not in _NUMERIC or len(shape) != 2 or 0 in shape:
             others.append(f"{name} ({kind}, {'x'.join(map(str, shape))})")
         elif 1 in shape:
@@ -354,11 +338,11 @@ def load_mat(path: Path) -> MatTable:
             along = "{name}(:,{number})" if shape[0] >= shape[1] else "{name}({number},:)"
             columns += [along.format(name=name, number=number + 1) for number in range(min(shape))]
     if not columns:
-        raise RecordError(f"{path}: no numeric vector; there is {listed(others) or 'nothing'}; save plain arrays")
+        raise RecordError(f"{path}: no numeric vector; there is {joined(others) or 'nothing'}; save plain arrays")
     return MatTable(path, tuple(columns))
 
 
-def _listed(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
+def _joined(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
     """Return name, shape and class of the variables."""
     try:
         with path.open("rb") as file:

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError
 from slpi_ros.io.atomic_file import all_or_nothing
-from slpi_ros.io.column_choice import Choice, Wishes, choose
-from slpi_ros.io.columns import Column
+from slpi_ros.io.columns import Column, ColumnChoice, ColumnOptions, choose_columns, match_column
 from slpi_ros.io.record import FloatArray, Record
-from slpi_ros.io.table_files import CsvTable, MatTable, called, load_csv, load_mat
+from slpi_ros.io.table_files import CsvTable, MatTable, load_csv, load_mat
 
 # message stamps count seconds in int32
 _TIME_END = 2.0**31
@@ -65,18 +64,18 @@ def import_table(
     UsageError
         If an option is wrong, contradicts the name of a column, or gives one column two roles.
     """
-    wishes = Wishes(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
-    return import_told(path, wishes)[0]
+    options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
+    return import_with_summary(path, options)[0]
 
 
-def import_told(path: str | os.PathLike[str], wishes: Wishes) -> tuple[Record, tuple[str, ...]]:
-    """Do as `import_table`, and tell what was taken for what.
+def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) -> tuple[Record, tuple[str, ...]]:
+    """Import a table as `import_table` does, with a summary of the columns.
 
     Parameters
     ----------
     path : path
         As of `import_table`.
-    wishes : Wishes
+    options : ColumnOptions
         The other parameters of `import_table`.
 
     Returns
@@ -86,13 +85,9 @@ def import_told(path: str | os.PathLike[str], wishes: Wishes) -> tuple[Record, t
     lines : tuple of str
         Columns, units and ranges, a line for each axis; before them one about time if its unit was assumed.
     """
-    record, choice = _imported(Path(path), wishes)
-    return record, tuple(_told(record, choice))
-
-
-def _imported(path: Path, wishes: Wishes) -> tuple[Record, Choice]:
+    path = Path(path)
     table = load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
-    choice = choose(table, wishes)
+    choice = choose_columns(table.columns, options, str(path))
     values = table.read([column.name for column in choice.columns()])
     record = Record(
         time_ns=_nanoseconds(_si(values, choice.time), choice.time.name, table),
@@ -100,24 +95,24 @@ def _imported(path: Path, wishes: Wishes) -> tuple[Record, Choice]:
         displacement={axis: _si(values, column) for axis, column in choice.displacement.items()},
         source=str(path),
     )
-    return record, choice
+    return record, tuple(_summary(record, choice))
 
 
 def _si(values: Mapping[str, FloatArray], column: Column) -> FloatArray:
     return values[column.name] * column.scale
 
 
-def _told(record: Record, choice: Choice) -> Iterable[str]:
-    """Yield lines that say what was taken for what."""
+def _summary(record: Record, choice: ColumnChoice) -> Iterable[str]:
+    """Yield a line for each axis, and one for time if its unit was assumed."""
     if choice.time.assumed:
         yield f"time: column '{choice.time.name}' taken as {choice.time.unit}"
     for axis in record.axes:
-        voltage = _told_column(choice.voltage[axis], record.voltage[axis], "V")
-        displacement = _told_column(choice.displacement[axis], record.displacement[axis] * 1e6, "um")
+        voltage = _column_summary(choice.voltage[axis], record.voltage[axis], "V")
+        displacement = _column_summary(choice.displacement[axis], record.displacement[axis] * 1e6, "um")
         yield f"axis {axis}: {voltage}, {displacement}"
 
 
-def _told_column(column: Column, values: FloatArray, unit: str) -> str:
+def _column_summary(column: Column, values: FloatArray, unit: str) -> str:
     """Return name and range of a column, and whether its unit was assumed."""
     known = values[np.isfinite(values)]
     assumed = " (unit assumed)" if column.assumed else ""
@@ -153,7 +148,7 @@ def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, d
     columns = {n.removesuffix(ending): n for n in table.columns if n.endswith(ending) and n != ending}
     if not columns:
         raise RecordError(f"{path}: no column <axis>{ending}; there is {table.listing()}")
-    time = called("time_s", table.columns)
+    time = match_column("time_s", table.columns)
     values = table.read((time, *columns.values()))
     for column, samples in values.items():
         table.require(np.isfinite(samples), column, samples, "every cell needs a finite number")

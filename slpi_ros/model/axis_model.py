@@ -17,11 +17,10 @@ from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis import multi_slope as smpi
 from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.hysteresis.shape import FAR
-from slpi_ros.model.limits import decaying_turns
-from slpi_ros.model.streaming import ROUNDING, EffectStream, Limits, StreamingInverse, accepted_range, refusal
+from slpi_ros.hysteresis.turning_points import FAR, Memory
+from slpi_ros.model.limits import Limits, decaying_turns
+from slpi_ros.model.streaming import ROUNDING, StreamingInverse, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -220,10 +219,8 @@ class AxisModel:
 
     def stream_from(self, memory: Memory, allowed: Limits) -> StreamingInverse:
         """Return a stream that goes on from a memory of this axis; its effects are at rest there."""
-        if not self.effects:
-            return StreamingInverse(memory, self.displacement_range, allowed)
         middle = self._middle if self.chain.rate_dependence else None
-        return EffectStream(memory, self.displacement_range, allowed, self.chain, middle)
+        return StreamingInverse(memory, self.displacement_range, allowed, self.effects, middle)
 
     def simulate(self, t: FloatArray, v: FloatArray) -> FloatArray:
         """Return the displacement, shape (N,), metres, for the voltage `v`, shape (N,), volts, at times `t` (s).
@@ -315,18 +312,12 @@ class AxisModel:
         """Return what `command` does where the hysteresis sees the voltage through a play: one sample after another."""
         chain = self.chain
         h = backward(chain.own, own, around)
-        stream = EffectStream(
-            self.memory("start"),
-            self.displacement_range,
-            between,
-            replace(chain, before=chain.before[-1:], own=(), shared=()),
-        )
+        stream = StreamingInverse(self.memory("start"), self.displacement_range, between, chain.before[-1:])
         u, held = np.empty_like(h), np.zeros(h.size, dtype=np.bool_)
-        for place, (dt, wish) in enumerate(
-            zip(np.diff(around.t, prepend=around.t[:1]).tolist(), h.tolist(), strict=True)
-        ):
-            u[place] = stream.move(dt, wish)
-            held[place] = stream.held
+        elapsed = np.diff(around.t, prepend=around.t[:1]).tolist()
+        for k, (dt, desired) in enumerate(zip(elapsed, h.tolist(), strict=True)):
+            u[k] = stream.move(dt, desired)
+            held[k] = stream.held
         return self._kept(backward(chain.before[:-1], u, around), held, allowed)
 
     def _kept(self, wanted: FloatArray, held: Mask, allowed: Limits) -> tuple[FloatArray, Mask]:
@@ -371,7 +362,7 @@ class AxisModel:
         """Return where a voltage at a limit does not give the wanted displacement."""
         held = (u <= allowed.lower) | (u >= allowed.upper)
         if held.any():
-            # At a limit a wish may just be met.
+            # At a limit a desired displacement may just be met.
             with warnings.catch_warnings():
                 # What stands in for loops that were never identified has been said.
                 warnings.simplefilter("ignore", slpi.UnidentifiedLoopWarning)

@@ -12,7 +12,8 @@ from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis import kinds
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.schemas import validate
-from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.stage_model import StageModel
 
 SCHEMA = "slpi_ros/model/1"
 # Characters; a model of many axes has a few hundred thousand.

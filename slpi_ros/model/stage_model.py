@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import RecordError, SlpiError, UsageError
-from slpi_ros.model.axis_model import AxisModel, FitQuality, Mask, Start, StartMemory
-from slpi_ros.model.streaming import Limits, StageStream, StreamingInverse
-
-__all__ = ["AxisModel", "FitQuality", "HeldAtLimitWarning", "StageModel", "Start", "check_time", "held_message"]
+from slpi_ros.model.axis_model import AxisModel, Mask, StartMemory
+from slpi_ros.model.limits import Limits
+from slpi_ros.model.streaming import StageStream, StreamingInverse
 
 FloatArray = NDArray[np.float64]
 Signal = ArrayLike | Mapping[str, ArrayLike]

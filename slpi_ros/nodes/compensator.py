@@ -1,47 +1,59 @@
-"""Node ``compensator``: desired displacements in, voltages out."""
+"""Node ``compensator``: desired displacements in, voltages out.
+
+The node only adapts: it decodes messages, asks the `Controller`, and publishes its voltages, what it rejects and its
+health. What moves without a message (points of trajectories, ramps, the reset of the memory) does so from one timer,
+which is set to when the controller says that it is due.
+"""
 
 import sys
+import time
 from collections.abc import Sequence
-from time import monotonic_ns
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+from numpy.typing import ArrayLike
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
-from slpi_ros.compensator.controller import Compensation
+from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.controller import Controller, Mode
+from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis, model_id
+from slpi_ros.compensator.ramps import PERIOD
 from slpi_ros.compensator.validation import RejectedError
-from slpi_ros.errors import SlpiError
+from slpi_ros.errors import ModelError, SlpiError
 from slpi_ros.io.cdr import multiarray_header
-from slpi_ros.io.messages import JointStates
+from slpi_ros.io.messages import SECOND_NS, JointStates, decode_trajectory
+from slpi_ros.model.document import load_model
+from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import (
     COMMANDS,
     LATCHED,
     MEASUREMENTS,
     WARN,
+    DeferredService,
     as_rclpy_reads,
     ask_for_priority,
     refuse_impossible_transitions,
     run,
 )
 from slpi_ros.nodes.compensator_diagnostics import Reporter
-from slpi_ros.nodes.compensator_driver import Driver
-from slpi_ros.nodes.compensator_memory import MemoryKeeper
-from slpi_ros.nodes.compensator_models import Models
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings
-from slpi_ros.nodes.compensator_reset import MemoryReset
-from slpi_ros.nodes.compensator_silence import Silence
-from slpi_ros.nodes.compensator_trajectory import TrajectoryFollower
+from slpi_ros.nodes.jobs import Read, Reading
 from slpi_ros.nodes.parameters import Parameters
 
-LOG_PERIOD = 5.0
+# Seconds between two messages of a kind in the log.
+LOG_PERIOD, FILE_LOG_PERIOD = 5.0, 60.0
 # How often the node looks whether commands have stopped, seconds.
 WATCH_PERIOD = 0.05
+# How often a simulated clock is looked at, nanoseconds; the shortest time that a timer is set to.
+SIMULATED_PERIOD_NS, SHORTEST_WAIT_NS = 1_000_000, 1_000
 # History, depth and reliability, by parameters qos_overrides./TOPIC.{publisher,subscription}.POLICY.
 OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 # How long an end waits until the last voltages have arrived.
@@ -68,31 +80,32 @@ class Compensator(LifecycleNode):
         refuse_impossible_transitions(self)
         self._parameter_set = Parameters(self, DECLARATIONS, CompensatorSettings.of)
         told = self._settings
-        self._compensation = Compensation(told.axes, told.limits, told.hardware_id, told.time, told.loops)
-        self._parameter_set.follow(self._use_settings, check=lambda new: self._compensation.check_limits(new.limits))
+        values = told.values
+        self._controller = Controller(values["axes"], told.limits, values["hardware_id"], told.time, told.loops)
+        self._parameter_set.follow(self._use_settings, check=self._check_settings)
         self._desired, self._measured = JointStates(), JointStates()
-        self._before_voltages = multiarray_header(len(told.axes))
+        self._voltage_header = multiarray_header(len(values["axes"]))
         self._failure: SlpiError | None = None
         self._excursions = 0
-        self._notes_voltages = told.memory_file != ""
-        self._keeper = MemoryKeeper(self, self._compensation, told.memory_file)
-        self._driver = Driver(self, self._compensation, self._publish, lambda: self._silence.given_ns)
-        self._silence = Silence(self._compensation, self._driver, lambda: self._settings)
-        self._reporter = Reporter(self, self._compensation, lambda: self._settings, self._silence)
-        self._follower = TrajectoryFollower(self, self._compensation, self._publish_point, self._driver)
-        self._reporter.lateness = self._follower.lateness
-        self._reset = MemoryReset(
-            self, self._compensation, self._driver, self._reporter, self._silence, lambda: self._settings
-        )
-        self._models = Models(self, self._compensation, self._keeper, self._reporter, lambda: self._settings)
-        # A simulated clock may stand still.
+        self._assumption = ""
+        self._memory_file = MemoryFile(values["memory_file"])
+        self._keeps_memory = values["memory_file"] != ""
+        self._reporter = Reporter(self, self._controller)
+        self._reset_service = DeferredService(self, "~/reset_memory", self._on_reset)
+        self._model_topic = self.resolve_topic_name("stage_model")
+        self._model_reader = ThreadPoolExecutor(1, "stage_model")
+        self._reading: Reading | None = None
+        # A simulated clock may stand still; the amplifier's slew is real.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(told.diagnostic_period, self._on_period, clock=steady)
+        self._timer = self.create_timer(PERIOD, self._on_timer, clock=steady)
+        self._timer.cancel()
+        self._on_simulated = False
+        self.create_timer(values["diagnostic_period"], self._on_period, clock=steady)
         self.create_timer(WATCH_PERIOD, self._watch, clock=steady)
-        if told.realtime_priority:
-            ask_for_priority(self, told.realtime_priority)
-        self._starting = told.autostart
-        if told.autostart:
+        if values["realtime_priority"]:
+            ask_for_priority(self, values["realtime_priority"])
+        self._starting = values["autostart"]
+        if self._starting:
             self.trigger_configure()
             if self._failure:
                 raise self._failure
@@ -102,31 +115,33 @@ class Compensator(LifecycleNode):
     @property
     def executor_kind(self) -> str:
         """Which executor is to spin this node."""
-        return self._settings.executor
+        return str(self._settings.values["executor"])
 
     @property
     def _settings(self) -> CompensatorSettings:
         return self._parameter_set.settings
 
+    def _check_settings(self, new: CompensatorSettings) -> None:
+        self._controller.check_limits(new.limits)
+
     def _use_settings(self, new: CompensatorSettings) -> None:
-        self._compensation.use_limits(new.limits)
-        self._compensation.use_loops(new.loops)
-        self._compensation.use_time(new.time)
+        self._controller.use_limits(new.limits)
+        self._controller.use_loops(new.loops)
+        self._controller.use_time(new.time)
 
     # Lifecycle
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the model file, if there is one, and take part in the topics."""
-        settings = self._settings
+        path = self._settings.values["model_file"]
         try:
-            if settings.model_file:
-                self._models.load(settings.model_file)
+            if path:
+                model = load_model(path)
+                self._use_model(model, model_id(model), path)
         except SlpiError as error:
             self._failure = error
             # Where the refusal ends the process, its message is printed anyway.
-            if not self._starting:
-                self.get_logger().error(f"model refused: {error}")
-            self._reporter.model_refused(str(error))
+            self._refuse_model(error, logged=not self._starting)
             return TransitionCallbackReturn.FAILURE
         self._publisher = self.create_lifecycle_publisher(
             Float64MultiArray, "voltage_command", COMMANDS, qos_overriding_options=OVERRIDABLE
@@ -136,14 +151,15 @@ class Compensator(LifecycleNode):
             "Float64": (Float64, self._on_value),
             "Float64MultiArray": (Float64MultiArray, self._on_values),
         }
-        kind, callback = on_desired[settings.desired_type]
+        kind, callback = on_desired[self._settings.values["desired_type"]]
         self._subscriptions_of_state = [
             self._subscribe(kind, "desired_displacement", callback, COMMANDS, raw=kind is JointState),
             self._subscribe(JointTrajectory, "desired_trajectory", self._on_trajectory, COMMANDS, raw=True),
             self._subscribe(JointState, "measured_displacement", self._on_measured, MEASUREMENTS, raw=True),
-            self._subscribe(String, "stage_model", self._models.on_message, LATCHED),
+            self._subscribe(String, "stage_model", self._on_model, LATCHED),
         ]
-        self._reporter.enter("inactive")
+        self._controller.configure()
+        self._report()
         return super().on_configure(state)
 
     def _subscribe(self, kind: Any, topic: str, callback: Any, qos: QoSProfile, raw: bool = False) -> Any:
@@ -151,55 +167,64 @@ class Compensator(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Answer from now on, starting at the present voltages."""
-        self._keeper.save(complete=False)
-        self._compensation.activate(True)
-        self._silence.begin()
-        self._reporter.enter("active")
-        return super().on_activate(state)
+        self._save_memory(complete=False)
+        self._controller.activate(time.monotonic_ns())
+        result = super().on_activate(state)
+        self._begin_memory()
+        self._report()
+        return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the present voltages, or go to the safe ones first."""
         self._end_activity()
-        self._reporter.enter("inactive")
+        self._report()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget the model and leave the topics."""
         result = super().on_cleanup(state)
-        self._compensation.forget_model()
+        self._controller.cleanup()
         self._leave_topics()
-        self._reporter.enter("unconfigured")
+        self._report()
         return result
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the present voltages for good, or go to the safe ones first."""
         self._end_activity()
         result = super().on_shutdown(state)
-        if self._reporter.state != "unconfigured":
+        if self._controller.mode is not Mode.UNCONFIGURED:
             self._leave_topics()
-        self._reporter.enter("finalized")
+        self._reporter.finalized = True
+        self._report()
         return result
 
     def destroy_node(self) -> None:
         """End the activity in order, and the node."""
-        self._models.end()
+        self._stop_reading()
         self._end_activity()
         super().destroy_node()
 
     def _end_activity(self) -> None:
-        if not self._compensation.active:
+        controller, safety, now_ns = self._controller, self._settings.safety, time.monotonic_ns()
+        if not controller.active:
             return
-        self._driver.stop()
-        self._follower.stop()
-        safety = self._settings.safety
-        if safety.ramps_on_deactivate and self._compensation.model:
-            self._driver.ramp_now(safety.voltages, safety.rate)
+        before = controller.mode
+        if safety.ramps_on_deactivate and controller.model:
+            controller.ramp(safety.voltages, safety.rate, now_ns)
         else:
-            self._driver.stop_now()
+            controller.hold(now_ns)
+        self._timer.cancel()
+        if before is Mode.RESETTING:
+            self._answer_reset()
+        while controller.ramping and self.context.ok():
+            time.sleep(PERIOD)
+            now_ns = time.monotonic_ns()
+            if controller.advance(now_ns, now_ns):
+                self._publish()
         # The process may end next, and with it what has not arrived.
         self._publisher.wait_for_all_acked(PATIENCE)
-        self._compensation.activate(False)
-        self._keeper.save(complete=True)
+        controller.deactivate(time.monotonic_ns())
+        self._save_memory(complete=True)
 
     def _leave_topics(self) -> None:
         for subscription in self._subscriptions_of_state:
@@ -212,90 +237,296 @@ class Compensator(LifecycleNode):
         self._answer(*(self._desired.read(data) or as_rclpy_reads(data)))
 
     def _on_values(self, message: Float64MultiArray) -> None:
-        self._answer(0, self._compensation.names, message.data)
+        self._answer(0, self._controller.names, message.data)
 
     def _on_value(self, message: Float64) -> None:
-        self._answer(0, self._compensation.names, (message.data,))
+        self._answer(0, self._controller.names, (message.data,))
+
+    def _answer(self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float]) -> None:
+        """Publish the voltages for one message, or say why not."""
+        controller, now_ns = self._controller, time.monotonic_ns()
+        # Asking for the time takes as long as compensating an axis.
+        arrival_ns = 0 if stamp_ns and not controller.needs_arrival else self.get_clock().now().nanoseconds
+        try:
+            held = controller.update(stamp_ns, names, displacements, now_ns, arrival_ns)
+        except RejectedError as error:
+            self._reject("", error)
+            return
+        self._publish()
+        self._reporter.timing.note(now_ns, time.monotonic_ns())
+        if held:
+            self._warn_held()
 
     def _on_measured(self, data: bytes) -> None:
         _, names, displacements = self._measured.read(data) or as_rclpy_reads(data)
         try:
-            self._compensation.measure(names, displacements)
+            changed = self._controller.measure(names, displacements, time.monotonic_ns())
         except RejectedError as error:
-            self._reporter.last_rejection = str(error)
-            self.get_logger().warning(f"measurement rejected: {error}", throttle_duration_sec=LOG_PERIOD)
-            self._reporter.report_at_least(WARN)
-
-    def _answer(self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float]) -> None:
-        """Publish the voltages for one message, or count why not."""
-        arrived = monotonic_ns()
-        # Asking for the time takes as long as compensating an axis.
-        now_ns = 0 if stamp_ns and not self._compensation.needs_arrival else self.get_clock().now().nanoseconds
-        try:
-            held = self._compensation.move(stamp_ns, names, displacements, now_ns)
-        except RejectedError as error:
-            self._reporter.last_rejection = str(error)
-            self.get_logger().warning(f"rejected: {error}", throttle_duration_sec=LOG_PERIOD)
-            self._reporter.report_at_least(WARN)
+            self._reject("measurement ", error)
             return
-        self._publish()
-        answered = monotonic_ns()
-        self._reporter.timing.note(arrived, answered)
-        self._silence.given_ns = answered
-        if held:
-            self._on_held()
+        for axis in changed:
+            self.get_logger().warning(f"axis '{axis.name}': {axis.confidence.doubt}")
+        if changed:
+            self._report()
 
     def _on_trajectory(self, data: bytes) -> None:
-        counts, following = self._compensation.counts, self._compensation.following
-        counts.trajectories += 1
+        controller = self._controller
+        stamp_ns, names, times, positions = _read_trajectory(data)
+        now_ns, clock_ns = self._clocks()
+        start_ns = stamp_ns + clock_ns - self.get_clock().now().nanoseconds if stamp_ns else 0
         try:
-            self._follower.take(data)
-        except SlpiError as error:
-            counts.trajectories_rejected += 1
-            self._reporter.last_rejection = str(error)
-            self.get_logger().warning(f"trajectory rejected: {error}", throttle_duration_sec=LOG_PERIOD)
-        else:
-            self._silence.after_trajectory()
-            self.get_logger().info(
-                f"trajectory: {following.remaining} points to come; of the new ones {following.points_held} wait at a "
-                f"voltage limit, {following.points_slewing} are slowed down by the slew limit"
-            )
-        self._reporter.report()
+            controller.follow(names, times, positions, start_ns, now_ns, clock_ns)
+        except RejectedError as error:
+            self._reject("trajectory ", error)
+            return
+        self._on_simulated = self._simulated
+        self._schedule()
+        self.get_logger().info(f"trajectory: {controller.trajectory.remaining} points to come")
+        self._report()
 
-    def _publish_point(self) -> None:
-        self._publish()
-        self._silence.given_ns = monotonic_ns()
-        if not self._compensation.following.on:
-            self._reporter.report()
+    def _reject(self, what: str, error: RejectedError) -> None:
+        """Say why a message was rejected; the controller has counted it."""
+        self._reporter.last_rejection = str(error)
+        self.get_logger().warning(f"{what}rejected: {error}", throttle_duration_sec=LOG_PERIOD)
+        self._report_at_least(WARN)
 
     def _publish(self) -> None:
         # As bytes: to make a message of them takes longer than to compensate an axis.
-        voltages = self._compensation.voltages.tobytes()
-        self._publisher.publish(self._before_voltages + voltages)
-        if self._notes_voltages:
-            self._keeper.note(voltages)
+        voltages = self._controller.voltages.tobytes()
+        self._publisher.publish(self._voltage_header + voltages)
+        if self._keeps_memory:
+            try:
+                self._memory_file.note(voltages)
+            except ModelError as error:
+                self.get_logger().error(str(error), throttle_duration_sec=FILE_LOG_PERIOD)
 
-    def _on_held(self) -> None:
+    def _warn_held(self) -> None:
         """Warn, once for each excursion."""
-        self._reporter.report_at_least(WARN)
-        if self._compensation.counts.excursions > self._excursions:
-            self._excursions = self._compensation.counts.excursions
-            out = [axis.name for axis in self._compensation.axes if axis.held]
+        self._report_at_least(WARN)
+        if self._controller.counts.excursions > self._excursions:
+            self._excursions = self._controller.counts.excursions
+            out = [axis.name for axis in self._controller.axes if axis.held]
             self.get_logger().warning(
                 f"desired displacement out of reach, held at a voltage limit: axis {', '.join(out)}; "
                 "send displacements within the identified range"
             )
 
-    # What happens without messages
+    # What moves without messages
+
+    def _clocks(self) -> tuple[int, int]:
+        """Return the time on a clock that never jumps, and that of trajectories, nanoseconds."""
+        now_ns = time.monotonic_ns()
+        return now_ns, self.get_clock().now().nanoseconds if self._simulated else now_ns
+
+    @property
+    def _simulated(self) -> bool:
+        return bool(self.get_clock().ros_time_is_active)
+
+    def _on_timer(self) -> None:
+        controller, before = self._controller, self._controller.mode
+        now_ns, clock_ns = self._clocks()
+        if before is Mode.TRAJECTORY and self._on_simulated != self._simulated:
+            controller.cancel(now_ns)
+            self.get_logger().error("use_sim_time was changed: the trajectory's times mean nothing now, stopped")
+        # One point at a time: others have their turn even where points come faster than they can be given.
+        deadline_ns = controller.trajectory.next_deadline_ns
+        held = controller.counts.points_held
+        if controller.advance(now_ns, clock_ns):
+            self._publish()
+            if deadline_ns is not None and deadline_ns <= clock_ns:
+                self._reporter.lateness.note(deadline_ns, clock_ns)
+            if controller.counts.points_held > held:
+                self._warn_held()
+        if controller.mode is not before:
+            if before is Mode.RESETTING:
+                self._answer_reset()
+            self._report()
+        self._schedule()
+
+    def _schedule(self) -> None:
+        """Set the timer to when the controller has something to do."""
+        now_ns, clock_ns = self._clocks()
+        due_ns = self._controller.next_due_ns(now_ns, clock_ns)
+        if due_ns is None:
+            self._timer.cancel()
+            return
+        wait_ns = max(due_ns - now_ns, SHORTEST_WAIT_NS)
+        self._timer.timer_period_ns = min(wait_ns, SIMULATED_PERIOD_NS) if self._simulated else wait_ns
+        self._timer.reset()
 
     def _on_period(self) -> None:
-        self._reporter.on_period()
-        if self._compensation.active:
-            self._keeper.save(complete=False)
+        self._report()
+        self._reporter.start_window()
+        if self._controller.active:
+            self._save_memory(complete=False)
 
     def _watch(self) -> None:
-        if self._silence.watch():
-            self._reporter.report()
+        if self._controller.watch(self._settings.safety, time.monotonic_ns()):
+            self._schedule()
+            self._report()
+
+    def _report(self) -> None:
+        self._reporter.report(self._settings)
+
+    def _report_at_least(self, level: bytes) -> None:
+        """Report now if the last report was better than this."""
+        if self._reporter.level < level:
+            self._report()
+
+    # Models
+
+    def _on_model(self, message: String) -> None:
+        """Use the model of a message soon, or say why not: the one before works on.
+
+        To check a document takes as long as many commands, so this is done in the background. Those that have not been
+        read when a newer one comes are left.
+        """
+        self._stop_reading()
+        try:
+            self._reading = Reading(message.data, self._model_topic)
+        except SlpiError as error:
+            self._refuse_model(error)
+            return
+        self._model_reader.submit(self._reading.read).add_done_callback(self._on_model_read)
+
+    def _stop_reading(self) -> None:
+        if self._reading:
+            self._reading.cancel()
+            self._reading = None
+
+    def _on_model_read(self, coming: Future[Read | None]) -> None:
+        """Go on in the thread that the node lives in."""
+        if self.executor:
+            self.executor.create_task(self._take_model, coming)
+
+    def _take_model(self, coming: Future[Read | None]) -> None:
+        if self._controller.mode is Mode.UNCONFIGURED:
+            return
+        try:
+            read = coming.result()
+            if read:
+                self._use_model(*read, self._model_topic)
+        except SlpiError as error:
+            self._refuse_model(error)
+
+    def _refuse_model(self, error: SlpiError, logged: bool = True) -> None:
+        if logged:
+            self.get_logger().error(f"model refused: {error}")
+        self._reporter.models_refused += 1
+        self._reporter.model_error = str(error)
+        self._report()
+
+    def _use_model(self, model: StageModel, fingerprint: str, source: str) -> None:
+        """Take a model over, unless it is the one in use: a latched document may come more than once."""
+        controller, settings, reporter = self._controller, self._settings, self._reporter
+        if controller.model is None or fingerprint != reporter.model_id:
+            try:
+                saved = None
+                if not controller.driven:
+                    saved = self._memory_file.find(model, controller.names, settings.limits)
+            except SlpiError as error:
+                self.get_logger().warning(str(error))
+            try:
+                controller.use_model(model, saved, settings.values["start_memory"])
+            except SlpiError as error:
+                raise ModelError(f"{source}: {error}") from None
+            self.get_logger().info(f"using the model of {source}, identified {model.created or 'at an unknown time'}")
+            reporter.model_id = fingerprint
+            if controller.active:
+                self._save_memory(complete=False)
+                self._begin_memory()
+        reporter.model_error = ""
+        self._report()
+
+    # The memory
+
+    def _begin_memory(self) -> None:
+        """Say once what is only assumed of the memory, or reset it if that is wanted, when active and with a model."""
+        controller = self._controller
+        unsure = [axis for axis in controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
+        if controller.model is None or controller.mode is not Mode.STREAMING or not unsure:
+            return
+        if self._settings.reset.on_start:
+            self._start_reset()
+            return
+        said = "; ".join(f"axis '{axis.name}' {self._assumed(axis)}" for axis in unsure)
+        if said != self._assumption:
+            self._assumption = said
+            self.get_logger().warning(
+                f"the memory is assumed: {said}; call {self.get_fully_qualified_name()}/reset_memory (~/reset_memory) "
+                "to wipe it, or set reset_on_start"
+            )
+
+    def _assumed(self, axis: Axis) -> str:
+        """Say what is assumed of the memory of an axis."""
+        if axis.confidence.doubt or not axis.start_memory:
+            return axis.confidence.doubt or "as it was left"
+        where = {"end": "where its record ended", "start": "where its record began", "wiped": "wiped"}
+        text = f"starts {where[axis.start_memory]} (start_memory {axis.start_memory})"
+        if axis.start_memory == "end" and axis.model and axis.model.end is None:
+            text += ", which the model does not tell: where it began is taken"
+        return text
+
+    def _start_reset(self) -> None:
+        reset, controller = self._settings.reset, self._controller
+        finals = self._settings.safety.voltages if reset.to_safe else list(controller.voltages)
+        controller.reset_memory(reset.cycles, reset.rate, finals, time.monotonic_ns())
+        self._schedule()
+        self._report()
+
+    def _on_reset(self) -> str:
+        """Start a reset, unless one is under way; return why that cannot be, or ""."""
+        controller = self._controller
+        if not controller.active or controller.model is None:
+            return "not reset: there must be a model, and the node must be active"
+        if controller.mode is Mode.TRAJECTORY:
+            return f"not reset: {controller.doing(time.monotonic_ns())}; wait, or cancel it with an empty one"
+        if controller.mode is not Mode.RESETTING:
+            self._start_reset()
+        return ""
+
+    def _answer_reset(self) -> None:
+        """Say how a reset has ended."""
+        axes, voltages = self._controller.axes, ", ".join(f"{v:.6g}" for v in self._controller.voltages)
+        doubts = [f"axis '{axis.name}': {axis.confidence.doubt}" for axis in axes if axis.confidence.state != KNOWN]
+        if any(axis.confidence.doubt == INTERRUPTED for axis in axes):
+            said = "interrupted; the memory is assumed"
+        elif doubts:
+            said = f"memory assumed; voltages {voltages} V; {'; '.join(doubts)}"
+        else:
+            said = f"memory known; voltages {voltages} V"
+        self._reset_service.answer(not doubts, said)
+
+    def _save_memory(self, complete: bool) -> None:
+        """Write the memory, or say why not; `complete`: nothing will move until the node has ended."""
+        controller = self._controller
+        if not self._keeps_memory or controller.model is None:
+            return
+        axes = {
+            axis.name: SavedAxis(axis.reversal_voltages, axis.confidence.state in (KNOWN, RESTORED))
+            for axis in controller.axes
+        }
+        try:
+            self._memory_file.save(controller.model, axes, complete)
+        except SlpiError as error:
+            self.get_logger().error(str(error), throttle_duration_sec=FILE_LOG_PERIOD)
+
+
+def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayLike]:
+    """Return stamp (ns), names, times (ns) and positions of a serialized JointTrajectory.
+
+    What cannot be read names nothing, and positions of different lengths stay as they are: the controller rejects both.
+    """
+    if arrays := decode_trajectory(data):
+        return arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.positions
+    try:
+        message = deserialize_message(data, JointTrajectory)
+    except RuntimeError:
+        return 0, (), [0], [[]]
+    stamp, points = message.header.stamp, message.points
+    times = [point.time_from_start.sec * SECOND_NS + point.time_from_start.nanosec for point in points]
+    positions = [point.positions.tolist() for point in points]
+    return stamp.sec * SECOND_NS + stamp.nanosec, message.joint_names, times, positions
 
 
 def main() -> int:

@@ -1,18 +1,17 @@
-"""What the compensator says of its health."""
+"""The compensator's health on ``/diagnostics``."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import UTC, datetime
 
 from rclpy.node import Node
 
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.controller import Compensation
+from slpi_ros.compensator.controller import Controller, Mode
 from slpi_ros.compensator.statistics import Timing, TimingReport
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
-from slpi_ros.nodes.compensator_silence import Silence
 
 Problem = tuple[bool, bytes, str]
 
@@ -23,95 +22,91 @@ class Reporter:
     Parameters
     ----------
     node : Node
-    compensation : Compensation
-    settings : callable
-        Returns the present ones.
-    silence : Silence
+    controller : Controller
 
     Attributes
     ----------
-    state : str
-        Of the lifecycle.
+    finalized : bool
+        Whether the node has been shut down.
     timing : Timing
         Of the messages.
     lateness : Timing
         Of the points of trajectories.
-    last_rejection : str
+    last_rejection, model_error : str
+        Why a message, and a model, was rejected last; "" where the model in use is newer.
+    models_refused : int
+    model_id : str
+        Fingerprint of the model in use.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        compensation: Compensation,
-        settings: Callable[[], CompensatorSettings],
-        silence: Silence,
-    ) -> None:
-        self.state = "unconfigured"
-        self.timing = self.lateness = Timing()
-        self.last_rejection = ""
-        self._compensation, self._settings, self._silence = compensation, settings, silence
-        self._models_refused, self._model_error, self._model_id = 0, "", ""
+    def __init__(self, node: Node, controller: Controller) -> None:
+        self.finalized = False
+        self.timing, self.lateness = Timing(), Timing()
+        self.last_rejection = self.model_error = self.model_id = ""
+        self.models_refused = 0
+        self._controller = controller
         self._diagnostics = Diagnostics(node, "compensator")
-        self._start_window()
+        self.start_window()
 
-    def enter(self, state: str) -> None:
-        """Report a new state of the lifecycle."""
-        self.state = state
-        self.report()
+    @property
+    def level(self) -> bytes:
+        """Of the last report."""
+        return self._diagnostics.level
 
-    def model_taken(self, fingerprint: str) -> None:
-        """Report the model in use."""
-        self._model_id, self._model_error = fingerprint, ""
-        self.report()
-
-    def model_refused(self, reason: str) -> None:
-        """Report why a model was refused."""
-        self._models_refused += 1
-        self._model_error = reason
-        self.report()
-
-    def on_period(self) -> None:
-        """Report what was since the last time."""
-        self.report()
-        self._start_window()
-
-    def report_at_least(self, level: bytes) -> None:
-        """Report now if the last report was better than this."""
-        if self._diagnostics.level < level:
-            self.report()
-
-    def report(self) -> None:
+    def report(self, settings: CompensatorSettings) -> None:
         """Publish the health."""
-        settings, model = self._settings(), self._compensation.model
+        model = self._controller.model
         values = self._counters() | self._pace() | self._model_values(model)
         if model:
-            for axis in self._compensation.axes:
+            for axis in self._controller.axes:
                 values |= _axis_values(axis)
         problems = tuple((level, text) for wrong, level, text in self._problems(settings) if wrong)
-        hardware_id = settings.hardware_id or (model.hardware_id if model else "")
+        hardware_id = settings.values["hardware_id"] or (model.hardware_id if model else "")
         self._diagnostics.report(Health(problems, self._summary(), values, hardware_id))
 
-    def _start_window(self) -> None:
-        self._window, self._window_start = self._compensation.counts.copy(), time.perf_counter()
+    def start_window(self) -> None:
+        """Count what comes from now on as news."""
+        self._window, self._window_start = self._controller.counts.copy(), time.perf_counter()
         self.timing.restart()
         self.lateness.restart()
 
+    @property
+    def _state(self) -> str:
+        """The state of the lifecycle."""
+        mode = self._controller.mode
+        if self.finalized:
+            return "finalized"
+        return mode.value if mode in (Mode.UNCONFIGURED, Mode.INACTIVE) else "active"
+
     def _summary(self) -> str:
-        if self.state != "active":
-            return self.state
-        if self._compensation.driving.resetting:
-            return "resetting the memory"
-        doing = self._compensation.following.doing or "compensating"
-        doubts = [f" (axis '{axis.name}': {axis.trust.doubt})" for axis in self._compensation.axes if axis.trust.doubt]
+        controller = self._controller
+        if not controller.active or self.finalized:
+            return self._state
+        doing = controller.doing(time.monotonic_ns())
+        if controller.mode is Mode.RESETTING:
+            return doing
+        axes = controller.axes
+        doubts = [f" (axis '{axis.name}': {axis.confidence.doubt})" for axis in axes if axis.confidence.doubt]
         return f"{doing}; memory {self._memory()}{''.join(doubts)}"
 
     def _memory(self) -> str:
-        return ", ".join(dict.fromkeys(axis.memory_state for axis in self._compensation.axes))
+        return ", ".join(dict.fromkeys(axis.confidence.state for axis in self._controller.axes))
+
+    def _silence(self) -> str:
+        """Say what is done about commands that have stopped; "" while they come."""
+        controller, watchdog = self._controller, self._controller.watchdog
+        if not watchdog.expired or controller.mode not in (Mode.STREAMING, Mode.RAMPING):
+            return ""
+        does = "are held"
+        if watchdog.safe_voltages:
+            does = "go to the safe ones" if controller.mode is Mode.RAMPING else "are the safe ones"
+        yet = "" if watchdog.commanded else " yet"
+        return f"no command{yet} for {watchdog.silence(time.monotonic_ns()):.3g} s; voltages {does}"
 
     def _counters(self) -> dict[str, object]:
-        counts = self._compensation.counts
+        counts = self._controller.counts
         return {
-            "state": self.state,
+            "state": self._state,
             "received": counts.received,
             "accepted": counts.accepted,
             "rejected": counts.rejected,
@@ -124,10 +119,10 @@ class Reporter:
             "slew_limited": counts.slew_limited,
             "trajectories": counts.trajectories,
             "trajectories_rejected": counts.trajectories_rejected,
-            "points_remaining": self._compensation.following.remaining,
-            "points_skipped": self._compensation.following.skipped,
-            "points_held_at_limit": self._compensation.following.points_held,
-            "points_slew_limited": self._compensation.following.points_slewing,
+            "points_remaining": self._controller.trajectory.remaining,
+            "points_skipped": self._controller.trajectory.skipped,
+            "points_held_at_limit": counts.points_held,
+            "points_slew_limited": counts.points_slewing,
             "gaps": counts.gaps,
             "time_jumps": counts.time_jumps,
             "memory": self._memory(),
@@ -139,7 +134,7 @@ class Reporter:
         p50, p99, longest = _microseconds(timing)
         late_p50, late_p99, latest = _microseconds(self.lateness.report())
         return {
-            "rate_hz": f"{(self._compensation.counts.received - self._window.received) / elapsed:.1f}",
+            "rate_hz": f"{(self._controller.counts.received - self._window.received) / elapsed:.1f}",
             "jitter_ms": f"{timing.jitter * 1e3:.3f}" if timing else "",
             "latency_p50_us": p50,
             "latency_p99_us": p99,
@@ -150,22 +145,22 @@ class Reporter:
         }
 
     def _model_values(self, model: StageModel | None) -> dict[str, object]:
-        kinds = [model.axis(axis.name).kind for axis in self._compensation.axes] if model else []
+        kinds = [model.axis(axis.name).kind for axis in self._controller.axes] if model else []
         return {
-            "model.id": self._model_id[:12] if model else "",
+            "model.id": self.model_id[:12] if model else "",
             "model.created": model.created if model else "",
             "model.age_h": _hours_since(model.created) if model else "",
             "model.hardware_id": model.hardware_id if model else "",
             "model.kind": ", ".join(kinds),
-            "models_refused": self._models_refused,
-            "last_model_error": self._model_error,
+            "models_refused": self.models_refused,
+            "last_model_error": self.model_error,
         }
 
     def _problems(self, settings: CompensatorSettings) -> Iterator[Problem]:
         """Say what is wrong, or was since the last periodic report."""
-        counts, window = self._compensation.counts, self._window
-        ready, active = self._compensation.model is not None, self.state == "active"
-        yield self._model_error != "", WARN if ready else ERROR, f"model refused: {self._model_error}"
+        counts, window = self._controller.counts, self._window
+        ready, active = self._controller.model is not None, self._controller.active
+        yield self.model_error != "", WARN if ready else ERROR, f"model refused: {self.model_error}"
         yield active and not ready, WARN, "waiting for a model"
         rejected = counts.rejected - window.rejected
         yield rejected > 0, WARN, f"{rejected} messages rejected, the last: {self.last_rejection}"
@@ -177,10 +172,13 @@ class Reporter:
         yield held > 0, WARN, f"{held} times held at a voltage limit"
         jumps = counts.time_jumps - window.time_jumps
         yield jumps > 0, WARN, f"the clock of the stamps was set back {jumps} times"
-        yield self._silence.said != "", WARN, self._silence.said
+        points = counts.points_held - window.points_held
+        yield points > 0, WARN, f"{points} points of a trajectory held at a voltage limit"
+        silence = self._silence()
+        yield silence != "", WARN, silence
         if ready:
-            for axis in self._compensation.axes:
-                yield from _axis_problems(axis, settings.drift_alarm, counts.accepted > window.accepted)
+            for axis in self._controller.axes:
+                yield from _axis_problems(axis, settings.values["drift_alarm"], counts.accepted > window.accepted)
 
 
 def _microseconds(report: TimingReport | None) -> tuple[str, str, str]:
@@ -193,11 +191,11 @@ def _axis_values(axis: Axis) -> dict[str, object]:
     drift, quality = axis.drift, axis.model.quality if axis.model else None
     values = {
         "voltage_V": f"{axis.voltage:.4f}",
-        "memory": axis.memory_state,
-        "memory_doubt": axis.trust.doubt,
+        "memory": axis.confidence.state,
+        "memory_doubt": axis.confidence.doubt,
         "covered": f"{quality.covered:.3f}" if quality else "",
         "held_out_rms_nm": f"{quality.held_out_rms * 1e9:.2f}" if quality else "",
-        "feedback": axis.feedback,
+        "feedback": axis.feedback_state,
         "correction_V": f"{axis.correction:.4f}",
         "residual_rms_nm": f"{drift.rms * 1e9:.2f}" if drift else "",
         "residual_mean_nm": f"{drift.mean * 1e9:.2f}" if drift else "",
@@ -206,7 +204,8 @@ def _axis_values(axis: Axis) -> dict[str, object]:
 
 
 def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]:
-    yield moving and axis.feedback == "holding", WARN, f"axis '{axis.name}': feedback holds, no fresh measurement"
+    yield moving and axis.feedback_state == "holding", WARN, f"axis '{axis.name}': feedback holds, no fresh measurement"
+    yield axis.confidence.contradicted, WARN, f"axis '{axis.name}': {axis.confidence.doubt}"
     drift, quality = axis.drift, axis.model.quality if axis.model else None
     if drift and quality:
         usual = max(quality.held_out_rms, quality.floor_rms)

@@ -1,38 +1,31 @@
-"""The compensator's parameters: what `ros2 param describe` shows."""
+"""The compensator's parameters: one table, from which declaration, validation and the README's table follow."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
+from typing import Any
 
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.compensator.ramps import Safety
 from slpi_ros.compensator.validation import TimeRules
 from slpi_ros.errors import UsageError
-from slpi_ros.model.streaming import Limits
-from slpi_ros.nodes.parameters import Declaration, Values, choice, number, numbers, whole
-
-DESIRED_TYPES = ("JointState", "Float64", "Float64MultiArray")
-EXECUTORS = ("events", "default")
-ENDS = ("hold", "safe")
-RESETS = ("present", "safe")
+from slpi_ros.model.axis_model import START_MEMORIES
+from slpi_ros.model.limits import Limits
+from slpi_ros.nodes.parameters import Declaration, Values
 
 VOLTAGE = (-10_000.0, 10_000.0)
 RATE = (0.0, 1e9)
 POSITIVE_RATE = (1e-3, 1e9)
 ACCELERATION = (0.0, 1e12)
 TIMEOUT = (0.0, 86_400.0)
-PERIOD = (0.05, 3600.0)
-JUMP = (1e-3, 86_400.0)
 GAIN = (0.0, 1e15)
-FILTER = (0.0, 1e3)
-FACTOR = (0.0, 1e6)
-CYCLES = (1, 1000)
-PRIORITY = (0, 99)
-
-EACH = "one value, or one for each axis"
+HOLD_OR_SAFE = ("hold", "safe")
 
 
 def each_axis(name: str, default: float, description: str, between: tuple[float, float]) -> Declaration:
     """Declare a number that each axis may have its own of."""
-    return Declaration(name, default, f"{description} {EACH.capitalize()}.", between=between, number=True)
+    text = f"{description} One value, or one for each axis."
+    return Declaration(name, default, text, between=between, number=True, each_axis=True)
 
 
 def scalar(
@@ -42,18 +35,23 @@ def scalar(
     return Declaration(name, default, description, read_only, between, number=True)
 
 
-def fixed(name: str, default: object, description: str) -> Declaration:
-    """Declare what only the start of the node may set."""
-    return Declaration(name, default, description, read_only=True)
+def text(name: str, default: str, description: str, *choices: str, read_only: bool = False) -> Declaration:
+    """Declare a string, one of the choices if there are any."""
+    return Declaration(name, default, description, read_only, choices=choices)
 
 
 DECLARATIONS = (
-    fixed("axes", ["x"], "Names of the axes; voltage_command holds their voltages in this order."),
     Declaration(
+        "axes", ["x"], "Names of the axes; voltage_command holds their voltages in this order.", read_only=True
+    ),
+    text(
         "model_file", "",
         "Model document to start with; empty: wait for one on stage_model. A change counts when configured next.",
     ),
-    fixed("hardware_id", "", "The stage; models of another one are refused. Empty: any model, named as it says."),
+    text(
+        "hardware_id", "", "The stage; models of another one are refused. Empty: any model, named as it says.",
+        read_only=True,
+    ),
     # Limits
     each_axis("voltage_min", 0.0, "Lowest voltage ever given, volts.", VOLTAGE),
     each_axis("voltage_max", 100.0, "Highest voltage ever given, volts.", VOLTAGE),
@@ -63,16 +61,17 @@ DECLARATIONS = (
         ACCELERATION,
     ),
     # Commands
-    fixed(
+    text(
         "desired_type", "JointState",
         "Type of desired_displacement, metres: JointState (axes by name), Float64 (for one axis) or Float64MultiArray "
         "(in the order of axes).",
+        "JointState", "Float64", "Float64MultiArray", read_only=True,
     ),
     scalar(
         "time_jump", 1.0,
         "Seconds. A stamp older than the last one by at most this is late and rejected, by more: the clock was set "
         "back and time starts anew. Newer by more: a gap, counted.",
-        JUMP,
+        (1e-3, 86_400.0),
     ),
     scalar("max_age", 0.0, "Seconds; a message stamped longer ago is rejected as stale. 0: none is.", TIMEOUT),
     scalar(
@@ -81,69 +80,65 @@ DECLARATIONS = (
         TIMEOUT,
     ),
     # Safe ends
-    Declaration("on_timeout", "hold", "When commands stop: hold the voltage, or go to the safe one (hold or safe)."),
-    Declaration(
+    text(
+        "on_timeout", "hold", "When commands stop: hold the voltage, or go to the safe one (hold or safe).",
+        *HOLD_OR_SAFE,
+    ),
+    text(
         "on_deactivate", "hold",
         "When deactivated or shut down: hold the voltage, or first go to the safe one (hold or safe).",
+        *HOLD_OR_SAFE,
     ),
     each_axis("safe_voltage", 0.0, "The safe voltage, volts.", VOLTAGE),
     scalar("ramp_rate", 50.0, "How fast to go to the safe voltage, V/s; slew_limit may be lower.", POSITIVE_RATE),
     # Memory
+    text(
+        "start_memory", "end",
+        "Memory to start with, of those that the model knows: that at the end of its record, at the start of it, or "
+        "wiped, as after reset_memory (end, start or wiped). A memory_file has precedence.",
+        *START_MEMORIES,
+    ),
+    Declaration(
+        "reset_on_start", False, "Whether to reset the memory after activation, before commands are answered.",
+    ),
     Declaration(
         "reset_cycles", 10, "Cycles of the decaying oscillation of reset_memory, from full range to none.",
-        between=CYCLES,
+        between=(1, 1000),
     ),
     scalar(
         "reset_rate", 200.0, "How fast reset_memory drives, V/s; slew_limit may be lower.", POSITIVE_RATE
     ),
-    Declaration("reset_to", "present", "Where reset_memory ends: present (where it began) or safe (the safe voltage)."),
-    fixed("memory_file", "", "File that keeps the memory over a restart; empty: none."),
+    text(
+        "reset_to", "present", "Where reset_memory ends: present (where it began) or safe (the safe voltage).",
+        "present", "safe",
+    ),
+    text("memory_file", "", "File that keeps the memory over a restart; empty: none.", read_only=True),
     # Feedback
     Declaration("feedback", False, "Whether measured_displacement corrects the voltage."),
     each_axis("kp", 0.0, "Proportional gain of the feedback, V/m.", GAIN),
     each_axis("ki", 0.0, "Integral gain of the feedback, V/(m s).", GAIN),
     each_axis("kd", 0.0, "Derivative gain of the feedback, V s/m, on the measured displacement.", GAIN),
-    each_axis("derivative_filter", 0.0, "Time constant of the low-pass on the derivative, seconds; 0: none.", FILTER),
+    each_axis(
+        "derivative_filter", 0.0, "Time constant of the low-pass on the derivative, seconds; 0: none.", (0.0, 1e3)
+    ),
     scalar("measurement_timeout", 0.1, "Seconds; an older measurement does not act: the correction is held.", TIMEOUT),
     scalar(
         "drift_alarm", 3.0,
         "/diagnostics warns when measurements are off the model by this many times its held-out error, rms; 0: never.",
-        FACTOR,
+        (0.0, 1e6),
     ),
     # The node
-    fixed("autostart", True, "Whether the node configures and activates itself."),
-    fixed("executor", "events", "Executor that spins the node: events (fast) or default (in every rclpy)."),
-    scalar("diagnostic_period", 1.0, "Seconds between two reports on /diagnostics.", PERIOD, read_only=True),
+    Declaration("autostart", True, "Whether the node configures and activates itself.", read_only=True),
+    text(
+        "executor", "events", "Executor that spins the node: events (fast) or default (in every rclpy).",
+        "events", "default", read_only=True,
+    ),
+    scalar("diagnostic_period", 1.0, "Seconds between two reports on /diagnostics.", (0.05, 3600.0), read_only=True),
     Declaration(
         "realtime_priority", 0, "Priority under SCHED_FIFO, 1 to 99, where the system allows it; 0: as any process.",
-        read_only=True, between=PRIORITY,
+        read_only=True, between=(0, 99),
     ),
 )  # fmt: skip
-
-Axes = tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Safety:
-    """What happens when commands end.
-
-    Parameters
-    ----------
-    command_timeout : float, seconds
-        0: none.
-    ramps_on_timeout, ramps_on_deactivate : bool
-        Whether to go to the safe voltages then; if not, voltages are held.
-    voltages : tuple of float, volts
-        The safe ones, one for each axis.
-    rate : float, V/s
-        How fast to go there.
-    """
-
-    command_timeout: float
-    ramps_on_timeout: bool
-    ramps_on_deactivate: bool
-    voltages: tuple[float, ...]
-    rate: float
 
 
 @dataclass(frozen=True)
@@ -156,21 +151,24 @@ class ResetSettings:
     rate : float, V/s
     to_safe : bool
         Whether it ends at the safe voltages, not at the present ones.
+    on_start : bool
+        Whether it is reset after activation.
     """
 
     cycles: int
     rate: float
     to_safe: bool
+    on_start: bool
 
 
 @dataclass(frozen=True)
 class CompensatorSettings:
-    """What the compensator is told by its parameters.
+    """What the parameters say together.
 
     Parameters
     ----------
-    axes : tuple of str
-    model_file, hardware_id, memory_file : str
+    values : mapping of str to object
+        All parameters by name, each checked by itself; tuples where each axis may have its own.
     limits : tuple of Limits
         One for each axis.
     time : TimeRules
@@ -178,34 +176,17 @@ class CompensatorSettings:
     reset : ResetSettings
     loops : tuple of LoopSettings
         One for each axis.
-    drift_alarm : float
-        Warn when measurements are off by so many times the held-out error; 0: never.
-    desired_type : str
-    autostart : bool
-    executor : str
-    diagnostic_period : float, seconds
-    realtime_priority : int
-        0: none.
     """
 
-    axes: Axes
-    model_file: str
-    hardware_id: str
-    memory_file: str
+    values: Mapping[str, Any]
     limits: tuple[Limits, ...]
     time: TimeRules
     safety: Safety
     reset: ResetSettings
     loops: tuple[LoopSettings, ...]
-    drift_alarm: float
-    desired_type: str
-    autostart: bool
-    executor: str
-    diagnostic_period: float
-    realtime_priority: int
 
     @classmethod
-    def of(cls, values: Values) -> "CompensatorSettings":
+    def of(cls, given: Values) -> "CompensatorSettings":
         """Make the settings of all parameters by name.
 
         Raises
@@ -213,33 +194,32 @@ class CompensatorSettings:
         UsageError
             If a value, or what they say together, makes no sense.
         """
-        axes = read_axes(values["axes"])
-        desired_type = choice(values, "desired_type", DESIRED_TYPES)
-        if desired_type == "Float64" and len(axes) > 1:
+        axes = given["axes"]
+        if not axes or not all(axes) or len(set(axes)) != len(axes):
+            raise UsageError(f"parameter axes is {list(axes)!r}; name at least one axis, and each once")
+        values = {entry.name: entry.read(given, axes) for entry in DECLARATIONS}
+        if values["desired_type"] == "Float64" and len(axes) > 1:
             raise UsageError(
                 f"desired_type Float64 holds one value, but axes are {', '.join(axes)}; "
                 "use Float64MultiArray or JointState"
             )
+        gains = zip(values["kp"], values["ki"], values["kd"], values["derivative_filter"], strict=True)
+        timeout = values["measurement_timeout"]
         settings = cls(
-            axes=axes,
-            model_file=values["model_file"],
-            hardware_id=values["hardware_id"],
-            memory_file=values["memory_file"],
-            limits=read_limits(values, axes),
-            time=TimeRules(number(values, "time_jump", *JUMP), number(values, "max_age", *TIMEOUT)),
-            safety=read_safety(values, axes),
-            reset=ResetSettings(
-                whole(values, "reset_cycles", *CYCLES),
-                number(values, "reset_rate", *POSITIVE_RATE),
-                choice(values, "reset_to", RESETS) == "safe",
+            values,
+            _limits(values),
+            TimeRules(values["time_jump"], values["max_age"]),
+            Safety(
+                values["command_timeout"],
+                values["on_timeout"] == "safe",
+                values["on_deactivate"] == "safe",
+                values["safe_voltage"],
+                values["ramp_rate"],
             ),
-            loops=read_loops(values, axes),
-            drift_alarm=number(values, "drift_alarm", *FACTOR),
-            desired_type=desired_type,
-            autostart=values["autostart"],
-            executor=choice(values, "executor", EXECUTORS),
-            diagnostic_period=number(values, "diagnostic_period", *PERIOD),
-            realtime_priority=whole(values, "realtime_priority", *PRIORITY),
+            ResetSettings(
+                values["reset_cycles"], values["reset_rate"], values["reset_to"] == "safe", values["reset_on_start"]
+            ),
+            tuple(LoopSettings(values["feedback"], PidGains(*each), timeout) for each in gains),
         )
         settings._require_safe_voltages()
         return settings
@@ -248,7 +228,7 @@ class CompensatorSettings:
         safety = self.safety
         if not (safety.ramps_on_timeout or safety.ramps_on_deactivate or self.reset.to_safe):
             return
-        for name, limits, voltage in zip(self.axes, self.limits, safety.voltages, strict=True):
+        for name, limits, voltage in zip(self.values["axes"], self.limits, safety.voltages, strict=True):
             if not limits.lower <= voltage <= limits.upper:
                 raise UsageError(
                     f"axis '{name}': safe_voltage {voltage:g} V is outside voltage_min..voltage_max, "
@@ -256,44 +236,15 @@ class CompensatorSettings:
                 )
 
 
-def read_axes(given: list[str]) -> Axes:
-    """Return the names of the axes; UsageError unless there are some, each with a name of its own."""
-    if not given or not all(given) or len(set(given)) != len(given):
-        raise UsageError(f"parameter axes is {list(given)!r}; name at least one axis, and each once")
-    return tuple(given)
-
-
-def read_limits(values: Values, axes: Axes) -> tuple[Limits, ...]:
+def _limits(values: Mapping[str, Any]) -> tuple[Limits, ...]:
     """Return the limits of each axis; UsageError where they leave no voltage."""
-    lower, upper = (numbers(values, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
-    slew = numbers(values, "slew_limit", axes, *RATE)
-    acceleration = numbers(values, "acceleration_limit", axes, *ACCELERATION)
-    for name, low, high in zip(axes, lower, upper, strict=True):
+    for name, low, high in zip(values["axes"], values["voltage_min"], values["voltage_max"], strict=True):
         if not low < high:
             raise UsageError(
                 f"axis '{name}': voltage_min {low:g} V is not below voltage_max {high:g} V; "
                 "leave some voltage between them"
             )
-    each = zip(lower, upper, slew, acceleration, strict=True)
-    return tuple(Limits(low, high, fastest or inf, sharpest or inf) for low, high, fastest, sharpest in each)
-
-
-def read_safety(values: Values, axes: Axes) -> Safety:
-    """Return what happens when commands end."""
-    return Safety(
-        number(values, "command_timeout", *TIMEOUT),
-        choice(values, "on_timeout", ENDS) == "safe",
-        choice(values, "on_deactivate", ENDS) == "safe",
-        tuple(numbers(values, "safe_voltage", axes, *VOLTAGE)),
-        number(values, "ramp_rate", *POSITIVE_RATE),
-    )
-
-
-def read_loops(values: Values, axes: Axes) -> tuple[LoopSettings, ...]:
-    """Return the feedback of each axis."""
-    gains = [numbers(values, name, axes, *GAIN) for name in ("kp", "ki", "kd")]
-    filters = numbers(values, "derivative_filter", axes, *FILTER)
-    timeout = number(values, "measurement_timeout", *TIMEOUT)
+    each = (values[name] for name in ("voltage_min", "voltage_max", "slew_limit", "acceleration_limit"))
     return tuple(
-        LoopSettings(values["feedback"], PidGains(*each), timeout) for each in zip(*gains, filters, strict=True)
+        Limits(low, high, slew or inf, acceleration or inf) for low, high, slew, acceleration in zip(*each, strict=True)
     )

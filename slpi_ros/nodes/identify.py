@@ -17,8 +17,8 @@ from std_srvs.srv import Trigger
 
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.fit import KINDS
-from slpi_ros.io.bag_watch import PATIENCE, BagWatch
-from slpi_ros.model.document import parse_model
+from slpi_ros.io.bag_files import PATIENCE, BagWatch
+from slpi_ros.model.document import parse_model, save_model
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, run
 from slpi_ros.nodes.jobs import (
@@ -288,6 +288,7 @@ class Identify(Node):
         self._failed = 0
         self._model: StageModel | None = None
         self._identified: Identified | None = None
+        self._doubtful: tuple[FitRequest, str] | None = None
         self._error = ""
         # A simulated clock may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -325,6 +326,7 @@ class Identify(Node):
         """Start to identify what the parameters name, in place of what is under way."""
         self._end_job()
         self._error = ""
+        self._doubtful = None
         self._waiting.clear()
         self._asked = settings.request if settings.request.bags else None
         self._watch = BagWatch(settings.watch_directory) if settings.watch_directory else None
@@ -346,7 +348,15 @@ class Identify(Node):
         self._start_next()
 
     def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Identify the parameter's bags again, or the newest one of the watched folder."""
+        """Publish the model that waits for it; else identify the parameter's bags, or the newest watched one, again."""
+        if self._doubtful:
+            (asked, document), self._doubtful = self._doubtful, None
+            self._take(asked, FitOutcome(document, self._written(asked, document)))
+            response.success, response.message = (
+                not self._error,
+                self._error or f"published the model of {asked.source}",
+            )
+            return response
         try:
             self._begin(self._parameter_set.settings)
         except SlpiError as error:
@@ -368,7 +378,9 @@ class Identify(Node):
         request, self._asked = self._asked, None
         if not request and self._waiting:
             bag = str(self._waiting.popleft())
-            request = replace(self._parameter_set.settings.request, bags=(bag,), stage=self._stage)
+            published = self._identified.document if self._identified and self._stage else ""
+            wanted = self._parameter_set.settings.request
+            request = replace(wanted, bags=(bag,), stage=self._stage, published=published)
         return request
 
     def _end_job(self) -> None:
@@ -386,7 +398,23 @@ class Identify(Node):
             self._take(request, outcome)
             self._start_next()
 
+    def _written(self, request: FitRequest, document: str) -> str:
+        """Write a model to the file, if one is named; return why that cannot be, or ""."""
+        try:
+            if request.output:
+                save_model(parse_model(document, request.source), request.output)
+        except SlpiError as error:
+            return str(error)
+        return ""
+
     def _take(self, request: FitRequest, outcome: FitOutcome) -> None:
+        if outcome.doubt:
+            self._doubtful = request, outcome.document
+            self._error = f"{outcome.doubt}; not published: call ~/identify to publish it all the same"
+            self.get_logger().warning(self._error)
+            self._report()
+            return
+        self._doubtful = None
         if outcome.document:
             self._model = parse_model(outcome.document, "identify")
             self._stage = StageIdentity.of(self._model, request.stage)
@@ -424,7 +452,7 @@ class Identify(Node):
                 f"{name}.covered": f"{quality.covered:.3f}",
                 f"{name}.source": quality.source,
             }
-        problems = ((ERROR, self._error),) if self._error else ()
+        problems = ((WARN if self._doubtful else ERROR, self._error),) if self._error else ()
         if not problems and not model and not self._job and not self._watch:
             problems = ((WARN, NOTHING_TO_DO),)
         if self._abandoned:

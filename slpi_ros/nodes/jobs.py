@@ -1,4 +1,4 @@
-"""The reading of one model document; a large one is checked in a process of its own."""
+"""Work in processes of its own: identifications, diagnoses, and the check of large model documents."""
 
 import json
 import multiprocessing
@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Generic, TypeVar
+
+import numpy as np
 
 from slpi_ros.compensator.persistence import model_id
 from slpi_ros.diagnosis.diagnose import diagnose
@@ -134,6 +136,8 @@ class FitRequest:
         File that gets the model too; "": none.
     stage : StageIdentity, optional
         The only stage whose bags are wanted; by default any.
+    published : str
+        The model document that the new one is to take the place of; "": none, and the new one is taken as it is.
     """
 
     bags: tuple[str, ...]
@@ -143,6 +147,7 @@ class FitRequest:
     stop: float | None
     output: str
     stage: StageIdentity | None = None
+    published: str = ""
 
     @property
     def source(self) -> str:
@@ -152,10 +157,14 @@ class FitRequest:
 
 @dataclass(frozen=True)
 class FitOutcome:
-    """What came of it: a model document, or an error, or both when only the file could not be written."""
+    """What came of it: a model document, or an error, or both when only the file could not be written.
+
+    `doubt` says why the model must not take the place of the published one unasked; it has not been written then.
+    """
 
     document: str = ""
     error: str = ""
+    doubt: str = ""
 
 
 class FitProcess(WorkerProcess[FitRequest, FitOutcome]):
@@ -175,11 +184,42 @@ def fit(request: FitRequest) -> FitOutcome:
                 request.stage.require(record)
         model = identify(records, request.kind, start=request.start, stop=request.stop)
         document = format_model(model)
+        if request.published:
+            doubt = doubt_about(model, parse_model(request.published, "stage_model"))
+            if doubt:
+                return FitOutcome(document, doubt=f"{request.source}: {doubt}")
         if request.output:
             save_model(model, request.output)
     except SlpiError as error:
         return FitOutcome(document, str(error))
     return FitOutcome(document)
+
+
+# A model takes the place of another one unasked only if its held-out error is less than so many times as large, and its
+# largest loop differs by less than this share of its height.
+MUCH_WORSE, FOREIGN = 3.0, 0.1
+
+
+def doubt_about(model: StageModel, published: StageModel) -> str:
+    """Return why a model should not take the place of a published one unasked: it is much worse, or foreign; or ""."""
+    for name, old in published.axes.items():
+        new = model.axes[name]
+        errors = [axis.quality.held_out_rms * 1e9 for axis in (new, old)]
+        if errors[0] > MUCH_WORSE * errors[1]:
+            return (
+                f"axis '{name}': held-out error {errors[0]:.3g} nm rms, that of the published model {errors[1]:.3g} nm"
+            )
+        low = max(axis.voltage_range[0] for axis in (new, old))
+        high = min(axis.voltage_range[1] for axis in (new, old))
+        if not low < high:
+            return f"axis '{name}': none of the voltages of the published model"
+        rise = np.linspace(low, high, 101)
+        way = np.concatenate([[high], rise, rise[::-1]])
+        loops = [axis.simulate(np.zeros(way.size), way)[1:] for axis in (new, old)]
+        off = float(np.ptp(loops[0] - loops[1]) / np.ptp(loops[1]))
+        if off > FOREIGN:
+            return f"axis '{name}': its largest loop differs by {off:.0%} from that of the published model"
+    return ""
 
 
 @dataclass(frozen=True)

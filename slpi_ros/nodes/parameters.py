@@ -1,5 +1,6 @@
 """Parameters of a node, declared in one table and validated together."""
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,10 @@ class Declaration:
         Smallest and largest value of a number; without it any.
     number : bool
         Whether integers, and one value for each axis, may stand for the default's one double. Not for whole numbers.
+    each_axis : bool
+        Whether each axis may have a value of its own.
+    choices : tuple of str
+        What a string may be; empty: anything.
     """
 
     name: str
@@ -40,6 +45,31 @@ class Declaration:
     read_only: bool = False
     between: tuple[float, float] | None = None
     number: bool = False
+    each_axis: bool = False
+    choices: tuple[str, ...] = ()
+
+    def read(self, values: Values, axes: Sequence[str]) -> Any:
+        """Return the checked value among all of them by name: a tuple with one for each axis where each may have one.
+
+        Raises
+        ------
+        UsageError
+            It names the parameter and what it may be.
+        """
+        if self.each_axis and self.between:
+            return tuple(numbers(values, self.name, axes, *self.between))
+        if self.number and self.between:
+            return number(values, self.name, *self.between)
+        if self.between:
+            return whole(values, self.name, int(self.between[0]), int(self.between[1]))
+        return choice(values, self.name, self.choices) if self.choices else values[self.name]
+
+    def row(self) -> str:
+        """Return its row of a README's table: name, default, description."""
+        default = self.default if isinstance(self.default, str | list) else f"{self.default}".lower()
+        text = json.dumps(default) if isinstance(default, list) or not default else default
+        fixed = " Read-only." if self.read_only else ""
+        return f"| `{self.name}` | `{text}` | {self.description}{fixed} |"
 
     def descriptor(self) -> ParameterDescriptor:
         """Return what rclpy shows, and checks where it can."""

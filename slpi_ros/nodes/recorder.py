@@ -13,7 +13,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.io.bag_reader import JOINT_STATE, BagWriter
+from slpi_ros.io.bag_writer import BagWriter
+from slpi_ros.io.messages import JOINT_STATE
 from slpi_ros.nodes.common import request_stop, run
 
 # a burst must fit while the disk is slow

@@ -16,6 +16,8 @@ from slpi_ros.simulation.stage import Stage, p11_stage
 
 LOG_PERIOD = 5.0
 RATE_MAX = 10e3
+# Seconds; after that creep is over.
+DAY = 86_400.0
 _READ_ONLY = ParameterDescriptor(read_only=True)
 # Otherwise ROS refuses 100 where 100.0 is meant.
 _NUMBER = ParameterDescriptor(read_only=True, dynamic_typing=True)
@@ -28,7 +30,9 @@ class StageSimulator(Node):
     ``stage_state`` (sensor_msgs/JointState: ``position`` in metres as measured, ``effort`` in volts as
     applied).
     Parameters, all read-only: ``axes``, ``seed``, ``preset``, ``noise_rms`` (m), ``rate`` (Hz), ``voltage_min`` and
-    ``voltage_max`` (V; commands beyond them are clipped, as the amplifier saturates), ``hardware_id``, and
+    ``voltage_max`` (V; commands beyond them are clipped, as the amplifier saturates), ``hardware_id`` (by default
+    ``simulated-`` with the preset, or the seed where there is none), ``initial_history`` (V; all axes went through
+    these voltages a day before and rested at 0 V since, so that a restart may find the stage as it was left), and
     ``answer_commands``: publish one state for each accepted command, or, when false, `rate` states a second.
 
     Without preset the stage is drawn from the seed, and only its hysteresis counts. Preset "p11" is the creeping and
@@ -50,12 +54,16 @@ class StageSimulator(Node):
         super().__init__("stage_simulator")
         self.ignored = 0
         axes = self._axes()
-        self._stage, self._latest = self._make_stage(axes), 0.0
+        self._stage, self._latest = self._make_stage(axes), -math.inf
         self._low, self._high = self._limits()
+        history = self._initial_history()
         self._state = JointState(name=axes)
-        self._state.header.frame_id = self.declare_parameter("hardware_id", "simulated", _READ_ONLY).value
+        self._state.header.frame_id = self.declare_parameter("hardware_id", self._hardware_id(), _READ_ONLY).value
         self._answers = bool(self.declare_parameter("answer_commands", True, _READ_ONLY).value)
         rate = self._rate()
+        now = self.get_clock().now().nanoseconds * 1e-9
+        for v in (*history, self._clip(0.0)):
+            self._stage.step(now - DAY, [v] * len(axes))
         self._apply([self._clip(0.0)] * len(axes))
         self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
         if not self._answers:
@@ -109,6 +117,20 @@ class StageSimulator(Node):
                 f"stage_simulator: axes are {', '.join(axes)}, those of preset p11 {', '.join(stage.axes)}; name these"
             )
         return stage
+
+    def _hardware_id(self) -> str:
+        """Return a name for each stage that is another one; the seed of a preset is only that of its noise."""
+        return f"simulated-{self.get_parameter('preset').value or self.get_parameter('seed').value}"
+
+    def _initial_history(self) -> list[float]:
+        # A stage that has stayed at 0 V has never been driven.
+        given = self.declare_parameter("initial_history", [0.0], _NUMBER).value
+        history = list(given) if isinstance(given, Sequence | array) and not isinstance(given, str) else [math.nan]
+        if not all(self._low <= v <= self._high for v in history):
+            raise UsageError(
+                f"stage_simulator: initial_history is {given!r}; give voltages within {self._low} to {self._high} V"
+            )
+        return history
 
     def _seed(self) -> int:
         seed = int(self.declare_parameter("seed", 0, _READ_ONLY).value)

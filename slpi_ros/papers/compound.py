@@ -12,11 +12,10 @@ from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, cycles
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.signal_statistics import ErrorMetrics, error_metrics
-from slpi_ros.model.stage_model import AxisModel, Start
-from slpi_ros.model.streaming import Limits
-from slpi_ros.papers import mpi_exhibits as pictures
-from slpi_ros.papers.exhibit import Exhibit, Picture, Table
-from slpi_ros.papers.mpi_exhibits import ERRORS, errors, um
+from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.limits import Limits
+from slpi_ros.papers.exhibit import Exhibit, Picture, Table, um
+from slpi_ros.papers.mpi_exhibits import ERRORS, errors, followed, scheme
 from slpi_ros.papers.mpi_study import (
     COMPOUND_BAND,
     COMPOUND_MEAN,
@@ -52,19 +51,20 @@ FEEDFORWARD_VOLTAGE = 80
 INTEGRAL_SHARE, PROPORTIONAL_SHARE = 1 / 3, 1 / 10
 
 KINDS = {SMPI: "smpi", FAMILY: "slpi"}
+PID = "PID"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A path followed.
+    """Desired, measured and true displacement along a path.
 
     Parameters
     ----------
     desired : ndarray, shape (N,), metres
     measured : ndarray, shape (N,), metres
-        What the sensor read.
+        By the sensor.
     displacement : ndarray, shape (N,), metres
-        What the stage did.
+        Of the stage itself, without sensor errors.
     """
 
     desired: FloatArray
@@ -107,7 +107,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class AxisStudy:
-    """What one axis did.
+    """The experiments on one axis.
 
     Parameters
     ----------
@@ -213,29 +213,26 @@ def follow(
         control.enable()
     reading, done, read = 0.0, np.empty_like(desired), np.empty_like(desired)
     ahead = np.append(feedforward[1:], feedforward[-1])
-    for k, (wish, v_ahead) in enumerate(zip(desired.tolist(), ahead.tolist(), strict=True)):
+    for k, (target, v_ahead) in enumerate(zip(desired.tolist(), ahead.tolist(), strict=True)):
         done[k], read[k] = y - zero, reading
-        voltage = control.correct(k / RATE, wish, reading, v_ahead)
+        voltage = control.correct(k / RATE, target, reading, v_ahead)
         y = axis.step((v.size + k) / RATE, voltage)
         reading = axis.measure(y) - zero
     return Outcome(desired, read, done)
 
 
 def _warm(model: AxisModel) -> AxisModel:
-    """Let a model start at 0 V and at the sensor's zero, where a long fall has led."""
+    """Return a model that starts at 0 V and at the sensor's zero, after a long fall."""
     return replace(model, start=Start(0.0, 0.0, (0.0,) if model.causal else ()), end=None)
 
 
-PID = "PID"
-
-
 def exhibits(seed: int = 0) -> list[Exhibit]:
-    """Run the experiments and return what they show; `seed` is that of the sensor noise."""
+    """Run the experiments and return their exhibits; `seed` is that of the sensor noise."""
     return present({name: run_study(axis, name) for name, axis in p11_stage(seed).axes.items()})
 
 
 def present(studies: Mapping[str, AxisStudy]) -> list[Exhibit]:
-    """Return what studies of axes, by name, show."""
+    """Return the exhibits of studies, by axis name."""
     return [_feedforward(studies), _scheme(studies), _compound(studies)]
 
 
@@ -265,7 +262,7 @@ def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
         ),
         pictures=(
             Picture(
-                pictures.followed({label: studies[first].feedforward[label].run(label) for label in KINDS}, None),
+                followed({label: studies[first].feedforward[label].run(label) for label in KINDS}, None),
                 f"Axis {first}: displacement and error by the sensor.",
             ),
         ),
@@ -273,7 +270,7 @@ def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
 
 
 def _offsets(outcomes: Iterable[Outcome]) -> str:
-    """Say how much of errors is a constant."""
+    """Return a sentence on the share of a constant offset in errors."""
     shares = [100.0 * (o.offset / o.read.root_mean_square) ** 2 for o in outcomes]
     return f"A constant offset is {min(shares):.0f} to {max(shares):.0f} % of the mean square error."
 
@@ -299,7 +296,7 @@ def _scheme(studies: Mapping[str, AxisStudy]) -> Exhibit:
         f"proportional one {PROPORTIONAL_SHARE:.2f}.",
         remark="Gains follow from the mode and the static gain of each axis; none was tried on the path.",
         tables=(Table(("axis", "K_p (V/µm)", "K_i (V/(µm s))", "K_d (V s/µm)"), tuple(rows)),),
-        pictures=(Picture(pictures.scheme(), "Feedforward and feedback."),),
+        pictures=(Picture(scheme(), "Feedforward and feedback."),),
     )
 
 
@@ -341,9 +338,7 @@ def _compound(studies: Mapping[str, AxisStudy]) -> Exhibit:
         ),
         pictures=tuple(
             Picture(
-                pictures.followed(
-                    {label: s.compound[label, True].run(f"{label} + {PID}") for label in KINDS}, COMPOUND_BAND
-                ),
+                followed({label: s.compound[label, True].run(f"{label} + {PID}") for label in KINDS}, COMPOUND_BAND),
                 f"Axis {axis}: displacement (Fig. 13) and error (Fig. 14) by the sensor; shaded: ±{COMPOUND_BAND} µm.",
             )
             for axis, s in studies.items()

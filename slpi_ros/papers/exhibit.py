@@ -1,4 +1,4 @@
-"""What an experiment shows: a table or figure of a paper, ours beside it, and what differs."""
+"""An exhibit: a table or figure of a paper, the one computed here beside it, and what differs."""
 
 from dataclasses import dataclass
 
@@ -46,3 +46,8 @@ class Exhibit:
     remark: str
     tables: tuple[Table, ...] = ()
     pictures: tuple[Picture, ...] = ()
+
+
+def um(metres: float, digits: int = 3) -> str:
+    """Return a length as text, in micrometres."""
+    return f"{metres * 1e6:.{digits}f}"

@@ -13,7 +13,7 @@ from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
 from slpi_ros.identification.fit import KINDS, identify
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
-from slpi_ros.model.stage_model import AxisModel
+from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.papers.exhibit import Exhibit, Table
 
 

@@ -11,7 +11,7 @@ from matplotlib.patches import FancyBboxPatch
 from numpy.typing import NDArray
 
 from slpi_ros.identification.signal_statistics import ErrorMetrics
-from slpi_ros.papers.exhibit import Exhibit, Picture, Table
+from slpi_ros.papers.exhibit import Exhibit, Picture, Table, um
 from slpi_ros.papers.mpi_study import (
     FAMILY,
     KINDS,
@@ -32,7 +32,8 @@ from slpi_ros.papers.mpi_study import (
     VariablePath,
     run_study,
 )
-from slpi_ros.reports.plots import COLOURS, DESIRED, MEASURED, Run, label, panels
+from slpi_ros.reports.chart import COLOURS, DESIRED, MEASURED
+from slpi_ros.reports.plots import Run, label, panels
 from slpi_ros.simulation.stage import p11_stage
 
 FloatArray = NDArray[np.float64]
@@ -42,6 +43,7 @@ COLOUR = {
     **dict(zip((OWN_MPI, ONE_MPI, FAMILY, SCALED_MPI), COLOURS, strict=True)),
 }
 V, UM, ERROR = "voltage (V)", "displacement (µm)", "error (µm)"
+ERRORS = "maximum / mean / root mean square (µm)"
 
 
 def loops(groups: Mapping[str, Mapping[str, Drive]], columns: int) -> Figure:
@@ -109,7 +111,7 @@ def fit_errors(drives: Mapping[float, Drive], simulated: Mapping[str, Mapping[fl
 
 
 def variable(path: VariablePath) -> Figure:
-    """Draw what was measured and what models say over the cycles, and the errors below."""
+    """Draw measured and simulated displacement over the cycles, and the errors below."""
     figure, (upper, lower) = panels(2, 1, (11, 7.0), height_ratios=(1, 1), sharex=True)
     cycle = np.arange(path.y.size) * sum(cycles for _, _, cycles in VARIABLE) / path.y.size
     upper.plot(cycle, path.y * 1e6, color=MEASURED, linewidth=3.0, label="measured")
@@ -128,7 +130,7 @@ def variable(path: VariablePath) -> Figure:
 
 
 def followed(runs: Mapping[str, Run], band: float | None) -> Figure:
-    """Draw what was desired and what ways of driving, by model, made of it, and errors below; shade a band (µm)."""
+    """Draw desired and achieved displacement, by model, and the errors below; shade a band (µm)."""
     figure, (upper, lower) = panels(2, 1, (11, 6.4), height_ratios=(1, 1), sharex=True)
     for name, run in runs.items():
         upper.plot(run.t, run.displacement * 1e6, color=COLOUR[name], linewidth=1.0, label=run.name)
@@ -198,16 +200,13 @@ def _legend(figure: Figure, drawn: Sequence[Axes], used: int) -> None:
         panel.set_axis_off()
 
 
-ERRORS = "maximum / mean / root mean square (µm)"
-
-
 def exhibits(seed: int = 0) -> list[Exhibit]:
-    """Run the experiments and return what they show; `seed` is that of the sensor noise."""
+    """Run the experiments and return their exhibits; `seed` is that of the sensor noise."""
     return present(run_study(p11_stage(seed).axes["x"]))
 
 
 def present(study: Study) -> list[Exhibit]:
-    """Return what a study with the paper's amplitudes and frequencies shows."""
+    """Return the exhibits of a study with the paper's amplitudes and frequencies."""
     return [
         _amplitudes(study),
         _frequencies(study),
@@ -217,11 +216,6 @@ def present(study: Study) -> list[Exhibit]:
         _variable(study),
         _scaled(study),
     ]
-
-
-def um(metres: float, digits: int = 3) -> str:
-    """Return a length in micrometres."""
-    return f"{metres * 1e6:.{digits}f}"
 
 
 def errors(metrics: ErrorMetrics) -> str:
@@ -396,7 +390,7 @@ def _fits(study: Study) -> Exhibit:
             Picture(fits(study.fastest, curves[MPI], MPI), "Settled cycles and the MPI model of each."),
             Picture(
                 fit_errors(study.fastest, curves),
-                "Model less measurement; the first half of the cycle is the rise.",
+                "Model - measured; the first half of the cycle is the rise.",
             ),
         ),
     )
@@ -432,7 +426,7 @@ def _variable(study: Study) -> Exhibit:
                 tuple(rows),
             ),
         ),
-        pictures=(Picture(variable(path), "Displacement, and model less measurement; shaded: ±1 µm."),),
+        pictures=(Picture(variable(path), "Displacement, and model - measured; shaded: ±1 µm."),),
     )
 
 

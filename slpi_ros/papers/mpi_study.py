@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.published_kinds import PeakFrequency, fit_peak_frequency
 from slpi_ros.identification.signal_statistics import ErrorMetrics, error_metrics
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel
+from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.papers.published import triangles
 from slpi_ros.simulation.preisach import PreisachStage
 

@@ -1,4 +1,4 @@
-"""All experiments, and the page that shows them."""
+"""All experiments of the two papers, and their page."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the SLPI paper prints: the parameters of Tables 2 to 5, as models, and its headline percentages.
+"""The SLPI paper's Tables 2 to 5 as models, its headline percentages, and the drives of both papers.
 
 The tables give no unit for the weights; they are taken for micrometres per volt.
 """
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
 
 FloatArray = NDArray[np.float64]
@@ -101,17 +102,9 @@ def triangles(amplitude: float, frequency: float, cycles: int, samples: int = 20
     return k / (samples * frequency), amplitude * (1.0 - np.abs(2.0 * phase - 1.0))
 
 
-def turning_points(x: FloatArray) -> list[int]:
-    """Return the first sample of `x`, shape (N,), those at which it turns back, and the last one."""
-    moves = np.flatnonzero(np.diff(x))
-    signs = np.sign(np.diff(x)[moves])
-    turns = moves[1:][np.diff(signs) != 0]
-    return [0, *turns.tolist(), x.size - 1]
-
-
 def straight_between_turns(x: FloatArray, at: FloatArray) -> FloatArray:
-    """Return `x`, shape (N,), made a straight line of `at`, shape (N,), between neighbouring turns of `at`."""
-    path = np.empty_like(x)
-    for a, b in pairwise(turning_points(at)):
+    """Return `x`, shape (N,), made a straight line over `at`, shape (N,), between neighbouring reversals of `at`."""
+    path = x.copy()
+    for a, b in pairwise(stop - 1 for _, stop in monotone_runs(at)):
         path[a : b + 1] = x[a] + (x[b] - x[a]) * (at[a : b + 1] - at[a]) / (at[b] - at[a])
     return path

@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.slpi_published import Loop, SeparatedLoops, Separation, SingleLoop
+from slpi_ros.hysteresis.slpi_published import Loop, SeparatedLoops, Separation
 from slpi_ros.identification.convex_fit import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import least_iterations
-from slpi_ros.papers.exhibit import Exhibit, Picture, Table
+from slpi_ros.papers.exhibit import Exhibit, Picture, Table, um
 from slpi_ros.papers.published import (
     HIGHEST_MEAN,
     OUTER_MAXIMUM,
@@ -38,12 +38,18 @@ from slpi_ros.papers.slpi_study import (
     study,
     unseen_paths,
 )
-from slpi_ros.reports.plots import COLOURS, DESIRED, MEASURED, label, panels
+from slpi_ros.reports.chart import COLOURS, DESIRED, MEASURED
+from slpi_ros.reports.plots import label, panels
 
+FloatArray = NDArray[np.float64]
 
-def um(metres: float) -> str:
-    """Return a length in micrometres, three digits behind the point."""
-    return f"{metres * 1e6:.3f}"
+COLOUR = dict(zip((CLASSICAL, AT_REST, CLOSING, FAMILY), COLOURS, strict=True))
+ROMAN = ("0", "I", "II", "III", "IV", "V")
+V, UM = "voltage (V)", "displacement (µm)"
+# The weights that the paper prints, by level, and the figures by which it compares SLPI with classical PI.
+PRINTED = {2: TABLE_2, 1: TABLE_3, 0: TABLE_4}
+FIGURES = ("outer loop's maximum", "highest loop's mean", "spread between loops", "overall mean")
+PAPER = (OUTER_MAXIMUM, HIGHEST_MEAN, SPREAD, OVERALL_MEAN)
 
 
 def turns_of(study: Study) -> str:
@@ -62,13 +68,6 @@ def errors_table(errors: Mapping[str, LoopErrors], separation: Separation, what:
     name = f"error {what} (µm)" if what else "error (µm)"
     header = (name, "mean", *(f"mean, level {level}" for level in levels), "maximum, level 0", "spread")
     return Table(header, tuple(rows), best=int(np.argmin([e.overall for e in errors.values()])))
-
-
-FloatArray = NDArray[np.float64]
-
-COLOUR = dict(zip((CLASSICAL, AT_REST, CLOSING, FAMILY), COLOURS, strict=True))
-ROMAN = ("0", "I", "II", "III", "IV", "V")
-V, UM = "voltage (V)", "displacement (µm)"
 
 
 def path_and_curve(v: FloatArray, y: FloatArray) -> Figure:
@@ -136,7 +135,7 @@ def single_models(separation: Separation, models: Mapping[str, SeparatedLoops]) 
         panel.plot(drive, y * 1e6, ".", color=MEASURED, markersize=5, label="measured")
         for name, model in models.items():
             single = model.loops[len(loops) - 1 - number]
-            panel.plot(drive, _moved(single, drive) * 1e6, color=COLOUR[name], linewidth=1.1, label=name)
+            panel.plot(drive, single.memory().forward_array(drive) * 1e6, color=COLOUR[name], linewidth=1.1, label=name)
         panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
         label(panel, "from the vertex (V)", "from the vertex (µm)" if panel is drawn[0] else "")
     drawn[0].legend(frameon=False)
@@ -147,10 +146,6 @@ def _own(separation: Separation, loop: Loop) -> tuple[FloatArray, FloatArray]:
     path = loop.path
     drive = loop.direction * (separation.voltage[path] - separation.voltage[loop.vertex])
     return drive, loop.direction * (separation.displacement[path] - separation.displacement[loop.vertex])
-
-
-def _moved(single: SingleLoop, drive: FloatArray) -> FloatArray:
-    return single.memory().forward_array(drive)
 
 
 def over_data(separation: Separation, errors: Mapping[str, LoopErrors], names: tuple[str, ...]) -> Figure:
@@ -182,10 +177,9 @@ def inverses(study: Study, names: tuple[str, ...]) -> Figure:
     return figure
 
 
-def draw_compensation(
-    study: Study, errors: Mapping[str, LoopErrors], desired: FloatArray, names: tuple[str, ...]
-) -> Figure:
+def draw_compensation(study: Study, names: tuple[str, ...]) -> Figure:
     """Draw achieved over desired displacement, and errors over the samples."""
+    errors, desired = study.compensated, study.desired
     figure, drawn = panels(2, len(names), (11, 6.4), height_ratios=(3, 2), sharey="row")
     for column, name in enumerate(names):
         upper, lower = drawn[column], drawn[len(names) + column]
@@ -202,11 +196,8 @@ def draw_compensation(
     return figure
 
 
-PRINTED = {2: TABLE_2, 1: TABLE_3, 0: TABLE_4}
-
-
 def exhibits(random: Study) -> list[Exhibit]:
-    """Run the experiments of the SLPI paper, beyond the study of its random path, and return what they show."""
+    """Run the experiments of the SLPI paper beside the study of its random path, and return their exhibits."""
     return [
         _nonlinear_curve(random),
         _inclinations(random),
@@ -366,10 +357,6 @@ def _inverse(study: Study) -> Exhibit:
     )
 
 
-FIGURES = ("outer loop's maximum", "highest loop's mean", "spread between loops", "overall mean")
-PAPER = (OUTER_MAXIMUM, HIGHEST_MEAN, SPREAD, OVERALL_MEAN)
-
-
 def _percentages(errors: Mapping[str, LoopErrors]) -> Table:
     rows = [("paper, SLPI", *(f"{value:.1f}" for value in PAPER))]
     rows += [(f"ours, {name}", *(f"{fall:.1f}" for fall in _falls(errors, name))) for name in MODELS[1:]]
@@ -388,7 +375,7 @@ def _falls(errors: Mapping[str, LoopErrors], name: str) -> tuple[float, float, f
 
 
 def _verdict(errors: Mapping[str, LoopErrors], name: str) -> str:
-    """Say how a model stands in each of the paper's four figures."""
+    """Return a comparison with each of the paper's four figures, as text."""
     parts = []
     for what, paper, ours in zip(FIGURES, PAPER, _falls(errors, name), strict=True):
         parts.append(f"{what} {-ours:+.1f} % ({'met' if ours >= paper else 'not met'})")
@@ -396,7 +383,7 @@ def _verdict(errors: Mapping[str, LoopErrors], name: str) -> str:
 
 
 def compensation(study: Study) -> Exhibit:
-    """Show what each model makes of the path that turns where the record did."""
+    """Return the exhibit of compensation along a path that turns where the record did."""
     errors = study.compensated
     return Exhibit(
         title="Fig. 15 and the four percentages: compensation",
@@ -408,12 +395,12 @@ def compensation(study: Study) -> Exhibit:
         "that were identified. The stage is a fresh one, errors are true ones, voltages stay within 0 to 100 V. The "
         "spread grows where the inner loops gain more than the outer one, whose shape no PI model has.",
         tables=(_percentages(errors), errors_table(errors, study.separation)),
-        pictures=(Picture(draw_compensation(study, errors, study.desired, DRAWN), "Achieved over desired; errors."),),
+        pictures=(Picture(draw_compensation(study, DRAWN), "Achieved over desired; errors."),),
     )
 
 
 def straight_line(study: Study) -> Exhibit:
-    """Show what each model makes of the paper's straight line."""
+    """Return the exhibit of compensation along the paper's straight line."""
     errors = study.straight
     return Exhibit(
         title="Fig. 15 with the paper's straight line",
@@ -427,7 +414,7 @@ def straight_line(study: Study) -> Exhibit:
 
 
 def other(title: str, study: Study) -> Exhibit:
-    """Show the models of another path."""
+    """Return the exhibit of the models of another path."""
     errors = study.modelled
     worst = {name: max(errors[name].means[1:]) for name in (CLASSICAL, CLOSING, FAMILY)}
     return Exhibit(
@@ -448,7 +435,7 @@ def other(title: str, study: Study) -> Exhibit:
 
 
 def unseen(unseen: UnseenPaths) -> Exhibit:
-    """Show what the models make of paths that were not identified."""
+    """Return the exhibit of paths that were not identified."""
     rows = [
         (name, *(um(mean) for mean in means), um(float(np.mean(means)))) for name, means in unseen.mean_errors.items()
     ]

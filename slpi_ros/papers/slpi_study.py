@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi_published import (
     KnownPath,
@@ -17,6 +16,7 @@ from slpi_ros.hysteresis.slpi_published import (
     UnidentifiedLoopWarning,
     separate,
 )
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.convex_fit import PLAY_OPERATORS
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.published_kinds import default_thresholds, fit_plays, least_iterations
@@ -83,7 +83,7 @@ class LoopErrors:
 
 @dataclass(frozen=True)
 class Study:
-    """One path on the stage, and what the models make of it.
+    """One path on the stage, and the errors of the models along it.
 
     Parameters
     ----------
@@ -93,9 +93,9 @@ class Study:
     classical : PrandtlIshlinskii
     at_rest, closing : SeparatedLoops
     modelled : dict of model name to LoopErrors
-        Model less measured.
+        Model - measured.
     compensated : dict of model name to LoopErrors
-        What the stage did less what was desired: straight lines between the displacements at the turns.
+        Achieved - desired displacement; desired are straight lines between the displacements at the turns.
     straight : dict of model name to LoopErrors
         The same for the straight line through zero and the largest displacement (4.1), which turns elsewhere.
     desired : ndarray, shape (N,), metres
@@ -134,13 +134,13 @@ def study(turns: tuple[float, ...]) -> Study:
     assert isinstance(at_rest, SeparatedLoops)
     assert isinstance(closing, SeparatedLoops)
     classical = classical_model(v, y)
-    family = identify(record).axis("x")
+    more_plays, family = (identify(record, kind).axis("x") for kind in ("pi", "slpi"))
     drives: dict[str, Callable[[], Drive]] = {
         CLASSICAL: lambda: Memory(classical, 0.0, float(y[0])),
-        MORE_PLAYS: identify(record, "pi").axis("x").memory,
+        MORE_PLAYS: lambda: more_plays.memory("start"),
         AT_REST: lambda: at_rest.along(0.0, float(y[0])),
         CLOSING: lambda: closing.along(0.0, float(y[0])),
-        FAMILY: family.memory,
+        FAMILY: lambda: family.memory("start"),
     }
     desired = straight_between_turns(y, v)
     straight = y[0] + (y.max() - y[0]) * v / v.max()
@@ -166,14 +166,14 @@ def study(turns: tuple[float, ...]) -> Study:
 
 @dataclass(frozen=True)
 class UnseenPaths:
-    """What the models of one study make of other paths.
+    """Errors of the models of one study along other paths.
 
     Parameters
     ----------
     turns : tuple of tuple of float, volts
         The paths.
     mean_errors : dict of model name to tuple of float, metres
-        Model less stage, free-run, for each path.
+        Of model - stage, free-run, for each path.
     loops, replaced : int
         Inner loops of all paths, and how many of them were never identified.
     """
@@ -200,7 +200,7 @@ def unseen_paths(known: Study, seed: int = 1) -> UnseenPaths:
         for loop in inner:
             span = float(np.ptp(v[loop.path]))
             place = loop.level, loop.direction, float(v[loop.vertex]), span
-            replaced += not known.closing.holds(known.closing.nearest(*place, 0), *place, 0)
+            replaced += not known.closing.matches(known.closing.nearest(*place, 0), *place, 0)
     return UnseenPaths(paths, {name: tuple(e) for name, e in errors.items()}, loops, replaced)
 
 
@@ -244,7 +244,7 @@ def reached(v: FloatArray) -> FloatArray:
 
 
 def forward(drive: Drive, v: FloatArray) -> FloatArray:
-    """Return the model's displacement, shape (N,), metres; that nearest loops stand in is told elsewhere."""
+    """Return the model's displacement, shape (N,), metres; unidentified loops are reported by `UnseenPaths`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnidentifiedLoopWarning)
         return drive.forward_array(v)

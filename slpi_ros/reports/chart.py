@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 MEASURED, DESIRED, NOISE = "#8a97a5", "#1b2733", "#c9d2da"
 COLOURS = ("#c8553d", "#d99a26", "#2a7f62", "#3b6ea5")
-# Samples that were not fitted: their time, the measurement, and the model.
-UNFITTED_SHADE, UNFITTED_MEASURED, UNFITTED_MODEL = "#fbeccb", "#e6cc94", "#b98a2f"
+# Samples that do not count: their time, the measurement, and the model.
+UNUSED_SHADE, UNUSED_MEASURED, UNUSED_MODEL = "#fbeccb", "#e6cc94", "#b98a2f"
 BEFORE, AFTER = COLOURS[0], COLOURS[2]
 # Of causes, in order of their weight; none is like BEFORE or AFTER.
 CAUSES = ("#3b6ea5", "#d99a26", "#8d5fb0", "#1f9aa6", "#b5467d", "#7a6a53")

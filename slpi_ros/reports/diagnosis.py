@@ -46,7 +46,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
     page.contents(tuple(diagnosis.axes))
     for name, found in diagnosis.axes.items():
         page.heading(f"Axis {name}", name)
-        page.verdict(name, f"Axis {name}: {found.summary}", _mood(found), found.verdict)
+        page.verdict(name, f"Axis {name}: {found.summary}", _severity(found), found.verdict)
         page.tiles(_figures(found))
         _show_causes(page, found)
         _show_records(page, found)
@@ -59,7 +59,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
     return path
 
 
-def _mood(found: AxisDiagnosis) -> Severity:
+def _severity(found: AxisDiagnosis) -> Severity:
     if found.verdict == NOTHING_FOUND:
         return "good"
     if found.verdict == NAMED:

@@ -11,7 +11,8 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.identification.cross_validation import CLASSICAL, CrossValidationReport, Slice
 from slpi_ros.identification.record_quality import Finding, assess, findings
 from slpi_ros.io.record import Record
-from slpi_ros.model.stage_model import AxisModel, StageModel
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE
 from slpi_ros.reports.page import Page, Severity
@@ -205,7 +206,7 @@ def _part(t: FloatArray, fitted: Mask) -> str:
     first, last = t[fitted][[0, -1]].tolist()
     return (
         f"Fitted were the samples from {first:.6g} s to {last:.6g} s, of {t[0]:.6g} s to {t[-1]:.6g} s. The others are "
-        f"drawn as '{views.UNFITTED}'; no figure, no histogram and no map counts them. Voltage before the part that "
+        f"drawn as '{views.UNUSED}'; no figure, no histogram and no map counts them. Voltage before the part that "
         "was fitted still moves the memory."
     )
 

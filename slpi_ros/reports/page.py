@@ -1,4 +1,4 @@
-"""One self-contained HTML page: text, tables, pictures and interactive charts, nothing to fetch."""
+"""One self-contained HTML page of text, tables, pictures and interactive charts; it loads nothing."""
 
 import base64
 import html
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 Severity = Literal["good", "warn", "bad"]
 
-# Whatever a page holds, a browser that shows it must fetch nothing.
-_NOTHING_FROM_OUTSIDE = (
+# A browser that shows a page must load nothing, whatever the page holds.
+_CONTENT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; "
     "base-uri 'none'; form-action 'none'"
 )
@@ -63,26 +63,26 @@ class Page:
         target = "" if axis is None else f' id="{html.escape(f"axis-{axis}")}"'
         self._parts.append(f"<h2{target}>{html.escape(text)}</h2>")
 
-    def verdict(self, axis: str, text: str, mood: Severity, word: str = "") -> None:
+    def verdict(self, axis: str, text: str, severity: Severity, word: str = "") -> None:
         """Add the sentence that sums up an axis, after a word; its element has the id ``verdict-<axis>``."""
         name, before = html.escape(f"verdict-{axis}"), f"<b>{html.escape(word.replace('_', ' '))}</b> " if word else ""
         said = f' data-verdict="{html.escape(word)}"' if word else ""
-        self._parts.append(f'<p class="verdict {mood}" id="{name}"{said}>{before}{html.escape(text)}</p>')
+        self._parts.append(f'<p class="verdict {severity}" id="{name}"{said}>{before}{html.escape(text)}</p>')
 
     def tiles(self, figures: Mapping[str, str]) -> None:
-        """Add figures that are seen at a glance, each with what it is."""
+        """Add key figures, by name."""
         tiles = (
             f"<div><b>{html.escape(text)}</b><span>{html.escape(name)}</span></div>" for name, text in figures.items()
         )
         self._parts.append(f'<div class="tiles">{"".join(tiles)}</div>')
 
     def findings(self, found: Iterable[Finding]) -> None:
-        """Add what was found about a record."""
+        """Add the findings on a record."""
         items = (f'<li><b class="{one.level}">{one.level}</b>{html.escape(one.text)}</li>' for one in found)
         self._parts.append(f'<ul class="findings">{"".join(items)}</ul>')
 
     def shares(self, parts: Sequence[Share]) -> None:
-        """Add a bar of parts of a whole, and what they are."""
+        """Add a bar of parts of a whole, with their names and shares."""
         bar = (f'<div style="flex:{part.share:.4f} 0 0;background:{part.colour}"></div>' for part in parts)
         keys = (
             f'<li><i style="background:{part.colour}"></i>{html.escape(part.name)} <b>{part.share:.0%}</b></li>'
@@ -114,7 +114,7 @@ class Page:
         self._parts.append(f"<p>{html.escape(text)}</p>")
 
     def definitions(self, texts: Mapping[str, str]) -> None:
-        """Add terms, each with what it is."""
+        """Add a list of terms and their definitions."""
         items = (f"<dt>{html.escape(term)}</dt><dd>{html.escape(text)}</dd>" for term, text in texts.items())
         self._parts.append(f"<dl>{''.join(items)}</dl>")
 
@@ -158,7 +158,7 @@ class Page:
         scripts = ("plotly-cartesian.min.js", "page.js") if self._has_charts else ()
         document = (
             f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-            f'<meta http-equiv="Content-Security-Policy" content="{_NOTHING_FROM_OUTSIDE}">'
+            f'<meta http-equiv="Content-Security-Policy" content="{_CONTENT_POLICY}">'
             f'<meta name="viewport" content="width=device-width"><style>{_asset("page.css")}</style></head>'
             f"<body><h1>{title}</h1>{''.join(self._parts)}"
             f"{''.join(f'<script>{_asset(name)}</script>' for name in scripts)}</body></html>"

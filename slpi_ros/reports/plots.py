@@ -1,4 +1,4 @@
-"""The pictures: loops, tracking, errors; µm and nm on the axes."""
+"""Pictures for pages without interactive charts: loops, tracking, errors; µm and nm on the axes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,25 +9,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slpi_ros.reports.chart import COLOURS as COLOURS
-from slpi_ros.reports.chart import DESIRED as DESIRED
-from slpi_ros.reports.chart import MEASURED as MEASURED
+from slpi_ros.reports.chart import COLOURS, DESIRED, MEASURED
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Run:
-    """A path followed in one way.
+    """Desired and achieved displacement along a path.
 
     Parameters
     ----------
     name : str
-        How.
+        How the stage was driven.
     t : ndarray, shape (N,), seconds
     desired : ndarray, shape (N,), metres
     displacement : ndarray, shape (N,), metres
-        What the stage did.
+        Achieved.
     """
 
     name: str
@@ -37,12 +35,12 @@ class Run:
 
     @property
     def error(self) -> FloatArray:
-        """Displacement less desired displacement, shape (N,), metres."""
+        """Achieved - desired displacement, shape (N,), metres."""
         return self.displacement - self.desired
 
 
 def loops(v: FloatArray, y: FloatArray, simulated: FloatArray) -> Figure:
-    """Draw displacement over voltage, measured and simulated, and the difference over time of the same samples.
+    """Draw displacement over voltage, measured and simulated, and measured - model beside it.
 
     Parameters
     ----------
@@ -54,13 +52,13 @@ def loops(v: FloatArray, y: FloatArray, simulated: FloatArray) -> Figure:
     left.plot(v, simulated * 1e6, color=COLOURS[2], linewidth=0.8, label="model")
     label(left, "voltage (V)", "displacement (µm)")
     left.legend(frameon=False)
-    right.plot(v, (simulated - y) * 1e9, ".", color=COLOURS[2], markersize=2)
-    label(right, "voltage (V)", "model less measured (nm)")
+    right.plot(v, (y - simulated) * 1e9, ".", color=COLOURS[2], markersize=2)
+    label(right, "voltage (V)", "measured - model (nm)")
     return figure
 
 
 def tracking(runs: Mapping[str, Run]) -> Figure:
-    """Draw what was desired and what each way of driving made of it, and the errors below."""
+    """Draw desired and achieved displacement of each run, and the errors below."""
     figure, (upper, lower) = panels(2, 1, (11, 6.4), height_ratios=(3, 2), sharex=True)
     for colour, run in zip(COLOURS, runs.values(), strict=False):
         upper.plot(run.t, run.displacement * 1e6, color=colour, linewidth=1.1, label=run.name)
@@ -74,7 +72,7 @@ def tracking(runs: Mapping[str, Run]) -> Figure:
 
 
 def linearity(runs: Mapping[str, Run]) -> Figure:
-    """Draw achieved over desired displacement, one panel for each way of driving: a straight line is the aim."""
+    """Draw achieved over desired displacement, one panel for each run."""
     figure, drawn = panels(1, len(runs), (11, 3.9), sharex=True, sharey=True)
     for panel, colour, run in zip(drawn, COLOURS, runs.values(), strict=False):
         panel.plot(run.desired * 1e6, run.displacement * 1e6, color=colour, linewidth=0.9)

@@ -1,4 +1,4 @@
-"""What a model holds, in words."""
+"""Models and changes of models as lines of text."""
 
 from collections.abc import Iterable
 
@@ -7,12 +7,12 @@ from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops
 from slpi_ros.identification.refit import AxisChange
-from slpi_ros.model.axis_model import StartMemory
-from slpi_ros.model.stage_model import AxisModel, StageModel
+from slpi_ros.model.axis_model import AxisModel, StartMemory
+from slpi_ros.model.stage_model import StageModel
 
 
 def describe_model(model: StageModel) -> list[str]:
-    """Return lines that say what a model holds, in µm and nm."""
+    """Return lines of text on a model, in µm and nm."""
     head = f"stage '{model.hardware_id}'" if model.hardware_id else "stage of unknown hardware id"
     lines = [f"{head}, identified {model.created or 'at an unknown time'}"]
     for name, axis in model.axes.items():
@@ -21,7 +21,7 @@ def describe_model(model: StageModel) -> list[str]:
 
 
 def describe_axis(axis: AxisModel) -> list[str]:
-    """Return lines that say what one axis holds."""
+    """Return lines of text on one axis."""
     quality, start, end = axis.quality, axis.start, axis.end
     (v_low, v_high), (y_low, y_high) = axis.voltage_range, axis.displacement_range
     began = "a memory taken for wiped" if start.history else "rest"
@@ -29,7 +29,7 @@ def describe_axis(axis: AxisModel) -> list[str]:
     return [
         f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {_parts(axis.hysteresis)}",
         f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} um "
-        f"({quality.covered:.0%} of the model seen)",
+        f"({quality.covered:.0%} of the model covered)",
         f"memory starts where the record did: {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um",
         f"and ends where the record did, at {end.voltage:.4g} V, {end.displacement * 1e6:.4g} um, "
         f"with {len(end.history)} turning voltages"
@@ -37,7 +37,7 @@ def describe_axis(axis: AxisModel) -> list[str]:
         else "the memory at the end of the record is not known",
         f"error on the record: {quality.rms * 1e9:.1f} nm rms ({quality.rms / stroke:.3%} of the displacement range), "
         f"{quality.maximum * 1e9:.1f} nm at most",
-        f"error on blocks left out: {quality.held_out_rms * 1e9:.1f} nm rms; "
+        f"held-out error: {quality.held_out_rms * 1e9:.1f} nm rms; "
         f"sensor noise about {quality.floor_rms * 1e9:.1f} nm rms",
         f"from {quality.samples} samples of {quality.source}",
         *(f"{effect.name}: {effect.describe()}" for effect in axis.effects),
@@ -59,8 +59,18 @@ def describe_start(model: StageModel, axes: Iterable[str], start_memory: StartMe
 
 
 def describe_change(axis: str, change: AxisChange) -> list[str]:
-    """Return lines that say what an update changed in one axis, in nm."""
-    verdict = "the stage has changed" if change.drifted else "no change beyond repeatability"
+    """Return lines of text on what a refit changed in one axis, in nm."""
+    found = change.match
+    same = max(abs(found.gain_change), found.gain_uncertainty)
+    zero = f"the zero has moved by {found.offset * 1e6:+.3g} um since" if found.zero_moved else ""
+    if change.drifted:
+        verdict = f"the stage has changed{f' and {zero}' if zero else ''}"
+    elif zero:
+        verdict = f"{zero}; the loops are the same within {same:.2%}"
+    else:
+        verdict = f"no change beyond repeatability; the loops are the same within {same:.2%}"
+    if change.match.known_from:
+        verdict += "; the initial history of the new record is not known and was not judged"
     return [
         f"axis {axis}: {verdict}: the old model's error on the new record is {change.error_before * 1e9:.1f} nm rms, "
         f"it was known to {change.repeatability * 1e9:.1f} nm",
@@ -70,7 +80,7 @@ def describe_change(axis: str, change: AxisChange) -> list[str]:
 
 
 def _parts(model: Hysteresis) -> str:
-    """Say what a model is made of."""
+    """Return the elements of a model as text."""
     match model:
         case LoopFamily():
             return f"{model.grid.size} loop vertices"

@@ -113,6 +113,8 @@ def describe_verification(found: Verification) -> list[str]:
         told = [("pass: " if axis.passed else "fail: ") + _summary(name, axis).removeprefix(f"Axis {name}: ")]
         for record in axis.records:
             told += [f"{record.error.name}: {line}" for line in (_error(record), *_notes(record))]
+            if record.tracking:
+                told += [f"{record.error.name}: {line}" for line in _tracking_notes(record.tracking)]
         told.append(f"{'error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}")
         for part in (axis.overall, *axis.by_level, *axis.by_speed, *axis.by_region):
             told.append(f"{part.name:<24}{part.samples:9}{part.rms * 1e9:9.1f}{part.maximum * 1e9:10.1f}")
@@ -134,7 +136,7 @@ def _summary(name: str, axis: AxisVerification) -> str:
 def _error(record: RecordVerification) -> str:
     error = record.error
     return (
-        f"measured - model is {_nm(error.rms)} rms, {_nm(error.maximum)} at most; {_nm(record.limit)} rms pass; "
+        f"measured - model is {_nm(error.rms)} rms (limit {_nm(record.limit)}), maximum {_nm(error.maximum)}; "
         f"noise floor {_nm(record.floor_rms)} rms"
     )
 
@@ -144,18 +146,15 @@ def _notes(record: RecordVerification) -> list[str]:
     start = (
         "the start is unknown: the initial history and the offset are those that best explain the record"
         if record.known_from is None
-        else f"the start is unknown: judged from {record.known_from:.4g} s on, when both ends of the voltage range had "
-        "been visited"
+        else f"the start is unknown: judged from {record.known_from:.4g} s on, where it adds nothing but a constant"
     )
     notes = [start]
     if record.zero_moved:
         notes.append(f"the zero has moved by {_um(record.offset)} µm, which does not count as an error")
     if not record.passed:
-        notes.append(f"the displacement changes by {record.gain:+.2%} more than the model says")
+        notes.append(f"against the model the gain is {record.gain:+.2%}, the width of the loops {record.width:+.2%}")
     if record.outside:
         notes.append(f"{record.outside} voltages lie outside of what the model was identified on: extrapolated there")
-    if record.tracking:
-        notes += _tracking_notes(record.tracking)
     return notes
 
 
@@ -163,7 +162,7 @@ def _tracking_notes(tracking: Tracking) -> list[str]:
     """Return how well a compensator did, and the causes of its error."""
     error = tracking.error
     told = sorted(tracking.shares.items(), key=lambda item: -item[1])
-    shares = [f"{cause} {share:.0%}" for cause, share in told if share >= _SMALLEST_SHARE]
+    shares = [f"{cause} {share:.0%}" for cause, share in told if abs(share) >= _SMALLEST_SHARE]
     notes = [
         f"measured - desired is {_nm(error.rms)} rms, {_nm(error.maximum)} at most; of its mean square: "
         f"{', '.join(shares) or 'nothing'}",
@@ -232,7 +231,7 @@ def _show_record(page: Page, name: str, record: RecordVerification) -> None:
     motion = Motion.of(t, v)
     models = [Curve("model", record.model, AFTER)]
     over_time, said = views.over_time(t, y, models, record.floor_rms, fitted=record.judged)
-    not_judged = "" if record.judged.all() else f" Shaded: not judged, here called '{views.UNFITTED}'."
+    not_judged = "" if record.judged.all() else " Shaded: before the memory is known."
     page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus and minus the floor.{not_judged} {said}")
     over_voltage, said = views.over_voltage(v, y - record.model, motion, record.floor_rms, record.judged)
     page.chart(f"{name}-residual", over_voltage, f"Over rising and falling voltage, and the histogram. {said}")
@@ -244,9 +243,11 @@ def _show_record(page: Page, name: str, record: RecordVerification) -> None:
 def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
     """Add where the error of a compensated path comes from."""
     page.subsection("Measured - desired displacement")
-    page.shares([Share(cause, max(share, 0.0), COLOUR[cause]) for cause, share in tracking.shares.items()])
+    shares = {cause: share for cause, share in tracking.shares.items() if share >= _SMALLEST_SHARE}
+    whole = sum(shares.values())
+    page.shares([Share(cause, share / whole, COLOUR[cause]) for cause, share in shares.items()])
+    page.definitions({cause: CAUSES[cause] for cause in shares})
     page.lines(_tracking_notes(tracking))
-    page.definitions({cause: CAUSES[cause] for cause, share in tracking.shares.items() if share >= _SMALLEST_SHARE})
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)
     error = np.sum(list(tracking.parts.values()), axis=0)
     t, desired = tracking.t, tracking.desired

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.design_matrix import Walk
-from slpi_ros.identification.drive import hold_band, resting, smallest_turn, turning_points
+from slpi_ros.identification.drive import hold_band, resting, smallest_turn
 from slpi_ros.identification.signal_statistics import digit, noise
 from slpi_ros.reports.chart import (
     COLOURS,
@@ -25,9 +26,9 @@ from slpi_ros.reports.chart import (
     SAMPLES,
     SCALE,
     TIME,
-    UNFITTED_MEASURED,
-    UNFITTED_MODEL,
-    UNFITTED_SHADE,
+    UNUSED_MEASURED,
+    UNUSED_MODEL,
+    UNUSED_SHADE,
     VOLTAGE,
     Chart,
     Panel,
@@ -48,7 +49,7 @@ SINCE = Quantity("time since the last reversal or stop", "s", digits=".3~g", log
 FREQUENCY = Quantity("frequency", "Hz", digits=".4~g", logarithmic=True)
 DENSITY = Quantity("spectral density", "nm/√Hz", 1e9, ".3~g", logarithmic=True)
 # In the legends.
-UNFITTED = "not fitted"
+UNUSED = "not used"
 
 # Samples to each side over which the speed is taken.
 _REACH = 3
@@ -94,7 +95,7 @@ class Motion:
         if v.size < _FEWEST_ARRIVALS or not np.ptp(v) > 0.0:
             return cls(np.zeros(v.size), t - t[:1], v.copy(), np.array([0, max(v.size - 1, 0)]))
         noise_rms = noise(v, t)
-        runs = turning_points(v, smallest_turn(v, noise_rms))
+        runs = reversals(v, smallest_turn(v, noise_rms))
         rests, _ = resting(t, v, hold_band(v, noise_rms, digit(v)))
         stops = np.unique(np.concatenate([[0], runs, _arrivals(v, runs), rests]))
         last = stops[np.searchsorted(stops, np.arange(v.size), side="right") - 1]
@@ -167,9 +168,9 @@ def loops(
     line = _straight(v, np.where(fitted, y, np.nan))[at]
     curves = [(Curve("measured", y, MEASURED), 3.0), *((model, 1.1) for model in models)]
     if not fitted.all():
-        colours = [UNFITTED_MEASURED, *(UNFITTED_MODEL for _ in models)]
+        colours = [UNUSED_MEASURED, *(UNUSED_MODEL for _ in models)]
         others = [
-            (Curve(f"{one.name}, {UNFITTED}", one.values, colour), width)
+            (Curve(f"{one.name}, {UNUSED}", one.values, colour), width)
             for (one, width), colour in zip(curves, colours, strict=True)
         ]
         _add_loops(chart, others, across, line, at, ~fitted)
@@ -249,7 +250,7 @@ def over_time(
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, ERROR, 1.2)], "column", 540)
     for start, stop in _rows(np.zeros(t.size, dtype=bool) if fitted is None else ~fitted):
         for panel in (0, 1):
-            chart.span(panel, UNFITTED, float(t[start]), float(t[stop]), UNFITTED_SHADE)
+            chart.span(panel, UNUSED, float(t[start]), float(t[stop]), UNUSED_SHADE)
     left = [y - model.values for model in models]
     kept = thin_line(y, *left)
     chart.line(0, "measured", t[kept], y[kept], MEASURED, width=2.6)
@@ -278,7 +279,7 @@ def over_voltage(v: FloatArray, left: FloatArray, motion: Motion, noise: float, 
     """Draw a residual, shape (N,), metres, over voltage (V), by direction, and its histogram where `fitted`."""
     chart = Chart([Panel(VOLTAGE, ERROR, 3.0), Panel(SAMPLES, ERROR, 1.0)], height=420)
     for name, colour, chosen in (
-        (UNFITTED, UNFITTED_MEASURED, ~fitted),
+        (UNUSED, UNUSED_MEASURED, ~fitted),
         ("rising", RISING, fitted & (motion.speed > 0.0)),
         ("falling", FALLING, fitted & (motion.speed < 0.0)),
     ):
@@ -287,7 +288,7 @@ def over_voltage(v: FloatArray, left: FloatArray, motion: Motion, noise: float, 
         if part.size:
             chart.dots(0, name, v[part], left[part], colour)
     chart.band(0, noise)
-    histogram(chart, 1, Curve("fitted samples", left[fitted], MEASURED))
+    histogram(chart, 1, Curve("used samples", left[fitted], MEASURED))
     return chart, focus(chart, (0, 1), [left], fitted)
 
 

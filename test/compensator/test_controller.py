@@ -13,21 +13,26 @@ rclpy = pytest.importorskip("rclpy")
 
 from nodes.ros_helpers import axis_model, stage_model, voltage_path  # noqa: E402
 
-from slpi_ros.compensator.controller import Compensation  # noqa: E402
+from slpi_ros.compensator.controller import Controller  # noqa: E402
 from slpi_ros.compensator.validation import CAUSES, RejectedError  # noqa: E402
 from slpi_ros.errors import SlpiError, UsageError  # noqa: E402
-from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel, Start  # noqa: E402
-from slpi_ros.model.streaming import MAX_DT, Limits  # noqa: E402
+from slpi_ros.model.axis_model import Start  # noqa: E402
+from slpi_ros.model.limits import MAX_DT, Limits  # noqa: E402
+from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel  # noqa: E402
 
 MS = 1_000_000
 START_NS = 1_700_000_000_123_456_789
 
 
 def compensation(axes=("x",), model=None, **limits):
-    made = Compensation(axes, [Limits(**{"lower": 0.0, "upper": 100.0, **limits})] * len(axes))
-    made.active = True
+    made = Controller(axes, [Limits(**{"lower": 0.0, "upper": 100.0, **limits})] * len(axes))
+    made.activate(0)
     made.use_model(model or stage_model(axes))
     return made
+
+
+def update(made, stamp_ns, names, displacements):
+    return made.update(stamp_ns, names, displacements, max(stamp_ns, 0))
 
 
 def snapshots(made):
@@ -46,7 +51,7 @@ def test_answers_are_the_library_s():
         expected = model.compensate(np.arange(3000) * 5e-3, wanted)
     for i, (x, y) in enumerate(zip(wanted["x"], wanted["y"], strict=True)):
         order = (["x", "y"], [x, y]) if i % 3 else (["y", "x"], [y, x])
-        made.move(START_NS + 5 * MS * i, *order)
+        update(made, START_NS + 5 * MS * i, *order)
         assert made.voltages[0] == pytest.approx(expected["x"][i], abs=1e-9)
         assert made.voltages[1] == pytest.approx(expected["y"][i], abs=1e-9)
     assert made.counts.accepted == 3000 and made.counts.rejected == 0
@@ -54,10 +59,10 @@ def test_answers_are_the_library_s():
 
 def test_axes_that_are_not_named_keep_their_voltage():
     made = compensation(("x", "y"))
-    made.move(START_NS, ["y"], [5e-6])
+    update(made, START_NS, ["y"], [5e-6])
     voltage = made.voltages[1]
     for i in range(1, 10):
-        made.move(START_NS + i * MS, ["x"], [i * 1e-6])
+        update(made, START_NS + i * MS, ["x"], [i * 1e-6])
         assert made.voltages[1] == voltage
 
 
@@ -74,10 +79,10 @@ REJECTIONS = {
 @pytest.mark.parametrize("cause", REJECTIONS)
 def test_a_rejected_message_moves_nothing(cause):
     made = compensation(("x", "y"))
-    made.move(START_NS, ["x", "y"], [3e-6, 4e-6])
+    update(made, START_NS, ["x", "y"], [3e-6, 4e-6])
     before, voltages = snapshots(made), list(made.voltages)
     with pytest.raises(RejectedError) as caught:
-        made.move(START_NS + MS, *REJECTIONS[cause])
+        update(made, START_NS + MS, *REJECTIONS[cause])
     assert caught.value.cause == cause
     assert made.counts.by_cause == {**dict.fromkeys(CAUSES, 0), cause: 1}
     assert (made.counts.received, made.counts.accepted, made.counts.rejected) == (2, 1, 1)
@@ -85,39 +90,39 @@ def test_a_rejected_message_moves_nothing(cause):
 
 
 def test_nothing_moves_before_a_model_or_activation():
-    made = Compensation(["x"], [Limits(0.0, 100.0)])
+    made = Controller(["x"], [Limits(0.0, 100.0)])
     causes = []
     for _ in range(2):
         with pytest.raises(RejectedError) as caught:
-            made.move(START_NS, ["x"], [1e-6])
+            update(made, START_NS, ["x"], [1e-6])
         causes.append(caught.value.cause)
-        made.active = True
+        made.activate(0)
     assert causes == ["inactive", "no_model"]
 
 
 def test_time_is_compared_in_nanoseconds_and_for_each_axis():
     made = compensation(("x", "y"))
-    made.move(START_NS, ["x"], [2e-6])
-    made.move(START_NS - 50 * MS, ["y"], [1e-6])
+    update(made, START_NS, ["x"], [2e-6])
+    update(made, START_NS - 50 * MS, ["y"], [1e-6])
     with pytest.raises(RejectedError) as caught:
-        made.move(START_NS - 1, ["y", "x"], [2e-6, 2e-6])
+        update(made, START_NS - 1, ["y", "x"], [2e-6, 2e-6])
     assert caught.value.cause == "time_backwards"
     made.use_model(stage_model(("x", "y"), stroke=9e-6))
     with pytest.raises(RejectedError):
-        made.move(START_NS - 1, ["x"], [2e-6])
+        update(made, START_NS - 1, ["x"], [2e-6])
 
 
 def test_what_is_just_out_of_reach_is_held_and_the_path_after_it_is_as_before():
     made = compensation()
     top = stage_model().axis("x").displacement_range[1]
-    made.move(START_NS, ["x"], [0.0])
+    update(made, START_NS, ["x"], [0.0])
     assert made.counts.held_at_limit == 0
-    assert made.move(START_NS + 1, ["x"], [1.1 * top])
+    assert update(made, START_NS + 1, ["x"], [1.1 * top])
     assert made.voltages[0] == 100.0 and made.counts.held_at_limit == 1
-    assert not made.move(START_NS + 2, ["x"], [0.5 * top])
+    assert not update(made, START_NS + 2, ["x"], [0.5 * top])
     clean = compensation()
     for i, y in enumerate((top, 0.5 * top)):
-        clean.move(START_NS + i, ["x"], [y])
+        update(clean, START_NS + i, ["x"], [y])
     assert made.voltages[0] == pytest.approx(clean.voltages[0], abs=1e-9)
 
 
@@ -127,7 +132,7 @@ def test_slew_is_respected_from_the_first_sample_on():
     last = made.voltages[0]
     reached = 0
     for i, y in enumerate(path):
-        made.move(START_NS + i * MS, ["x"], [y])
+        update(made, START_NS + i * MS, ["x"], [y])
         assert abs(made.voltages[0] - last) <= (0.5 if i else 0.0) + 1e-9
         reached += abs(made.axes[0].stream.memory.displacement - y) < 1e-12
         last = made.voltages[0]
@@ -146,7 +151,7 @@ def test_a_new_model_takes_over_where_the_voltage_is(slew):
             made.use_model(StageModel({"x": narrow}))
             assert made.voltages[0] == before
         last = made.voltages[0]
-        made.move(START_NS + i * MS, ["x"], [min(y, narrow.displacement_range[1])])
+        update(made, START_NS + i * MS, ["x"], [min(y, narrow.displacement_range[1])])
         assert 0.0 <= made.voltages[0] <= 100.0
         assert abs(made.voltages[0] - last) <= slew * 1e-3 + 1e-9
 
@@ -162,25 +167,25 @@ def refused_models():
 @pytest.mark.parametrize(("why", "axes"), list(refused_models()))
 def test_a_refused_model_leaves_the_old_one_working(why, axes):
     made = compensation()
-    made.move(START_NS, ["x"], [4e-6])
+    update(made, START_NS, ["x"], [4e-6])
     before, model = snapshots(made), made.model
     with pytest.raises(SlpiError, match=why):
         made.use_model(StageModel(axes))
     assert snapshots(made) == before and made.model is model
-    made.move(START_NS + MS, ["x"], [5e-6])
+    update(made, START_NS + MS, ["x"], [5e-6])
 
 
 def test_limits_change_while_it_runs_unless_they_leave_the_stage_outside():
     made = compensation()
-    made.move(START_NS, ["x"], [5e-6])
+    update(made, START_NS, ["x"], [5e-6])
     before = snapshots(made)
     made.use_limits([Limits(0.0, 70.0, 1000.0)])
     assert snapshots(made) == before
-    made.move(START_NS + 10**9, ["x"], [9e-6])
+    update(made, START_NS + 10**9, ["x"], [9e-6])
     assert made.voltages[0] == 70.0
     with pytest.raises(UsageError, match="move it inside first"):
         made.use_limits([Limits(0.0, 60.0)])
-    made.forget_model()
+    made.cleanup()
     with pytest.raises(UsageError, match="move it inside first"):
         made.use_limits([Limits(0.0, 60.0)])
 
@@ -201,14 +206,14 @@ LIMITS = st.tuples(st.floats(-50.0, 40.0), st.floats(1.0, 120.0), st.sampled_fro
 def test_no_flood_brings_a_voltage_outside(events, bounds):
     lower, width, slew = bounds
     limits = Limits(lower, lower + width, slew)
-    made = Compensation(("x", "y"), [limits] * 2)
-    made.active = True
+    made = Controller(("x", "y"), [limits] * 2)
+    made.activate(0)
     try:
         made.use_model(stage_model(("x", "y")))
     except UsageError:
         return
-    clean = Compensation(("x", "y"), [limits] * 2)
-    clean.active = True
+    clean = Controller(("x", "y"), [limits] * 2)
+    clean.activate(0)
     clean.use_model(stage_model(("x", "y")))
     now, last = START_NS, list(made.voltages)
     latest: dict[str, int] = {}
@@ -227,11 +232,11 @@ def test_no_flood_brings_a_voltage_outside(events, bounds):
         step, names, displacements = event
         now += step
         try:
-            made.move(now, names, displacements)
+            update(made, now, names, displacements)
         except RejectedError:
             assert list(made.voltages) == last
         else:
-            clean.move(now, names, displacements)
+            update(clean, now, names, displacements)
             for name, before, after in zip("xy", last, made.voltages, strict=True):
                 assert limits.lower <= after <= limits.upper
                 elapsed = min(max(now - latest.get(name, now), 0) * 1e-9, MAX_DT)

@@ -10,7 +10,8 @@ from strategies import FAMILY_CASE, fractions
 
 from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.errors import UsageError
-from slpi_ros.model.streaming import Limits, StreamingInverse
+from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.streaming import StreamingInverse
 
 INF = float("inf")
 NAN = float("nan")
@@ -166,26 +167,27 @@ def test_a_wrong_gain_leaves_no_error(wrong):
 @given(scripts(), st.just(INF) | fractions(1, 1e5), fractions(0, 100), gains_drawn)
 def test_the_voltage_keeps_to_its_limits_and_their_slew(script, slew, start, gains):
     feedback = Feedback(gains, Limits(0.0, 100.0, slew), start)
-    before, moved_limits = None, False
+    before = None
     for action, sample, new_gains in script:
         voltage = feedback.voltage
         act(feedback, action, sample, new_gains)
-        moved_limits = moved_limits or action == "limits"
+        limits = feedback.limits
         if action not in ("correct", "hold"):
             assert feedback.voltage == voltage
             continue
-        assert feedback.limits.lower <= feedback.voltage <= feedback.limits.upper
-        if not moved_limits and slew < INF:
-            reach = slew * (sample[0] - before) if before is not None else 0.0
-            assert abs(feedback.voltage - voltage) <= reach + 1e-12 * 100
-        before, moved_limits = sample[0], False
+        reach = slew * (sample[0] - before) if before is not None and slew < INF else 0.0 if slew < INF else INF
+        assert abs(feedback.voltage - voltage) <= reach + 1e-12 * 100
+        # Outside of new limits it goes inside at full pace.
+        outside, was_outside = (max(limits.lower - v, v - limits.upper, 0.0) for v in (feedback.voltage, voltage))
+        assert outside <= max(was_outside - reach, 0.0) + 1e-12 * 100
+        before = sample[0]
 
 
 @given(st.lists(samples_drawn, min_size=1), st.just(INF) | fractions(1, 1000), gains_drawn)
 def test_a_disabled_feedback_gives_what_the_stream_gives(samples, slew, gains):
     limits = Limits(5.0, 80.0, slew)
     stream = StreamingInverse(FAMILY_CASE.memory(), (2e-6, 14e-6), limits)
-    feedback, t = Feedback(gains, limits), 0.0
+    feedback, t = Feedback(gains, limits, 5.0), 0.0
     for dt, share, measured, _ in samples:
         t += dt
         desired = 8e-6 + 0.4 * share
@@ -256,18 +258,20 @@ def test_a_slew_limit_neither_winds_the_integral_up_nor_makes_it_forget(sign):
     assert feedback.correction == pytest.approx(learnt, abs=0.1)
 
 
-def test_new_limits_bring_the_voltage_inside_at_once():
-    feedback = Feedback(PID, Limits(0.0, 100.0, 1.0), 60.0)
+@pytest.mark.parametrize("acceleration", [INF, 1e3])
+def test_a_voltage_outside_goes_inside_as_a_rate_limiter_lets_it_and_no_faster(acceleration):
+    """One rule for feedforward and feedback: at the start, and within new limits."""
+    outside = Limits(0.0, 40.0, 10.0, acceleration)
+    feedback, pace, v = Feedback(PID, Limits(0.0, 100.0, 10.0, acceleration), 60.0), RateLimiter(outside), 60.0
     feedback.hold(0.0, 60.0)
-    feedback.limits = Limits(0.0, 40.0, 1.0)
-    assert feedback.hold(0.1, 60.0) == 40.0
-    feedback.limits = Limits(70.0, 90.0, 1.0)
-    assert feedback.hold(0.1, 60.0) == 70.0
-    assert feedback.hold(0.6, 90.0) == 70.5
-
-
-def test_the_start_is_brought_inside_the_limits():
-    assert [Feedback(PID, STAGE, voltage).voltage for voltage in (-5.0, 30.0, 120.0)] == [0.0, 30.0, 100.0]
+    feedback.limits = outside
+    for k in range(1, 30):
+        v = pace.step(v, 40.0, 0.1 * k - 0.1 * (k - 1))
+        assert feedback.hold(0.1 * k, 60.0) == pytest.approx(v, abs=1e-9)
+    assert v == pytest.approx(40.0, abs=1e-6)
+    feedback = Feedback(PID, Limits(0.0, 100.0, 10.0), 120.0)
+    assert [feedback.hold(0.1 * k, 50.0) for k in range(4)] == pytest.approx([120.0, 119.0, 118.0, 117.0])
+    assert Feedback(PID, STAGE, 120.0).hold(0.0, 50.0) == 50.0
 
 
 # On, off and other gains.
@@ -484,7 +488,8 @@ def test_the_same_samples_give_the_same_voltages(script):
     one, other = Feedback(PID, STAGE), Feedback(PID, STAGE)
     play(one, script)
     play(other, script)
-    assert vars(one) == vars(other)
+    states = [{**vars(each), "pace": (each.pace.limits, each.pace.rate)} for each in (one, other)]
+    assert states[0] == states[1]
 
 
 # What makes no controller.

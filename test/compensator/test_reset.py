@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model, cases, fractions, paths, stream_forward
 
-from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.persistence import ASSUMED, KNOWN, RESETTING, MemoryConfidence
+from slpi_ros.compensator.controller import Controller, Mode
+from slpi_ros.compensator.persistence import ASSUMED, INTERRUPTED, KNOWN, RESETTING, MemoryConfidence
 from slpi_ros.compensator.ramps import Ramp
 from slpi_ros.errors import UsageError
-from slpi_ros.model.limits import decaying_turns
+from slpi_ros.model.limits import Limits, RateLimiter, decaying_turns
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.streaming import Limits, RateLimiter
 
 LIMITS = Limits(0.0, 100.0)
 
@@ -114,21 +113,21 @@ def stage(voltage: float = 100.0) -> StageModel:
     return StageModel({"x": replace(axis_model(FAMILY_CASE), voltage_range=(0.0, voltage))}, "", "")
 
 
-def reset(limits: Limits, model: StageModel, swaps_to: StageModel | None = None, steps: int = 10**6) -> Compensation:
+def reset(limits: Limits, model: StageModel, swaps_to: StageModel | None = None, steps: int = 10**6) -> Controller:
     """Return a compensator whose memory has been reset, or driven for so many steps."""
-    made = Compensation(["x"], [limits])
+    made = Controller(["x"], [limits])
     made.use_model(model)
-    made.activate(True)
-    made.driving.reset(2, 1000.0, [30.0])
-    arrived = False
-    for _ in range(steps):
-        if arrived := made.drive(0.01):
+    made.activate(0)
+    made.reset_memory(2, 1000.0, [30.0], 0)
+    for k in range(1, steps):
+        assert made.axes[0].confidence.state == RESETTING
+        made.advance(k * 10**7, 0)
+        if made.mode is not Mode.RESETTING:
             break
-    if swaps_to:
-        made.use_model(swaps_to)
-    assert made.axes[0].memory_state == RESETTING
-    assert arrived or steps < 10**6
-    made.driving.stop()
+        if swaps_to and k == 10:
+            made.use_model(swaps_to)
+    assert made.mode is Mode.STREAMING or steps < 10**6
+    made.hold(steps * 10**7)
     return made
 
 
@@ -137,17 +136,16 @@ def reset(limits: Limits, model: StageModel, swaps_to: StageModel | None = None,
     (Limits(20.0, 40.0), ASSUMED), (Limits(0.0, 98.0), ASSUMED), (Limits(2.0, 100.0), ASSUMED),
 ])  # fmt: skip
 def test_only_a_drive_through_all_that_was_identified_makes_the_memory_known(limits, state):
-    trust = reset(limits, stage()).axes[0].trust
+    trust = reset(limits, stage()).axes[0].confidence
     assert trust.state == state
     if state == ASSUMED:
-        assert f"wiped from {limits.lower:g} to {limits.upper:g} V only" in trust.doubt and "\n" not in trust.doubt
-        assert "0 to 100 V" in trust.doubt
+        assert all(f"{v:g}" in trust.doubt for v in (limits.lower, limits.upper, 100.0)) and "\n" not in trust.doubt
     else:
         assert trust.doubt == ""
 
 
 def test_an_interrupted_reset_leaves_the_memory_assumed():
-    assert reset(LIMITS, stage(), steps=5).axes[0].trust == MemoryConfidence(ASSUMED, "the reset was interrupted")
+    assert reset(LIMITS, stage(), steps=5).axes[0].confidence == MemoryConfidence(ASSUMED, INTERRUPTED)
 
 
 def test_a_new_model_knows_the_memory_only_where_it_was_wiped():
@@ -156,9 +154,9 @@ def test_a_new_model_knows_the_memory_only_where_it_was_wiped():
     for after, state in ((wider, ASSUMED), (noisy, KNOWN), (narrower, KNOWN)):
         made = reset(limits, stage())
         made.use_model(after)
-        assert made.axes[0].memory_state == state
-        assert reset(limits, stage(), swaps_to=after).axes[0].memory_state == state
+        assert made.axes[0].confidence.state == state
+        assert reset(limits, stage(), swaps_to=after).axes[0].confidence.state == state
     # What was not known cannot become so by a model.
     made = reset(Limits(0.0, 90.0), stage())
     made.use_model(narrower)
-    assert made.axes[0].memory_state == ASSUMED
+    assert made.axes[0].confidence.state == ASSUMED

@@ -1,25 +1,22 @@
 """Axes whose models know effects, at run time: messages, trajectories, swaps, pauses, feedback, reset."""
 
 from dataclasses import replace
-from unittest import mock
 
 import numpy as np
 import pytest
 from strategies import FAMILY_CASE, PI_CASE, axis_model
 
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.controller import Compensation
-from slpi_ros.compensator.driving import Driving
+from slpi_ros.compensator.controller import Controller, Mode
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.model_swap import take_over
-from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.resonance import Resonance
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.streaming import Limits
 
 MS, START = 1_000_000, 10**18
 DT = 1e-3
@@ -38,21 +35,21 @@ PATHS = {"x": 2e-6 + 4e-6 * RISE * (1 + 0.3 * np.sin(15 * T)), "y": 3e-6 * RISE 
 
 
 def compensation(model=COUPLED, limits=LIMITS):
-    made = Compensation(list(model.axes), [limits] * len(model.axes))
-    made.active = True
+    made = Controller(list(model.axes), [limits] * len(model.axes))
+    made.activate(START)
     made.use_model(model)
     return made
 
 
 def move(made, k, *names):
     names = list(names or PATHS)
-    made.move(START + k * MS, names, [float(PATHS[name][k]) for name in names])
+    made.update(START + k * MS, names, [float(PATHS[name][k]) for name in names], START + k * MS)
     return list(made.voltages)
 
 
 def with_effects(*effects, limits=LIMITS, settings=OFF):
     model = replace(X, effects=effects)
-    axis = Axis("x", 0, limits, settings, lambda: 0.0)
+    axis = Axis("x", 0, limits, settings)
     axis.use(model, axis.prepare(model))
     return axis
 
@@ -76,56 +73,78 @@ def test_an_axis_that_is_not_named_keeps_its_voltage_and_is_reckoned_with():
     assert x.uncoupled_displacement + 0.05 * y.uncoupled_displacement == pytest.approx(PATHS["x"][399], abs=2e-9)
 
 
-def give(made, trajectory):
-    """Return the voltages of every point, shape (N, axes)."""
-    made.following.start(trajectory, lambda: START, START)
+def follow(made, paths=PATHS, first=0, start_ns=0):
+    """Let a trajectory of one point every millisecond take over, its time counted from `first`."""
+    rows = np.column_stack(list(paths.values()))
+    made.follow(list(paths), np.arange(len(rows)) * MS, rows, start_ns, START + first * MS, START + first * MS)
+
+
+def give(made, count=T.size, start=0):
+    """Return the voltages after each millisecond, shape (count, axes)."""
     given = []
-    for k in range(len(trajectory)):
-        made.follow(START + k * MS)
+    for k in range(start, start + count):
+        while made.advance(START + k * MS, START + k * MS):
+            pass
         given.append(list(made.voltages))
     return np.array(given)
 
 
-def trajectory(paths=PATHS):
-    return Trajectory.of(list(paths), np.arange(T.size) * MS, np.column_stack(list(paths.values())), axes=["x", "y"])
-
-
 def test_trajectories_are_followed_as_messages_are():
     made, twin = compensation(), compensation()
-    given = give(made, trajectory())
+    follow(made)
     expected = np.array([move(twin, k) for k in range(T.size)])
-    np.testing.assert_allclose(given, expected, rtol=0, atol=1e-5)
-    assert made.following.points_held == made.following.points_slewing == 0
+    np.testing.assert_allclose(give(made), expected, rtol=0, atol=1e-9)
+    assert made.counts.points_held == made.counts.points_slewing == 0 and made.mode is Mode.STREAMING
 
 
 def test_a_path_reckons_with_axes_that_another_path_brings_elsewhere():
-    """Until it takes over, x moves on; what y is then asked for is planned for where x will be."""
+    """Until it takes over, x moves on; what y is then asked for is compensated for where x is."""
     made, twin = compensation(), compensation()
-    begin = START + 300 * MS
-    first, second = (slice(0, 300), slice(300, 600))
-    x = Trajectory.of(["x"], np.arange(300) * MS, PATHS["x"][first, None], axes=["x", "y"])
-    y = Trajectory.of(["y"], np.arange(300) * MS, PATHS["y"][second, None], begin, axes=["x", "y"])
-    made.following.start(x, lambda: START, START)
-    made.following.start(y, lambda: START, START)
-    with mock.patch.object(Axis, "move", None):
-        given = []
-        for k in range(600):
-            made.follow(START + k * MS)
-            given.append(list(made.voltages))
+    follow(made, {"x": PATHS["x"][:300]})
+    follow(made, {"y": PATHS["y"][300:]}, start_ns=START + 300 * MS)
+    given = give(made)
     # A pause of y before its path; a jump of x in both.
     twin.axes[1].stamps.accept(START)
     expected = np.array([move(twin, k, "x" if k < 300 else "y") for k in range(600)])
-    np.testing.assert_allclose(given, expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(given, expected, rtol=0, atol=1e-9)
 
 
-def test_a_known_path_is_previewed_against_a_delay():
-    model = StageModel(
-        {name: replace(axis, effects=(Delay(0.02), *axis.effects)) for name, axis in COUPLED.axes.items()}
-    )
-    given = give(compensation(model), trajectory())
-    seen = model.simulate(T, {"x": given[:, 0], "y": given[:, 1]})
+DELAYED = StageModel({name: replace(axis, effects=(Delay(0.02), *axis.effects)) for name, axis in COUPLED.axes.items()})
+
+
+@pytest.mark.parametrize("start", [0, 50])
+def test_points_are_given_earlier_by_the_delay_where_possible(start):
+    """At once: those that would have had to be given before are left out. Stamped for later: none is."""
+    made = compensation(DELAYED)
+    follow(made, start_ns=START + start * MS if start else 0)
+    assert made.trajectory.remaining == T.size - (0 if start else 20)
+    given = give(made, T.size + start)
+    seen = DELAYED.simulate(DT * np.arange(len(given)), {"x": given[:, 0], "y": given[:, 1]})
     for name, path in PATHS.items():
-        np.testing.assert_allclose(seen[name][:-25], path[:-25], rtol=0, atol=2e-8)
+        np.testing.assert_allclose(seen[name][start:][25:], path[25:], rtol=0, atol=2e-8)
+    assert made.trajectory.skipped == 0
+
+
+def test_axes_with_delays_of_their_own_arrive_together():
+    model = StageModel({
+        "x": replace(X, effects=(Delay(0.02),)), "y": replace(Y, effects=(Delay(-0.005),)),
+    })  # fmt: skip
+    made = compensation(model)
+    follow(made, start_ns=START + 50 * MS)
+    assert made.trajectory.remaining == T.size
+    given = give(made, T.size + 60)
+    assert made.trajectory.skipped == 0 and made.mode is Mode.STREAMING
+    seen = model.simulate(DT * np.arange(len(given)), {"x": given[:, 0], "y": given[:, 1]})
+    for name, path in PATHS.items():
+        np.testing.assert_allclose(seen[name][50 : 50 + T.size], path, rtol=0, atol=1e-9)
+
+
+def test_a_late_single_point_is_given_at_once():
+    made, undelayed = compensation(DELAYED), compensation()
+    for each in (made, undelayed):
+        follow(each, {"x": PATHS["x"][300:301]})
+        each.advance(START, START)
+    assert list(made.voltages) == list(undelayed.voltages) != [0.0, 0.0]
 
 
 @pytest.mark.parametrize("effects", [(LAG,), (CREEP,), (LAG, CREEP)])
@@ -134,7 +153,7 @@ def test_the_same_model_again_changes_nothing(effects):
     for k, y in enumerate(PATHS["x"].tolist()):
         if k in (150, 300):
             other.use(one.model, other.prepare(one.model))
-        assert other.move(DT if k else 0.0, y) == pytest.approx(one.move(DT if k else 0.0, y), abs=1e-6)
+        assert other.update(DT if k else 0.0, y, 0) == pytest.approx(one.update(DT if k else 0.0, y, 0), abs=1e-6)
 
 
 @pytest.mark.parametrize("before", [(), (LAG,), (CREEP,), (LAG, CREEP, MODE)])
@@ -142,19 +161,19 @@ def test_the_same_model_again_changes_nothing(effects):
 def test_the_voltage_does_not_jump_when_another_model_takes_over(before, after):
     axis = with_effects(*before)
     for k, y in enumerate(PATHS["x"][:110].tolist()):
-        axis.move(DT if k else 0.0, y)
+        axis.update(DT if k else 0.0, y, 0)
     voltage, model = axis.voltage, replace(X, effects=after)
     axis.use(model, axis.prepare(model))
     assert axis.voltage == voltage
     for y in PATHS["x"][110:].tolist():
-        axis.move(DT, y)
+        axis.update(DT, y, 0)
     assert not axis.held
 
 
 def test_the_way_that_is_kept_over_a_restart_ends_with_the_command():
     axis = with_effects(LAG)
     for k, y in enumerate(PATHS["x"][:110].tolist()):
-        axis.move(DT if k else 0.0, y)
+        axis.update(DT if k else 0.0, y, 0)
     assert axis.reversal_voltages[-1] == axis.voltage != axis.stream.memory.voltage
     assert take_over(axis.model, LIMITS, axis.reversal_voltages).voltage == axis.voltage
 
@@ -164,12 +183,12 @@ def test_creep_goes_on_in_a_pause():
     axis, patient = with_effects(CREEP), with_effects(CREEP)
     for k, y in enumerate(PATHS["x"][:180].tolist()):
         for each in (axis, patient):
-            each.move(DT if k else 0.0, y)
+            each.update(DT if k else 0.0, y, 0)
     wish = float(PATHS["x"][179])
     for _ in range(2000):
-        patient.move(DT, wish)
+        patient.update(DT, wish, 0)
     before = axis.voltage
-    assert axis.move(2.0, wish) == pytest.approx(patient.voltage, abs=0.2 * (before - patient.voltage))
+    assert axis.update(2.0, wish, 0) == pytest.approx(patient.voltage, abs=0.2 * (before - patient.voltage))
 
 
 def test_health_knows_the_effects():
@@ -177,8 +196,8 @@ def test_health_knows_the_effects():
     axis = with_effects(LAG, CREEP)
     stage = axis.model.stream()
     for k, y in enumerate(PATHS["x"].tolist()):
-        v = axis.move(DT if k else 0.0, y)
-        axis.measure(stage.drive(v, DT if k else 0.0))
+        v = axis.update(DT if k else 0.0, y, 0)
+        axis.measure(stage.drive(v, DT if k else 0.0), 0)
     assert axis.drift.samples == 500
     assert axis.drift.rms < 1e-12
 
@@ -191,29 +210,32 @@ def test_feedback_with_effects():
         axis = with_effects(LAG, CREEP, settings=each)
         stage = axis.model.stream()
         for k, y in enumerate(np.append(PATHS["x"], np.full(1500, PATHS["x"][-1])).tolist()):
-            v = axis.move(DT if k else 0.0, y)
+            v = axis.update(DT if k else 0.0, y, 0)
             measured = stage.drive(v + 2.0, DT if k else 0.0)
-            axis.measure(measured)
+            axis.measure(measured, 0)
             errors[each.enabled] = abs(measured - y)
     assert errors[True] < 0.05 * errors[False]
 
 
 @pytest.mark.parametrize("effects", [(LAG,), (CREEP,), (LAG, CREEP, MODE)])
 def test_reset_and_ramps_move_the_effects_too(effects):
-    axis = with_effects(*effects, limits=Limits(*X.voltage_range))
-    stage, driving = axis.model.stream(), Driving([axis])
-    driving.reset(3, 2000.0, [0.0])
-    while not driving.step(DT):
-        stage.drive(axis.voltage, DT)
-    stage.drive(axis.voltage, DT)
-    driving.stop()
+    made = Controller(["x"], [Limits(*X.voltage_range)])
+    made.activate(0)
+    made.use_model(StageModel({"x": replace(X, effects=effects)}))
+    (axis,) = made.axes
+    stage, now_ns = axis.model.stream(), 0
+    made.reset_memory(3, 2000.0, [0.0], now_ns)
+    while made.mode is Mode.RESETTING:
+        now_ns += 4 * MS
+        made.advance(now_ns, 0)
+        stage.drive(axis.voltage, 4 * DT)
     assert axis.voltage == pytest.approx(0.0, abs=1e-6)
     assert axis.stream.uncoupled_displacement == pytest.approx(stage.uncoupled_displacement, abs=1e-15)
-    assert axis.memory_state == "known"
+    assert axis.confidence.state == "known"
     # And wishes are met from there.
     errors = []
     for y in np.linspace(stage.uncoupled_displacement, 5e-6, 400).tolist():
-        errors.append(stage.drive(axis.move(DT, y), DT) - y)
+        errors.append(stage.drive(axis.update(DT, y, 0), DT) - y)
     assert np.abs(errors[-50:]).max() < 2e-8
 
 
@@ -223,7 +245,7 @@ def test_reset_and_ramps_move_the_effects_too(effects):
 def test_limits_are_kept_and_told(limits):
     axis, voltages, flags = with_effects(LAG, CREEP, limits=limits), [], set()
     for k in range(1500):
-        voltages.append(axis.move(DT if k else 0.0, 4e-6 if k % 500 < 250 else 9e-6))
+        voltages.append(axis.update(DT if k else 0.0, 4e-6 if k % 500 < 250 else 9e-6, 0))
         flags |= {"held"} if axis.held else set()
         flags |= {"slewing"} if axis.slewing else set()
     assert min(voltages) >= limits.lower

@@ -25,7 +25,7 @@ from slpi_ros.compensator.persistence import (
     save_memory,
 )
 from slpi_ros.errors import ModelError
-from slpi_ros.model.streaming import Limits
+from slpi_ros.model.limits import Limits
 
 MODEL = two_axes()
 SAVED = SavedMemory(
@@ -81,9 +81,9 @@ def test_after_a_crash_it_is_where_the_last_command_led(tmp_path):
 def test_after_a_crash_nothing_is_certain(tmp_path):
     found = crashed(tmp_path / "memory.json")
     assert found.axes["x"] == SavedAxis(SAVED.axes["x"].reversal_voltages, True, CRASHED)
-    assert found.axes["x"].trust((0.0, 50.0)) == MemoryConfidence(ASSUMED, CRASHED)
-    assert SAVED.axes["x"].trust((0.0, 50.0)) == MemoryConfidence(RESTORED, "", (0.0, 50.0))
-    assert SAVED.axes["y"].trust((0.0, 50.0)) == MemoryConfidence()
+    assert found.axes["x"].confidence((0.0, 50.0)) == MemoryConfidence(ASSUMED, CRASHED)
+    assert SAVED.axes["x"].confidence((0.0, 50.0)) == MemoryConfidence(RESTORED, "", (0.0, 50.0))
+    assert SAVED.axes["y"].confidence((0.0, 50.0)) == MemoryConfidence()
 
 
 @given(st.integers(1, 5), st.integers(0, 100), st.integers(0, 300), st.binary(max_size=8))

@@ -10,8 +10,8 @@ from strategies import FAMILY_CASE, axis_model, axis_models, cases_and_paths, st
 
 from slpi_ros.compensator.model_swap import take_over, turning_voltages
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.hysteresis.shape import FAR
-from slpi_ros.model.streaming import Limits
+from slpi_ros.hysteresis.turning_points import FAR
+from slpi_ros.model.limits import Limits
 
 OPEN = Limits(-1e4, 1e4)
 

@@ -8,7 +8,7 @@ import pytest
 import slpi_ros
 from benchmarks.hidden import NAMES, calibration_of, hide
 from benchmarks.hidden.size import beyond_hysteresis
-from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.bag_writer import write_bag
 
 SAMPLES = 12_000
 # All ten take minutes: `make bench-diagnosis`.

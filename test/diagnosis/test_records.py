@@ -91,14 +91,14 @@ def test_a_coarse_sensor_is_no_cause(digits):
 
 
 def test_a_lag_is_proved_on_records_at_other_speeds():
-    physics = Physics(amplifier=Amplifier(lag=12e-3))
+    physics = Physics(amplifier=Amplifier(lag=4e-3))
     pair = [record(hertz, physics, seed=seed) for hertz, seed in ((0.8, 11), (3.0, 12))]
     plain = slpi_ros.identify(pair)
     axis, extended = found(pair, plain)
     first = axis.effects[0]
     assert {"lag", "delay"} & {first.name, *first.alternatives}
     seconds = first.effect.seconds if isinstance(first.effect, Delay) else first.effect.time_constant
-    assert seconds == pytest.approx(12e-3, rel=0.2)
+    assert seconds == pytest.approx(4e-3, rel=0.2)
     assert len(axis.records) == 2 and all(each.left_out_rms < 0.5 * each.before_rms for each in axis.records)
     third = record(5.0, physics, seed=13)
     before, after = (

@@ -17,8 +17,8 @@ from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import CoercivityFollower, RateDependence
 from slpi_ros.effects.registry import in_order
 from slpi_ros.model.document import format_model, parse_model
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.model.streaming import Limits
 from slpi_ros.simulation.dynamics import RateLaw, Viscosity
 
 BARE = replace(axis_model(FAMILY_CASE), voltage_range=(-20.0, 120.0))

@@ -18,17 +18,17 @@ from slpi_ros.effects.registry import EFFECTS, from_document, in_order, to_docum
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.errors import SlpiError
+from slpi_ros.io.schemas import load_schema
 
 EXACT = ("rate_dependence", "creep", "gain_drift", "cross_coupling", "thermal_drift", "sensor_periodic", "hum")
 FOLLOWED = ("lag", "saturation", "creep", "resonance", "sensor_periodic")
 
 
-def test_every_effect_has_its_place():
-    assert list(EFFECTS) == [
-        *("delay", "lag", "saturation", "rate_dependence", "creep", "resonance", "gain_drift", "cross_coupling"),
-        *("thermal_drift", "sensor_periodic", "hum"),
-    ]
-    assert set(BY_NAME) == set(EFFECTS)
+def test_registry_schemas_and_strategies_know_the_same_effects():
+    model, diagnosis = (load_schema(name)["$defs"]["effect"] for name in ("model", "diagnosis"))
+    # The model's schema lists them in the order of the signal chain.
+    assert list(EFFECTS) == model["properties"]["name"]["enum"]
+    assert set(EFFECTS) == set(diagnosis["enum"]) == set(BY_NAME)
     for name, kind in EFFECTS.items():
         assert kind.name == name
 

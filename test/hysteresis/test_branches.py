@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from strategies import cases_and_paths
+from strategies import cases_and_paths, repeated
 
 from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, Piece, trace
 
@@ -56,6 +56,7 @@ STARTS = [(True, False), (True, True), (False, False), (False, True)]
 
 
 @pytest.mark.parametrize(("symmetric_rest", "primed"), STARTS)
+@repeated
 @given(drawn=cases_and_paths(), at_rest=st.integers(1, 3))
 def test_every_moved_sample_lies_on_one_branch_and_the_right_one(symmetric_rest, primed, drawn, at_rest):
     case, path = drawn

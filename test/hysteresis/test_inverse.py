@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import cases_and_paths, stream_forward, stream_inverse
 
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii, play
+from slpi_ros.hysteresis.turning_points import Memory
 
 STREAMED = (stream_forward, stream_inverse)
 IN_BATCHES = (Memory.forward_array, Memory.inverse_array)

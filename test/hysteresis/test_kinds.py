@@ -23,7 +23,7 @@ def test_documents_keep_every_bit(shape):
     document = to_document(shape)
     again = from_document(kind, json.loads(json.dumps(document, allow_nan=False)))
     assert type(again) is type(shape)
-    for name in ("thresholds", "weights") if kind == "pi" else ("grid", "surface", "rise", "edge_gain"):
+    for name in ("thresholds", "weights") if kind == "pi" else ("grid", "everett", "rise", "edge_gain"):
         assert np.array_equal(getattr(again, name), getattr(shape, name))
     assert to_document(again) == document
 
@@ -50,7 +50,7 @@ def test_document_of_every_kind_comes_back(kind):
 
 def test_published_loops_that_contradict_themselves():
     for change in ({"direction": 0}, {"span_V": 0.0}, {"run_in_V": -1.0}, {"weights_m_per_V": [0.0, 1e-7, 0.0]}):
-        with pytest.raises(ModelError, match="loop 1"):
+        with pytest.raises(ModelError, match=r"\b1\b"):
             from_document("slpi-published", {"dead_band_V": 0.0, "loops": [LOOP, {**LOOP, **change}]})
 
 
@@ -104,5 +104,6 @@ def test_huge_whole_numbers_in_a_pi_model(huge):
 
 
 def test_unknown_kind():
-    with pytest.raises(ModelError, match="unknown kind 'bouc-wen'.*slpi, slpi-published, pi"):
+    with pytest.raises(ModelError, match="bouc-wen") as refusal:
         from_document("bouc-wen", {})
+    assert all(kind in str(refusal.value) for kind in DESCRIPTIONS)

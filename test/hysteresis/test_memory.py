@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from strategies import FAMILY_CASE, Case, cases, cases_and_paths, paths, stream_forward, stream_inverse
 
 from slpi_ros.errors import UsageError
-from slpi_ros.hysteresis.memory import Memory, MemoryState
 from slpi_ros.hysteresis.prandtl_ishlinskii import play
+from slpi_ros.hysteresis.turning_points import Memory, MemoryState
 
 NOT_FINITE = (float("nan"), float("inf"), -float("inf"))
 ABSURD = (1e6, -1e6, 1e300, -1e300)

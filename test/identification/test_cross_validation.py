@@ -8,8 +8,8 @@ from identification.records import calibration, record_of, rms
 
 import slpi_ros
 from slpi_ros.errors import UsageError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification import cross_validation as truth
 from slpi_ros.identification.cross_validation import cross_validate
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slpi_ros.hysteresis.memory import Memory
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.bases import PlayBasis, SurfaceBasis
 from slpi_ros.identification.design_matrix import Design, Walk
 

@@ -1,39 +1,12 @@
 """What a voltage does: turns, speeds, holds and the pairs of voltages it visits."""
 
-import itertools
-
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from slpi_ros.hysteresis.reversals import without_small_reversals
-from slpi_ros.identification.drive import Runs, covered, holds, turning_points
+from slpi_ros.identification.drive import Runs, covered, holds
 
 T = np.arange(8000) * 1e-3
 HOLDS = np.interp(T, [0, 1, 2, 3, 5, 6, 8], [0, 100, 100, 20, 20, 80, 80])
-
-
-@given(st.lists(st.integers(0, 12), min_size=2, max_size=60), st.sampled_from([0.0, 0.5, 1.0, 2.0, 5.0]))
-def test_turning_points(values, dead_band):
-    v = np.array(values, float)
-    ends = turning_points(v, dead_band)
-    assert np.all(np.diff(ends) > 0)
-    swing = np.diff(v[ends])
-    assert np.all(swing[1:] * swing[:-1] < 0)
-    assert np.all(np.abs(swing) > dead_band) or (swing.size == 1 and np.ptp(v) <= dead_band)
-    for outside in (v[: ends[0] + 1], v[ends[-1] :]):
-        assert np.ptp(outside) <= dead_band
-    for (start, stop), move in zip(itertools.pairwise(ends), swing, strict=True):
-        # Nothing within a run turns back by more than the dead band.
-        along = v[start : stop + 1] * (1 if move >= 0 else -1)
-        if swing.size > 1:
-            assert np.max(np.maximum.accumulate(along) - along) <= dead_band
-    # The other way in which the package passes over small reversals knows the same turns.
-    flat = without_small_reversals(v, dead_band)
-    way = np.sign(np.diff(flat))
-    way = way[way != 0]
-    assert np.count_nonzero(np.diff(way)) == max(swing.size - 1, 0)
 
 
 def test_speeds_and_holds():

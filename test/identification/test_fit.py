@@ -10,8 +10,8 @@ import slpi_ros
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.fit import KINDS
 from slpi_ros.simulation.paths import scan_path
 
@@ -80,7 +80,7 @@ def test_a_classical_stage_is_identified_by_both_kinds():
 
 def test_identification_is_deterministic(recorded, model):
     again = slpi_ros.identify(recorded[0])
-    np.testing.assert_array_equal(again.axes["x"].hysteresis.surface, model.axes["x"].hysteresis.surface)
+    np.testing.assert_array_equal(again.axes["x"].hysteresis.everett, model.axes["x"].hysteresis.everett)
 
 
 def test_outliers_stale_samples_and_dropouts_do_little_harm(recorded, model):
@@ -237,7 +237,7 @@ def test_several_records_share_one_model(recorded):
 
 def test_one_record_in_a_list_is_that_record(recorded, model):
     again = slpi_ros.identify([recorded[0]]).axes["x"]
-    np.testing.assert_array_equal(again.hysteresis.surface, model.axes["x"].hysteresis.surface)
+    np.testing.assert_array_equal(again.hysteresis.everett, model.axes["x"].hysteresis.everett)
 
 
 def test_records_that_do_not_belong_together(recorded):

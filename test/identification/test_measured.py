@@ -5,7 +5,7 @@ import pytest
 from identification.records import rms
 
 import slpi_ros
-from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.tables import import_table
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from identification.records import record_of
 
 from slpi_ros.errors import IdentificationError
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope, thresholds_for
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.least_squares import solve_qp

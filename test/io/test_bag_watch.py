@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from slpi_ros.errors import UsageError
-from slpi_ros.io.bag_reader import BagWriter, write_bag
-from slpi_ros.io.bag_watch import BagWatch
+from slpi_ros.io.bag_files import BagWatch
+from slpi_ros.io.bag_writer import BagWriter, write_bag
 from slpi_ros.io.record import Record
 
 

@@ -16,7 +16,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.bag_files import partial_path
-from slpi_ros.io.bag_reader import JOINT_STATE, BagWriter, read_bag, write_bag
+from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.bag_writer import BagWriter, write_bag
+from slpi_ros.io.messages import JOINT_STATE
 from slpi_ros.io.record import Record
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -345,7 +347,7 @@ def test_time_that_no_stamp_can_hold(tmp_path):
 FILL_THE_DISK = """
 import sys
 import numpy as np
-from slpi_ros.io.bag_reader import write_bag
+from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.errors import RecordError
 from slpi_ros.io.record import Record
 

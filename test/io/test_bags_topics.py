@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slpi_ros.errors import SlpiError
-from slpi_ros.io.alignment import SeparateTopics, combine
+from slpi_ros.io.alignment import SeparateTopics, Signals, combine
 from slpi_ros.io.bag_reader import read_bag
-from slpi_ros.io.signals import Signals
 
 BOTH = SeparateTopics("command", "sensor")
 MS = 10**6

@@ -5,9 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slpi_ros.errors import RecordError, SlpiError, UsageError
-from slpi_ros.io.column_choice import Wishes
-from slpi_ros.io.columns import DISPLACEMENT, TIME, VOLTAGE, named
-from slpi_ros.io.tables import import_table, import_told
+from slpi_ros.io.columns import DISPLACEMENT, TIME, VOLTAGE, ColumnOptions, parse_column
+from slpi_ros.io.tables import import_table, import_with_summary
 
 UNITS = {
     TIME: {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
@@ -41,7 +40,7 @@ def refusal(kind, call, *args, **kwargs) -> str:
 def test_a_unit_is_read_in_every_notation(known, notation, axis, capital):
     quantity, unit, scale = known
     word = quantity.name.capitalize() if capital else quantity.name
-    column = named(notation.format(f"{word}{axis}", unit), quantity)
+    column = parse_column(notation.format(f"{word}{axis}", unit), quantity)
     assert (column.scale, column.assumed, column.axis) == (scale, False, axis.strip(" _") or "x")
 
 
@@ -65,7 +64,7 @@ def test_a_unit_is_read_in_every_notation(known, notation, axis, capital):
     ],
 )
 def test_names_as_programs_write_them(name, quantity, unit, axis):
-    column = named(name, quantity)
+    column = parse_column(name, quantity)
     assert (column.unit, column.axis, column.assumed) == (unit, axis, False)
 
 
@@ -83,7 +82,7 @@ def test_names_as_programs_write_them(name, quantity, unit, axis):
     ],
 )
 def test_a_name_without_a_unit(name, quantity, axis):
-    column = named(name, quantity)
+    column = parse_column(name, quantity)
     assert (column.unit, column.assumed, column.axis) == (quantity.default, True, axis)
 
 
@@ -109,7 +108,7 @@ def test_a_name_without_a_unit(name, quantity, axis):
     ],
 )
 def test_another_unit_is_refused(name, quantity, unit):
-    message = refusal(RecordError, named, name, quantity)
+    message = refusal(RecordError, parse_column, name, quantity)
     assert f"column '{name}': '{unit}' is no unit of {quantity.name}" in message
     assert all(known in message for known in quantity.units)
 
@@ -117,7 +116,7 @@ def test_another_unit_is_refused(name, quantity, unit):
 @given(st.text(max_size=30), st.sampled_from([TIME, VOLTAGE, DISPLACEMENT]))
 def test_any_name_is_read_or_refused(name, quantity):
     try:
-        column = named(name, quantity)
+        column = parse_column(name, quantity)
     except SlpiError:
         return
     assert column.unit in quantity.units and column.axis
@@ -179,15 +178,17 @@ def test_a_column_has_one_role(table):
 
 def test_an_import_tells_columns_units_and_ranges(table):
     path = table("time_ms,voltage_mV,displacement_nm", "0,0,-500", "1,100000,19800", "2,5,")
-    assert import_told(path, Wishes())[1] == ("axis x: voltage_mV 0 to 100 V, displacement_nm -0.5 to 19.8 um",)
+    assert import_with_summary(path, ColumnOptions())[1] == (
+        "axis x: voltage_mV 0 to 100 V, displacement_nm -0.5 to 19.8 um",
+    )
     path = table("Time,Voltage,x_V,Position,displacement_y_um", "0,1,2,3,4", "1,5,6,7,8")
-    wishes = Wishes(voltage=("Voltage", "x_V"), displacement=("position", "displacement_y_um"))
-    lines = import_told(path, wishes)[1]
+    options = ColumnOptions(voltage=("Voltage", "x_V"), displacement=("position", "displacement_y_um"))
+    lines = import_with_summary(path, options)[1]
     assert lines == (
         "time: column 'Time' taken as s",
         "axis x: Voltage 1 to 5 V (unit assumed), Position 3 to 7 um (unit assumed)",
         "axis y: x_V 2 to 6 V, displacement_y_um 4 to 8 um",
     )
     path = table("time_s,voltage_V,displacement", "0,1,", "1,5,nan")
-    lines = import_told(path, Wishes(displacement_unit="nm"))[1]
+    lines = import_with_summary(path, ColumnOptions(displacement_unit="nm"))[1]
     assert lines == ("axis x: voltage_V 1 to 5 V, displacement without a value",)

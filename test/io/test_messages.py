@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from slpi_ros.errors import RecordError
+from slpi_ros.io.bag_reader import decode_signals
 from slpi_ros.io.bag_storage import MessageBlock
-from slpi_ros.io.messages import JOINT_STATE, JointStateBlock, encode_joint_states, joint_state_layout
-from slpi_ros.io.signals import decode_signals
+from slpi_ros.io.messages import JOINT_STATE, JointStateBlock, encode_joint_states, read_message
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -39,7 +39,6 @@ def decode(*messages, blocks=1):
     return decode_signals(
         [MessageBlock.of(part.tolist(), [messages[row] for row in part]) for part in parts],
         JOINT_STATE,
-        lambda data: STORE.deserialize_cdr(data, JOINT_STATE),
     )
 
 
@@ -56,16 +55,18 @@ def test_all_at_once_agrees_with_one_by_one(names, frame_id, velocities, data):
     given_rows = st.lists(numbers, min_size=len(names), max_size=len(names))
     drawn = data.draw(st.lists(st.tuples(stamps, given_rows, given_rows), min_size=1, max_size=5))
     messages = [serialised(t, names, p, e, frame_id, [1.0] * velocities) for t, p, e in drawn]
-    assert joint_state_layout(tuple(names), frame_id, velocities).decode(rows(*messages)) is not None
+    assert read_message(messages[0], JOINT_STATE).layout.decode(rows(*messages)) is not None
     alike = decode(*messages)
     # one more message of another length leaves only the slow way
     each = decode(*messages, serialised(1, [*names, "one more"], [], []))
     assert alike.frame_id == frame_id
     stamp = np.zeros(len(drawn)) if alike.stamp is None else alike.stamp
     assert stamp.tolist() == each.stamp[:-1].tolist() == [stamp for stamp, _, _ in drawn]
-    for name in names:
-        for field in ("position", "effort"):
-            np.testing.assert_array_equal(alike.fields[field][name], each.fields[field][name][:-1])
+    for column, name in enumerate(names):
+        for place, field in ((1, "position"), (2, "effort")):
+            given_values = [row[place][column] for row in drawn]
+            np.testing.assert_array_equal(alike.fields[field][name], given_values)
+            np.testing.assert_array_equal(each.fields[field][name][:-1], given_values)
 
 
 def test_names_of_one_length_are_not_mixed_up():
@@ -95,7 +96,7 @@ def test_short_arrays_and_absent_joints_are_nan(blocks):
 def test_blocks_in_the_order_of_the_log():
     messages = [serialised(t, ["a"], [t], [-t]) for t in (1, 2, 3, 4)]
     blocks = [MessageBlock.of([30, 40], messages[2:]), MessageBlock.of([10, 30], messages[:2])]
-    signals = decode_signals(blocks, JOINT_STATE, lambda data: STORE.deserialize_cdr(data, JOINT_STATE))
+    signals = decode_signals(blocks, JOINT_STATE)
     assert signals.logged.tolist() == [10, 30, 30, 40]
     assert signals.fields["position"]["a"].tolist() == signals.stamp.tolist() == [1, 3, 2, 4]
 
@@ -107,7 +108,7 @@ def test_big_endian_messages():
 
 def test_garbage_in_padding_and_at_the_end():
     clean = serialised(7, ["x", "long"], [1, 2], [3, 4], "id")
-    layout = joint_state_layout(("x", "long"), "id")
+    layout = read_message(clean, JOINT_STATE).layout
     dirty = bytearray(clean)
     for place in np.flatnonzero(~layout.fixed):
         if not any(first <= place < first + 16 for _, first in layout.fields.values()):
@@ -129,7 +130,8 @@ def test_rclpy_both_ways():
     assert (read.header.stamp.sec, read.header.stamp.nanosec) == (12, 34)
     assert (read.header.frame_id, list(read.name)) == ("stage", ["x", "another"])
     assert (list(read.position), list(read.effort)) == ([1.5, 2.5], [3.5, 4.5])
-    again = joint_state_layout(names, "stage").decode(rows(*[serialization.serialize_message(read)] * 3))
+    message = serialization.serialize_message(read)
+    again = read_message(message, JOINT_STATE).layout.decode(rows(*[message] * 3))
     assert again is not None
     assert again["sec"].tolist() == [12] * 3
     assert again["nanosec"].tolist() == [34] * 3

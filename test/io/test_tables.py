@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.io.bag_reader import read_bag, write_bag
+from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.tables import import_table, read_table, write_table
 
 MEASURED = {

@@ -21,8 +21,8 @@ from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.thermal_drift import ThermalDrift
 from slpi_ros.errors import ModelError, SlpiError
 from slpi_ros.model.document import format_model, parse_model
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
-from slpi_ros.model.streaming import Limits
 
 # Rest is not at a limit.
 X = replace(axis_model(FAMILY_CASE), voltage_range=(-20.0, 120.0))

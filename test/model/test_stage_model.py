@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 from strategies import FAMILY_CASE, PI_CASE, axis_model, axis_models, cases, fractions, paths
 
 from slpi_ros.errors import RecordError, SlpiError, UnreachableError, UsageError
-from slpi_ros.hysteresis.memory import Memory
-from slpi_ros.model.stage_model import AxisModel, HeldAtLimitWarning, StageModel, Start
-from slpi_ros.model.streaming import Limits
+from slpi_ros.hysteresis.turning_points import Memory
+from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.limits import Limits
+from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
 
 T = np.arange(5.0)
 X = axis_model(FAMILY_CASE)

@@ -15,8 +15,8 @@ from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.errors import SlpiError
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
-from slpi_ros.model.streaming import Limits, StreamingInverse
 
 LAG, MODE = Lag(0.015), Resonance(150.0, 0.02)
 RATE = RateDependence(0.1, 2e-8, 0.7, 500.0, 2.0)
@@ -185,7 +185,7 @@ def test_snapshots_and_twins(effects, at):
 
 
 def test_without_effects_there_is_nothing_in_the_way():
-    assert type(X.stream()) is StreamingInverse
+    assert X.stream().timeless
     stream = X.stream()
     followed(stream, path()[:500], T[:500])
     twin, state = stream.copy(), stream.snapshot()

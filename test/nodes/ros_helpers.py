@@ -21,7 +21,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from slpi_ros.hysteresis.loop_family import LoopFamily
-from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.stage_model import StageModel
 
 RELIABLE = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

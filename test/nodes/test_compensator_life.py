@@ -23,8 +23,9 @@ from slpi_ros.hysteresis.multi_slope import (  # noqa: E402
     MultiSlope,
     thresholds_for,
 )
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Start  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
-from slpi_ros.model.stage_model import AxisModel, FitQuality, StageModel, Start  # noqa: E402
+from slpi_ros.model.stage_model import StageModel  # noqa: E402
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP

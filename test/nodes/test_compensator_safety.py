@@ -18,9 +18,9 @@ from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
+from slpi_ros.compensator.ramps import PERIOD  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
-from slpi_ros.model.streaming import MAX_DT  # noqa: E402
-from slpi_ros.nodes.compensator_driver import PERIOD  # noqa: E402
+from slpi_ros.model.limits import MAX_DT  # noqa: E402
 
 SAFE = {"safe_voltage": 10, "ramp_rate": 200.0}
 MS = 1_000_000

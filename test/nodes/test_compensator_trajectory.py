@@ -1,4 +1,4 @@
-"""Trajectories over DDS: compensated as one block, given at their own times, replaced and cancelled."""
+"""Trajectories over DDS: accepted as a whole, given at their own times, replaced and cancelled."""
 
 import time
 from pathlib import Path

@@ -21,10 +21,10 @@ from nodes.ros_helpers import LATCHED, RELIABLE, stage_model, voltage_path  # no
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_msgs.msg import Float64, String  # noqa: E402
 
-from slpi_ros.compensator.controller import Compensation  # noqa: E402
+from slpi_ros.compensator.controller import Controller  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
+from slpi_ros.model.limits import MAX_DT, Limits  # noqa: E402
 from slpi_ros.model.stage_model import StageModel  # noqa: E402
-from slpi_ros.model.streaming import MAX_DT, Limits  # noqa: E402
 
 AXES = ["x", "y"]
 MODEL = stage_model(AXES)
@@ -53,17 +53,17 @@ class Twin:
     """What the node must be like: a compensator without ROS, and the promises that every answer has to keep."""
 
     def __init__(self, model: StageModel = MODEL) -> None:
-        self.compensation = Compensation(AXES, [Limits(LOW, HIGH, SLEW)] * 2)
-        self.compensation.activate(True)
-        self.compensation.use_model(model)
+        self.controller = Controller(AXES, [Limits(LOW, HIGH, SLEW)] * 2)
+        self.controller.activate(0)
+        self.controller.use_model(model)
         self.answers: list[list[float]] = []
         self._last_ns: int | None = None
 
     def wish(self, row: list[float], stamp_ns: int) -> None:
         """Take a valid sample."""
-        before = list(self.compensation.voltages)
-        self.compensation.move(stamp_ns, AXES, row)
-        answer = list(self.compensation.voltages)
+        before = list(self.controller.voltages)
+        self.controller.update(stamp_ns, AXES, row, 0)
+        answer = list(self.controller.voltages)
         elapsed = 0.0 if self._last_ns is None else min(max(stamp_ns - self._last_ns, 0) * 1e-9, MAX_DT)
         for v, last in zip(answer, before, strict=True):
             assert LOW <= v <= HIGH
@@ -218,9 +218,9 @@ def test_two_hundred_models_during_motion(model_file):
             model = StageModel(model.axes, model.hardware_id, f"model {i}")
             models.publish(String(data=format_model(model)))
             client.report("the new model", **{"model.created": f"model {i}"})
-            before = list(twin.compensation.voltages)
-            twin.compensation.use_model(model)
-            assert list(twin.compensation.voltages) == before
+            before = list(twin.controller.voltages)
+            twin.controller.use_model(model)
+            assert list(twin.controller.voltages) == before
         _, values = client.report(models_refused=0)
         assert "Traceback" not in client.node.stderr
     v = np.array(twin.answers)

@@ -14,11 +14,11 @@ rclpy = pytest.importorskip("rclpy")
 
 from nodes.ros_helpers import stage_model  # noqa: E402
 
-from slpi_ros.compensator.controller import Compensation  # noqa: E402
+from slpi_ros.compensator.controller import Controller  # noqa: E402
 from slpi_ros.compensator.validation import RejectedError  # noqa: E402
 from slpi_ros.errors import SlpiError  # noqa: E402
 from slpi_ros.model.document import format_model, parse_model  # noqa: E402
-from slpi_ros.model.streaming import Limits  # noqa: E402
+from slpi_ros.model.limits import Limits  # noqa: E402
 
 SLPI = json.loads(format_model(stage_model()))
 PI = copy.deepcopy(SLPI)
@@ -62,10 +62,10 @@ def spoilt(draw: st.DrawFn) -> str:
 @settings(max_examples=300)
 @given(spoilt(), st.integers(0, 2**32 - 1))
 def test_a_spoilt_document_is_refused_or_harmless(text, seed):
-    made = Compensation(["x"], [Limits(0.0, 100.0)])
-    made.active = True
+    made = Controller(["x"], [Limits(0.0, 100.0)])
+    made.activate(0)
     made.use_model(stage_model())
-    made.move(1, ["x"], [3e-6])
+    made.update(1, ["x"], [3e-6], 0)
     before = made.voltages[0]
     try:
         model = parse_model(text, "spoilt")
@@ -77,7 +77,7 @@ def test_a_spoilt_document_is_refused_or_harmless(text, seed):
     low, high = model.axis("x").displacement_range
     for i, y in enumerate(np.random.default_rng(seed).uniform(low - 0.2 * (high - low), high + 0.2 * (high - low), 40)):
         try:
-            made.move(2 + i, ["x"], [float(y)])
+            made.update(2 + i, ["x"], [float(y)], 0)
         except RejectedError:
             continue
         assert 0.0 <= made.voltages[0] <= 100.0

@@ -30,7 +30,8 @@ from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from slpi_ros.identification.fit import identify  # noqa: E402
-from slpi_ros.io.bag_reader import read_bag, write_bag  # noqa: E402
+from slpi_ros.io.bag_reader import read_bag  # noqa: E402
+from slpi_ros.io.bag_writer import write_bag  # noqa: E402
 from slpi_ros.io.record import Record  # noqa: E402
 from slpi_ros.io.schemas import validate  # noqa: E402
 from slpi_ros.model.document import load_model, parse_model  # noqa: E402

@@ -107,6 +107,19 @@ def test_every_command_is_answered_in_order_with_what_the_stage_does():
     assert stamps == sorted(stamps) and stamps[0][0] > 0
 
 
+def test_a_restart_finds_the_stage_as_it_was_left():
+    history, commands = [60.0, 20.0, 80.0], [[30.0], [50.0], [10.0]]
+    with simulator(noise_rms=0.0, seed=3, initial_history=history) as (bench, process):
+        bench.connect(process, axes=1)
+        for command in commands:
+            bench.send(*command)
+        bench.spin_until(lambda: len(bench.moved()) >= len(commands), process)
+        states = bench.moved()
+    left, fresh = (expected(3, ["x"], [*before, *commands])[-3:] for before in ([[v] for v in [*history, 0.0]], []))
+    assert [list(state.position) for state in states] == left != fresh
+    assert all(state.header.frame_id == "simulated-3" for state in states)
+
+
 def test_the_amplifier_saturates():
     with simulator(noise_rms=0, voltage_min=0, voltage_max=80) as (bench, process):
         bench.connect(process, axes=1)

@@ -8,16 +8,18 @@ import subprocess
 import numpy as np
 import pytest
 
-from slpi_ros.papers import compound, measured, page
+from slpi_ros.papers import compound, measured, page, slpi_exhibits
 from slpi_ros.papers import mpi_exhibits as mpi_paper
 from slpi_ros.papers.exhibit import Exhibit
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
+def written(tmp_path_factory, random, slpi_shown):
     """Write the page with the SLPI paper's part as it is, and short stand-ins for what takes long."""
     short = [Exhibit("Fig. 2 of the other paper", "what it says", "what we found <1 µm", "a remark")]
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "study", lambda turns: random)
+        patch.setattr(slpi_exhibits, "exhibits", lambda study: slpi_shown)
         patch.setattr(mpi_paper, "exhibits", lambda: short)
         patch.setattr(compound, "exhibits", lambda: [])
         return page.write_experiments(tmp_path_factory.mktemp("page") / "new" / "folder", None)

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.kinds import from_document, to_document
-from slpi_ros.hysteresis.memory import Memory
 from slpi_ros.hysteresis.slpi_published import separate
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.papers.published import TABLES, THRESHOLDS, ramps, table_loops, table_model
 
 FloatArray = NDArray[np.float64]

@@ -76,7 +76,7 @@ def test_all_is_said_without_javascript(written):
     assert verdicts == [NAMED, NOTHING_FOUND]
     for words in (
         *("Holds go on by 31 nm.", "A line stands at 50 Hz.", "thermal_drift", "slpi excite --for creep"),
-        *("repeats: 9 moves", "150.0", "37.5", "6.0", "75.0 %", "once in 500 records", "85%", "12%", "unexplained"),
+        *("repeats: 9 moves", "150.0", "37.5", "6.0", "75.0 %", "0.002", "85%", "12%", "unexplained"),
     ):
         assert words in text
     assert set(page.charts) == {f"{axis}-{chart}" for axis in "xy" for chart in CHARTS}

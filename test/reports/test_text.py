@@ -7,7 +7,7 @@ import numpy as np
 from slpi_ros.effects.hum import Hum
 from slpi_ros.effects.lag import Lag
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.model.stage_model import AxisModel, FitQuality, Start
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.reports.text import describe_axis
 
 

@@ -56,5 +56,5 @@ def test_the_clip_comes_after_the_lag():
     "wrong", [{"lower": 5.0, "upper": 5.0}, {"lag": -1.0}, {"softness": -0.1}, {"delay": float("nan")}]
 )
 def test_what_is_no_amplifier(wrong):
-    with pytest.raises(UsageError, match="gives nothing"):
+    with pytest.raises(UsageError):
         Amplifier(**wrong)

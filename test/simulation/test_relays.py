@@ -134,6 +134,6 @@ def test_scale_and_all_down():
 def test_a_voltage_out_of_range_is_refused_and_changes_nothing(voltage):
     relays = triangle()
     before = relays.step(30)
-    with pytest.raises(UsageError, match="is not within"):
+    with pytest.raises(UsageError):
         relays.step(voltage)
     assert relays.step(30) == before

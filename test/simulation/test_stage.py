@@ -22,7 +22,7 @@ def test_axes_move_independently_and_in_order():
 
 
 def test_axes_must_be_there_and_unique():
-    with pytest.raises(UsageError, match="no axis"):
+    with pytest.raises(UsageError):
         Stage({})
-    with pytest.raises(UsageError, match="not unique"):
+    with pytest.raises(UsageError, match=r"\bx\b"):
         Stage.random(["x", "x"], seed=0)

@@ -1,0 +1,74 @@
+"""The memory at the start, over DDS: what is assumed is said once, a reset comes first where wanted."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from nodes.compensator_client import compensator  # noqa: E402
+from nodes.ros_helpers import stage_model  # noqa: E402
+from rclpy.qos import qos_profile_sensor_data  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+
+from slpi_ros.model.document import save_model  # noqa: E402
+from slpi_ros.model.stage_model import StageModel  # noqa: E402
+
+
+def ended_model() -> StageModel:
+    """Return a stage whose record ended within a loop."""
+    axis = stage_model().axis("x")
+    quality = replace(axis.quality, held_out_rms=8e-9, floor_rms=8e-9)
+    end = axis.after(np.array([100.0, 0.0, 80.0, 20.0, 60.0]))
+    return StageModel({"x": replace(axis, end=end, quality=quality)}, "stage under test", "")
+
+
+@pytest.fixture
+def x_file(tmp_path: Path) -> str:
+    path = tmp_path / "x.json"
+    save_model(ended_model(), path)
+    return str(path)
+
+
+def test_what_is_assumed_is_said_once_and_a_measurement_chooses(x_file):
+    model = ended_model().axis("x")
+    with compensator(model_file=x_file) as client:
+        client.connect()
+        _, values = client.report(memory="assumed")
+        assert float(values["x.voltage_V"]) == pytest.approx(60.0, abs=1e-4)
+        client.graph.spin_until(lambda: "~/reset_memory" in client.node.stderr, "what is assumed")
+        measured = client.graph.publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
+        measured.publish(JointState(name=["x"], position=[model.start.displacement]))
+        client.report("the other memory", **{"x.voltage_V": f"{model.start.voltage:.4f}"})
+        # What comes now is the library's answer from there.
+        assert client.ask(["x"], [5e-6]) == pytest.approx([model.memory("start").inverse(5e-6)], abs=1e-9)
+        assert client.node.stderr.count("~/reset_memory") == 1
+
+
+def test_a_measurement_that_fits_no_memory_is_a_warning(x_file):
+    with compensator(model_file=x_file, start_memory="wiped") as client:
+        client.connect()
+        measured = client.graph.publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
+        measured.publish(JointState(name=["x"], position=[-1.5e-6]))
+        status = client.graph.wait_for_status(
+            f"{client.name}: compensator", lambda status: status.level == b"\1", "the warning"
+        )
+        assert "~/reset_memory" in status.message
+        _, values = client.report(memory="assumed")
+        assert values["x.memory_doubt"]
+
+
+def test_a_reset_comes_before_the_first_command_where_that_is_wanted(x_file):
+    told = {"reset_on_start": True, "reset_rate": 400.0, "reset_cycles": 2}
+    with compensator(model_file=x_file, **told) as client:
+        client.connect()
+        client.report(memory="resetting")
+        client.wish(["x"], [5e-6])
+        client.report("the rejection", **{"rejected.resetting": 1})
+        client.report(memory="known")
+        assert "the memory is assumed" not in client.node.stderr
+        way = np.array(client.answers)[:, 0]
+        assert way.max() == pytest.approx(100.0) and way.min() == pytest.approx(0.0, abs=1e-9)
+        assert client.ask(["x"], [5e-6])[0] > 0.0

@@ -13,6 +13,8 @@ from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
 from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, Selection, counts, select
+from slpi_ros.effects.base import Effect
+from slpi_ros.effects.creep import Creep
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.initial_history import histories
@@ -31,6 +33,8 @@ FloatArray = NDArray[np.float64]
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects that do the same wherever they are not told apart: one of them may stand for the other.
 SAME_ELSEWHERE = ({"delay", "lag"},)
+# What creeps on from before a record is the stage's where all records agree within this share.
+BEGAN_ALIKE = 0.3
 # Initial histories explain a record as well as the best one with so many times its error; a zero has moved when that is
 # so many times the error. The gain is compared on so many stretches, of so many samples at least.
 AS_WELL, ZERO, STRETCHES, FEWEST = 1.1, 4.0, 8, 50
@@ -212,10 +216,10 @@ def _starts(model: AxisModel, part: Part) -> list[Start]:
     ends = np.array([min(low, v0), max(high, v0)])
     whole = Samples(np.append(v0, ends), np.zeros(3), np.ones(3, dtype=bool))
     # Whatever went before, a sweep over the whole range ends at one displacement.
-    swept = model.memory().forward_array(ends)[-1]
+    swept = model.memory("start").forward_array(ends)[-1]
     found = [model.start] if model.start.voltage == v0 else []
     for history in dict.fromkeys((part.history, model.start.history, *histories(whole))):
-        way = replace(model, start=Start(v0, 0.0, history)).memory().forward_array(ends)[-1]
+        way = replace(model, start=Start(v0, 0.0, history)).memory("start").forward_array(ends)[-1]
         found.append(Start(v0, float(swept - way), history))
     return found
 
@@ -303,7 +307,9 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
         start=Start(float(first.v[0]), starts[0], first.history),
         voltage_range=(float(voltage.min()), float(voltage.max())),
         displacement_range=(float(y.min()), float(y.max())),
-        effects=tuple(effect for effect in now.with_uncertainty() if not isinstance(effect, EachRecord)),
+        effects=tuple(
+            _creeping_on(effect, now) for effect in now.with_uncertainty() if not isinstance(effect, EachRecord)
+        ),
         quality=replace(
             model.quality,
             rms=float(np.sqrt(np.mean(errors**2))),
@@ -315,3 +321,14 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
         ),
     )
     return replace(extended, end=extended.after(now.u))
+
+
+def _creeping_on(effect: Effect, now: Explanation) -> Effect:
+    """Return a creep that goes on from a move before the record, where all of several records say the same of it."""
+    records = len(now.evidence.parts)
+    if not isinstance(effect, Creep) or records == 1 or now.began.size != records or not effect.gains[0]:
+        return effect
+    moves = -now.began / effect.gains[0]
+    initial = float(np.mean(moves))
+    alike = bool(np.all(np.abs(moves - initial) <= BEGAN_ALIKE * abs(initial)))
+    return replace(effect, initial=initial) if alike else effect

@@ -336,6 +336,8 @@ class Explanation:
         What the effects add behind the hysteresis, or lead round it.
     settling : ndarray, shape (N,), metres
         What still goes on at the start of the record from moves before it.
+    began : ndarray, shape (k,), metres
+        How much of it, of each record one behind the other.
     """
 
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
@@ -363,6 +365,7 @@ class Explanation:
     def _fit(self) -> None:
         fit = self.joint.fit(self.target, self._before)
         self._x, self.settling = fit.x, self._before @ fit.gains
+        self.began = fit.gains[: len(self._starting)]
         self._loops = [cache(partial(self._loop, fit.x, k)) for k in range(len(self.evidence.parts))]
 
     @property

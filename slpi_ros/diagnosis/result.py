@@ -182,6 +182,8 @@ class AxisDiagnosis:
         One for each record.
     dropped : tuple of str
         Effects that were found on some records and make others worse.
+    given : Given or None
+        How well the given model does as it is.
     """
 
     verdict: str
@@ -196,6 +198,7 @@ class AxisDiagnosis:
     traces: Traces
     records: tuple[RecordOutcome, ...] = ()
     dropped: tuple[str, ...] = ()
+    given: "Given | None" = None
 
     def to_document(self) -> dict[str, Any]:
         """Return the axis's part of the diagnosis document."""
@@ -330,6 +333,7 @@ def judged(
         traces=_traces(base, now),
         records=records,
         dropped=selection.dropped,
+        given=given,
     )
 
 

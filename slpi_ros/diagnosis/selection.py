@@ -339,7 +339,8 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
-    rivals: dict[str, list[Contender]] = {}
+    # Their effects alone: a fit takes much room.
+    rivals: dict[str, list[Effect]] = {}
     dropped: set[str] = set()
     finest = max(FINEST * float(np.ptp(now.y[now.used])), ROUNDING_LEFT * now.evidence.rounding)
     while len(rivals) < MOST_EFFECTS and now.held_out.rms > finest:
@@ -353,7 +354,7 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
         if not found or not found[0].counts_beside(now):
             break
         best = _simplest(found, now)
-        rivals[best.name] = [other for other in found if other is not best]
+        rivals[best.name] = [other.effect for other in found if other is not best]
         now = _without_needless(best.explanation.smoothed(), set(rivals) - {best.name})
     now = _without_needless(now.bare(), set(rivals))
     named = _named(start, now, rivals)
@@ -386,7 +387,7 @@ def _best_structure(now: Explanation, taken: tuple[str, ...]) -> tuple[str | Non
     for name, columns in STRUCTURES.items():
         if name not in taken:
             allowing = now.beside(columns(now))
-            if counts(now.held_out, allowing.held_out) and allowing.held_out.rms < best[1].held_out.rms:
+            if counts(now.held_out, allowing.held_out, own=False) and allowing.held_out.rms < best[1].held_out.rms:
                 best = name, allowing
     return best
 
@@ -395,7 +396,7 @@ def _beats(one: Score, other: Score) -> bool:
     return one.rms < other.rms and chance_of_gain(other, one) <= ALIKE
 
 
-def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[Contender]]) -> tuple[Named, ...]:
+def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[Effect]]) -> tuple[Named, ...]:
     """Return the effects, each added to those before it, the one that gains most first."""
     left = [effect.name for effect in now.effects if effect.name in rivals]
     taken, before, ordered = [effect.name for effect in start.effects], start.held_out, []
@@ -410,7 +411,7 @@ def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[C
 
 
 def _in_its_place(
-    name: str, now: Explanation, rivals: Sequence[Contender]
+    name: str, now: Explanation, rivals: Sequence[Effect]
 ) -> tuple[tuple[str, ...], tuple[str, float] | None]:
     """Return which rivals would do as well in the place of an effect, and the best of them."""
     present = {effect.name for effect in now.effects}
@@ -418,8 +419,7 @@ def _in_its_place(
     tried = []
     for rival in rivals:
         if rival.name not in present:
-            effect = next(effect for effect in rival.explanation.effects if effect.name == rival.name)
-            tried.append(Contender(rival.name, rest.adding(effect).refined(STEPS)))
+            tried.append(Contender(rival.name, rest.adding(rival).refined(STEPS)))
     tried.sort(key=lambda contender: contender.rms)
     alone = one_speed(now.evidence)
     best = Contender(name, now)

@@ -48,6 +48,9 @@ class Creep:
     time_constants : tuple of float, length K >= 1, seconds
     gains : tuple of float, length K
         Shares of the motion ``h - h_0`` that come later.
+    initial : float, metres
+        How far the stage had moved just before the record: `apply`, which replays one, goes on with what creeps of
+        that. What drives a stage begins at rest.
     uncertainty : mapping of str to float
         Of single elements as ``gains.0``.
     """
@@ -58,6 +61,7 @@ class Creep:
 
     time_constants: tuple[float, ...]
     gains: tuple[float, ...]
+    initial: float = 0.0
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -69,6 +73,7 @@ class Creep:
             ("gains", len(self.gains) == len(self.time_constants), "one for each time constant"),
             ("gains", sum(min(g, 0.0) for g in self.gains) > -0.9, "more than -0.9 in sum where they are negative"),
             ("gains", sum(self.gains) <= 10, "at most 10 in sum"),
+            ("initial", abs(self.initial) <= 1e3, "within 1000 m"),
         )
 
     @by_record
@@ -80,6 +85,10 @@ class Creep:
         crept = np.zeros_like(moved)
         for gain, (now, before, kept) in zip(self.gains, self._holds(grid.dt), strict=True):
             crept += gain * lfilter([now, before], [1.0, -kept], moved)
+        if self.initial:
+            since = grid.grid - grid.grid[:1]
+            for gain, tau in zip(self.gains, self.time_constants, strict=True):
+                crept -= gain * self.initial * np.exp(-since / tau)
         return signal + grid.off(crept)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:

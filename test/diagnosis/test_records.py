@@ -1,0 +1,110 @@
+"""From one record to the next: what is said of a stage that has, or has not, changed; and causes proved on others."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import slpi_ros
+from slpi_ros.effects.delay import Delay
+from slpi_ros.io.record import Record
+from slpi_ros.reports.diagnosis import format_diagnosis
+from slpi_ros.simulation.chain import Physics, own_motion
+from slpi_ros.simulation.dynamics import Amplifier
+from slpi_ros.simulation.parameters import StageParameters
+
+RATE, NOISE, HIGH = 500.0, 6e-9, 100.0
+STAGE = replace(StageParameters.random(3), stiffening=0.0)
+
+
+def drive(hertz, seconds=12.0, before=(), seed=0):
+    """Return a voltage from 0 V: amplitudes that grow and shrink at one frequency, after moves to other voltages."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    turns = np.floor(t * hertz)
+    tops = np.random.default_rng(seed).permutation(np.linspace(0.25, 1.0, int(turns[-1]) + 1))
+    tops[:2] = 1.0
+    wave = 0.5 * HIGH * tops[turns.astype(int)] * (1.0 - np.cos(2.0 * np.pi * hertz * t))
+    way = np.interp(np.arange(0.0, len(before) * 0.5, 1.0 / RATE), 0.5 * np.arange(len(before) + 1), [0.0, *before])
+    # The stage comes back to 0 V before the record begins.
+    back = np.linspace(way[-1] if way.size else 0.0, 0.0, 250)
+    return np.concatenate([way, back]), wave
+
+
+def record(hertz, physics=None, before=(), seed=0, gain=1.0, offset=0.0, late=0.0, digit=0.0):
+    """Return a record of the stage; what came before it, with the same physics, is not in it."""
+    way, wave = drive(hertz, before=before, seed=seed)
+    v = np.concatenate([way, wave])
+    t = np.arange(v.size) / RATE
+    y = own_motion(STAGE, physics or Physics(), t, np.interp(t - late, t, v))[way.size :]
+    y = gain * y + offset + NOISE * np.random.default_rng(seed + 100).normal(size=y.size)
+    y = np.round(y / digit) * digit if digit else y
+    stamps = np.round(np.arange(wave.size) / RATE * 1e9).astype(np.int64)
+    return Record(stamps, {"x": wave}, {"x": y}, f"record at {hertz} Hz", "stage")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return slpi_ros.identify(record(1.5))
+
+
+def found(records, model):
+    diagnosis = slpi_ros.diagnose(records, model)
+    format_diagnosis(diagnosis)
+    return diagnosis.axes["x"], diagnosis.extended.axes["x"]
+
+
+@pytest.mark.parametrize("before", [(100.0,), (60.0, 20.0, 45.0)])
+def test_another_initial_history_is_no_change(model, before):
+    axis, extended = found(record(1.5, before=before, seed=5), model)
+    assert not axis.given.changed and axis.given.zero_moved is None
+    assert not axis.effects and extended == model.axes["x"]
+
+
+def test_a_change_of_the_gain_is_told(model):
+    axis, _ = found(record(1.5, seed=6, gain=1.01), model)
+    assert axis.given.changed
+    assert axis.given.gain == pytest.approx(0.01, rel=0.2)
+
+
+def test_a_moved_zero_is_no_change_of_the_loops(model):
+    axis, _ = found(record(1.5, seed=7, offset=-0.6e-6), model)
+    assert not axis.given.changed
+    assert axis.given.zero_moved == pytest.approx(-0.6e-6, rel=0.2)
+    assert axis.records[0].offset == pytest.approx(-0.6e-6, rel=0.2)
+
+
+def test_a_delay_at_one_speed_stays_open_and_out_of_the_model():
+    one = record(1.5, late=0.04, seed=8)
+    model = slpi_ros.identify(one)
+    axis, extended = found(one, model)
+    assert axis.verdict != "named" and not axis.given.changed
+    assert not extended.effects
+    if axis.effects:
+        assert "delay" in (axis.effects[0].name, *axis.effects[0].alternatives)
+
+
+@pytest.mark.parametrize("digits", [60, 400])
+def test_a_coarse_sensor_is_no_cause(digits):
+    one = record(1.5, seed=9, digit=15e-6 / digits)
+    axis, extended = found(one, slpi_ros.identify(one))
+    assert not axis.effects and not axis.given.changed and not extended.effects
+
+
+def test_a_lag_is_proved_on_records_at_other_speeds():
+    physics = Physics(amplifier=Amplifier(lag=4e-3))
+    pair = [record(hertz, physics, seed=seed) for hertz, seed in ((0.8, 11), (3.0, 12))]
+    plain = slpi_ros.identify(pair)
+    axis, extended = found(pair, plain)
+    first = axis.effects[0]
+    assert {"lag", "delay"} & {first.name, *first.alternatives}
+    seconds = first.effect.seconds if isinstance(first.effect, Delay) else first.effect.time_constant
+    assert seconds == pytest.approx(4e-3, rel=0.2)
+    assert len(axis.records) == 2 and all(each.left_out_rms < 0.5 * each.before_rms for each in axis.records)
+    third = record(5.0, physics, seed=13)
+    before, after = (
+        np.std(one.simulate(third.t, third.voltage["x"]) - third.displacement["x"])
+        for one in (plain.axes["x"], extended)
+    )
+    assert after < 0.5 * before
+    told = 1.0 - first.gain_percent / 100.0
+    assert after / before == pytest.approx(told, abs=0.2)

@@ -21,7 +21,7 @@ from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESETTING, Memo
 from slpi_ros.compensator.ramps import PERIOD, Ramp, Safety
 from slpi_ros.compensator.statistics import Counts
 from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor
-from slpi_ros.compensator.validation import RejectedError, TimeRules, require_names
+from slpi_ros.compensator.validation import RejectedError, TimestampRules, require_names
 from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.io.messages import SECOND_NS
@@ -129,7 +129,7 @@ class Controller:
         axes: Sequence[str],
         limits: Sequence[Limits],
         hardware_id: str = "",
-        time: TimeRules | None = None,
+        time: TimestampRules | None = None,
         loops: Sequence[LoopSettings] = (),
     ) -> None:
         self.names = list(axes)
@@ -151,7 +151,7 @@ class Controller:
         self._next_step_ns = 0
         # Of the clock of trajectories against the other one, when both were seen last.
         self._clock_ahead_ns = 0
-        self.use_time(time or TimeRules())
+        self.use_time(time or TimestampRules())
 
     # Life and models
 
@@ -249,7 +249,7 @@ class Controller:
         for axis, settings in zip(self.axes, loops, strict=True):
             axis.retune(settings)
 
-    def use_time(self, rules: TimeRules) -> None:
+    def use_time(self, rules: TimestampRules) -> None:
         """Judge stamps by these rules from now on."""
         self._jump, self._max_age_ns = rules.jump, int(rules.max_age * SECOND_NS)
         for axis in self.axes:

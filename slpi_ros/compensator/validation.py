@@ -72,7 +72,7 @@ def implausible(y: float, accepted: tuple[float, float], kind: str) -> RejectedE
 
 
 @dataclass(frozen=True)
-class TimeRules:
+class TimestampRules:
     """How stamps are judged.
 
     Parameters

@@ -104,7 +104,7 @@ class EachRecord:
         """Yield nothing: its parts look for themselves."""
         yield from ()
 
-    def follower(self) -> None:
+    def streaming(self) -> None:
         """Return None: it belongs to the records' clocks."""
         return
 

@@ -28,8 +28,8 @@ from slpi_ros.effects.creep import Creep, settling
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import Hysteresis
-from slpi_ros.identification.convex_fit import SMOOTHNESS
 from slpi_ros.identification.least_squares import FOLDS, Problem, blocked_folds
+from slpi_ros.identification.linear_kinds import SMOOTHNESS
 from slpi_ros.identification.samples import Samples
 
 FloatArray = NDArray[np.float64]

@@ -12,11 +12,11 @@ from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, SurfaceBasis
-from slpi_ros.identification.convex_fit import SELECTION_SAMPLES, SMOOTHNESS
 from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.drive import Runs
 from slpi_ros.identification.initial_history import choose_start
 from slpi_ros.identification.least_squares import Problem, solve_free
+from slpi_ros.identification.linear_kinds import SELECTION_SAMPLES, SMOOTHNESS
 from slpi_ros.identification.published_kinds import voltage_dead_band
 from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples

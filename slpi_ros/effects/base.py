@@ -70,7 +70,7 @@ def by_record(
     return applied
 
 
-class Follower(Protocol):
+class StreamingEffect(Protocol):
     """An effect sample by sample; it remembers what it needs of the past."""
 
     def start(self, x: float) -> None:
@@ -89,7 +89,7 @@ class Follower(Protocol):
         """Take over a state from `snapshot`."""
 
 
-class DrivenFollower(Follower, Protocol):
+class DrivenStreamingEffect(StreamingEffect, Protocol):
     """A follower that also looks at the voltage that drives the hysteresis."""
 
     def attach(self, middle: Callable[[float], float]) -> None:
@@ -126,7 +126,7 @@ class Effect(Protocol):
     def describe(self) -> str:
         """Say in one sentence what it is, with numbers."""
 
-    def follower(self) -> Follower | None:
+    def streaming(self) -> StreamingEffect | None:
         """Return what follows it sample by sample; None: nothing can be done so."""
 
 

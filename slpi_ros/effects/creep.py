@@ -148,15 +148,15 @@ class Creep:
         span = f"{fast:.3g} s" if slow == fast else f"{fast:.3g} to {slow:.3g} s"
         return f"after a move the stage creeps on by {sum(self.gains) * 100:.3g} % of it, with time constants of {span}"
 
-    def follower(self) -> "CreepFollower":
+    def streaming(self) -> "StreamingCreep":
         """Return the creep sample by sample."""
-        return CreepFollower(self)
+        return StreamingCreep(self)
 
     def _holds(self, dt: float) -> list[Hold]:
         return [hold(dt, tau) for tau in self.time_constants]
 
 
-class CreepFollower:
+class StreamingCreep:
     """Creep sample by sample."""
 
     def __init__(self, creep: Creep) -> None:
@@ -187,7 +187,7 @@ class CreepFollower:
             self._over(dt)
         return self._origin + (wanted - self._origin - self._crept()) / (1.0 + self._now)
 
-    def resume(self, other: "CreepFollower", x: float) -> None:
+    def resume(self, other: "StreamingCreep", x: float) -> None:
         """Creep on as another one does, from the displacement `x` (m); what is of another time constant is at rest."""
         moved = other._input
         known = dict(zip(other._creep.time_constants, other._states, strict=True))

@@ -69,7 +69,7 @@ class CrossCoupling:
         parts = [f"{gain * 100:.3g} % of axis {axis}" for axis, gain in self.gains.items()]
         return f"the axis moves along with {' and '.join(parts)}"
 
-    def follower(self) -> None:
+    def streaming(self) -> None:
         """Return None: one axis alone cannot know how the others move; the stage takes the axes apart."""
         return
 

@@ -69,6 +69,6 @@ class Delay:
             return f"the displacement is stamped {-self.seconds * 1e3:.3g} ms too early for its voltage"
         return f"the displacement answers {self.seconds * 1e3:.3g} ms after the voltage"
 
-    def follower(self) -> None:
+    def streaming(self) -> None:
         """Return None: without the path ahead there is no preview."""
         return

@@ -18,7 +18,7 @@ class GainDrift:
     """A factor on the displacement that depends on time only, ``y = origin + (1 + g(t)) (x - origin)``.
 
     ``g`` is 0 at the record's start, linear between knots, and keeps its last value after the last one: a sensitivity
-    that has changed by the record's end stays changed. So `apply` and `invert` use the record's clock, and `follower`
+    that has changed by the record's end stays changed. So `apply` and `invert` use the record's clock, and `streaming`
     the last value.
 
     The change of the active material scales hysteresis, creep and resonance alike: it acts behind them. Another axis
@@ -102,12 +102,12 @@ class GainDrift:
             f"{self.times[-1]:.3g} s of this record, half of it in the first {half:.3g} s{back}"
         )
 
-    def follower(self) -> "GainFollower":
+    def streaming(self) -> "StreamingGainDrift":
         """Return the sensitivity of the record's end, sample by sample."""
-        return GainFollower(self.origin, 1.0 + self.gains[-1])
+        return StreamingGainDrift(self.origin, 1.0 + self.gains[-1])
 
 
-class GainFollower:
+class StreamingGainDrift:
     """A constant factor on the displacement; there is nothing to remember."""
 
     def __init__(self, origin: float, factor: float) -> None:

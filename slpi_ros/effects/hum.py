@@ -82,6 +82,6 @@ class Hum:
         """Say how large and how fast it is."""
         return f"the reading hums with {self.amplitude * 1e9:.3g} nm at {self.frequency:.4g} Hz"
 
-    def follower(self) -> None:
+    def streaming(self) -> None:
         """Return None: its phase belongs to the record's clock."""
         return

@@ -81,12 +81,12 @@ class Lag:
         """Say how slow it is."""
         return f"the piezo's voltage lags behind the command with a time constant of {self.time_constant * 1e3:.3g} ms"
 
-    def follower(self) -> "LagFollower":
+    def streaming(self) -> "StreamingLag":
         """Return the lag sample by sample."""
-        return LagFollower(self.time_constant)
+        return StreamingLag(self.time_constant)
 
 
-class LagFollower:
+class StreamingLag:
     """A lag sample by sample."""
 
     def __init__(self, time_constant: float) -> None:

@@ -40,7 +40,7 @@ def reversible(v: FloatArray, gains: Sequence[float]) -> FloatArray:
     return np.asarray(np.polynomial.polynomial.polyval(v, [0.0, *gains]), dtype=np.float64)
 
 
-class CoercivityFollower:
+class StreamingCoercivity:
     """The play sample by sample.
 
     The command for a desired displacement depends on its own rate: taken from the commands, that would run away. The
@@ -129,7 +129,7 @@ COMPARISON = 0.02
 RateState = tuple[float | None, float, float, float | None, float, float, float]
 
 
-class RateFollower:
+class StreamingRateDependence:
     """Rate dependence sample by sample; it looks at the voltage too.
 
     The voltage for a desired displacement depends on its own rate: taken from the voltages, that would run away. The
@@ -391,11 +391,13 @@ class RateDependence:
             return f"as their power {self.exponent:.2g}"
         return f"as the power {self.exponent:.2g} of 1 + rate / {self.onset:.3g} V/s, nearly their logarithm"
 
-    def follower(self) -> RateFollower | CoercivityFollower:
+    def streaming(self) -> StreamingRateDependence | StreamingCoercivity:
         """Return the effect sample by sample."""
         if self.coercivity:
-            return CoercivityFollower(self._growth, self.settling, self.reversible)
-        return RateFollower(self.widening, self.backlash, self.exponent, self.reference_rate, self.transition)
+            return StreamingCoercivity(self._growth, self.settling, self.reversible)
+        return StreamingRateDependence(
+            self.widening, self.backlash, self.exponent, self.reference_rate, self.transition
+        )
 
     def _drive(self, around: EffectContext) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the loop's middle (m), the speed to the power and the direction, shape (N,) each."""

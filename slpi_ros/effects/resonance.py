@@ -64,7 +64,7 @@ class Unringing:
         )
 
 
-class ResonanceFollower:
+class StreamingResonance:
     """A mode sample by sample."""
 
     def __init__(self, mode: Mode) -> None:
@@ -222,9 +222,9 @@ class Resonance:
         """Say where it rings."""
         return f"the stage rings at {self.frequency:.4g} Hz after turns, with a damping ratio of {self.damping:.3g}"
 
-    def follower(self) -> ResonanceFollower:
+    def streaming(self) -> StreamingResonance:
         """Return the mode sample by sample."""
-        return ResonanceFollower(self.mode)
+        return StreamingResonance(self.mode)
 
     @property
     def mode(self) -> Mode:

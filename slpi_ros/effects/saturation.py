@@ -71,9 +71,9 @@ class Saturation:
         where = [text for text, limit in ((below, self.lower), (above, self.upper)) if not isinf(limit)]
         return f"the amplifier clips {' and '.join(where) or 'nowhere'}"
 
-    def follower(self) -> "SaturationFollower":
+    def streaming(self) -> "StreamingSaturation":
         """Return the limits sample by sample."""
-        return SaturationFollower(self.lower, self.upper)
+        return StreamingSaturation(self.lower, self.upper)
 
 
 def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -95,7 +95,7 @@ def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tupl
     return middle[chosen], dv[chosen], dy[chosen]
 
 
-class SaturationFollower:
+class StreamingSaturation:
     """Limits sample by sample; there is nothing to remember."""
 
     def __init__(self, lower: float, upper: float) -> None:

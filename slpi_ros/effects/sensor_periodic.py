@@ -103,12 +103,12 @@ class SensorPeriodic:
             f"{self.period * 1e9:.4g} nm of displacement"
         )
 
-    def follower(self) -> "SensorFollower":
+    def streaming(self) -> "StreamingSensorError":
         """Return the error sample by sample."""
-        return SensorFollower(self)
+        return StreamingSensorError(self)
 
 
-class SensorFollower:
+class StreamingSensorError:
     """The error of a sensor sample by sample; there is nothing to remember."""
 
     def __init__(self, sensor: SensorPeriodic) -> None:

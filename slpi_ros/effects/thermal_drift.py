@@ -70,6 +70,6 @@ class ThermalDrift:
         way, span = max(self.values) - min(self.values), self.times[-1] - self.times[0]
         return f"whatever the voltage, the stage drifts over {way * 1e6:.3g} um within {span:.3g} s of this record"
 
-    def follower(self) -> None:
+    def streaming(self) -> None:
         """Return None: it belongs to the record's clock."""
         return

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
-from slpi_ros.identification.convex_fit import fit_family, fit_multi_slope, fit_plays
 from slpi_ros.identification.least_squares import Fitted, noise_rms
+from slpi_ros.identification.linear_kinds import fit_family, fit_multi_slope, fit_plays
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import fit_amplitude_scaled, fit_at_rest, fit_primed
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.errors import UsageError
-from slpi_ros.identification.convex_fit import SMOOTHNESS, choose, plays, surfaces
 from slpi_ros.identification.least_squares import Problem
+from slpi_ros.identification.linear_kinds import SMOOTHNESS, choose, plays, surfaces
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.io.record import Record

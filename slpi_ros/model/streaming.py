@@ -9,18 +9,18 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import DrivenFollower, Effect, Follower
+from slpi_ros.effects.base import DrivenStreamingEffect, Effect, StreamingEffect
 from slpi_ros.effects.chain import Chain
-from slpi_ros.effects.creep import CreepFollower
+from slpi_ros.effects.creep import StreamingCreep
 from slpi_ros.effects.cross_coupling import Coupling
-from slpi_ros.effects.rate_dependence import CoercivityFollower, RateDependence
+from slpi_ros.effects.rate_dependence import RateDependence, StreamingCoercivity
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
 from slpi_ros.hysteresis.turning_points import Memory, MemoryState
 from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 
 FloatArray = NDArray[np.float64]
-Followers = dict[str, Follower]
+StreamingEffects = dict[str, StreamingEffect]
 
 # A desired displacement farther outside the identified ones than this share of their span is taken for a mistake (a
 # wrong unit, another stage) and refused; nearer ones are held at the voltage limit.
@@ -102,17 +102,17 @@ class StreamingInverse:
         self._t = -inf
         self.coupled = 0.0
         # An amplifier that clips narrows the limits, and needs no follower.
-        self._before = _followers(effect for effect in chain.before if not isinstance(effect, Saturation))
-        self._behind, self._shared = _followers(chain.own), _followers(chain.shared)
+        self._before = _streaming(effect for effect in chain.before if not isinstance(effect, Saturation))
+        self._behind, self._shared = _streaming(chain.own), _streaming(chain.shared)
         self._find()
         self.pace = RateLimiter(limits)
         self.limits = limits
         # The axis may rest outside its limits; the first voltage it is given is inside.
         memory.forward(self.limits.clip(memory.voltage))
-        for follower in self._before.values():
-            follower.start(memory.voltage)
-        for follower in (*self._behind.values(), *self._shared.values()):
-            follower.start(memory.displacement)
+        for streaming in self._before.values():
+            streaming.start(memory.voltage)
+        for streaming in (*self._behind.values(), *self._shared.values()):
+            streaming.start(memory.displacement)
         if self._driven and middle:
             self._driven.attach(lambda u: float(middle(np.array(u))))
             self._driven.drive(0.0, memory.voltage)
@@ -123,11 +123,11 @@ class StreamingInverse:
         self._follow(0.0)
 
     def _find(self) -> None:
-        """Note the followers that need more than the displacement."""
-        self._followers: Followers = {**self._before, **self._behind, **self._shared}
-        rate = self._followers.get(RateDependence.name)
-        self._play = rate if isinstance(rate, CoercivityFollower) else None
-        self._driven = None if self._play else cast(DrivenFollower | None, rate)
+        """Note the streaming effects that need more than the displacement."""
+        self._streaming: StreamingEffects = {**self._before, **self._behind, **self._shared}
+        rate = self._streaming.get(RateDependence.name)
+        self._play = rate if isinstance(rate, StreamingCoercivity) else None
+        self._driven = None if self._play else cast(DrivenStreamingEffect | None, rate)
 
     @property
     def limits(self) -> Limits:
@@ -144,7 +144,7 @@ class StreamingInverse:
     @property
     def timeless(self) -> bool:
         """Whether it does not matter how long a voltage stays."""
-        return not self._followers
+        return not self._streaming
 
     @property
     def voltage(self) -> float:
@@ -154,18 +154,18 @@ class StreamingInverse:
     @property
     def uncoupled_displacement(self) -> float:
         """Displacement (m) that the model gives the present voltage, before other axes come in."""
-        return self._displacement if self._followers else self.memory.displacement
+        return self._displacement if self._streaming else self.memory.displacement
 
     @property
     def missed(self) -> bool:
         """Whether the last desired displacement is not met, for whatever limit."""
-        return (self._missing if self._followers else self._beyond_rounding(self.desired)) != 0.0
+        return (self._missing if self._streaming else self._beyond_rounding(self.desired)) != 0.0
 
     @property
     def held(self) -> bool:
         """Whether the voltage waits at the limit beyond which the last desired displacement lies."""
         missing = short = self._beyond_rounding(self.desired)
-        if self._followers:
+        if self._streaming:
             missing, short = self._missing, self._short
         limits, v = self.pace.limits, self.voltage
         # What goes through effects comes to a limit but for rounding; what undoes them may ask for a detour.
@@ -175,8 +175,8 @@ class StreamingInverse:
 
     def remove_sensor_effects(self, y: float) -> float:
         """Return the displacement of the stage (m) at which a sensor reads `y` (m)."""
-        for follower in self._shared.values():
-            y = follower.inverse(0.0, y)
+        for streaming in self._shared.values():
+            y = streaming.inverse(0.0, y)
         return y
 
     def check(self, t: float, y: float) -> None:
@@ -228,7 +228,7 @@ class StreamingInverse:
         UsageError
             If the model has no voltage for it; without effects nothing has moved then.
         """
-        if not self._followers:
+        if not self._streaming:
             h = y - self.coupled
             v = self._move(dt, dt, h)
             self.desired = h
@@ -239,8 +239,8 @@ class StreamingInverse:
             counted = MAX_DT
             self.wait(dt - counted)
         h = displacement = self.remove_sensor_effects(y) - self.coupled
-        for follower in reversed(self._behind.values()):
-            h = follower.inverse(counted, h)
+        for streaming in reversed(self._behind.values()):
+            h = streaming.inverse(counted, h)
         v = self._move(dt, counted, h)
         self.desired, self._command = h, v
         self._follow(counted)
@@ -254,13 +254,13 @@ class StreamingInverse:
         self.desired, self._missing = self.memory.displacement, 0.0
         self._follow(dt)
         y = self.uncoupled_displacement + self.coupled
-        for follower in self._shared.values():
-            y = follower.forward(0.0, y)
+        for streaming in self._shared.values():
+            y = streaming.forward(0.0, y)
         return y
 
     def wait(self, duration: float) -> None:
         """Let time (s) pass at the present voltage."""
-        if self._followers:
+        if self._streaming:
             self.drive(self.voltage, duration)
 
     def snapshot(self) -> StreamState:
@@ -272,7 +272,7 @@ class StreamingInverse:
             self.pace.rate,
             self.desired,
             self.uncoupled_displacement,
-            {name: each.snapshot() for name, each in self._followers.items()},
+            {name: each.snapshot() for name, each in self._streaming.items()},
         )
 
     def restore(self, state: StreamState) -> None:
@@ -280,8 +280,8 @@ class StreamingInverse:
         self.memory.restore(state.memory)
         self._command, self._goal, self.pace.rate = state.voltage, state.goal, state.rate
         self.desired, self._displacement = state.desired, state.displacement
-        for name, follower in self._followers.items():
-            follower.restore(state.effects[name])
+        for name, streaming in self._streaming.items():
+            streaming.restore(state.effects[name])
 
     def resume(self, before: "StreamingInverse") -> None:
         """Go on where another model's stream has been; its voltage stays, and what its effects have begun."""
@@ -292,10 +292,10 @@ class StreamingInverse:
         # The command jumps there, and no time passes.
         self.memory.forward(self._reaching(0.0, before.voltage))
         self.desired = self.memory.displacement
-        for name, follower in self._behind.items():
+        for name, streaming in self._behind.items():
             other = before._behind.get(name)
-            if isinstance(follower, CreepFollower) and isinstance(other, CreepFollower):
-                follower.resume(other, self.memory.displacement)
+            if isinstance(streaming, StreamingCreep) and isinstance(other, StreamingCreep):
+                streaming.resume(other, self.memory.displacement)
         self._follow(0.0)
 
     def copy(self) -> "StreamingInverse":
@@ -315,16 +315,16 @@ class StreamingInverse:
         memory, pace = self.memory, self.pace
         if not self._before and pace.limits.acceleration == inf:
             v = memory.inverse(h, *pace.reach(memory.voltage, dt))
-            if self._followers:
+            if self._streaming:
                 self._missing = self._beyond_rounding(h)
             return v
         state, present = memory.snapshot(), self.voltage
         goal, reversible_bypass = self._played(h)
         u = memory.voltage
         self._missing = self._beyond_rounding(h - reversible_bypass)
-        for follower in reversed(self._before.values()):
-            if follower is not self._play:
-                goal = follower.inverse(counted, goal)
+        for streaming in reversed(self._before.values()):
+            if streaming is not self._play:
+                goal = streaming.inverse(counted, goal)
         v = pace.step(present, goal, dt, self._goal)
         if not self._missing and abs(goal - v) > ROUNDING * (1.0 + abs(goal)):
             self._missing = goal - v
@@ -361,8 +361,8 @@ class StreamingInverse:
 
     def _reaching(self, dt: float, v: float) -> float:
         """Let a command (V) go through to the hysteresis; return the voltage (V) that arrives."""
-        for follower in self._before.values():
-            v = follower.forward(dt, v)
+        for streaming in self._before.values():
+            v = streaming.forward(dt, v)
         return v
 
     def _follow(self, dt: float) -> None:
@@ -370,14 +370,14 @@ class StreamingInverse:
         y = self.memory.displacement + (self._play.reversible_bypass if self._play else 0.0)
         if self._driven:
             self._driven.drive(dt, self.memory.voltage)
-        for follower in self._behind.values():
-            y = follower.forward(dt, y)
+        for streaming in self._behind.values():
+            y = streaming.forward(dt, y)
         self._displacement = y
 
 
-def _followers(effects: Iterable[Effect]) -> Followers:
-    """Return the followers of effects, of those that have one, by the effect's name."""
-    return {effect.name: follower for effect in effects if (follower := effect.follower())}
+def _streaming(effects: Iterable[Effect]) -> StreamingEffects:
+    """Return the streaming effects of effects, of those that have one, by the effect's name."""
+    return {effect.name: streaming for effect in effects if (streaming := effect.streaming())}
 
 
 def accepted_range(displacement_range: tuple[float, float]) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.ramps import Safety
-from slpi_ros.compensator.validation import TimeRules
+from slpi_ros.compensator.validation import TimestampRules
 from slpi_ros.errors import UsageError
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.limits import Limits
@@ -180,7 +180,7 @@ class CompensatorSettings:
 
     values: Mapping[str, Any]
     limits: tuple[Limits, ...]
-    time: TimeRules
+    time: TimestampRules
     safety: Safety
     reset: ResetSettings
     loops: tuple[LoopSettings, ...]
@@ -208,7 +208,7 @@ class CompensatorSettings:
         settings = cls(
             values,
             _limits(values),
-            TimeRules(values["time_jump"], values["max_age"]),
+            TimestampRules(values["time_jump"], values["max_age"]),
             Safety(
                 values["command_timeout"],
                 values["on_timeout"] == "safe",

@@ -102,7 +102,7 @@ def triangles(amplitude: float, frequency: float, cycles: int, samples: int = 20
     return k / (samples * frequency), amplitude * (1.0 - np.abs(2.0 * phase - 1.0))
 
 
-def straight_between_turns(x: FloatArray, at: FloatArray) -> FloatArray:
+def straight_between_reversals(x: FloatArray, at: FloatArray) -> FloatArray:
     """Return `x`, shape (N,), made a straight line over `at`, shape (N,), between neighbouring reversals of `at`."""
     path = x.copy()
     for a, b in pairwise(stop - 1 for _, stop in monotone_runs(at)):

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.slpi_published import Loop, SeparatedLoops, Separation
-from slpi_ros.identification.convex_fit import PLAY_OPERATORS
+from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import least_iterations
 from slpi_ros.papers.exhibit import Exhibit, Picture, Table, um
 from slpi_ros.papers.published import (

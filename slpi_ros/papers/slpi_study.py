@@ -17,11 +17,11 @@ from slpi_ros.hysteresis.slpi_published import (
     separate,
 )
 from slpi_ros.hysteresis.turning_points import Memory
-from slpi_ros.identification.convex_fit import PLAY_OPERATORS
 from slpi_ros.identification.fit import identify
+from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import default_thresholds, fit_plays, least_iterations
 from slpi_ros.io.record import Record
-from slpi_ros.papers.published import ramps, straight_between_turns
+from slpi_ros.papers.published import ramps, straight_between_reversals
 from slpi_ros.simulation.stage import flexure_stage
 
 FloatArray = NDArray[np.float64]
@@ -142,7 +142,7 @@ def study(turns: tuple[float, ...]) -> Study:
         CLOSING: lambda: closing.along(0.0, float(y[0])),
         FAMILY: lambda: family.memory("start"),
     }
-    desired = straight_between_turns(y, v)
+    desired = straight_between_reversals(y, v)
     straight = y[0] + (y.max() - y[0]) * v / v.max()
     voltages = {name: voltage_for(drive(), desired) for name, drive in drives.items()}
     loops = separation.loops

@@ -14,7 +14,7 @@ from strategies import FAMILY_CASE, axis_model
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.coercivity_path import play, settled_rate
 from slpi_ros.effects.lag import Lag
-from slpi_ros.effects.rate_dependence import CoercivityFollower, RateDependence
+from slpi_ros.effects.rate_dependence import RateDependence, StreamingCoercivity
 from slpi_ros.effects.registry import in_order
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.model.limits import Limits
@@ -78,12 +78,12 @@ def test_it_comes_back_from_its_inverse(effect, record):
 @given(coercivities(), records("voltage"))
 def test_it_is_followed_nearly(effect, record):
     """Backwards only, the rate comes half a sample late."""
-    follower, steps = effect.follower(), np.diff(record.around.t, prepend=0.0).tolist()
-    follower.start(float(record.signal[0]))
-    followed = [follower.forward(dt, v) for dt, v in zip(steps, record.signal.tolist(), strict=True)]
+    streaming, steps = effect.streaming(), np.diff(record.around.t, prepend=0.0).tolist()
+    streaming.start(float(record.signal[0]))
+    followed = [streaming.forward(dt, v) for dt, v in zip(steps, record.signal.tolist(), strict=True)]
     missed = effect.apply(record.signal, record.around) - followed
     assert rms(missed) <= 0.2 * rms(effect.apply(record.signal, record.around) - record.signal) + 1e-12
-    assert follower.reversible_bypass == pytest.approx(
+    assert streaming.reversible_bypass == pytest.approx(
         float(effect.reversible_bypass(record.signal[-1:], np.array(followed[-1:]))[0]), abs=1e-15
     )
 
@@ -92,10 +92,10 @@ def test_it_is_followed_nearly(effect, record):
 def test_a_play_along_a_path_is_the_follower_s(samples):
     v, widths = np.array(samples).reshape(-1, 2).T.copy()
     followed = []
-    follower = CoercivityFollower(lambda _: float(widths[len(followed)]), 0.0, ())
-    follower.start(float(v[0]) if v.size else 0.0)
+    streaming = StreamingCoercivity(lambda _: float(widths[len(followed)]), 0.0, ())
+    streaming.start(float(v[0]) if v.size else 0.0)
     for x in v.tolist():
-        followed.append(follower.forward(1.0, x))
+        followed.append(streaming.forward(1.0, x))
     np.testing.assert_allclose(play(v, widths), followed, rtol=0, atol=1e-12)
 
 
@@ -104,10 +104,10 @@ def test_on_a_ramp_the_settled_rate_is_the_follower_s(steps, slope, settling):
     """A ramp has one rate, whichever samples it is taken from; the stamps are uneven."""
     t = np.cumsum([0.0, *steps])
     rates, expected = [], [0.0]
-    follower = CoercivityFollower(lambda rate: rates.append(rate) or 0.0, settling, ())
+    streaming = StreamingCoercivity(lambda rate: rates.append(rate) or 0.0, settling, ())
     for dt, v in zip(np.diff(t).tolist(), (slope * t[1:]).tolist(), strict=True):
         del rates[:]
-        follower.forward(dt, v)
+        streaming.forward(dt, v)
         expected.append(rates[0])
     np.testing.assert_allclose(settled_rate(t, slope * t, settling), expected, rtol=1e-12, atol=1e-12)
 
@@ -123,7 +123,7 @@ def test_at_even_stamps_the_settled_rate_is_filtered(record, settling):
 
 @given(coercivities(), records("voltage"), st.integers(1, 600))
 def test_a_snapshot_is_the_whole_state(effect, record, at):
-    one, other = effect.follower(), effect.follower()
+    one, other = effect.streaming(), effect.streaming()
     samples = list(zip(np.diff(record.around.t, prepend=0.0).tolist(), record.signal.tolist(), strict=True))
     one.start(samples[0][1])
     for dt, v in samples[:at]:

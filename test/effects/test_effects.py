@@ -86,9 +86,9 @@ def test_at_rest_nothing_changes(drawn, verb):
 @given(effects_and_records(FOLLOWED))
 def test_follower_does_what_apply_does(drawn):
     effect, record = drawn
-    follower, samples, steps = effect.follower(), record.signal.tolist(), np.diff(record.around.t, prepend=0.0)
-    follower.start(samples[0])
-    followed = [follower.forward(dt, x) for dt, x in zip(steps.tolist(), samples, strict=True)]
+    streaming, samples, steps = effect.streaming(), record.signal.tolist(), np.diff(record.around.t, prepend=0.0)
+    streaming.start(samples[0])
+    followed = [streaming.forward(dt, x) for dt, x in zip(steps.tolist(), samples, strict=True)]
     # Stamps are even to rounding only.
     expected = effect.apply(record.signal, record.around)
     np.testing.assert_allclose(followed, expected, rtol=0, atol=1e-8 * record.span)
@@ -108,35 +108,35 @@ def test_follower_gives_what_is_wanted(drawn, data):
     wanted = np.interp(t, record.around.t, wanted)
     if isinstance(effect, Saturation):
         wanted = np.clip(wanted, effect.lower, effect.upper)
-    follower = effect.follower()
-    follower.start(float(wanted[0]))
+    streaming = effect.streaming()
+    streaming.start(float(wanted[0]))
     got = []
     for dt, y in zip(np.diff(t, prepend=0.0).tolist(), wanted.tolist(), strict=True):
-        before = follower.snapshot()
-        x = follower.inverse(dt, y)
-        assert follower.inverse(dt, y) == x
-        assert follower.snapshot() == before
-        got.append(follower.forward(dt, x))
+        before = streaming.snapshot()
+        x = streaming.inverse(dt, y)
+        assert streaming.inverse(dt, y) == x
+        assert streaming.snapshot() == before
+        got.append(streaming.forward(dt, x))
     np.testing.assert_allclose(got, wanted, rtol=0, atol=accuracy * record.span)
 
 
 @given(effects_and_records((*FOLLOWED, "rate_dependence")), st.integers(1, 1000))
 def test_a_snapshot_is_the_whole_state(drawn, at):
     effect, record = drawn
-    one, other = effect.follower(), effect.follower()
+    one, other = effect.streaming(), effect.streaming()
 
-    def step(follower, dt, y, u):
-        x = follower.inverse(dt, y)
-        if hasattr(follower, "drive"):
-            follower.drive(dt, u)
-        return follower.forward(dt, x)
+    def step(streaming, dt, y, u):
+        x = streaming.inverse(dt, y)
+        if hasattr(streaming, "drive"):
+            streaming.drive(dt, u)
+        return streaming.forward(dt, x)
 
     steps = np.diff(record.around.t, prepend=0.0).tolist()
     samples = list(zip(steps, record.signal.tolist(), record.around.u.tolist(), strict=True))
-    for follower in (one, other):
-        if hasattr(follower, "attach"):
-            follower.attach(record.around.middle)
-        follower.start(samples[0][1])
+    for streaming in (one, other):
+        if hasattr(streaming, "attach"):
+            streaming.attach(record.around.middle)
+        streaming.start(samples[0][1])
     for sample in samples[:at]:
         step(one, *sample)
     # Through JSON, as a file keeps it.
@@ -152,13 +152,13 @@ def _tuples(value):
 @given(BY_NAME["rate_dependence"], records("displacement"))
 def test_rate_dependence_is_followed_nearly(effect, record):
     """Backwards only, the rate comes two samples late."""
-    follower, around = effect.follower(), record.around
-    follower.attach(around.middle)
-    follower.start(float(record.signal[0]))
+    streaming, around = effect.streaming(), record.around
+    streaming.attach(around.middle)
+    streaming.start(float(record.signal[0]))
     followed, steps = [], np.diff(around.t, prepend=0.0).tolist()
     for dt, x, u in zip(steps, record.signal.tolist(), around.u.tolist(), strict=True):
-        follower.drive(dt, u)
-        followed.append(follower.forward(dt, x))
+        streaming.drive(dt, u)
+        followed.append(streaming.forward(dt, x))
     added = effect.apply(record.signal, around) - record.signal
     missed = np.array(followed) - record.signal - added
     assert np.sqrt(np.mean(missed**2)) <= 0.2 * np.sqrt(np.mean(added**2)) + 1e-15
@@ -217,10 +217,10 @@ def test_a_kick_ends_the_ringing():
     mode, dt = Resonance(100.0, 0.01), 1e-4
     t = np.arange(5000) * dt
     wish = 1e-5 * np.clip(t / 0.05, 0, 1)
-    follower = mode.follower()
-    follower.start(0.0)
+    streaming = mode.streaming()
+    streaming.start(0.0)
     y = np.array(
-        [follower.forward(d, follower.inverse(d, w)) for d, w in zip(np.diff(t, prepend=0), wish, strict=True)]
+        [streaming.forward(d, streaming.inverse(d, w)) for d, w in zip(np.diff(t, prepend=0), wish, strict=True)]
     )
     rings = mode.apply(wish, EffectContext(t)) - wish
     settled = t > 0.05 + 0.005

@@ -27,11 +27,11 @@ def test_loops_shrink_about_the_origin():
 def test_after_the_record_the_last_sensitivity_stays():
     later = EffectContext(T + 1e6)
     np.testing.assert_allclose(DRIFT.apply(H, later), 4e-6 + 0.97 * (H - 4e-6), rtol=1e-12)
-    follower = DRIFT.follower()
-    follower.start(float(H[0]))
+    streaming = DRIFT.streaming()
+    streaming.start(float(H[0]))
     for x in H[:50].tolist():
-        assert follower.forward(0.01, x) == pytest.approx(4e-6 + 0.97 * (x - 4e-6), rel=1e-12)
-        assert follower.forward(0.01, follower.inverse(0.01, x)) == pytest.approx(x, rel=1e-12)
+        assert streaming.forward(0.01, x) == pytest.approx(4e-6 + 0.97 * (x - 4e-6), rel=1e-12)
+        assert streaming.forward(0.01, streaming.inverse(0.01, x)) == pytest.approx(x, rel=1e-12)
 
 
 @given(st.floats(0.0, 12e-6), st.floats(0.02, 0.9))

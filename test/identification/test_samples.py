@@ -12,7 +12,7 @@ from identification.records import calibration, rms
 import slpi_ros
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.slpi_published import separate
-from slpi_ros.identification import convex_fit as linear
+from slpi_ros.identification import linear_kinds as linear
 from slpi_ros.identification.initial_history import InitialHistoryWarning
 from slpi_ros.identification.samples import Samples, select_samples
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.papers import slpi_exhibits
-from slpi_ros.papers.published import OVERALL_MEAN, ramps, straight_between_turns, triangles
+from slpi_ros.papers.published import OVERALL_MEAN, ramps, straight_between_reversals, triangles
 from slpi_ros.papers.slpi_study import (
     AT_REST,
     CLASSICAL,
@@ -98,7 +98,7 @@ def test_ramps_go_through_every_turn(turns):
 def test_straight_lines_between_turns():
     v = ramps((0.0, 30.0, 10.0), 5.0)
     y = v**2
-    straight = straight_between_turns(y, v)
+    straight = straight_between_reversals(y, v)
     np.testing.assert_allclose(straight[:7], 30.0 * v[:7])
     np.testing.assert_allclose(straight[6:], 900.0 + (v[6:] - 30.0) * 40.0)
 

@@ -72,3 +72,14 @@ def test_a_reset_comes_before_the_first_command_where_that_is_wanted(x_file):
         way = np.array(client.answers)[:, 0]
         assert way.max() == pytest.approx(100.0) and way.min() == pytest.approx(0.0, abs=1e-9)
         assert client.ask(["x"], [5e-6])[0] > 0.0
+
+
+def test_a_reset_at_the_start_that_leaves_the_memory_assumed_is_not_silent(x_file):
+    told = {"reset_on_start": True, "reset_rate": 400.0, "reset_cycles": 2, "voltage_min": 20.0, "voltage_max": 80.0}
+    with compensator(model_file=x_file, **told) as client:
+        client.connect()
+        client.report(memory="resetting")
+        client.report(memory="assumed")
+        client.graph.spin_until(lambda: "~/reset_memory" in client.node.stderr, "the warning")
+        warned = [line for line in client.node.stderr.splitlines() if "~/reset_memory" in line]
+        assert len(warned) == 1 and "WARN" in warned[0]

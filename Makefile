@@ -20,7 +20,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-records bench-latency bench-soak bench-trajectory bench-xy clean distclean FORCE
+.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-records bench-latency bench-soak bench-trajectory bench-xy bench-readme clean distclean FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -34,6 +34,7 @@ help:
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'
 	@echo 'make bench-trajectory  a trajectory of a million points: acceptance and deadlines'
 	@echo 'make bench-xy       the five segments of the MPI paper through the nodes, with and without feedback'
+	@echo 'make bench-readme   the commands of README on five simulated stages, and on the next day, 10 minutes'
 	@echo 'make clean      remove what was built and all caches'
 	@echo 'make distclean  the same, and .venv'
 	@echo 'PYTHON=/path/to/python3.12 chooses the Python; 3.11 and 3.12 work'
@@ -81,6 +82,9 @@ bench-trajectory: build
 
 bench-xy: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/xy_stage.py
+
+bench-readme: build
+	$(IN_WORKSPACE) $(VENV) benchmarks/readme_steps.py
 
 clean:
 	rm -rf build install log .hypothesis .mypy_cache .pytest_cache .ruff_cache

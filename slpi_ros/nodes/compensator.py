@@ -495,6 +495,10 @@ class Compensator(LifecycleNode):
             said = f"memory assumed; voltages {voltages} V; {'; '.join(doubts)}"
         else:
             said = f"memory known; voltages {voltages} V"
+        if doubts:
+            self.get_logger().warning(f"~/reset_memory: {said}")
+        else:
+            self.get_logger().info(f"~/reset_memory: {said}")
         self._reset_service.answer(not doubts, said)
 
     def _save_memory(self, complete: bool) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
-from nodes.compensator_client import compensator  # noqa: E402
+from nodes.compensator_client import Client, compensator  # noqa: E402
 from nodes.ros_helpers import stage_model  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
@@ -25,6 +25,13 @@ def ended_model() -> StageModel:
     return StageModel({"x": replace(axis, end=end, quality=quality)}, "stage under test", "")
 
 
+def measure(client: Client, displacement: float) -> None:
+    """Publish a measured displacement (m) from now on: a best-effort reader may miss the first ones."""
+    measured = client.graph.publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
+    message = JointState(name=["x"], position=[displacement])
+    client.graph.node.create_timer(0.1, lambda: measured.publish(message))
+
+
 @pytest.fixture
 def x_file(tmp_path: Path) -> str:
     path = tmp_path / "x.json"
@@ -39,8 +46,7 @@ def test_what_is_assumed_is_said_once_and_a_measurement_chooses(x_file):
         _, values = client.report(memory="assumed")
         assert float(values["x.voltage_V"]) == pytest.approx(60.0, abs=1e-4)
         client.graph.spin_until(lambda: "~/reset_memory" in client.node.stderr, "what is assumed")
-        measured = client.graph.publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
-        measured.publish(JointState(name=["x"], position=[model.start.displacement]))
+        measure(client, model.start.displacement)
         client.report("the other memory", **{"x.voltage_V": f"{model.start.voltage:.4f}"})
         # What comes now is the library's answer from there.
         assert client.ask(["x"], [5e-6]) == pytest.approx([model.memory("start").inverse(5e-6)], abs=1e-9)
@@ -50,8 +56,7 @@ def test_what_is_assumed_is_said_once_and_a_measurement_chooses(x_file):
 def test_a_measurement_that_fits_no_memory_is_a_warning(x_file):
     with compensator(model_file=x_file, start_memory="wiped") as client:
         client.connect()
-        measured = client.graph.publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
-        measured.publish(JointState(name=["x"], position=[-1.5e-6]))
+        measure(client, -1.5e-6)
         status = client.graph.wait_for_status(
             f"{client.name}: compensator", lambda status: status.level == b"\1", "the warning"
         )
@@ -72,3 +77,14 @@ def test_a_reset_comes_before_the_first_command_where_that_is_wanted(x_file):
         way = np.array(client.answers)[:, 0]
         assert way.max() == pytest.approx(100.0) and way.min() == pytest.approx(0.0, abs=1e-9)
         assert client.ask(["x"], [5e-6])[0] > 0.0
+
+
+def test_a_reset_at_the_start_that_leaves_the_memory_assumed_is_not_silent(x_file):
+    told = {"reset_on_start": True, "reset_rate": 400.0, "reset_cycles": 2, "voltage_min": 20.0, "voltage_max": 80.0}
+    with compensator(model_file=x_file, **told) as client:
+        client.connect()
+        client.report(memory="resetting")
+        client.report(memory="assumed")
+        client.graph.spin_until(lambda: "~/reset_memory" in client.node.stderr, "the warning")
+        warned = [line for line in client.node.stderr.splitlines() if "~/reset_memory" in line]
+        assert len(warned) == 1 and "WARN" in warned[0]

@@ -121,11 +121,13 @@ def _diagnose_axis(
     given = _given(model, selection)
     floor = _floor(selection.now)
     left_out = _ambiguous(selection)
-    refitted = given.changed or BIAS in selection.structures or len(left_out) < len(selection.named)
+    # Beside what stays open, nothing that was fitted together with it can be trusted elsewhere.
+    refitted = given.changed or BIAS in selection.structures or bool(selection.named and not left_out)
     final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
     extended = _extended(model, final, floor, ", ".join(part.source for part in evidence.parts)) if refitted else model
     outcomes = _outcomes(model, selection.now, final if refitted else None)
-    found = judged(selection, floor, before, given, outcomes, left_out, driven_alike(records, axis))
+    missing = left_out if refitted else [named.name for named in selection.named]
+    found = judged(selection, floor, before, given, outcomes, missing, driven_alike(records, axis))
     return found, extended
 
 

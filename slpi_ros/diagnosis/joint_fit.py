@@ -190,6 +190,9 @@ class Joint:
         x = scipy.linalg.cho_solve(self._record_factors[k], vector, check_finite=False)
         missed = np.concatenate([self._errors(sums, group, x, gains) for group in left])
         began = np.concatenate([sums.columns[group][:, starting] for group in left])
+        # Others cannot tell what depends on the initial history alone.
+        judged = _judged(self.problem)[np.concatenate([self._groups[group] for group in left])]
+        missed, began = missed[judged], began[judged]
         own = np.column_stack([np.ones(missed.size), began[:, began.any(axis=0)]])
         return float(np.mean((missed - own @ np.linalg.lstsq(own, missed, rcond=None)[0]) ** 2))
 
@@ -289,10 +292,7 @@ def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
 
     The beginning is never left out: what settles there from before the record shows nowhere else.
     """
-    walk = problem.design.walk
-    # While it has not moved yet the memory does not matter: what shows there comes from outside.
-    judged = (problem.judged & ~walk.first_rise) | (walk.direction == 0)
-    groups = []
+    judged, groups = _judged(problem), []
     for rows in evidence.slices:
         fitted = evidence.rows[rows][problem.weights[evidence.rows[rows]] > 0]
         fitted = fitted[:: -(-problem.count // MOST_ROWS)]
@@ -303,6 +303,13 @@ def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
         always = np.setdiff1d(fitted, np.concatenate(folds), assume_unique=True)
         groups += [always, *folds]
     return groups
+
+
+def _judged(problem: Problem) -> NDArray[np.bool_]:
+    """Return which rows other parts of a record, or other records, can predict, shape (N,)."""
+    walk = problem.design.walk
+    # While it has not moved yet the memory does not matter: what shows there comes from outside.
+    return np.asarray((problem.judged & ~walk.first_rise) | (walk.direction == 0))
 
 
 def _rest(everything: Sequence[int], left: Sequence[int]) -> list[int]:

@@ -33,8 +33,8 @@ SECTION = re.compile(r"^## Calibrate a real stage.*?(?=^### )", re.DOTALL | re.M
 BLOCK = re.compile(r"^```\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 # Shares of the identified range that are asked for after README's own set point.
 SHARES = (0.85, 0.2, 0.65, 0.4)
-# States that are averaged at each set point, after half as many that are not: 8 nm of noise become 0.8 nm.
-READINGS = 100
+# States that are averaged at each set point, after half as many that are not: 8 nm of noise become 1.1 nm.
+READINGS = 50
 PATIENCE_S = 90.0
 # The graph shows a node a moment before its topics are connected, seconds.
 SETTLE_S = 1.0

@@ -462,7 +462,7 @@ class Compensator(LifecycleNode):
         if axis.confidence.doubt or not axis.start_memory:
             return axis.confidence.doubt or "as it was left"
         where = {"end": "where its record ended", "start": "where its record began", "wiped": "wiped"}
-        text = f"starts {where[axis.start_memory]} (start_memory {axis.start_memory})"
+        text = f"starts {where[axis.start_memory]}, at {axis.stream.voltage:.6g} V (start_memory {axis.start_memory})"
         if axis.start_memory == "end" and axis.model and axis.model.end is None:
             text += ", which the model does not tell: where it began is taken"
         return text

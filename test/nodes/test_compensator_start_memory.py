@@ -9,7 +9,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from nodes.compensator_client import Client, compensator  # noqa: E402
-from nodes.ros_helpers import stage_model  # noqa: E402
+from nodes.ros_helpers import stage_model, values_of  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
@@ -82,9 +82,9 @@ def test_a_reset_comes_before_the_first_command_where_that_is_wanted(x_file):
 def test_a_reset_at_the_start_that_leaves_the_memory_assumed_is_not_silent(x_file):
     told = {"reset_on_start": True, "reset_rate": 400.0, "reset_cycles": 2, "voltage_min": 20.0, "voltage_max": 80.0}
     with compensator(model_file=x_file, **told) as client:
-        client.connect()
-        client.report(memory="resetting")
-        client.report(memory="assumed")
         client.graph.spin_until(lambda: "~/reset_memory" in client.node.stderr, "the warning")
+        status = client.graph.wait_for_status(
+            f"{client.name}: compensator", lambda status: values_of(status).get("x.memory_doubt"), "the doubt"
+        )
         warned = [line for line in client.node.stderr.splitlines() if "~/reset_memory" in line]
-        assert len(warned) == 1 and "WARN" in warned[0]
+        assert len(warned) == 1 and "WARN" in warned[0] and values_of(status)["x.memory_doubt"] in warned[0]

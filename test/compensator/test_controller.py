@@ -183,10 +183,10 @@ def test_limits_change_while_it_runs_unless_they_leave_the_stage_outside():
     assert snapshots(made) == before
     update(made, START_NS + 10**9, ["x"], [9e-6])
     assert made.voltages[0] == 70.0
-    with pytest.raises(UsageError, match="move it inside first"):
+    with pytest.raises(UsageError, match="\b60\b"):
         made.use_limits([Limits(0.0, 60.0)])
     made.cleanup()
-    with pytest.raises(UsageError, match="move it inside first"):
+    with pytest.raises(UsageError, match="\b60\b"):
         made.use_limits([Limits(0.0, 60.0)])
 
 
@@ -198,10 +198,10 @@ def test_a_sample_that_is_older_than_allowed_is_stale(max_age, age, taken):
     made.use_time(TimeRules(max_age=max_age))
     arrival = START_NS + round(age * 1e9)
     if taken:
-        made.update(START_NS, ["x"], [4e-6], arrival)
+        made.update(START_NS, ["x"], [4e-6], arrival, arrival)
         return
     with pytest.raises(RejectedError) as caught:
-        made.update(START_NS, ["x"], [4e-6], arrival)
+        made.update(START_NS, ["x"], [4e-6], arrival, arrival)
     assert caught.value.cause == STALE and "0.501 s" in str(caught.value)
 
 

@@ -14,7 +14,7 @@ rclpy = pytest.importorskip("rclpy")
 from nodes.ros_helpers import axis_model, stage_model, voltage_path  # noqa: E402
 
 from slpi_ros.compensator.controller import Controller  # noqa: E402
-from slpi_ros.compensator.validation import CAUSES, RejectedError  # noqa: E402
+from slpi_ros.compensator.validation import CAUSES, STALE, RejectedError, TimeRules  # noqa: E402
 from slpi_ros.errors import SlpiError, UsageError  # noqa: E402
 from slpi_ros.model.axis_model import Start  # noqa: E402
 from slpi_ros.model.limits import MAX_DT, Limits  # noqa: E402
@@ -188,6 +188,21 @@ def test_limits_change_while_it_runs_unless_they_leave_the_stage_outside():
     made.cleanup()
     with pytest.raises(UsageError, match=r"\b60\b"):
         made.use_limits([Limits(0.0, 60.0)])
+
+
+@pytest.mark.parametrize(("max_age", "age", "taken"), [
+    (0.5, 0.499, True), (0.5, 0.501, False), (0.5, -3.0, True), (0.0, 1000.0, True),
+])  # fmt: skip
+def test_a_sample_that_is_older_than_allowed_is_stale(max_age, age, taken):
+    made = compensation()
+    made.use_time(TimeRules(max_age=max_age))
+    arrival = START_NS + round(age * 1e9)
+    if taken:
+        made.update(START_NS, ["x"], [4e-6], arrival, arrival)
+        return
+    with pytest.raises(RejectedError) as caught:
+        made.update(START_NS, ["x"], [4e-6], arrival, arrival)
+    assert caught.value.cause == STALE and "0.501 s" in str(caught.value)
 
 
 NUMBER = st.one_of(

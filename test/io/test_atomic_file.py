@@ -1,6 +1,6 @@
 """Folders are made before long work, and refused in one line."""
 
-import pytest
+from refusals import refusal
 
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.atomic_file import make_folder
@@ -15,6 +15,4 @@ def test_makes_a_folder_and_those_above(tmp_path):
 def test_says_why_not(tmp_path):
     (tmp_path / "file").touch()
     for path in (tmp_path / "file", tmp_path / "file" / "below", "/proc/none", "nul\0"):
-        with pytest.raises(SlpiError, match="choose another place") as failure:
-            make_folder(path)
-        assert "\n" not in str(failure.value)
+        assert str(path).strip("\0") in refusal(SlpiError, make_folder, path)

@@ -1,0 +1,80 @@
+"""The rules by which effects win, lose or draw, on scores made by hand."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from slpi_ros.diagnosis.joint_fit import Score
+from slpi_ros.diagnosis.selection import LEAST_GAIN, alike, carries_over, counts, gain
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.lag import Lag
+
+BLOCKS = 12
+NOTHING = np.empty(0)
+
+
+def score(rms: float, records: np.ndarray = NOTHING, spread: float = 0.0, seed: int = 0) -> Score:
+    """Return the score of blocks that all have about this error (m)."""
+    factors = 1.0 + spread * np.random.default_rng(seed).standard_normal(BLOCKS)
+    losses = factors**2 / np.mean(factors**2) * rms**2
+    return Score(losses, NOTHING, records)
+
+
+@dataclass
+class Rival:
+    """What `alike` asks of an effect that competes."""
+
+    name: str
+    score: Score
+    effect: object = None
+    step: float = 1e-3
+
+    @property
+    def explanation(self) -> SimpleNamespace:
+        return SimpleNamespace(t=np.arange(50) * self.step)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.2 * LEAST_GAIN, False), (0.9 * LEAST_GAIN, False), (0.2, True)])
+def test_a_gain_counts_from_a_least_share_on_however_sure_it_is(share, expected):
+    before, after = score(1e-8), score(1e-8 * (1.0 - share))
+    assert gain(before, after) == pytest.approx(share)
+    assert counts(before, after) is expected
+    assert 0.01 <= LEAST_GAIN <= 0.1
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.9 * LEAST_GAIN, False), (0.2, True)])
+def test_a_gain_carries_over_from_the_same_share_on(share, expected):
+    before = score(1e-8, np.full(3, 1e-16))
+    assert carries_over(before, score(1e-9, np.full(3, (1e-8 * (1.0 - share)) ** 2))) is expected
+
+
+def test_a_gain_that_chance_gives_does_not_count():
+    before, after = score(1e-8, spread=0.5, seed=1), score(0.9e-8, spread=0.5, seed=2)
+    assert gain(before, after) > LEAST_GAIN and not counts(before, after)
+
+
+@pytest.mark.parametrize(("other", "expected"), [(1.01e-9, True), (9e-9, False)])
+def test_effects_that_explain_as_much_are_alike(other, expected):
+    best = Rival("creep", score(1e-9, spread=0.3, seed=1))
+    rival = Rival("thermal_drift", score(other, spread=0.3, seed=2))
+    assert alike(best, rival, score(1e-8), one_speed=False) is expected
+
+
+def test_effects_that_differ_beyond_chance_are_not_alike():
+    best, rival = Rival("creep", score(1e-9)), Rival("thermal_drift", score(2e-9))
+    assert not alike(best, rival, score(1e-8), one_speed=False)
+
+
+def test_at_one_speed_time_and_rate_are_alike_although_one_is_better():
+    best, rival = Rival("creep", score(1e-9)), Rival("rate_dependence", score(6e-9))
+    assert alike(best, rival, score(1e-8), one_speed=True)
+    assert not alike(best, rival, score(1e-8), one_speed=False)
+
+
+@pytest.mark.parametrize(("shift", "expected"), [(0.5e-3, True), (5e-3, False)])
+def test_delay_and_lag_of_less_than_a_sample_are_alike(shift, expected):
+    for best, rival in ((Delay(shift), Lag(shift)), (Lag(shift), Delay(shift))):
+        one, other = Rival(best.name, score(1e-9), best), Rival(rival.name, score(2e-9), rival)
+        assert alike(one, other, score(1e-8), one_speed=False) is expected

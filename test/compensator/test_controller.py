@@ -183,10 +183,10 @@ def test_limits_change_while_it_runs_unless_they_leave_the_stage_outside():
     assert snapshots(made) == before
     update(made, START_NS + 10**9, ["x"], [9e-6])
     assert made.voltages[0] == 70.0
-    with pytest.raises(UsageError, match="\b60\b"):
+    with pytest.raises(UsageError, match=r"'x'.*\b70 V.*\b60 V"):
         made.use_limits([Limits(0.0, 60.0)])
     made.cleanup()
-    with pytest.raises(UsageError, match="\b60\b"):
+    with pytest.raises(UsageError, match=r"'x'.*\b70 V.*\b60 V"):
         made.use_limits([Limits(0.0, 60.0)])
 
 

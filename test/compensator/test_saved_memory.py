@@ -1,6 +1,8 @@
 """The memory in a file: back as it was, or refused in one line."""
 
+import errno
 import json
+import os
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -44,11 +46,11 @@ def test_it_comes_back_to_the_last_bit(tmp_path):
 
 def test_it_belongs_to_one_model_its_axes_and_its_limits():
     other = replace(MODEL, created="2030-01-01T00:00:00Z")
-    with pytest.raises(ModelError, match="^[^\n]+$"):
+    with pytest.raises(ModelError, match="another model"):
         SAVED.require_fit(other, ["x"], LIMITS[:1])
     with pytest.raises(ModelError, match="'z'"):
         SAVED.require_fit(MODEL, ["x", "z"], LIMITS)
-    with pytest.raises(ModelError, match=r"-0\.1 .*'y'.*0\.\.1 V"):
+    with pytest.raises(ModelError, match=r"-0\.1 V.*'y'.*0\.\.1 V"):
         SAVED.require_fit(MODEL, ["x", "y"], [Limits(0.0, 1.0)] * 2)
 
 
@@ -117,7 +119,7 @@ def test_last_voltages_of_other_axes_or_nowhere(tmp_path):
     assert LastVoltages(path, 1) and read_last_voltages(path, 1, 1) is None, "a new life starts without"
     last.discard()
     assert not path.exists()
-    with pytest.raises(ModelError, match="^[^\n]+cannot be written[^\n]+$"):
+    with pytest.raises(ModelError, match=f"^{tmp_path}[^\n]+$"):
         LastVoltages(tmp_path, 1)
 
 
@@ -155,7 +157,7 @@ def test_noise_is_refused_in_one_line(tmp_path, noise):
 
 
 def test_a_place_that_cannot_be_written_is_said(tmp_path):
-    with pytest.raises(ModelError, match="no folder"):
+    with pytest.raises(ModelError, match=os.strerror(errno.ENOENT)):
         save_memory(SAVED, tmp_path / "no folder" / "memory.json")
-    with pytest.raises(ModelError, match="^[^\n]+$"):
+    with pytest.raises(ModelError, match=f"^[^\n]*{tmp_path}[^\n]*$"):
         load_memory(tmp_path)

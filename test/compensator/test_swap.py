@@ -64,7 +64,7 @@ AXIS = axis_model(FAMILY_CASE)
 def test_a_voltage_just_outside_goes_inside_and_one_far_outside_is_a_reason_to_refuse(present, taken):
     limits = Limits(-500.0, 500.0, 100.0)
     if not taken:
-        with pytest.raises(UsageError, match=rf"{present:g} V.*0\.\.100 V"):
+        with pytest.raises(UsageError, match=rf"{present:g} V.*\b0\.\.100 V"):
             take_over(AXIS, limits, (0.0, present))
         return
     stream = take_over(AXIS, limits, (0.0, present))

@@ -82,13 +82,13 @@ def test_no_room(room, says):
 
 def test_too_little_time_says_how_much_is_needed():
     path = path_of(0.0, [(1.0, 1.0, True), (0.0, 1.0, True)])
-    with pytest.raises(UsageError, match=r"2 moves .* at least 4 s at 100 Hz and 50 V/s, not 3\.5 s"):
+    with pytest.raises(UsageError, match=r"\b2\b.*\b4 s\b.*100 Hz.*50 V/s.*3\.5 s"):
         path.voltages(Room(0.0, 100.0, 3.5, 100.0, 50.0))
     assert path.voltages(Room(0.0, 100.0, 4.0, 100.0, 50.0)).max() == 100.0
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1e9), (-1e9, 0.0), (0.0, np.nextafter(1e4, np.inf))])
 def test_no_stage_takes_such_voltages(low, high):
-    with pytest.raises(UsageError, match="at most 10000 V"):
+    with pytest.raises(UsageError, match="10000 V"):
         Room(low, high, 1.0, 100.0)
     assert Room(-1e4, 1e4, 1.0, 100.0).span == 2e4

@@ -54,7 +54,7 @@ def test_points_that_are_not_alike_are_read_or_left_to_rclpy(message, data):
     which = data.draw(st.sampled_from(["positions", "velocities", "accelerations", "effort"]))
     setattr(message.points[longer], which, [*getattr(message.points[longer], which), 1.0])
     found = decode_trajectory(serialize_message(message))
-    # The first two points may have their own layouts where no third one follows; a longer first one may shift the rest.
+    # All points behind the first share one layout; a longer first one may shift that of the rest.
     if which == "positions" or (longer > 0 and len(message.points) > 2):
         assert found is None
     else:

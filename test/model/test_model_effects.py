@@ -93,7 +93,7 @@ def test_a_model_without_effects_does_not_look_at_time():
 def test_effects_stand_in_the_order_in_which_they_act():
     axis = with_effects(CREEP, Lag(0.01), Saturation(0.0, 90.0))
     assert [effect.name for effect in axis.effects] == ["lag", "saturation", "creep"]
-    with pytest.raises(ModelError, match="'lag' comes twice"):
+    with pytest.raises(ModelError, match="'lag'"):
         with_effects(Lag(0.01), Lag(0.02))
 
 
@@ -217,7 +217,7 @@ def test_documents_with_effects_that_make_no_sense(effect):
 def test_a_document_has_each_effect_once():
     document = json.loads(format_model(StageModel({"x": with_effects(Lag(0.1))})))
     document["axes"]["x"]["effects"] *= 2
-    with pytest.raises(ModelError, match="twice"):
+    with pytest.raises(ModelError, match="^here: .*'lag'"):
         parse_model(json.dumps(document), "here")
 
 

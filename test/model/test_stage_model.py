@@ -148,7 +148,7 @@ def test_limits_narrow_the_identified_voltages():
 
 def test_out_of_reach_waits_at_the_limit_with_a_warning():
     y = np.array([4e-6, 15e-6, 15.5e-6, 6e-6, 5e-6])
-    with pytest.warns(HeldAtLimitWarning, match=r"^2 of 5 .*first sample 1;") as caught:
+    with pytest.warns(HeldAtLimitWarning, match=r"^2 of 5 .*sample 1\b") as caught:
         v = ONE.compensate(T, y)
     assert v[1] == v[2] == 100.0
     reached = ONE.simulate(T, v)
@@ -174,7 +174,7 @@ def test_what_is_met_is_no_reason_to_warn():
 @pytest.mark.parametrize(
     ("signal", "error", "words"),
     [
-        ({"z": VOLTS}, UsageError, "no axis 'z'; it holds x, y"),
+        ({"z": VOLTS}, UsageError, "'z'.*x, y"),
         (VOLTS, UsageError, "mapping"),
         ({"x": VOLTS[:4]}, UsageError, r"axis 'x'.*\(4,\).*\(5,\)"),
         ({"x": VOLTS[:, None]}, UsageError, "axis 'x'"),
@@ -196,7 +196,7 @@ def test_signals_that_do_not_fit(method, signal, error, words):
 @pytest.mark.parametrize(
     ("t", "words"),
     [
-        ([0.0, 1.0, 0.5, 2.0, 3.0], "backwards at sample 2"),
+        ([0.0, 1.0, 0.5, 2.0, 3.0], "sample 2"),
         ([0.0, 1.0, np.nan, 2.0, 3.0], "finite"),
         ([0.0, 1.0, 2.0, 3.0, np.inf], "finite"),
         (0.0, "time"),
@@ -232,5 +232,5 @@ def test_an_absurd_voltage_is_refused():
 
 def test_axes_by_name():
     assert TWO.axis("y") is Y
-    with pytest.raises(UsageError, match="no axis 'yaw'; it holds x, y"):
+    with pytest.raises(UsageError, match="'yaw'.*x, y"):
         TWO.stream("yaw")

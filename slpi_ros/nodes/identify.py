@@ -136,18 +136,18 @@ class Identified:
 
     Parameters
     ----------
-    bag, topic : str
-        The newest bag of the fit.
-    document : str
+    bags : tuple of str
+        Those of the fit.
+    topic, document : str
     """
 
-    bag: str
+    bags: tuple[str, ...]
     topic: str
     document: str
 
 
 class DiagnosisService:
-    """Says what the model in use gets wrong on the bag it was fitted to, and answers when that is known.
+    """Says what the model in use gets wrong on the bags it was fitted to, and answers when that is known.
 
     Writes files and publishes nothing: a diagnosis changes no model that is running.
 
@@ -187,7 +187,7 @@ class DiagnosisService:
     @property
     def doing(self) -> str:
         """What is under way, in words; "" when nothing is."""
-        return f"diagnosing {self._job.request.bag} for {time.monotonic() - self._began:.0f} s" if self._job else ""
+        return f"diagnosing {self._job.request.source} for {time.monotonic() - self._began:.0f} s" if self._job else ""
 
     @property
     def values(self) -> dict[str, object]:
@@ -195,7 +195,7 @@ class DiagnosisService:
         state = "diagnosing" if self._job else "failed" if self.error else "done" if self._last else "none"
         return {
             "diagnosis.state": state,
-            "diagnosis.bag": self._last.bag if self._last else "",
+            "diagnosis.bag": self._last.source if self._last else "",
             "diagnosis.folder": self._last.folder if self._last else "",
             **{f"{axis}.verdict": verdict for axis, verdict in self._outcome.verdicts.items()},
             **{f"{axis}.diagnosis": summary for axis, summary in self._outcome.summaries.items()},
@@ -222,7 +222,7 @@ class DiagnosisService:
             return NO_MODEL
         try:
             folder = os.path.abspath(self._folder() or self._temporary_folder())
-            request = DiagnosisRequest(identified.bag, identified.topic, identified.document, folder)
+            request = DiagnosisRequest(identified.bags, identified.topic, identified.document, folder)
             self._job, self._began = DiagnosisProcess(request), time.monotonic()
         except OSError as error:
             return f"no diagnosis can be started: {error}; free memory or disk, or set diagnosis_directory"
@@ -264,7 +264,7 @@ class Identify(Node):
     """A node that identifies the stage of bags and keeps the model latched on ``stage_model``.
 
     Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`; the service ``~/identify``
-    (``std_srvs/Trigger``) starts anew, ``~/diagnose`` says what the published model gets wrong on its bag. A bag that
+    (``std_srvs/Trigger``) starts anew, ``~/diagnose`` says what the published model gets wrong on its bags. A bag that
     cannot be identified is reported and skipped, and the last good model stays published; so is a bag of the watched
     folder that is of another stage than that model.
 
@@ -418,7 +418,7 @@ class Identify(Node):
         if outcome.document:
             self._model = parse_model(outcome.document, "identify")
             self._stage = StageIdentity.of(self._model, request.stage)
-            self._identified = Identified(request.bags[-1], request.topic, outcome.document)
+            self._identified = Identified(request.bags, request.topic, outcome.document)
             self._diagnosis.forget()
             self._publisher.publish(String(data=outcome.document))
             self.get_logger().info(described(self._model))

@@ -228,17 +228,24 @@ class DiagnosisRequest:
 
     Parameters
     ----------
-    bag, topic : str
+    bags : tuple of str
+        Paths; all in one diagnosis.
+    topic : str
     document : str
         The model's.
     folder : str
         Of the files to be written.
     """
 
-    bag: str
+    bags: tuple[str, ...]
     topic: str
     document: str
     folder: str
+
+    @property
+    def source(self) -> str:
+        """The bags, in words."""
+        return ", ".join(self.bags)
 
 
 @dataclass(frozen=True)
@@ -254,18 +261,19 @@ class DiagnosisProcess(WorkerProcess[DiagnosisRequest, DiagnosisOutcome]):
     """A diagnosis under way."""
 
     def __init__(self, request: DiagnosisRequest) -> None:
-        super().__init__(judge, request, DiagnosisOutcome, f"{request.bag}: the diagnosis")
+        super().__init__(judge, request, DiagnosisOutcome, f"{request.source}: the diagnosis")
 
 
 def judge(request: DiagnosisRequest) -> DiagnosisOutcome:
-    """Read the bag, diagnose the model and write the files."""
+    """Read the bags, diagnose the model and write the files."""
     # Plotting is slow to load, and a node that only identifies does without.
     from slpi_ros.reports.diagnosis import make_room, write_files
 
     folder = Path(request.folder)
     try:
         make_room(folder)
-        diagnosis = diagnose(read_bag(request.bag, request.topic), parse_model(request.document, "stage_model"))
+        records = [read_bag(bag, request.topic) for bag in request.bags]
+        diagnosis = diagnose(records, parse_model(request.document, "stage_model"))
         write_files(folder, diagnosis)
     except SlpiError as error:
         return DiagnosisOutcome(error=str(error))

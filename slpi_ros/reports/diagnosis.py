@@ -94,11 +94,20 @@ def _show_records(page: Page, found: AxisDiagnosis) -> None:
     if len(found.records) > 1:
         page.section("Record by record")
         rows = [
-            [each.source, *(_nm(rms) for rms in (each.before_rms, each.after_rms)), _nm(each.left_out_rms or 0.0)]
+            [
+                each.source,
+                f"{each.offset * 1e6:+.3g}",
+                *(_nm(rms) for rms in (each.before_rms, each.after_rms)),
+                "-" if each.left_out_rms is None else _nm(each.left_out_rms),
+            ]
             for each in found.records
         ]
-        caption = "Errors, rms, without the constant of each record; left out: by a fit to the other records."
-        page.table(("Record", "given model", "extended model", "left out"), rows, None, caption)
+        caption = (
+            "Offset: by how much the zero has moved against the given model. Errors, rms, without it; left out: by a "
+            "fit to the other records."
+        )
+        header = ("Record", "offset (um)", "given model", "extended model", "left out")
+        page.table(header, rows, None, caption)
 
 
 def _shares(found: AxisDiagnosis) -> list[Share]:

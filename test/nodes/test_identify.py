@@ -70,6 +70,12 @@ def humming_bag(tmp_path_factory) -> str:
     return write_calibration(tmp_path_factory.mktemp("bags") / "humming", samples=1500, hum=100e-9)
 
 
+@pytest.fixture(scope="module")
+def second_humming_bag(tmp_path_factory) -> str:
+    """Return another bag of that stage, driven otherwise."""
+    return write_calibration(tmp_path_factory.mktemp("bags") / "second", seed=2, samples=1500, hum=100e-9)
+
+
 @dataclass
 class Client:
     graph: Graph
@@ -301,8 +307,9 @@ def test_trigger_without_anything_to_do():
         assert not answer.success and "no bag" in answer.message
 
 
-def test_a_diagnosis_of_the_model_in_use(humming_bag, tmp_path):
-    with identifying(bags=[humming_bag], kind="slpi", output=str(tmp_path / "stage.json")) as client:
+def test_a_diagnosis_of_the_model_in_use_over_all_its_bags(humming_bag, second_humming_bag, tmp_path):
+    bags = [humming_bag, second_humming_bag]
+    with identifying(bags=bags, kind="slpi", output=str(tmp_path / "stage.json")) as client:
         client.identified()
         assert client.diagnosis("none")["diagnosis.folder"] == ""
         answer = client.diagnose()
@@ -310,13 +317,17 @@ def test_a_diagnosis_of_the_model_in_use(humming_bag, tmp_path):
         assert answer.success and "x: named: Found: hum" in answer.message and "\n" not in answer.message
         assert str(folder / "report.html") in answer.message and str(folder / "extended_model.json") in answer.message
         # Reports went on meanwhile.
-        assert client.diagnosis("diagnosing")["diagnosis.bag"] == humming_bag
+        assert client.diagnosis("diagnosing")["diagnosis.bag"] == ", ".join(bags)
         done = client.diagnosis("done")
         assert done["x.verdict"] == "named" and done["diagnosis.folder"] == str(folder)
         document = json.loads((folder / "diagnosis.json").read_text())
         validate(document, "diagnosis", "test")
-        assert [effect["name"] for effect in document["axes"]["x"]["effects"]] == ["hum"]
-        assert load_model(folder / "extended_model.json").axes["x"].effects
+        found = document["axes"]["x"]
+        assert [effect["name"] for effect in found["effects"]] == ["hum"]
+        assert [record["source"] for record in found["records"]] == bags
+        assert all(record["left_out_rms_m"] > 0.0 for record in found["records"])
+        # The phase of a hum is each record's own.
+        assert not load_model(folder / "extended_model.json").axes["x"].effects
         assert (folder / "report.html").read_text().startswith("<!doctype html>")
         # What is running stays as it is.
         assert len(client.models) == 1 and not parse_model(client.models[0].data, "test").axes["x"].effects

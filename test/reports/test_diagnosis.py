@@ -15,6 +15,7 @@ from slpi_ros.diagnosis.result import (
     AxisDiagnosis,
     Diagnosis,
     NamedEffect,
+    RecordOutcome,
     Traces,
 )
 from slpi_ros.effects.creep import Creep
@@ -158,3 +159,14 @@ def test_a_person_reads_the_verdict_and_toggles_a_cause(written, tmp_path):
         assert [url for url in browser.fetched() if not url.startswith("data:")] == [written.as_uri()]
     finally:
         browser.close()
+
+
+def test_each_record_has_its_row(tmp_path):
+    records = (
+        RecordOutcome("first bag", -930e-9, 210e-9, 12.5e-9, 17.5e-9),
+        RecordOutcome("second bag", 40e-9, 180e-9, 11.5e-9, None),
+    )
+    text = write(tmp_path, {"x": found(records=records)}).read_text(encoding="utf-8")
+    cells = ["first bag", "-0.93", "210.0 nm", "12.5 nm", "17.5 nm", "second bag", "+0.04", "180.0 nm", "11.5 nm", "-"]
+    rows = [f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in (cells[:5], cells[5:])]
+    assert "".join(rows) in text

@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
         commands.add_parser("diagnose", help="find the causes of a model's errors on bags and extend the model")
     )
     _verify_options(commands.add_parser("verify", help="test a model on bags not used to identify it: pass or fail"))
-    _excite_options(commands.add_parser("excite", help="generate the excitation voltages to record for an identification"))
+    _excite_options(commands.add_parser("excite", help="generate excitation voltages for an identification"))
     _refit_options(
         commands.add_parser("refit", help="update a model with a new bag, keeping regions that the bag does not visit")
     )
@@ -94,7 +94,7 @@ def _import_options(command: Any) -> None:
     )  # fmt: skip
     command.add_argument("-o", "--output", metavar="BAG", required=True, help="folder of the new bag")
     command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
-    command.add_argument("--voltage", metavar="COLUMN", nargs="+", default=(), help="one column for all axes or one per axis")
+    command.add_argument("--voltage", metavar="COLUMN", nargs="+", default=(), help="one for all axes or one per axis")
     command.add_argument("--displacement", metavar="COLUMN", nargs="+", default=(), help="one column per axis")
     command.add_argument(
         "--displacement-unit", help="m, mm, um, nm or pm, for columns without a unit in the name; default: um"
@@ -158,8 +158,8 @@ def _axes(command: Any, **told: Any) -> None:
 
 
 def _span(command: Any) -> None:
-    command.add_argument("--start", metavar="S", type=float, help="start of the fitted part, seconds from the first stamp")
-    command.add_argument("--stop", metavar="S", type=float, help="end of the fitted part, seconds, exclusive")
+    command.add_argument("--start", metavar="S", type=float, help="start of the fit, seconds from the first stamp")
+    command.add_argument("--stop", metavar="S", type=float, help="end of the fit, seconds from the first stamp")
 
 
 def _where_in_the_bag(command: Any) -> None:
@@ -168,7 +168,7 @@ def _where_in_the_bag(command: Any) -> None:
     command.add_argument("--displacement-topic", metavar="TOPIC", help="for separate topics: the displacement")
     clocks = ("displacement", "voltage")
     command.add_argument("--clock", choices=clocks, help=f"for separate topics: sample times; default: {clocks[0]}")
-    command.add_argument("--voltage-measured", action="store_true", help="voltage is measured: interpolate, do not hold")
+    command.add_argument("--voltage-measured", action="store_true", help="interpolate the measured voltage, do not hold")
 
 
 def _excite_options(command: Any) -> None:
@@ -267,7 +267,7 @@ def _identify(options: argparse.Namespace) -> None:
     _require_another_file(options.output, *options.bags)
     target = Path(options.output)
     if target.is_dir() or not target.parent.is_dir():
-        raise ModelError(f"{target}: cannot be written: a folder has this name, or its parent folder is missing; choose another place")
+        raise ModelError(f"{target}: cannot be written: it is a folder, or its parent is missing; choose another place")
     if options.uncertainty:
         require_known_uncertainty(options.kind)
     if options.report:

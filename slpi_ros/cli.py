@@ -168,7 +168,7 @@ def _where_in_the_bag(command: Any) -> None:
     command.add_argument("--displacement-topic", metavar="TOPIC", help="for separate topics: the displacement")
     clocks = ("displacement", "voltage")
     command.add_argument("--clock", choices=clocks, help=f"for separate topics: sample times; default: {clocks[0]}")
-    command.add_argument("--voltage-measured", action="store_true", help="interpolate the measured voltage, do not hold")
+    command.add_argument("--voltage-measured", action="store_true", help="voltage is measured: interpolate it")
 
 
 def _excite_options(command: Any) -> None:

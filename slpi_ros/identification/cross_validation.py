@@ -103,7 +103,7 @@ class CrossValidationReport:
 
     def lines(self) -> list[str]:
         """Return the held-out errors as a text table, in nanometres."""
-        head = f"{'held-out error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}{'classical PI':>14}"
+        head = f"{'on blocks left out, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}{'classical PI':>14}"
         parts = (self.overall, *self.by_level, *self.by_region, *self.by_speed)
         floor = f"{'repeatability floor':<33}{self.floor.rms * 1e9:9.1f}   from {self.floor.source}"
         return [head, *(part.line() for part in parts), floor]

@@ -1,8 +1,8 @@
 """Decomposition of a voltage into hysteresis branches, and the design matrix of the linear prediction.
 
 Displacement is linear in a model's parameters: the displacement of a sample is that of the reversal at which its
-branch started, plus the increment along the branch. With the increments ``A_local``, a matrix ``P`` that selects each
-sample's reversal and the predictions ``T`` at reversals, the record is ``(A_local + P T) x``; the product is not formed.
+branch started, plus the increment along the branch. With the increments ``A_local``, the matrix ``P`` that selects
+each sample's reversal and the predictions ``T`` at reversals, the record is ``(A_local + P T) x``; the product is never formed.
 """
 
 from collections.abc import Sequence

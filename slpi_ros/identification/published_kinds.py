@@ -366,7 +366,7 @@ def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the knots of ``X_p`` over amplitude for the SMPI model: cycles of nearly equal amplitude are averaged.
+    """Return the knots of ``X_p`` over amplitude for the SMPI model; cycles of nearly equal amplitude are averaged.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Bases of the models that are linear in their parameters: branch increments, roughness and monotonicity constraints."""
+"""Bases of the models that are linear in their parameters: branch increments, roughness, monotonicity constraints."""
 
 from dataclasses import dataclass
 from functools import cached_property

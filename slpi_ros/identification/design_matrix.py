@@ -2,7 +2,8 @@
 
 Displacement is linear in a model's parameters: the displacement of a sample is that of the reversal at which its
 branch started, plus the increment along the branch. With the increments ``A_local``, the matrix ``P`` that selects
-each sample's reversal and the predictions ``T`` at reversals, the record is ``(A_local + P T) x``; the ``(A_local + P T) x``; the product is never formed.
+each sample's reversal and the predictions ``T`` at reversals, the record is ``(A_local + P T) x``;
+the product is never formed.
 """
 
 from collections.abc import Sequence

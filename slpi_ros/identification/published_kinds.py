@@ -385,7 +385,7 @@ def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     amplitudes, peaks = cycle_peaks(v, y)
     if not amplitudes.size:
-        raise IdentificationError("no cycle starts at the lowest voltage; drive up from there and back, for each amplitude")
+        raise IdentificationError("no cycle starts at the lowest voltage; drive up and back from there, per amplitude")
     order = np.argsort(amplitudes)
     amplitudes, peaks = amplitudes[order], peaks[order]
     group = np.zeros(amplitudes.size, dtype=np.int64)

@@ -391,7 +391,7 @@ def _clock_findings(clock: ClockQuality) -> Iterator[Finding]:
         yield Finding("warn", text)
     if clock.unseen:
         yield Finding(
-            "warn", f"{clock.unseen} gaps within which the voltage moved: missing reversals leave the hysteresis state uncertain"
+            "warn", f"{clock.unseen} gaps within which the voltage moved: unseen reversals leave the memory uncertain"
         )
     if clock.duplicates:
         yield Finding("warn", f"{_of(clock.duplicates, clock.samples)} with the stamp of the one before")

@@ -171,7 +171,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
 
 
 def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int, int]:
-    """Return indices ``first:until`` with ``start <= t < stop`` (s) in ordered times; UsageError unless start < stop."""
+    """Return indices ``first:until`` of ``start <= t < stop`` (s) in ordered times; UsageError unless start < stop."""
     low, high = -np.inf if start is None else start, np.inf if stop is None else stop
     if not low < high:
         raise UsageError(f"start {start} s is not before stop {stop} s; give seconds from the first stamp, in order")

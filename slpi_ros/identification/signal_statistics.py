@@ -1,6 +1,6 @@
-"""What is wrong with the readings of a sensor: noise, digits, values that repeat or stand alone.
+"""Statistics of sensor readings: noise, resolution, repeated values, outliers and the repeatability floor.
 
-All tests know the voltage: a displacement may rest while the voltage rests, and turn where the voltage turns.
+All tests take the voltage into account: a displacement may rest or reverse where the voltage does.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from slpi_ros.identification.drive import hold_band, resting, smallest_turn
 
 @dataclass(frozen=True)
 class ErrorMetrics:
-    """How far a model, or a stage, is from what it should be.
+    """Error metrics of a model against a measurement, or of a measurement against a setpoint.
 
     The MPI paper's "mean square error" is `root_mean_square` in all places: Tables 2 and 4, 0.1201 µm (feedforward) and
     0.2949 µm (feedforward and PID). Its unit is µm, and it exceeds the mean absolute error as a root must. A mean
@@ -50,13 +50,14 @@ class ErrorMetrics:
 
 
 def error_metrics(measured: ArrayLike, model: ArrayLike) -> ErrorMetrics:
-    """Compare a model with what was measured, or what was measured with what was desired.
+    """Compute the error metrics of a model against a measurement, or of a measurement against a setpoint.
 
     Parameters
     ----------
     measured : array_like, shape (N,), metres
         The reference; R² is relative to its variation.
     model : array_like, shape (N,), metres
+        Values to compare with the reference.
 
     Raises
     ------
@@ -85,22 +86,22 @@ def error_metrics(measured: ArrayLike, model: ArrayLike) -> ErrorMetrics:
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# False alarms that a clean record may give, of each kind.
+# Expected number of false alarms of each test on a clean record.
 FALSE_ALARMS = 0.01
-# After a turn a piezo moves less per volt than on average; this share of it is left at least.
+# Least gain of a piezo after a reversal, as a share of the mean gain.
 LEAST_GAIN = 0.2
-# So many readings tell as much of noise and digits as all of a long record.
+# Number of readings from which noise and resolution are estimated.
 _ENOUGH = 100_000
-# Readings of a long record that are judged together.
+# Block size, in readings, for long records.
 _BLOCK = 1_000_000
-# A reading is compared with so many before it.
+# Number of preceding readings with which a reading is compared.
 _EARLIER = 3
-# A displacement may turn this many samples away from the voltage, and ring so many after it jumped.
+# Largest delay of a displacement reversal, and duration of ringing after a jump, in samples.
 _TURN_REACH, _RINGING = 5, 200
 
 
 def digit(x: FloatArray) -> float:
-    """Return the step between possible readings, 0 where they are continuous.
+    """Return the resolution of readings `x`, shape (N,), in their unit; 0 if they are continuous.
 
     The largest step of which (nearly) all small differences between sorted readings are multiples.
     """
@@ -116,24 +117,24 @@ def digit(x: FloatArray) -> float:
 
 
 def spread(x: FloatArray) -> float:
-    """Return how far the readings reach, outliers apart."""
+    """Return the range of readings `x`, shape (N,), between the 1st and 99th percentile."""
     low, high = np.percentile(x[:: max(1, x.size // _ENOUGH)], (1, 99))
     return float(high - low) or float(np.ptp(x))
 
 
 def noise(x: FloatArray, *drivers: FloatArray) -> float:
-    """Return the rms of what changes from reading to reading, outliers apart.
+    """Return the robust rms of the noise from reading to reading.
 
-    From what each reading differs from the line, or the curve, through its neighbours; or from the line along a driver,
-    which an uneven rate does not disturb. Where the signal bends, each of them sees more than noise, and a median
-    passes over that; the least one counts. Noise that lasts for several samples is not seen.
+    The least of several estimates: deviations from a line or a cubic through the neighbours, and from a line in a
+    driver, which is insensitive to an uneven rate. The curvature of the signal increases each estimate; medians reduce
+    this effect. Noise correlated over several samples is not detected.
 
     Parameters
     ----------
     x : ndarray, shape (N,), N >= 5
         Readings.
     *drivers : ndarray, shape (N,)
-        What the readings follow: time, or a voltage.
+        Signals that the readings follow: time, or a voltage.
     """
     every = max(1, x.size // _ENOUGH)
     far_before, before, own, after, far_after = (x[first : x.size - 4 + first : every] for first in range(5))
@@ -201,17 +202,18 @@ class Repeats:
 
 
 def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: float) -> Repeats:
-    """Return the repeats of a displacement that are none by chance.
+    """Return the repeats of a displacement that are not due to chance.
 
-    Either it would have had to follow the voltage, or so many equal readings are improbable in the noise.
+    Either the voltage moved so that the displacement had to follow, or equal readings are improbable given the noise.
 
     Parameters
     ----------
     y, v : ndarray, shape (N,), metres and volts
         Displacement and voltage.
     gain : float, metres per volt
+        Mean gain of the stage.
     noise_rms, step : float, metres
-        Of the displacement.
+        Noise and resolution of the displacement.
     """
     repeats = Repeats.within(y)
     moved = repeats.spans(v)
@@ -224,9 +226,9 @@ def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: fl
 
 
 def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the readings that repeat the one before, three and more in a row, though noise should tell them apart.
+    """Return the repeated readings in runs of three or more of a displacement `y` (m) whose noise exceeds its resolution.
 
-    Digits coarser than the noise repeat readings too; of such a displacement, shape (N,), metres, none is returned.
+    If the noise is below the resolution, repeats are expected and none is returned. `v` (V) is the voltage.
     """
     repeats = Repeats.within(y)
     if not np.any(repeats.length > 2):
@@ -241,9 +243,9 @@ def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
 
 
 def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repeats:
-    """Return the repeats of a voltage that it must have missed: the displacement moves on, and then the voltage jumps.
+    """Return the repeats of a voltage during which the displacement moves and after which the voltage jumps.
 
-    Parameters are those of `frozen`. A voltage that rests after a jump is none: the displacement still follows.
+    Parameters as for `frozen`. A hold after a voltage jump is excluded: there the displacement still follows the jump.
     """
     repeats = Repeats.within(v)
     moved = repeats.spans(y) / gain
@@ -255,7 +257,7 @@ def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repe
 
 
 def lone_outliers(y: FloatArray, v: FloatArray, gain: float, noise_y: float, noise_v: float) -> NDArray[np.int64]:
-    """Return the readings that stand off the line of their four neighbours, which they share, unlike the voltage.
+    """Return the readings that deviate from a line through their four neighbours where the voltage does not.
 
     Parameters
     ----------
@@ -313,9 +315,9 @@ def _off_neighbours(x: FloatArray) -> FloatArray:
 
 
 def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArray[np.int64]:
-    """Return those of the outliers that repeat, but for the noise, one of the readings before.
+    """Return the outliers that repeat one of the preceding readings within the noise.
 
-    Outliers of any size now and then do so by chance; but then they hit a reading after them as often.
+    If outliers match later readings about as often, the matches are due to chance and none is returned.
     """
     near = 3.0 * np.sqrt(2.0) * noise_rms
     reach = np.arange(1, _EARLIER + 1)
@@ -339,10 +341,10 @@ _MIXED_MOST = 1.3
 
 
 def mixed_readings(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the readings of a displacement that come early or late, or mix two.
+    """Return the readings of a displacement that are early, late or a mixture of two neighbouring values.
 
-    Such a reading lies between its own place and that of the next one, or of the one before, as from a link that
-    delivers an old value or parts of two. They all lie off to one side: noise and outliers do not.
+    Such a reading lies between its true value and that of a neighbour, as from a link that delivers an old value or
+    parts of two. All deviate to the same side, unlike noise and outliers.
 
     Parameters
     ----------
@@ -417,13 +419,14 @@ NO_NOISE = 1e-9
 
 @dataclass(frozen=True)
 class Floor:
-    """How well a record repeats itself.
+    """Repeatability floor of a record.
 
     Parameters
     ----------
     rms : float, metres
+        Rms of the differences between repetitions, per reading.
     source : str
-        What it was seen in, with numbers.
+        Data from which it was estimated, with numbers.
     """
 
     rms: float
@@ -431,10 +434,10 @@ class Floor:
 
 
 def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray | None = None) -> Floor:
-    """Find how well a record repeats itself, outliers apart.
+    """Estimate the repeatability floor of a record, without outliers.
 
-    From moves that are made again between the same turns, where there are enough of them; else from holds; else from
-    what changes from sample to sample. What differs slowly and evenly (drift, creep) does not count.
+    Estimated from repeated moves between the same reversals if there are enough; else from holds; else from the
+    sample-to-sample noise. Slow and smooth differences (drift, creep) do not count.
 
     Parameters
     ----------
@@ -443,8 +446,8 @@ def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray |
     y : ndarray, shape (N,), metres
         Displacement; NaN where there is none.
     residual : ndarray, shape (N,), metres, optional
-        What a model leaves of it. It is looked at instead of `y`, so that what the model says about time (drift, hum)
-        does not count.
+        Residual of a model. It replaces `y` in the estimate, so that drift and hum described by the model do not
+        count.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Bags on disk: finding one and its topic, translating errors of damaged ones, watching a folder for new ones."""
+"""Bags on disk: locating bags and topics, translating errors of damaged bags, watching a folder for new bags."""
 
 import errno
 import os
@@ -87,7 +87,7 @@ def unpacked(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def translated(source: Path) -> Iterator[None]:
-    """Turn whatever a damaged bag makes its reader raise into a RecordError of one line."""
+    """Translate every exception raised while reading a damaged bag into a one-line RecordError."""
     try:
         _require_whole(source)
         yield
@@ -124,7 +124,7 @@ def _require_whole(source: Path) -> None:
 
 
 def _remedy(source: Path) -> str:
-    """Say what can be tried with a bag that does not open."""
+    """Return the remedy for a bag that cannot be opened."""
     if source.is_dir():
         return "rebuild metadata.yaml with `ros2 bag reindex`, or give its .mcap or .db3 file alone"
     if source.suffix == ".zstd":
@@ -179,7 +179,7 @@ def absolute_name(topic: str) -> str:
 
 
 class BagWatch:
-    """Watches a folder for bags that are complete; one that is still being written is not.
+    """Watch a folder for newly completed bags; bags still being written are ignored.
 
     A rosbag2 folder is complete once it holds ``metadata.yaml``, which its writer adds last; a lone mcap file once it
     ends as such files do. Lone sqlite3 files do not tell, and are left out.

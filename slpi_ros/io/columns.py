@@ -1,4 +1,4 @@
-"""The columns of a table: unit and axis from a name, however it is written, and the choice among them."""
+"""Interpretation of column names (quantity, unit, axis) and choice of the columns of a record."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Tables in and out: measured data to import, and the command tables of the command line."""
+"""Import of measured data from tables; reading and writing of the command line's tables."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,7 +26,7 @@ def import_table(
     displacement_unit: str | None = None,
     axes: Sequence[str] = (),
 ) -> Record:
-    """Read measured data from any source; the names of the columns say what they are.
+    """Import measured data from a table, identifying columns and units by name or option.
 
     A unit in a name is honoured, as in ``time_ms``, ``Voltage (mV)``, ``x [nm]`` or ``displacement in nm``; case
     counts only where it decides. Without one, values are seconds, volts and micrometres.

@@ -160,14 +160,14 @@ def _rms(deviation: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Repeats:
-    """Stretches of equal readings in a row.
+    """Runs of equal consecutive readings.
 
     Parameters
     ----------
     first : ndarray of int, shape (M,)
-        The first reading of each.
+        First reading of each run.
     length : ndarray of int, shape (M,)
-        Readings in each, at least 2.
+        Number of readings in each run, at least 2.
     """
 
     first: NDArray[np.int64]
@@ -175,14 +175,14 @@ class Repeats:
 
     @classmethod
     def within(cls, x: FloatArray) -> "Repeats":
-        """Find all in `x`, shape (N,)."""
+        """Find all runs in `x`, shape (N,)."""
         bounds = np.concatenate([[0], np.flatnonzero(x[1:] != x[:-1]) + 1, [x.size]])
         length = np.diff(bounds)
         several = length > 1
         return cls(bounds[:-1][several], length[several])
 
     def spans(self, x: FloatArray) -> FloatArray:
-        """Return how far `x`, shape (N,), moves during each, shape (M,)."""
+        """Return the range of `x`, shape (N,), during each run, shape (M,)."""
         if not self.first.size:
             return np.empty(0)
         # Every second range of reduceat is one of ours, and what lies between is left out.
@@ -192,12 +192,12 @@ class Repeats:
         return np.asarray(high - low)
 
     def where(self, chosen: Mask) -> "Repeats":
-        """Return the `chosen` ones, shape (M,)."""
+        """Return the runs that are `chosen`, a mask of shape (M,)."""
         return Repeats(self.first[chosen], self.length[chosen])
 
     @property
     def readings(self) -> int:
-        """How many readings repeat the one before."""
+        """Number of readings that repeat the preceding one."""
         return int(np.sum(self.length - 1))
 
 
@@ -226,7 +226,7 @@ def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: fl
 
 
 def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the repeated readings in runs of three or more of a displacement `y` (m) whose noise exceeds its resolution.
+    """Return the repeated readings, in runs of three or more, of a displacement `y` (m) with noise above its resolution.
 
     If the noise is below the resolution, repeats are expected and none is returned. `v` (V) is the voltage.
     """
@@ -303,7 +303,7 @@ def _outliers_of_block(
 
 
 def _after_jumps(v: FloatArray, jump: float) -> Mask:
-    """Return where the voltage has jumped not long ago, shape (N,)."""
+    """Return the mask, shape (N,), of samples within `_RINGING` samples after a voltage jump above `jump` (V)."""
     jumps = np.flatnonzero(np.abs(np.diff(v, prepend=v[0])) > jump)
     last = np.zeros(v.size, np.int64)
     last[jumps] = jumps + _RINGING
@@ -484,7 +484,7 @@ def _seen(t: FloatArray, v: FloatArray, signal: FloatArray, *, alone: bool) -> F
 
 
 def robust_rms(x: FloatArray) -> float:
-    """Return the rms of `x`, shape (N,), outliers apart; that of a Gaussian is not changed."""
+    """Return the rms of `x`, shape (N,), without outliers; unbiased for a Gaussian distribution."""
     size = np.abs(x)
     spread = 1.4826 * float(np.median(size))
     for _ in range(_CUTS):
@@ -494,10 +494,10 @@ def robust_rms(x: FloatArray) -> float:
 
 
 def _repeats(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatArray]:
-    """Yield, for each move that was made before, how it differs, in units of one reading's noise.
+    """Yield the difference of each repeated move from its earlier repetition (m), scaled to the noise of one reading.
 
-    On a move from one turn to the next the stage follows a branch of its own, up to where the loop around it closes:
-    what it has done before the turn before does not matter.
+    Between two reversals the stage follows one branch until the enclosing loop closes; motion before the previous
+    reversal has no influence.
     """
     span = float(np.ptp(v))
     ends = reversals(v, smallest_turn(v, noise(v, t)))
@@ -552,7 +552,7 @@ def _difference(own: Move, other: Move, within: NDArray[np.bool_], same: float) 
 
 
 def _shift(t: FloatArray, v: FloatArray, t_other: FloatArray, v_other: FloatArray) -> float:
-    """Return by how much later (s) the other move passes the voltages of this one."""
+    """Return the delay (s) of the other move at equal voltages."""
     rate = np.gradient(v, np.maximum.accumulate(t) + 1e-12 * np.arange(t.size))
     shift = 0.0
     for _ in range(3):
@@ -562,7 +562,7 @@ def _shift(t: FloatArray, v: FloatArray, t_other: FloatArray, v_other: FloatArra
 
 
 def _holds(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatArray]:
-    """Yield, for each piece of a hold, what is left when a parabola is taken out."""
+    """Yield the residual (m) of a parabola fitted to each piece of a hold."""
     starts, stops = resting(t, v, hold_band(v, noise(v, t), digit(v)))
     every = max(1, starts.size // _ENOUGH_PIECES)
     for start, stop in zip(starts[::every].tolist(), stops[::every].tolist(), strict=True):
@@ -576,7 +576,7 @@ def _holds(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatAr
 
 
 def _without(x: FloatArray, *columns: FloatArray) -> FloatArray:
-    """Return what is left of `x`, shape (n,), when a sum of columns is taken out; as large as it was before."""
+    """Return the residual of a robust fit of `columns` to `x`, shape (n,), corrected for the degrees of freedom."""
     design = np.column_stack(columns)
     size = np.sqrt((design**2).sum(axis=0))
     design = design[:, size > 0.0] / size[size > 0.0]
@@ -598,9 +598,9 @@ _DEAD_BAND = 2.0
 
 
 def voltage_noise(t: FloatArray, v: FloatArray) -> float:
-    """Return the noise (V rms) of a measured voltage, shape (N,), volts; 0 for a commanded one, which has next to none.
+    """Return the noise (V rms) of a measured voltage, shape (N,), volts; 0 for a commanded voltage.
 
-    Noise changes from sample to sample; differences of a high order pass over what does so smoothly.
+    Noise is estimated from high-order differences, which suppress smooth signals.
     """
     if v.size <= max(_ORDERS):
         return 0.0
@@ -621,10 +621,10 @@ def _central_binomial(order: int) -> float:
 
 
 def without_noise(t: FloatArray, v: FloatArray) -> FloatArray:
-    """Return a voltage, shape (N,), without the noise of its measurement; a commanded one as it is.
+    """Return a voltage, shape (N,), volts, with measurement noise removed; a commanded voltage is unchanged.
 
-    Each reading gives way to a parabola through those around it, as many as lie on it but for their noise. What still
-    turns back by no more than the noise is flattened.
+    Each reading is replaced by a parabola over the largest window that fits within the noise. Remaining reversals
+    within the noise are flattened.
     """
     noise = voltage_noise(t, v)
     if not noise:

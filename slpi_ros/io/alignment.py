@@ -14,9 +14,9 @@ from slpi_ros.io.record import FloatArray, Record
 
 TimeArray = NDArray[np.int64]
 
-# Where neighbours are this many periods apart, nothing is known between them.
+# Gap length, in periods, within which values are not interpolated.
 _GAP = 10.0
-# Names for columns that no message names.
+# Axis names for columns without names.
 _AXES = ("x", "y", "z")
 
 
@@ -68,9 +68,9 @@ class SeparateTopics:
     voltage, displacement : str
         Names, as for a single topic.
     clock : {"displacement", "voltage"}
-        Whose messages become samples. With "displacement", nothing measured is changed: its messages get the voltage
-        of their time, and a voltage that turns unseen between two of them becomes a sample of its own, whose
-        displacement is NaN. With "voltage", displacement is interpolated linearly.
+        Signal whose messages become samples. With "displacement", the voltage is resampled at the displacement's
+        times; a voltage reversal between two displacements becomes an additional sample with displacement NaN. With
+        "voltage", displacement is interpolated linearly.
     held : bool
         A commanded voltage stays as it is until the next message. With the clock "voltage", a sample then lies in the
         middle between its message and the next. False for a measured voltage, which is interpolated linearly.

@@ -31,7 +31,7 @@ def partial_path(path: str | os.PathLike[str]) -> Path:
 
 
 def locate(path: Path) -> list[Path]:
-    """Return what a bag reader can open: a folder with metadata, or bag files, in order if there are several.
+    """Return the paths to open for a bag: a folder with metadata, or its bag files in order.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def _parts(files: list[Path], folder: Path) -> list[Path]:
 
 @contextmanager
 def unpacked(file: Path) -> Iterator[Path]:
-    """Provide a lone bag file that its recorder compressed as a whole; any other is provided as it is."""
+    """Provide a bag file, decompressed to a temporary file if the recorder compressed it as a whole."""
     if file.suffix != ".zstd":
         yield file
         return
@@ -135,12 +135,12 @@ def _remedy(source: Path) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """Return what the error says, short and without line breaks."""
+    """Return the message of an error, at most 200 characters on one line."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str], source: Path) -> str:
-    """Return the full name of the topic that is meant.
+    """Resolve a topic name to the full name of a topic in the bag.
 
     Parameters
     ----------

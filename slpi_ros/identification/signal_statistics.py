@@ -226,7 +226,7 @@ def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: fl
 
 
 def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the repeated readings, in runs of three or more, of a displacement `y` (m) with noise above its resolution.
+    """Return repeated readings, in runs of three or more, of a displacement `y` (m) with noise above its resolution.
 
     If the noise is below the resolution, repeats are expected and none is returned. `v` (V) is the voltage.
     """

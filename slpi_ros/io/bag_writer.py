@@ -165,12 +165,12 @@ class BagWriter:
         self.message_count += 1
 
     def close(self) -> None:
-        """Complete the bag and put it in its place.
+        """Complete the bag and move it to its final path.
 
         Raises
         ------
         RecordError
-            If the disk does not take it; what is there stays in the partial folder.
+            If the bag cannot be written; the data written so far remain in the partial folder.
         """
         try:
             self._writer.close()
@@ -243,5 +243,5 @@ def write_bag(
 
 @cache
 def typestore() -> Any:
-    """Return the message types that are known here: those of ROS 2 Jazzy."""
+    """Return the type store of the supported message types, those of ROS 2 Jazzy."""
     return get_typestore(Stores.ROS2_JAZZY)

@@ -60,7 +60,7 @@ def import_table(
     Raises
     ------
     RecordError
-        If the file, a column, its unit or a value is not what it should be.
+        If the file, a column, its unit or a value is invalid.
     UsageError
         If an option is wrong, contradicts the name of a column, or gives one column two roles.
     """
@@ -122,7 +122,7 @@ def _column_summary(column: Column, values: FloatArray, unit: str) -> str:
 
 
 def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Read a command table, in which every value counts.
+    """Read a command table, in which every value must be finite.
 
     Parameters
     ----------

@@ -49,9 +49,9 @@ def read_bag(
     path : path-like
         A rosbag2 folder, or a lone mcap or sqlite3 file.
     topic : str or slpi_ros.io.alignment.SeparateTopics
-        A topic of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts; or one topic of each.
+        A ``sensor_msgs/JointState`` topic with ``position`` in metres and ``effort`` in volts, or a pair of topics.
     axes : sequence of str, optional
-        The axes to read; all by default.
+        Names of the axes to read; by default every axis of the bag.
 
     Returns
     -------
@@ -61,9 +61,9 @@ def read_bag(
     Raises
     ------
     SlpiError
-        If the bag cannot be read; the message says what to do.
+        If the bag cannot be read; the message names the remedy.
     """
-    # Bags need rosbags, models do not: whoever only compensates does without it.
+    # Imported here so that simulation and compensation do not require rosbags.
     from slpi_ros.io.bag_reader import read_bag as read
 
     return read(path, topic, axes=axes)

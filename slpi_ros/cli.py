@@ -1,6 +1,6 @@
-"""The command line ``slpi``: it needs no running ROS graph.
+"""The command line ``slpi``, usable without a running ROS graph.
 
-Exit codes: 0 done, 1 the data do not allow it, 2 wrong usage; what is wrong is said in one line.
+Exit codes: 0 success, 1 the data do not allow the request, 2 wrong usage. Errors are reported on one line.
 """
 
 import argparse
@@ -38,19 +38,19 @@ from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel, check_time, held_message
 from slpi_ros.reports.text import describe_change, describe_model, describe_start
 
-# Where a bag holds voltage and displacement, if nothing else is said.
+# Default topic with voltage and displacement.
 TOPIC = "stage_state"
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that says what is wrong in one line."""
+    """Argument parser that reports usage errors on one line."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
 class _EachOnce(argparse.Action):
-    """Several names, none of them twice."""
+    """Store a list of names and reject duplicates."""
 
     def __call__(
         self,
@@ -62,68 +62,68 @@ class _EachOnce(argparse.Action):
         names = list(values or ())
         for name in names:
             if names.count(name) > 1:
-                raise argparse.ArgumentError(self, f"'{name}' comes more than once; name each axis once")
+                raise argparse.ArgumentError(self, f"'{name}' is given more than once; name each axis once")
         setattr(namespace, self.dest, names)
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands; the chosen one is the option ``command``."""
+    """Return the parser of all commands; it stores the name of the chosen command as ``command``."""
     whole = _Parser(prog="slpi", description="Hysteresis models of piezo stages: identify, diagnose, compensate.")
     commands = whole.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
     _import_options(commands.add_parser("import", help="turn a table of measured data into a bag"))
     _identify_options(commands.add_parser("identify", help="identify the model of a stage from a bag"))
     _diagnose_options(
-        commands.add_parser("diagnose", help="say what a model gets wrong on a bag, why, and what mends it")
+        commands.add_parser("diagnose", help="find the causes of a model's errors on bags and extend the model")
     )
-    _verify_options(commands.add_parser("verify", help="judge a model on bags that it has not seen: pass or fail"))
-    _excite_options(commands.add_parser("excite", help="make the voltages to record for an identification"))
+    _verify_options(commands.add_parser("verify", help="test a model on bags not used to identify it: pass or fail"))
+    _excite_options(commands.add_parser("excite", help="generate excitation voltages for an identification"))
     _refit_options(
-        commands.add_parser("refit", help="update a model with a new bag; what the bag does not visit stays")
+        commands.add_parser("refit", help="update a model with a new bag, keeping regions that the bag does not visit")
     )
-    _simulate_options(commands.add_parser("simulate", help="voltage to displacement"))
-    _compensate_options(commands.add_parser("compensate", help="desired displacement to voltage"))
-    _experiments_options(commands.add_parser("experiments", help="compute the two papers' tables and figures anew"))
-    commands.add_parser("show", help="say what a model holds").add_argument("model", metavar="MODEL.json")
+    _simulate_options(commands.add_parser("simulate", help="compute the displacement for a voltage"))
+    _compensate_options(commands.add_parser("compensate", help="compute the voltage for a desired displacement"))
+    _experiments_options(commands.add_parser("experiments", help="reproduce the tables and figures of the two papers"))
+    commands.add_parser("show", help="print the contents of a model").add_argument("model", metavar="MODEL.json")
     return whole
 
 
 def _import_options(command: Any) -> None:
     command.add_argument(
         "table", metavar="DATA.csv|DATA.mat",
-        help="columns by comma, semicolon or tab; their names say the units, as in x_nm, x (nm), x [nm] or x in nm",
+        help="columns separated by comma, semicolon or tab; names include the unit: x_nm, x (nm), x [nm] or x in nm",
     )  # fmt: skip
     command.add_argument("-o", "--output", metavar="BAG", required=True, help="folder of the new bag")
     command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
-    command.add_argument("--voltage", metavar="COLUMN", nargs="+", default=(), help="one for all axes or one for each")
-    command.add_argument("--displacement", metavar="COLUMN", nargs="+", default=(), help="one for each axis")
+    command.add_argument("--voltage", metavar="COLUMN", nargs="+", default=(), help="one for all axes or one per axis")
+    command.add_argument("--displacement", metavar="COLUMN", nargs="+", default=(), help="one column per axis")
     command.add_argument(
-        "--displacement-unit", help="m, mm, um, nm or pm, where column names do not say it; default: um"
+        "--displacement-unit", help="m, mm, um, nm or pm, for columns without a unit in the name; default: um"
     )
     command.add_argument(
-        "--axes", metavar="NAME", nargs="+", default=(), help="names of the axes; default: from the columns"
+        "--axes", metavar="NAME", nargs="+", default=(), help="names of the axes; default: from the column names"
     )
-    command.add_argument("--hardware-id", metavar="ID", default="", help="which stage it is")
+    command.add_argument("--hardware-id", metavar="ID", default="", help="identifier of the stage; default: none")
     command.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
 
 
 def _identify_options(command: Any) -> None:
-    command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a lone mcap or sqlite3 file")
-    command.add_argument("-o", "--output", metavar="MODEL.json", required=True)
-    command.add_argument("--kind", choices=KINDS, default="slpi")
+    command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a single mcap or sqlite3 file")
+    command.add_argument("-o", "--output", metavar="MODEL.json", required=True, help="model document to write")
+    command.add_argument("--kind", choices=KINDS, default="slpi", help="kind of model; default: slpi")
     command.add_argument(
         "--loops-at-rest", action="store_true", help="slpi-published: operators start at rest, as published"
     )
     _where_in_the_bag(command)
     _axes(command, help="default: every axis of the bag")
     _span(command)
-    command.add_argument("--report", metavar="DIR", help="also write a page with plots, of the first bag")
-    command.add_argument("--uncertainty", action="store_true", help="also say how surely the curves are known")
+    command.add_argument("--report", metavar="DIR", help="also write a report with plots of the first bag")
+    command.add_argument("--uncertainty", action="store_true", help="also print the uncertainty of the curves")
 
 
 def _diagnose_options(command: Any) -> None:
     command.add_argument(
         "bags", metavar="BAG", nargs="+",
-        help="rosbag2 folder, or a lone mcap or sqlite3 file; several records of the stage prove a cause on each other",
+        help="rosbag2 folder, or a single mcap or sqlite3 file; several records allow cross-validation of each cause",
     )  # fmt: skip
     command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
     command.add_argument(
@@ -136,18 +136,18 @@ def _diagnose_options(command: Any) -> None:
 
 
 def _verify_options(command: Any) -> None:
-    command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a lone mcap or sqlite3 file")
-    command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
+    command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a single mcap or sqlite3 file")
+    command.add_argument("--model", metavar="MODEL.json", required=True, help="model of the same stage")
     command.add_argument(
         "--tolerance", metavar="UM", type=float,
-        help="the largest rms error that passes, micrometres; default: three times the record's noise floor, but at "
-        "least 0.02 % of the stroke",
+        help="largest rms error that passes, micrometres; default: three times the repeatability floor of the record, "
+        "at least 0.02 %% of the stroke",
     )  # fmt: skip
     command.add_argument("-o", "--output", metavar="DIR", help="folder of verification.json and report.html")
     command.add_argument("--json", action="store_true", help="print the document instead of its summary")
     command.add_argument(
         "--desired-topic", metavar="TOPIC",
-        help=f"adds how well the stage was compensated; default: {bags.DESIRED}, where a bag holds it",
+        help=f"also evaluate the tracking error against this topic; default: {bags.DESIRED}, if present in the bag",
     )  # fmt: skip
     _where_in_the_bag(command)
     _axes(command, help="default: every axis that bags and model share")
@@ -158,39 +158,39 @@ def _axes(command: Any, **told: Any) -> None:
 
 
 def _span(command: Any) -> None:
-    command.add_argument("--start", metavar="S", type=float, help="fit only from here on, seconds from the first stamp")
-    command.add_argument("--stop", metavar="S", type=float, help="fit only up to here")
+    command.add_argument("--start", metavar="S", type=float, help="start of the fit, seconds from the first stamp")
+    command.add_argument("--stop", metavar="S", type=float, help="end of the fit, seconds from the first stamp")
 
 
 def _where_in_the_bag(command: Any) -> None:
-    command.add_argument("--topic", help=f"default: {TOPIC}")
-    command.add_argument("--voltage-topic", metavar="TOPIC", help="where voltage and displacement are apart")
-    command.add_argument("--displacement-topic", metavar="TOPIC")
+    command.add_argument("--topic", help=f"topic with voltage and displacement; default: {TOPIC}")
+    command.add_argument("--voltage-topic", metavar="TOPIC", help="for bags with separate topics: the voltage")
+    command.add_argument("--displacement-topic", metavar="TOPIC", help="for separate topics: the displacement")
     clocks = ("displacement", "voltage")
-    command.add_argument("--clock", choices=clocks, help=f"whose stamps count there; default: {clocks[0]}")
-    command.add_argument("--voltage-measured", action="store_true", help="voltage is a reading, no command that holds")
+    command.add_argument("--clock", choices=clocks, help=f"for separate topics: sample times; default: {clocks[0]}")
+    command.add_argument("--voltage-measured", action="store_true", help="voltage is measured: interpolate it")
 
 
 def _excite_options(command: Any) -> None:
     command.add_argument("-o", "--output", metavar="DRIVE.csv", required=True, help="columns time_s, <axis>_V")
-    _axes(command, default=("x",), help="they move one after the other")
-    command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="never left")
-    command.add_argument("--voltage-max", metavar="V", type=float, required=True)
-    command.add_argument("--slew", metavar="V/S", type=float, default=0.0, help="fastest change; 0: none")
-    command.add_argument("--duration", metavar="S", type=float, default=30.0)
-    command.add_argument("--rate", metavar="HZ", type=float, default=200.0)
-    command.add_argument("--seed", metavar="N", type=int, default=0)
+    _axes(command, default=("x",), help="axes to excite, one after the other; default: x")
+    command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="lowest voltage")
+    command.add_argument("--voltage-max", metavar="V", type=float, required=True, help="highest voltage")
+    command.add_argument("--slew", metavar="V/S", type=float, default=0.0, help="rate limit; 0 (default): no limit")
+    command.add_argument("--duration", metavar="S", type=float, default=30.0, help="duration; default: 30 s")
+    command.add_argument("--rate", metavar="HZ", type=float, default=200.0, help="sample rate; default: 200 Hz")
+    command.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the random sequence; default: 0")
     command.add_argument(
         "--for", dest="drive", metavar="EFFECT", choices=DRIVES, default=DRIVES[0],
-        help=f"what the record is to tell from others: {', '.join(DRIVES[1:])}",
+        help=f"effect that the record must distinguish from others: {', '.join(DRIVES[1:])}",
     )  # fmt: skip
 
 
 def _refit_options(command: Any) -> None:
     command.add_argument("model", metavar="MODEL.json")
     command.add_argument("bag", metavar="BAG")
-    command.add_argument("-o", "--output", metavar="MODEL.json", required=True, help="may be the same file")
-    command.add_argument("--topic", default=TOPIC)
+    command.add_argument("-o", "--output", metavar="MODEL.json", required=True, help="may be the input model file")
+    command.add_argument("--topic", default=TOPIC, help=f"topic with voltage and displacement; default: {TOPIC}")
 
 
 def _simulate_options(command: Any) -> None:
@@ -203,25 +203,25 @@ def _compensate_options(command: Any) -> None:
     command.add_argument("model", metavar="MODEL.json")
     command.add_argument("table", metavar="DESIRED.csv", help="columns time_s, <axis>_m")
     command.add_argument("-o", "--output", metavar="VOLTAGE.csv", required=True)
-    command.add_argument("--voltage-min", metavar="V", type=float, default=-np.inf, help="default: what was identified")
-    command.add_argument("--voltage-max", metavar="V", type=float, default=np.inf)
+    command.add_argument("--voltage-min", metavar="V", type=float, default=-np.inf, help="default: identified range")
+    command.add_argument("--voltage-max", metavar="V", type=float, default=np.inf, help="default: identified range")
     command.add_argument(
         "--start-memory", choices=START_MEMORIES, default=START_MEMORIES[0],
-        help="what the stage went through before: up to the end of the identified record (default), up to its start, "
-        "or a decaying drive that wiped the memory",
+        help="initial history of the stage: as at the end of the identified record (default), as at its start, "
+        "or reset by a decaying oscillation",
     )  # fmt: skip
 
 
 def _experiments_options(command: Any) -> None:
     command.add_argument("-o", "--output", metavar="DIR", required=True, help="folder of index.html")
-    command.add_argument("--data", metavar="DIR", help="folder of measured records, to be compared too")
+    command.add_argument("--data", metavar="DIR", help="folder of measured records to include in the comparison")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code."""
     options = parser().parse_args(arguments)
     for output in (sys.stdout, sys.stderr):
-        # A terminal that cannot show a character gets its number.
+        # Characters that the terminal encoding lacks are printed as escape sequences.
         if isinstance(output, TextIOWrapper):
             output.reconfigure(errors="backslashreplace")
     warnings.showwarning = partial(_show_warning, options.command)
@@ -267,7 +267,7 @@ def _identify(options: argparse.Namespace) -> None:
     _require_another_file(options.output, *options.bags)
     target = Path(options.output)
     if target.is_dir() or not target.parent.is_dir():
-        raise ModelError(f"{target}: cannot be written: no file can be there; choose another place")
+        raise ModelError(f"{target}: cannot be written: it is a folder, or its parent is missing; choose another place")
     if options.uncertainty:
         require_known_uncertainty(options.kind)
     if options.report:
@@ -279,7 +279,7 @@ def _identify(options: argparse.Namespace) -> None:
     told = []
     part = {"start": options.start, "stop": options.stop}
     if options.report:
-        # Plotting is slow to load, and most commands do without.
+        # Imported here: plotting is slow to load, and most commands do not need it.
         from slpi_ros.reports.identification import write_report
 
         truth = {
@@ -295,22 +295,22 @@ def _identify(options: argparse.Namespace) -> None:
 
 
 def _topics(options: argparse.Namespace) -> str | SeparateTopics:
-    """Return where the bag holds voltage and displacement."""
+    """Return the topic or topics of voltage and displacement that the options select."""
     voltage, displacement = options.voltage_topic, options.displacement_topic
     if bool(voltage) != bool(displacement):
         raise UsageError("--voltage-topic and --displacement-topic go together; give both, or --topic")
     if voltage and options.topic is not None:
-        raise UsageError("--topic does not go with --voltage-topic and --displacement-topic; give it, or both of them")
+        raise UsageError("--topic excludes --voltage-topic and --displacement-topic; give either the one or the two")
     if voltage:
         held = not options.voltage_measured
         return SeparateTopics(voltage, displacement, clock=options.clock or "displacement", held=held)
     if options.clock or options.voltage_measured:
-        raise UsageError("--clock and --voltage-measured are for --voltage-topic and --displacement-topic; give both")
+        raise UsageError("--clock and --voltage-measured require --voltage-topic and --displacement-topic; give both")
     return TOPIC if options.topic is None else str(options.topic)
 
 
 def _judged(record: Record, options: argparse.Namespace) -> dict[str, list[Finding]]:
-    """Print and return what the record is good for, by axis; stop where it is good for nothing."""
+    """Print and return the findings on a record, per axis; IdentificationError if one prevents a fit."""
     judged = {}
     for axis in record.axes:
         judged[axis] = found = findings(assess(record, axis, start=options.start, stop=options.stop))
@@ -320,7 +320,7 @@ def _judged(record: Record, options: argparse.Namespace) -> dict[str, list[Findi
 
 
 def _diagnose(options: argparse.Namespace) -> None:
-    # Plotting is slow to load, and most commands do without.
+    # Imported here: plotting is slow to load, and most commands do not need it.
     from slpi_ros.reports.diagnosis import PAGE, describe_diagnosis, make_room, write_files
 
     topics = _topics(options)
@@ -336,7 +336,7 @@ def _diagnose(options: argparse.Namespace) -> None:
             require_usable(findings(assess(record, axis)), f"{record.source}: axis '{axis}'")
         diagnosis = diagnose(records, model, axes=axes, start=options.start, stop=options.stop)
     except UsageError as error:
-        # That bag and model do not go together shows only once both have been read.
+        # Exit code 1: the mismatch between bag and model is found in the data, not in the call.
         raise ModelError(str(error)) from None
     write_files(folder, diagnosis)
     print("\n".join(describe_diagnosis(diagnosis)))
@@ -344,9 +344,9 @@ def _diagnose(options: argparse.Namespace) -> None:
 
 
 def _with_other_axes(bag: str, options: argparse.Namespace, topics: str | SeparateTopics) -> Record:
-    """Return all axes of the bag: each may show on the others. Where that cannot be, only those asked for."""
+    """Read all axes of the bag, to identify cross-coupling; only the requested axes if the others are unreadable."""
     if options.axis and isinstance(topics, SeparateTopics):
-        # There the axes may have no names but those given.
+        # Separate topics may not name their axes; the names are then those of the options.
         return bags.read_bag(bag, topics, axes=options.axis)
     try:
         return bags.read_bag(bag, topics)
@@ -361,11 +361,11 @@ def _verify(options: argparse.Namespace) -> int:
 
     topics = _topics(options)
     if options.tolerance is not None and not 0.0 < options.tolerance < np.inf:
-        raise UsageError(f"--tolerance {options.tolerance:g}: give a positive one, micrometres")
+        raise UsageError(f"--tolerance {options.tolerance:g}: give a positive number of micrometres")
     model = load_model(options.model)
     if options.output:
         make_room(Path(options.output))
-    # The other axes may move those asked for; separate topics may have no names but those given.
+    # Read all axes because of cross-coupling; separate topics may not name their axes, so the options name them.
     axes = options.axis if isinstance(topics, SeparateTopics) else None
     records = bags.read_bags(options.bags, topics, axes=axes)
     desired = [
@@ -375,7 +375,7 @@ def _verify(options: argparse.Namespace) -> int:
     try:
         found = verify(records, model, tolerance, axes=options.axis, desired=desired)
     except UsageError as error:
-        # That bags and model do not go together shows only once all have been read.
+        # Exit code 1: the mismatch between bags and model is found in the data, not in the call.
         raise ModelError(str(error)) from None
     if options.output:
         write_files(Path(options.output), found)
@@ -417,7 +417,7 @@ def _simulate(options: argparse.Namespace) -> None:
         if outside:
             print(
                 f"slpi simulate: axis '{axis}': {outside} of {v.size} voltages lie outside the identified "
-                f"{low:.4g} to {high:.4g} V; there the model is a guess",
+                f"{low:.4g} to {high:.4g} V; there the model extrapolates",
                 file=sys.stderr,
             )
 
@@ -441,18 +441,18 @@ def _compensate(options: argparse.Namespace) -> None:
 
 
 def _require_another_file(output: str, *inputs: str) -> None:
-    """Refuse to write over what is read."""
+    """Raise UsageError if the output file is one of the inputs."""
     for path in map(Path, inputs):
         if path.exists() and Path(output).exists() and path.samefile(output):
-            raise UsageError(f"{output}: is also read from; give another file to write (-o)")
+            raise UsageError(f"{output}: is also read from; give another output file (-o)")
 
 
 def _known(columns: dict[str, FloatArray], model: StageModel, table: str) -> dict[str, FloatArray]:
-    """Return the columns of a table if the model holds all their axes."""
+    """Return the columns of a table; SlpiError if the model lacks one of their axes."""
     for axis in columns:
         if axis not in model.axes:
             raise SlpiError(
-                f"{table}: column of axis '{axis}', but the model holds {', '.join(model.axes)}; rename the column"
+                f"{table}: column of axis '{axis}', but the model has axes {', '.join(model.axes)}; rename the column"
             )
     return columns
 

@@ -1,24 +1,24 @@
-"""The package's exceptions: one root, so that a caller can catch everything we raise on purpose."""
+"""Exceptions of the package, all derived from `SlpiError`."""
 
 
 class SlpiError(Exception):
-    """The data or a document do not allow what was asked; the message says what, where and what to do."""
+    """Base class: the data or a document do not allow the request; the message names the cause, place and remedy."""
 
     exit_code = 1
 
 
 class UsageError(SlpiError):
-    """The call itself is wrong: an unknown option value, axis or kind."""
+    """The call is invalid: an unknown option value, axis or kind."""
 
     exit_code = 2
 
 
 class RecordError(SlpiError):
-    """A recording cannot be read or does not hold what is needed."""
+    """A record cannot be read or lacks required data."""
 
 
 class ModelError(SlpiError):
-    """A model document cannot be read, has the wrong version or does not fit the stage."""
+    """A model document cannot be read, has an unsupported version or belongs to another stage."""
 
 
 class IdentificationError(SlpiError):
@@ -26,4 +26,4 @@ class IdentificationError(SlpiError):
 
 
 class UnreachableError(SlpiError):
-    """A desired displacement lies far outside what the model was identified on."""
+    """A desired displacement lies far outside the identified displacement range."""

@@ -1,1 +1,1 @@
-"""From a record to a model."""
+"""Identification of a hysteresis model from one or several records."""

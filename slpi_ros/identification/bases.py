@@ -1,4 +1,4 @@
-"""What each kind of model adds along a branch, linear in its parameters, and what its parameters must obey."""
+"""Bases of the models that are linear in their parameters: branch increments, roughness, monotonicity constraints."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,18 +15,18 @@ from slpi_ros.identification.design_matrix import Walk
 
 FloatArray = NDArray[np.float64]
 
-# No branch may be flatter than this share of the mean gain: a flat branch has no inverse.
+# Least slope of a branch as a share of the mean gain, so that every branch has an inverse.
 LEAST_GAIN = 0.02
-# How firmly the first rise is kept parallel to a rise from the low end, where the record does not show it.
+# Weight of the penalty that keeps the first rise parallel to a rise from the low end.
 RISE_TIE = 0.1
-# Beyond the grid the largest branches go on as they did over this share of it.
+# Share of the grid whose mean slope extrapolates the largest branches beyond the grid.
 END_SHARE = 0.1
-# Vertices for which the roughness penalties are dimensioned, so that one weight means the same on every grid.
+# Number of vertices for which roughness is scaled, so that a weight has the same effect on every grid.
 REFERENCE_VERTICES = 41
 
 
 class Basis(Protocol):
-    """Parameters ``x``, shape (size + 1,), of a model; the last one is the displacement at rest."""
+    """Interface of a basis; its parameters ``x``, shape (size + 1,), end with the displacement at rest."""
 
     @property
     def size(self) -> int:
@@ -37,10 +37,10 @@ class Basis(Protocol):
         """As in `slpi_ros.hysteresis.turning_points.Shape`."""
 
     def branch_part(self, walk: Walk) -> sp.csr_array:
-        """Return what each sample's branch adds, shape (N, size)."""
+        """Return the displacement increment along each sample's branch per unit of each parameter, shape (N, size)."""
 
     def roughness(self) -> sp.csr_array:
-        """Return the rows whose squared sum is the roughness, shape (r, size + 1)."""
+        """Return the matrix R of the roughness ``|R x|^2``, shape (r, size + 1)."""
 
     def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
         """Return ``C``, shape (m, size + 1), and bound of ``C x >= bound``, for a mean gain in units of x per volt."""
@@ -49,25 +49,25 @@ class Basis(Protocol):
         """Return the model with parameters `x` (m) and mean gain `gain` (m/V)."""
 
     def covered(self, branch_part: sp.csr_array) -> float:
-        """Return the share of the parameters that the samples of a `branch_part` touch, 0..1."""
+        """Return the share of the parameters that the samples of a `branch_part` determine, 0..1."""
 
 
 @dataclass(frozen=True)
 class SurfaceBasis:
-    """The loop family on a uniform grid: the surface below the diagonal, then the first rise."""
+    """Basis of the loop family on a uniform grid (V): Everett function below the diagonal, then the first rise."""
 
     grid: FloatArray
     symmetric_rest: bool = False
 
     @property
     def size(self) -> int:
-        """Cells below the diagonal and values of the first rise."""
+        """Number of Everett values below the diagonal plus values of the first rise."""
         n = self.grid.size
         return n * (n - 1) // 2 + n
 
     @cached_property
     def _column(self) -> NDArray[np.int64]:
-        """Parameter of each vertex pair, shape (n, n); -1 on and above the diagonal."""
+        """Parameter index of each vertex pair, shape (n, n); -1 on and above the diagonal."""
         n = self.grid.size
         column = np.full((n, n), -1)
         column[np.tril_indices(n, -1)] = np.arange(n * (n - 1) // 2)
@@ -79,7 +79,7 @@ class SurfaceBasis:
         return n * (n - 1) // 2 + np.arange(n)
 
     def branch_part(self, walk: Walk) -> sp.csr_array:
-        """Return plus or minus the surface between origin and sample; on the first rise, the rise between them."""
+        """Return the signed Everett function between reversal and sample; on the first rise, the rise between both."""
         v, v_origin, sign = walk.v, walk.v_origin, walk.direction.astype(np.float64)
         rises, falls_long = walk.first_rise, walk.long_fall
         upper, lower = np.maximum(v, v_origin), np.minimum(v, v_origin)
@@ -99,7 +99,7 @@ class SurfaceBasis:
         return cell, x - cell
 
     def _surface_rows(self, upper: FloatArray, lower: FloatArray, factor: FloatArray) -> sp.csr_array:
-        """Rows that give `factor` times the surface: bilinear, and linear in the cells on the diagonal."""
+        """Return rows of `factor` times the interpolated surface: bilinear, but linear in cells on the diagonal."""
         (i, p), (j, q) = self._cell(upper), self._cell(lower)
         row = np.arange(upper.size)
         on_diagonal = i == j
@@ -123,11 +123,11 @@ class SurfaceBasis:
         return sp.csr_array((values, (np.concatenate([row, row]), columns)), shape=(v.size, self.size))
 
     def roughness(self) -> sp.csr_array:
-        """Return differences that vanish for what a record does not show to be otherwise.
+        """Return the rows of the roughness penalty, shape (r, size + 1).
 
-        Third differences along a branch: loops are smooth. Second differences along the diagonal: loops change evenly
-        with their vertex (for the classical PI model not at all). The first rise: smooth, and parallel to a rise from
-        the low end.
+        Third differences along branches penalise uneven loops; second differences along the diagonal penalise uneven
+        change of the loops with their vertex (zero for the classical PI model); the first rise is penalised for
+        curvature and for deviation from a rise from the low end.
         """
         n, column, rise = self.grid.size, self._column, self._rise_columns
         i, j = np.tril_indices(n, -1)
@@ -148,7 +148,7 @@ class SurfaceBasis:
         return sp.csr_array(sp.hstack([rows, sp.csr_array((rows.shape[0], 1))], format="csr"))
 
     def _differences(self, stencil: list[tuple[NDArray[np.int64], NDArray[np.int64], float]]) -> sp.csr_array:
-        """Rows of weighted sums over the surface, where the whole stencil lies on it (zero on the diagonal)."""
+        """Return rows of weighted sums over the surface, for stencils that lie on it; the diagonal counts as zero."""
         n = self.grid.size
         fits = np.ones(stencil[0][0].size, dtype=bool)
         for i, j, _ in stencil:
@@ -162,7 +162,7 @@ class SurfaceBasis:
         return sp.csr_array(total)
 
     def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
-        """Every branch, and the first rise, must rise by the least gain between neighbouring vertices."""
+        """Return the constraints that branches and the first rise have at least the least gain between vertices."""
         n = self.grid.size
         i, j = np.tril_indices(n, -1)
         upward = self._differences([(i, j, 1.0), (i - 1, j, -1.0)])
@@ -177,7 +177,7 @@ class SurfaceBasis:
         return sp.csr_array(matrix), np.full(rows.shape[0], least)
 
     def shape(self, x: FloatArray, gain: float) -> LoopFamily:
-        """Return the loop family."""
+        """Return the loop family with parameters `x` (m); `gain` is not used."""
         n = self.grid.size
         surface = np.zeros((n, n))
         surface[np.tril_indices(n, -1)] = x[: n * (n - 1) // 2]
@@ -187,14 +187,14 @@ class SurfaceBasis:
         return LoopFamily(self.grid, surface, x[self._rise_columns] - x[self._rise_columns[0]], edge_gain)
 
     def covered(self, branch_part: sp.csr_array) -> float:
-        """Return the share of the surface's vertex pairs that the samples of a `branch_part` touch, 0..1."""
+        """Return the share of the surface's vertex pairs that the samples of a `branch_part` determine, 0..1."""
         pairs = self.size - self.grid.size
         touched = np.unique(branch_part.indices)
         return float(np.count_nonzero(touched < pairs) / pairs)
 
 
 class OperatorWeights:
-    """What models with one weight for each operator have in common."""
+    """Common part of bases with one weight for each operator, with `thresholds` (V), shape (size,)."""
 
     thresholds: FloatArray
 
@@ -204,29 +204,29 @@ class OperatorWeights:
         return self.thresholds.size
 
     def roughness(self) -> sp.csr_array:
-        """Return no rows: the weights are few and not negative, that is smooth enough."""
+        """Return a zero row: the non-negative weights need no roughness penalty."""
         return sp.csr_array((1, self.size + 1))
 
     def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
-        """No weight may be negative, and that of the lowest threshold must be positive."""
+        """Return the constraints of non-negative weights and a positive weight at the lowest threshold."""
         bound = np.zeros(self.size)
         bound[0] = LEAST_GAIN * gain
         return sp.csr_array(sp.eye_array(self.size, self.size + 1)), bound
 
     def covered(self, branch_part: sp.csr_array) -> float:
-        """Return the share of operators that the samples of a `branch_part` move, 0..1."""
+        """Return the share of operators that move within the samples of a `branch_part`, 0..1."""
         return float(np.count_nonzero(np.unique(branch_part.indices) < self.size) / self.size)
 
 
 @dataclass(frozen=True)
 class PlayBasis(OperatorWeights):
-    """The classical PI model: one weight for each threshold."""
+    """Basis of the classical PI model with one weight for each threshold (V)."""
 
     thresholds: FloatArray
     symmetric_rest: bool = True
 
     def branch_part(self, walk: Walk) -> sp.csr_array:
-        """Return how far each play operator has moved along the branch."""
+        """Return the motion (V) of each play operator along the branch of each sample, shape (N, size)."""
         way = np.abs(walk.v - walk.v_origin)[:, None]
         play = np.where(walk.from_rest[:, None], 1.0, 2.0) * self.thresholds
         play[walk.long_fall] = 0.0
@@ -234,5 +234,5 @@ class PlayBasis(OperatorWeights):
         return sp.csr_array(moved)
 
     def shape(self, x: FloatArray, gain: float) -> PrandtlIshlinskii:
-        """Return the PI model."""
+        """Return the PI model with weights `x` (m/V); `gain` is not used."""
         return PrandtlIshlinskii(self.thresholds, np.maximum(x[:-1], 0.0))

@@ -1,7 +1,7 @@
-"""How wrong a model is where it was not fitted: on blocks left out, by loop level, by region and by speed.
+"""Held-out error of a model by cross-validation, overall and by loop level, voltage region and speed.
 
-The same blocks are predicted by the classical PI model, fitted to the same others; and there is a floor, below which
-no model can come.
+For comparison, the report includes the held-out error of the classical PI model on the same blocks, and the
+repeatability floor of the record, a lower bound for the error of any model.
 """
 
 import warnings
@@ -27,29 +27,31 @@ IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 CLASSICAL = "pi"
-# A record is thinned to about so many samples: more of them tell the same errors later.
+# Number of samples to which a record is thinned; more samples cost time and give the same errors.
 SAMPLES = 40_000
-# Loops as deep as that or deeper are one class; the voltage range is cut into so many regions.
+# Loops of this level and above form one class; number of voltage regions.
 DEEPEST, REGIONS = 3, 5
-# Slower than this share of the fast moves counts as rest; speeds that differ by less than this factor, as one.
+# Below this share of the 95th percentile of the speed the stage counts as at rest; below this ratio speeds are equal.
 _REST, _ONE_SPEED = 0.02, 1.5
 _SPEED_CLASSES = 3
-# Samples on each side between which a speed is measured.
+# Samples before and after the current one between which the speed is computed.
 _SPEED_REACH = 2
 
 
 @dataclass(frozen=True)
 class Slice:
-    """Errors of a part of the samples left out.
+    """Held-out errors of one class of samples.
 
     Parameters
     ----------
     name : str
-        Which part.
+        Name of the class.
     samples : int
+        Number of samples in the class.
     rms, maximum : float, metres
+        Rms and largest absolute held-out error of the model.
     classical_rms : float, metres
-        That of the classical PI model; NaN where it could not be fitted.
+        Rms held-out error of the classical PI model; NaN where it could not be fitted.
     """
 
     name: str
@@ -59,29 +61,32 @@ class Slice:
     classical_rms: float
 
     def line(self) -> str:
-        """Return a line of the table, nm."""
+        """Return the errors as a line of the table, in nanometres."""
         classical = f"{self.classical_rms * 1e9:.1f}" if np.isfinite(self.classical_rms) else "-"
         return f"{self.name:<24}{self.samples:9}{self.rms * 1e9:9.1f}{self.maximum * 1e9:10.1f}{classical:>14}"
 
 
 @dataclass(frozen=True)
 class CrossValidationReport:
-    """Errors on blocks left out of the fit, free-run.
+    """Held-out errors of a model, free-run, in total and by class.
 
     Parameters
     ----------
     axis, kind : str
+        Name of the axis and kind of the model.
     floor : Floor
-        How well the record repeats itself; of several the middle one.
+        Repeatability floor of the record; of several records, the median.
     overall : Slice
+        Errors of all held-out samples.
     by_level : tuple of Slice
-        How deep the loop lies in others: 0 for the outer one.
+        Errors by nesting level of the loop; 0 is the outer loop.
     by_region : tuple of Slice
-        By voltage, from the lowest on.
+        Errors by voltage region, in ascending order.
     by_speed : tuple of Slice
-        By the size of dv/dt, from rest on.
-    t, v, error, classical : ndarray, shape (M,), seconds, volts and metres
-        The samples left out themselves: model minus measurement. Times count from each record's first stamp.
+        Errors by the magnitude of dv/dt, in ascending order from rest.
+    t, v, error, classical : ndarray, shape (M,), seconds, volts, metres and metres
+        Time from the first stamp of each record, voltage, and held-out errors (model minus measured) of the model and
+        of the classical PI model.
     """
 
     axis: str
@@ -97,16 +102,16 @@ class CrossValidationReport:
     classical: FloatArray
 
     def lines(self) -> list[str]:
-        """Return a table in words and nm."""
+        """Return the held-out errors as a text table, in nanometres."""
         head = f"{'on blocks left out, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}{'classical PI':>14}"
         parts = (self.overall, *self.by_level, *self.by_region, *self.by_speed)
-        floor = f"{'floor':<33}{self.floor.rms * 1e9:9.1f}   from {self.floor.source}"
+        floor = f"{'repeatability floor':<33}{self.floor.rms * 1e9:9.1f}   from {self.floor.source}"
         return [head, *(part.line() for part in parts), floor]
 
 
 @dataclass(frozen=True)
 class _Part:
-    """One thinned record: its samples, and when each was taken (s)."""
+    """Samples of one thinned record and their times (s)."""
 
     samples: Samples
     t: FloatArray
@@ -114,7 +119,7 @@ class _Part:
     @classmethod
     def of(cls, record: Record, axis: str, start: float | None, stop: float | None, most: int) -> "_Part":
         samples = select_samples(record, axis, start, stop)
-        # Samples without a voltage are left out, and those after the stop.
+        # `samples` excludes those without a voltage and those after `stop`.
         t = record.t[np.isfinite(record.voltage[axis])][: samples.v.size]
         kept = samples.thinning(most)
         return cls(samples.at(kept), t[kept])
@@ -129,18 +134,20 @@ def cross_validate(
     stop: float | None = None,
     loops_at_rest: bool = False,
 ) -> CrossValidationReport:
-    """Fit a kind of model to a thinned record, block after block left out, and judge it there.
+    """Cross-validate a kind of model on a thinned record: fit all blocks but one fold, evaluate on that fold.
 
     Parameters
     ----------
     record : Record or sequence of Record
+        One record, or several that are fitted together.
     axis : str
+        Name of the axis.
     kind, start, stop, loops_at_rest
         As for `slpi_ros.identify`.
 
     Returns
     -------
-    HeldOutTruth
+    CrossValidationReport
 
     Raises
     ------
@@ -152,7 +159,7 @@ def cross_validate(
     parts = [_Part.of(one, axis, start, stop, SAMPLES // len(records)) for one in records]
     samples = [part.samples for part in parts]
     with threadpool_limits(1), warnings.catch_warnings():
-        # What the fit of the whole record leaves aside has been said.
+        # The fit of the whole record has already issued this warning.
         warnings.simplefilter("ignore", InitialHistoryWarning)
         error = fit(samples).held_out
         classical = error if kind == CLASSICAL else _classical(samples)
@@ -188,7 +195,7 @@ def _classical(samples: Sequence[Samples]) -> FloatArray:
     try:
         return FITS[CLASSICAL](samples).held_out
     except SlpiError:
-        # A record that suits one kind may not suit the other.
+        # The record may determine the given kind, but not the classical PI model.
         return np.full(sum(part.v.size for part in samples), np.nan)
 
 
@@ -203,7 +210,7 @@ def _slice(name: str, error: FloatArray, classical: FloatArray) -> Slice:
 
 
 def loop_levels(t: FloatArray, v: FloatArray) -> IntArray:
-    """Return how deep the loop of each sample lies in others, shape (N,)."""
+    """Return the nesting level of the loop of each sample, shape (N,), for times (s) and voltages (V)."""
     level = np.zeros(v.size, np.int64)
     for loop in separate(v, dead_band=smallest_turn(v, noise(v, t))).loops:
         level[loop.samples] = loop.level
@@ -211,7 +218,7 @@ def loop_levels(t: FloatArray, v: FloatArray) -> IntArray:
 
 
 def speeds(t: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the size of dv/dt (V/s), shape (N,), over some samples on each side."""
+    """Return the magnitude of dv/dt (V/s), shape (N,), by differences over a few samples."""
     at = np.arange(v.size)
     before, after = np.maximum(at - _SPEED_REACH, 0), np.minimum(at + _SPEED_REACH, v.size - 1)
     seconds = t[after] - t[before]
@@ -219,7 +226,7 @@ def speeds(t: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def level_classes(level: IntArray) -> Iterator[tuple[str, Mask]]:
-    """Yield classes of samples by the depth of their loop, shape (N,): name and which samples."""
+    """Yield the name and mask, shape (N,), of each class of loop levels, for levels of shape (N,)."""
     yield "outer loop", level == 0
     for depth in range(1, DEEPEST):
         yield f"loops of level {depth}", level == depth
@@ -227,7 +234,7 @@ def level_classes(level: IntArray) -> Iterator[tuple[str, Mask]]:
 
 
 def region_classes(v: FloatArray) -> Iterator[tuple[str, Mask]]:
-    """Yield classes of samples by voltage, shape (N,), volts: name and which samples."""
+    """Yield the name and mask, shape (N,), of each voltage region, for voltages (V) of shape (N,)."""
     edges = np.linspace(v.min(), v.max(), REGIONS + 1)
     region = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, REGIONS - 1)
     for number, (low, high) in enumerate(pairwise(edges.tolist())):
@@ -235,7 +242,7 @@ def region_classes(v: FloatArray) -> Iterator[tuple[str, Mask]]:
 
 
 def speed_classes(speed: FloatArray) -> Iterator[tuple[str, Mask]]:
-    """Yield classes of samples by the size of dv/dt, shape (N,), volts per second: name and which samples."""
+    """Yield the name and mask, shape (N,), of each class of speeds, for speeds (V/s) of shape (N,)."""
     rest = speed <= _REST * float(np.quantile(speed, 0.95))
     yield "at rest", rest
     moving = speed[~rest]

@@ -1,8 +1,9 @@
-"""A record's voltage as the stack of turning points sees it, and the linear prediction that follows from it.
+"""Decomposition of a voltage into hysteresis branches, and the design matrix of the linear prediction.
 
-Displacement is linear in a model's parameters: that of a sample is that of the turning point its branch started from,
-plus what the branch adds. With ``A_local`` the branch parts, ``P`` picking each sample's turning point and ``T`` the
-predictions at turning points, the whole record is ``(A_local + P T) x``; the product is never formed.
+Displacement is linear in a model's parameters: the displacement of a sample is that of the reversal at which its
+branch started, plus the increment along the branch. With the increments ``A_local``, the matrix ``P`` that selects
+each sample's reversal and the predictions ``T`` at reversals, the record is ``(A_local + P T) x``;
+the product is never formed.
 """
 
 from collections.abc import Sequence
@@ -20,17 +21,18 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Walk:
-    """Where each sample of a voltage stands.
+    """Hysteresis branch of each sample of a voltage.
 
     Parameters
     ----------
     v : ndarray, shape (N,), volts
+        Voltage.
     origin : ndarray of int, shape (N,)
-        Sample at which its branch started, or `AT_REST` or `LONG_FALL`.
+        Sample at which the branch started, or `AT_REST` or `LONG_FALL`.
     direction : ndarray of int, shape (N,)
-        +1, -1, or 0 for samples that still rest.
+        +1 for rising, -1 for falling, 0 for samples before the first motion.
     first : ndarray of int, shape (N,)
-        First sample of the record that each one belongs to: there the voltage rested.
+        Index of the first sample of the record to which the sample belongs.
     """
 
     v: FloatArray
@@ -40,7 +42,7 @@ class Walk:
 
     @classmethod
     def along(cls, v: FloatArray, *, symmetric_rest: bool, primed: bool) -> "Walk":
-        """Walk through the voltage `v`, from rest (or primed) at its first value."""
+        """Find the branches of a voltage `v`, shape (N,), that starts at rest or, if `primed`, after a long fall."""
         origin = np.full(v.size, LONG_FALL if primed else AT_REST)
         direction = np.full(v.size, -1 if primed else 0)
         for piece in trace(v, symmetric_rest=symmetric_rest, primed=primed):
@@ -50,7 +52,7 @@ class Walk:
 
     @classmethod
     def joined(cls, walks: Sequence["Walk"]) -> "Walk":
-        """Put the walks of several records one behind the other; each starts anew."""
+        """Concatenate the walks of several records; each record keeps its own initial state."""
         shifts = np.cumsum([0, *(walk.v.size for walk in walks[:-1])])
         moved = zip(walks, shifts.tolist(), strict=True)
         origin, first = zip(
@@ -67,28 +69,38 @@ class Walk:
 
     @property
     def v_origin(self) -> FloatArray:
-        """Voltage at which each sample's branch started, shape (N,), volts; where it rested, if it starts there."""
+        """Voltage at which each sample's branch started, shape (N,), volts; `v_rest` for branches without reversal."""
         return np.where(self.origin >= 0, self.v[np.maximum(self.origin, 0)], self.v_rest)
 
     @property
     def first_rise(self) -> NDArray[np.bool_]:
-        """Which samples lie on the first rise from rest, shape (N,)."""
+        """Mask of the samples on the first rise from rest, shape (N,)."""
         return np.asarray((self.origin == AT_REST) & (self.direction > 0))
 
     @property
     def from_rest(self) -> NDArray[np.bool_]:
-        """Which samples lie on a branch that leaves rest, shape (N,)."""
+        """Mask of the samples on a branch that starts at rest, shape (N,)."""
         return np.asarray((self.origin == AT_REST) & (self.direction != 0))
 
     @property
     def long_fall(self) -> NDArray[np.bool_]:
-        """Which samples lie on the long fall that primed the memory, shape (N,)."""
+        """Mask of the samples on the long fall that initialised the hysteresis state, shape (N,)."""
         return np.asarray(self.origin == LONG_FALL)
 
 
 @dataclass(frozen=True)
 class Design:
-    """The linear prediction: a column for each parameter, then one for each record's displacement at rest."""
+    """Design matrix of the linear prediction: one column per parameter, then each record's displacement at rest.
+
+    Parameters
+    ----------
+    local : sparse array, shape (N, p)
+        Increments along the branch of each sample.
+    turns : ndarray of int
+        Samples at which branches start (reversals), in ascending order.
+    walk : Walk
+        Branches of the samples.
+    """
 
     local: sp.csr_array
     turns: NDArray[np.int64]
@@ -96,14 +108,14 @@ class Design:
 
     @cached_property
     def pick(self) -> sp.csr_array:
-        """What picks each sample's turning point, shape (N, turns)."""
+        """Sparse matrix that selects the reversal at which each sample's branch started, shape (N, turns)."""
         own = np.flatnonzero(self.walk.origin >= 0)
         column = np.searchsorted(self.turns, self.walk.origin[own])
         return sp.csr_array((np.ones(own.size), (own, column)), shape=(self.walk.v.size, self.turns.size))
 
     @cached_property
     def at_turns(self) -> FloatArray:
-        """Predictions at turning points, each from the one before it, shape (turns, p)."""
+        """Rows of the linear prediction at the reversals, accumulated from earlier reversals, shape (turns, p)."""
         rows: FloatArray = self.local[self.turns].toarray()
         before = self.walk.origin[self.turns]
         for row, origin in enumerate(before.tolist()):
@@ -113,7 +125,7 @@ class Design:
 
     @classmethod
     def of(cls, walk: Walk, branch_part: sp.csr_array) -> "Design":
-        """Complete the `branch_part`, shape (N, size), of a basis by the columns of the displacements at rest."""
+        """Append the columns of the displacements at rest to the `branch_part`, shape (N, size), of a basis."""
         rows = np.flatnonzero(walk.origin < 0)
         starts, record = np.unique(walk.first, return_inverse=True)
         no_turn = sp.csr_array((np.ones(rows.size), (rows, record[rows])), shape=(walk.v.size, starts.size))
@@ -121,12 +133,12 @@ class Design:
         return cls(local, np.unique(walk.origin[walk.origin >= 0]), walk)
 
     def predict(self, x: FloatArray) -> FloatArray:
-        """Return the displacement of every sample, shape (N,), in the unit of `x`."""
+        """Return the displacement of every sample, shape (N,), for parameters `x`, shape (p,), in the unit of `x`."""
         result: FloatArray = self.local @ x + self.pick @ (self.at_turns @ x)
         return result
 
     def normal_equations(self, y: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``A' W A``, shape (p, p), and ``A' W y``, shape (p,), for weights of shape (N,)."""
+        """Return ``A' W A``, shape (p, p), and ``A' W y``, shape (p,), for `y` and `weights` of shape (N,)."""
         local, pick, at_turns = self.local, self.pick, self.at_turns
         weigh = sp.diags_array(weights)
         local_w, pick_w = (local.T @ weigh).tocsr(), (pick.T @ weigh).tocsr()

@@ -1,4 +1,4 @@
-"""What the voltage of a record does: where it turns, how fast it goes, where it rests."""
+"""Properties of the voltage signal of a record: reversals, speeds, holds and coverage."""
 
 from dataclasses import dataclass
 
@@ -11,28 +11,29 @@ from slpi_ros.hysteresis.reversals import reversals
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Cells on each side of the map of turning points and voltages.
+# Cells per dimension of the map of reversal voltage and present voltage.
 _CELLS = 10
-# Runs of nearly one swing are compared, and speeds that differ by less than this factor are one.
+# Swings within this factor count as equal, and so do speeds within this factor.
 _SWING_FACTOR = 1.6
 SPEED_FACTOR = 1.5
-# Anything shorter is a turn; creep shows from here on.
+# Shortest hold, seconds; creep becomes visible after this time.
 _SHORTEST_HOLD = 0.5
-# Turns smaller than this share of the range say nothing about loops; larger ones than that are never noise.
+# Smallest and largest dead band for reversals, as shares of the voltage range.
 _SMALLEST_TURN, _LARGEST_DEAD_BAND = 0.005, 0.1
 
 
 @dataclass(frozen=True)
 class Runs:
-    """The stretches between turning points.
+    """Monotone runs of the voltage between reversals.
 
     Parameters
     ----------
     ends : ndarray of int, shape (M + 1,)
-        Samples at which they begin and end, as from `reversals`.
+        Samples at which the runs begin and end, as from `reversals`.
     swing : ndarray, shape (M,), volts
-        How far each goes, with its sign.
+        Signed voltage change of each run.
     duration : ndarray, shape (M,), seconds
+        Duration of each run.
     """
 
     ends: IntArray
@@ -41,39 +42,39 @@ class Runs:
 
     @classmethod
     def of(cls, t: FloatArray, v: FloatArray, dead_band: float) -> "Runs":
-        """Cut a voltage, shape (N,), at its turns; smaller ones than the dead band (V) do not count."""
+        """Split a voltage, shape (N,), at its reversals; reversals smaller than the dead band (V) are ignored."""
         ends = reversals(v, dead_band)
         return cls(ends, np.diff(v[ends]), np.diff(t[ends]))
 
     @property
     def turns(self) -> int:
-        """Number of turning points."""
+        """Number of reversals."""
         return max(self.ends.size - 2, 0)
 
     @property
     def speeds(self) -> tuple[float, ...]:
-        """Speeds (V/s) at which swings of one size are run through, from slow to fast; the most varied size counts."""
+        """Distinct speeds (V/s), ascending, of swings of one size: the size with the largest number of speeds."""
         timed = (self.duration > 0.0) & (self.swing != 0.0)
         swing, speed = np.abs(self.swing[timed]), np.abs(self.swing[timed]) / self.duration[timed]
         best: tuple[float, ...] = ()
         for size in np.unique(np.round(np.log(swing) / np.log(_SWING_FACTOR))).tolist():
             alike = np.abs(np.log(swing) / np.log(_SWING_FACTOR) - size) < 0.5
             found = _distinct(np.sort(speed[alike]))
-            # Of equally varied sizes the largest.
+            # Of sizes with equally many speeds, take the largest.
             if len(found) >= max(len(best), 1):
                 best = found
         return best
 
     @property
     def speed_range(self) -> tuple[float, float]:
-        """Speeds (V/s) of the slowest and the fastest stretch; zeros where none takes time."""
+        """Speeds (V/s) of the slowest and the fastest run; zeros if no run has a duration."""
         timed = (self.duration > 0.0) & (self.swing != 0.0)
         speed = np.abs(self.swing[timed]) / self.duration[timed]
         return (float(speed.min()), float(speed.max())) if speed.size else (0.0, 0.0)
 
 
 def _distinct(speeds: FloatArray) -> tuple[float, ...]:
-    """Return one of each group of sorted speeds, of those that come at least twice."""
+    """Return the median of each group of similar speeds that has at least two members; `speeds` are sorted."""
     result: list[float] = []
     for group in np.split(speeds, np.flatnonzero(speeds[1:] > speeds[:-1] * np.sqrt(SPEED_FACTOR)) + 1):
         middle = float(np.median(group))
@@ -83,29 +84,29 @@ def _distinct(speeds: FloatArray) -> tuple[float, ...]:
 
 
 def covered(v: FloatArray, runs: Runs) -> float:
-    """Return the share of all pairs of turning point and voltage that the record visits, of a map of cells."""
+    """Return the share, 0..1, of all pairs of reversal voltage and present voltage that a record visits."""
     low, high = float(v.min()), float(v.max())
     cell = np.minimum((v - low) * (_CELLS / (high - low)), _CELLS - 1).astype(np.int8)
     origin = np.repeat(cell[runs.ends[:-1]], np.diff(runs.ends))
     visited = np.bincount(_CELLS * origin + cell[runs.ends[0] : runs.ends[-1]], minlength=_CELLS**2) > 0
-    # The diagonal is where every turn begins.
+    # Every run visits the diagonal, where present voltage and reversal voltage are equal.
     off_diagonal = ~np.eye(_CELLS, dtype=bool).ravel()
     return float(np.mean(visited[off_diagonal]))
 
 
 def smallest_turn(v: FloatArray, noise: float) -> float:
-    """Return the swing (V) up to which a reversal of `v`, shape (N,), volts, with `noise` (V rms) says nothing."""
+    """Return the dead band (V) for reversals of the voltage `v`, shape (N,), volts, with `noise` (V rms)."""
     span = float(np.ptp(v))
     return float(np.clip(8.0 * noise, _SMALLEST_TURN * span, _LARGEST_DEAD_BAND * span))
 
 
 def hold_band(v: FloatArray, noise: float, digit: float) -> float:
-    """Return within how many volts a voltage rests, for its noise (V rms) and the step between its readings (V)."""
+    """Return the tolerance band (V) of a hold, for noise (V rms) and resolution `digit` (V) of the voltage."""
     return max(1e-4 * float(np.ptp(v)), 6.0 * noise, 1.5 * digit)
 
 
 def resting(t: FloatArray, v: FloatArray, band: float) -> tuple[IntArray, IntArray]:
-    """Find where the voltage rests within `band` (V).
+    """Find the holds, where the voltage `v`, shape (N,), at times `t` (s) stays within `band` (V).
 
     Returns
     -------
@@ -116,7 +117,7 @@ def resting(t: FloatArray, v: FloatArray, band: float) -> tuple[IntArray, IntArr
     width = max(5, round(_SHORTEST_HOLD / period)) if period > 0.0 else 5
     if width >= v.size:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    # A window that begins at each sample.
+    # Filter windows that begin at each sample.
     low, high = (filtered(v, width, origin=-(width // 2)) for filtered in (minimum_filter1d, maximum_filter1d))
     high -= low
     still = (high <= band)[: v.size - width + 1]
@@ -125,6 +126,6 @@ def resting(t: FloatArray, v: FloatArray, band: float) -> tuple[IntArray, IntArr
 
 
 def holds(t: FloatArray, v: FloatArray, band: float) -> FloatArray:
-    """Return how long the voltage rests, within `band` (V), each time it does so, shape (H,), seconds."""
+    """Return the duration of each hold, shape (H,), seconds; a hold stays within `band` (V)."""
     starts, stops = resting(t, v, band)
     return np.asarray(t[stops - 1] - t[starts])

@@ -1,4 +1,4 @@
-"""From a record to a model: every axis by itself, by the fit that its kind of model needs."""
+"""Identification of a stage model from records: each axis separately, by the fit of the requested kind."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -28,7 +28,7 @@ FITS: dict[str, Callable[[Sequence[Samples]], Fitted]] = {
     "smpi": fit_amplitude_scaled,
 }
 KINDS = tuple(FITS)
-# A model that leaves more than this share of the displacement's rms unexplained is none.
+# Largest held-out rms error of an acceptable model, as a share of the standard deviation of the displacement.
 SENSELESS = 0.5
 
 
@@ -41,35 +41,37 @@ def identify(
     axes: Sequence[str] | None = None,
     loops_at_rest: bool = False,
 ) -> StageModel:
-    """Identify the model of a stage from a record, or from several in one fit.
+    """Identify the model of a stage from one record, or from several in one fit.
 
     Parameters
     ----------
     record : Record or sequence of Record
-        Voltage before `start` still moves the memory; only the displacement there is not fitted. Several records share
-        the hysteresis, but each has its own memory at the start and its own displacement at rest; the model starts as
-        the first one given does, and ends as the last one by its stamps. Kinds ``slpi``, ``pi`` and ``mpi``
-        can be fitted to several.
+        Voltage before `start` updates the hysteresis state, but displacement before `start` is not fitted. Several
+        records share the hysteresis; each has its own initial history and displacement at rest. The model stores the
+        initial state of the first record given and the final state of the latest record. Kinds ``slpi``, ``pi`` and
+        ``mpi`` accept several records.
     kind : str
         ``slpi`` (the loop family), ``slpi-published`` (a classical PI model for each separated loop), ``pi`` (classical
-        Prandtl-Ishlinskii), ``mpi`` (multi-slope PI) or ``smpi`` (the same, scaled with the amplitude).
+        Prandtl-Ishlinskii), ``mpi`` (multi-slope PI) or ``smpi`` (multi-slope PI scaled with the amplitude).
     loops_at_rest : bool
-        Only for ``slpi-published``: the play operators of every loop start at rest, as in the paper, instead of primed.
+        For ``slpi-published`` only: the play operators of every loop start at rest, as in the paper, instead of
+        primed. Default False.
     start, stop : float, seconds, optional
-        Fit only samples with ``start <= t < stop``, t from the record's first stamp.
+        Fit only samples with ``start <= t < stop``, where t counts from the first stamp; by default all samples.
     axes : sequence of str, optional
-        All axes of the first record by default.
+        Axes to identify; by default all axes of the first record.
 
     Returns
     -------
     StageModel
+        Identified model of every axis.
 
     Raises
     ------
     UsageError
-        If the kind or an axis is not known.
+        If the kind or an axis is unknown.
     RecordError, IdentificationError
-        If the record does not allow a fit; the message says what is missing.
+        If the record does not allow a fit; the message names the cause.
     """
     fit = fit_of(kind, loops_at_rest=loops_at_rest)
     records = [record] if isinstance(record, Record) else list(record)
@@ -81,12 +83,12 @@ def identify(
         report_progress(f"axis {axis}: identification")
         samples = [select_samples(part, axis, start, stop) for part in records]
         try:
-            # The matrices are small: more threads than one only stand in each other's way.
+            # The matrices are small: one thread is fastest.
             with threadpool_limits(1):
                 fitted = fit(samples)
                 model = _axis_model(kind, fitted, source)
                 if model.causal:
-                    # The stage went on after `stop`.
+                    # The final state includes the voltage after `stop`.
                     whole = samples[last] if stop is None else select_samples(records[last], axis, None, None)
                     model = replace(model, end=replace(model, start=fitted.starts[last]).after(whole.v))
                 models[axis] = model
@@ -96,22 +98,22 @@ def identify(
 
 
 def fit_of(kind: str, *, loops_at_rest: bool) -> Callable[[Sequence[Samples]], Fitted]:
-    """Return the fit of a kind; UsageError if there is none."""
+    """Return the fit function of a kind; UsageError if the kind is unknown."""
     if kind not in KINDS:
         raise UsageError(f"unknown kind '{kind}'; this version identifies {', '.join(KINDS)}")
     if loops_at_rest and kind != "slpi-published":
-        raise UsageError(f"loops at rest are a matter of kind 'slpi-published', not of '{kind}'; leave that out")
+        raise UsageError(f"loops at rest are an option of kind 'slpi-published', not of '{kind}'; omit the option")
     return fit_at_rest if loops_at_rest else FITS[kind]
 
 
 def _one_stage(records: Sequence[Record]) -> str:
-    """Return the hardware id of records; UsageError where there are none, or of several stages."""
+    """Return the common hardware id of records; UsageError if there is no record or they are of several stages."""
     if not records:
-        raise UsageError("no record given; give at least one")
+        raise UsageError("no record given; give at least one record")
     named = {record.hardware_id: record.source for record in records if record.hardware_id}
     if len(named) > 1:
         stages = ", ".join(f"'{stage}' ({source})" for stage, source in named.items())
-        raise UsageError(f"records of several stages: {stages}; identify each stage by itself")
+        raise UsageError(f"records of several stages: {stages}; identify each stage separately")
     return next(iter(named), "")
 
 
@@ -137,13 +139,12 @@ def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:
 
 
 def _require_sense(fitted: Fitted) -> None:
-    """Refuse a model that says nothing."""
+    """Raise IdentificationError if the record does not determine a model, or voltage does not explain displacement."""
     if fitted.covered == 0.0:
         raise IdentificationError(NEVER_TURNS)
     spread = float(np.std(fitted.y))
     if not fitted.held_out_rms <= SENSELESS * spread:
         raise IdentificationError(
-            f"the voltage does not explain the displacement: error {fitted.held_out_rms * 1e9:.4g} nm rms on blocks "
-            f"left out, of {spread * 1e9:.4g} nm rms in all; check that both signals belong to this axis, and their "
-            "clocks"
+            f"the voltage does not explain the displacement: held-out error {fitted.held_out_rms * 1e9:.4g} nm rms, "
+            f"displacement {spread * 1e9:.4g} nm rms; check that both signals belong to this axis and have one clock"
         )

@@ -1,7 +1,7 @@
-"""The initial history of a record: what moved the stage before it began is not known, and must not be judged.
+"""Initial history of a record: the unknown motion of the stage before the first sample.
 
-`choose_start` chooses the history for a fit. `match` compares a model with a record that starts from any memory: what
-the record makes known decides whether the stage has changed, and the rest says nothing.
+`choose_start` chooses the initial history for a fit. `match` compares a model with a record of unknown initial
+history, using only samples whose prediction does not depend on that history.
 """
 
 import warnings
@@ -20,34 +20,34 @@ from slpi_ros.model.axis_model import AxisModel, Start
 
 FloatArray = NDArray[np.float64]
 
-# Turns of the decaying drive that stands for "somewhere in the middle".
+# Cycles of the decaying oscillation that represents an initial state near the middle of the loop.
 MIDDLE_LOOPS = 20
-# Another start than rest must explain the record this much better than rest does.
+# A history other than rest is chosen if its rms error is below this share of the error from rest.
 BETTER = 0.9
-# The beginning of a record disagrees with the rest when its error is this many times as large.
+# Ratio of the errors before and after the hysteresis state is reset, above which a warning is issued.
 DISAGREES = 3.0
-# What came before the memory was wiped is left out when it makes the rest of the record fit this much worse.
+# Samples before the reset of the hysteresis state are excluded if they increase the error after it by this factor.
 MISLEADING = 1.1
 
 
 class InitialHistoryWarning(UserWarning):
-    """The beginning of a record does not agree with the rest, whatever went before."""
+    """The first samples of a record do not agree with the rest for any initial history."""
 
 
 class Fit(Protocol):
-    """A fit of the samples it was made for."""
+    """Fit of the samples from which it was made."""
 
     def reweighted(self) -> "Fit":
-        """Return the fit with outliers weighed down."""
+        """Return the fit with reduced weights of outliers."""
 
     def residual(self) -> FloatArray:
-        """Return the error of every sample, fitted or not, shape (N,)."""
+        """Return the error of every sample, fitted or not, shape (N,), model minus measured."""
 
 
 def histories(samples: Samples) -> list[tuple[float, ...]]:
-    """Return what may have gone before: nothing (rest), a long fall, a long rise, a decaying oscillation.
+    """Return the candidate initial histories: none (rest), a long fall, a long rise, a decaying oscillation.
 
-    Each is a list of voltages (V) as in `slpi_ros.model.stage_model.Start`.
+    Each is a tuple of voltages (V) as in `slpi_ros.model.stage_model.Start`.
     """
     v0, low, high = float(samples.v[0]), float(samples.v.min()), float(samples.v.max())
     shrink = 1.0 - np.arange(1, MIDDLE_LOOPS) / MIDDLE_LOOPS
@@ -58,37 +58,38 @@ def histories(samples: Samples) -> list[tuple[float, ...]]:
 
 @dataclass(frozen=True)
 class InitialHistory:
-    """What a fit takes for granted about the beginning of a record.
+    """Initial history that a fit assumes for a record.
 
     Parameters
     ----------
     history : tuple of float, volts
         As in `slpi_ros.model.stage_model.Start`.
     only_wiped : bool
-        Whether what came before the memory was wiped is left out: no history explains it.
+        Whether samples before the reset of the hysteresis state are excluded, because no history explains them.
     """
 
     history: tuple[float, ...]
     only_wiped: bool
 
     def of(self, samples: Samples) -> Samples:
-        """Return the samples to be fitted, with the history before them."""
+        """Return the samples to be fitted, preceded by the voltages of the initial history."""
         return (samples.only(samples.wiped) if self.only_wiped else samples).after(self.history)
 
 
 def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> InitialHistory:
-    """Choose the history that explains the record best.
+    """Choose the initial history with the lowest fit error.
 
     Parameters
     ----------
     samples : Samples
-        From rest.
+        Record without an initial history.
     pose : callable
-        Makes a fit of samples.
+        Function from samples to a fit.
 
     Returns
     -------
     InitialHistory
+        Chosen history, and whether samples before the reset of the hysteresis state are excluded.
     """
     wiped = samples.fitted & samples.wiped
     enough = np.count_nonzero(wiped) >= FEWEST and samples.mostly_wiped
@@ -112,45 +113,45 @@ def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> InitialHis
 
 
 def warn_of_rest(samples: Sequence[Samples], beginnings: Sequence[InitialHistory]) -> None:
-    """Warn of how many samples are left aside, as no history explains them."""
+    """Issue InitialHistoryWarning with the number of samples that are excluded because no history explains them."""
     pairs = zip(samples, beginnings, strict=True)
     excluded = sum(np.count_nonzero(part.fitted & ~part.wiped) for part, beginning in pairs if beginning.only_wiped)
     if excluded:
         count = sum(np.count_nonzero(part.fitted) for part in samples)
         warnings.warn(
-            f"{excluded} of {count} samples are left out: what comes before the voltage has gone over its whole range "
-            "does not agree with the rest, whatever went before; `slpi diagnose` tells whether it is something else",
+            f"{excluded} of {count} samples are left out: before the voltage has gone over its whole range, they agree "
+            "with the rest for no initial history; `slpi diagnose` tests for other causes",
             InitialHistoryWarning,
             stacklevel=3,
         )
 
 
 def warn_of_initial_history(before: FloatArray, after: FloatArray) -> None:
-    """Warn where errors (m) from before the memory was wiped are much larger than those from after it."""
+    """Warn if the errors (m) before the reset of the hysteresis state are much larger than those after it."""
     if before.size and after.size:
         first, rest = (float(np.sqrt(np.mean(errors**2))) * 1e9 for errors in (before, after))
         if first > DISAGREES * rest:
             warnings.warn(
                 f"{before.size} of {before.size + after.size} samples, before the voltage has gone over its whole "
-                f"range, are off by {first:.3g} nm rms and never left out; the others by {rest:.3g} nm; "
-                "`slpi diagnose` tells whether there is something beside the hysteresis",
+                f"range, have an error of {first:.3g} nm rms, the others {rest:.3g} nm; the former do not count in "
+                "the held-out error; `slpi diagnose` tests for effects other than hysteresis",
                 InitialHistoryWarning,
                 stacklevel=3,
             )
 
 
 def _residual(fit: Fit, samples: Samples) -> FloatArray:
-    """Return the errors of a fit on `samples`, without those of its history."""
+    """Return the errors of a fit on `samples`, shape (N,), without those of the initial history."""
     return fit.reweighted().residual()[-samples.v.size :]
 
 
-# Voltages at which the last move before a record may have begun, as shares of the way to either end, in `match`.
+# In `match`: candidate start voltages of the last move before a record, as shares of the distance to either end.
 LAST_MOVES = np.linspace(0.0, 1.0, 9)
-# Readings of one stretch between two new extremes of the voltage need to be so many to be compared with each other.
+# Fewest samples of a stretch between two new extremes of the voltage that are compared with each other.
 FEWEST_OF_STRETCH = 20
-# Parts of the record that are left out in turn for the uncertainty of `match`.
+# Number of parts of the record for the jackknife uncertainty of `match`.
 PARTS = 10
-# A change is one beyond chance if it exceeds this many of its standard deviations.
+# A change is significant if it exceeds this many of its standard deviations.
 BEYOND_CHANCE = 4.0
 # Errors beyond this many robust standard deviations are outliers.
 OUTLIER = 6.0
@@ -158,30 +159,30 @@ OUTLIER = 6.0
 
 @dataclass(frozen=True)
 class Match:
-    """How a model fits a record whose initial history is not known.
+    """Comparison of a model with a record of unknown initial history.
 
     Parameters
     ----------
     start : Start
-        The initial history that explains the record best, at the first voltage that reaches the hysteresis, with the
-        displacement in the record's own zero.
+        Initial state with the lowest error, at the first voltage of the hysteresis, with the displacement relative to
+        the zero of the record.
     offset, offset_uncertainty : float, metres
-        By how much the zero of the record lies above that of the model, and by how much no more is known: what an
-        unknown history can hide, and the standard deviation.
+        Zero of the record minus zero of the model, and its uncertainty: the range due to the unknown initial history
+        plus `BEYOND_CHANCE` standard deviations.
     gain_change, gain_uncertainty : float
-        By which share the record's loops are higher, and its standard deviation.
+        Relative change of the loop height, and its standard deviation.
     width_change, width_uncertainty : float
-        By which share they are wider beyond that, and its standard deviation.
+        Relative change of the loop width in addition to `gain_change`, and its standard deviation.
     rms : float, metres
-        Error of the model on the `known` samples, but for the zero.
+        Rms error of the model on the `known` samples, without the offset.
     rms_explained : float, metres
-        What is left of it beside changes of gain and width, a lag and a linear drift.
+        Rms error that remains after fitting changes of gain and width, a lag and a linear drift.
     known_from : int
-        First sample from which on the initial history does not matter, but for the zero; N if there is none.
+        First sample after which the initial history affects only the offset; N if there is none.
     known : ndarray of bool, shape (N,)
-        Samples that can be judged: with each other, between two new extremes of the voltage.
+        Samples that can be compared with others of the same stretch between two new extremes of the voltage.
     residual : ndarray, shape (N,), metres
-        Model minus measurement, free-run from `start`; NaN where not fitted.
+        Model minus measured, free-run from `start`; NaN where not fitted.
     """
 
     start: Start
@@ -199,38 +200,39 @@ class Match:
 
     @property
     def gain_changed(self) -> bool:
-        """Whether the gain differs beyond chance."""
+        """Whether the change of gain is significant."""
         return abs(self.gain_change) > BEYOND_CHANCE * self.gain_uncertainty
 
     @property
     def width_changed(self) -> bool:
-        """Whether the width of the loops differs beyond chance, and beyond what the gain does."""
+        """Whether the change of loop width, in addition to that of gain, is significant."""
         return abs(self.width_change) > BEYOND_CHANCE * self.width_uncertainty
 
     @property
     def zero_moved(self) -> bool:
-        """Whether the zero lies elsewhere, whatever the initial history was."""
+        """Whether the zero has moved by more than the initial history and the uncertainty explain."""
         return abs(self.offset) > self.offset_uncertainty
 
 
 def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Match:
-    """Compare a model with a record, whatever moved the stage before.
+    """Compare a model with a record of unknown initial history.
 
-    Between two new extremes of the voltage the initial history adds nothing but a constant, so that the readings there
-    can be compared with each other. After both ends of the model's range were visited the zero is known, too.
+    Between two new extremes of the voltage the initial history adds only a constant, so the samples of such a stretch
+    can be compared with each other. After both ends of the model's range were visited, the zero is known as well.
 
     Parameters
     ----------
     axis : AxisModel
-        Its effects that belong to one record (drift, hum) are left aside.
+        Model of the axis; effects that belong to one record (drift, hum) are ignored.
     samples : Samples
-        The record, without an earlier drive.
+        Record without an initial history.
     t : ndarray, shape (N,), seconds, optional
-        Times of the samples; needed where the model has effects.
+        Times of the samples; required if the model has effects. By default the sample number.
 
     Returns
     -------
     Match
+        Offset, changes of gain and width, and their uncertainties.
     """
     time = np.arange(float(samples.v.size)) if t is None else t
     axis = replace(axis, effects=lasting_effects(axis))
@@ -271,11 +273,11 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Mat
 
 
 def lasting_effects(axis: AxisModel) -> tuple[Effect, ...]:
-    """Return the effects of an axis that another record shows too: no drift or hum, and the gain that a drift left."""
+    """Return the effects of an axis that persist in other records: no drift or hum; of a gain drift the final gain."""
     lasting: list[Effect] = []
     for effect in axis.effects:
         if isinstance(effect, GainDrift):
-            # From the first moment on what it was at the end.
+            # Constant at the final gain.
             lasting.append(replace(effect, times=(1e-9,), gains=effect.gains[-1:], uncertainty={}))
         elif effect.removable != "record":
             lasting.append(effect)
@@ -283,7 +285,7 @@ def lasting_effects(axis: AxisModel) -> tuple[Effect, ...]:
 
 
 def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
-    """Return possible states of the memory at the voltage `v` (V), those farthest from each other among them."""
+    """Return possible hysteresis states at the voltage `v` (V), including the two extreme states."""
     if not axis.causal:
         return [axis.start, axis.start]
     low, high = axis.voltage_range
@@ -294,34 +296,35 @@ def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
     decay = np.column_stack([v + (high - v) * shrink, v + (low - v) * shrink]).ravel()
     ways.append([low, *decay.tolist()])
     starts = [axis.after(np.array(way)) for way in ways]
-    # Within the range that was visited a stage that had never been moved is like one whose memory was wiped.
+    # Within the visited range, a stage at rest behaves like one whose hysteresis state was reset.
     wiped = [replace(start, from_rest=False) for start in starts]
     return [*wiped, axis.after(np.array([v])), axis.after(np.array([v]), "end")]
 
 
 def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> NDArray[np.int64]:
-    """Return the number of the stretch of each sample, shape (N,), in which the initial history adds a constant.
+    """Return the stretch number of each sample, shape (N,); within a stretch the initial history adds a constant.
 
     Parameters
     ----------
     v : ndarray, shape (N,), volts
+        Voltage.
     apart : ndarray, shape (N,), metres
-        By how much the displacements of possible histories differ.
+        Range of the predicted displacements over all candidate histories.
     tolerance : float, metres
-        Smaller changes of that do not count.
+        Changes of `apart` below this value are ignored.
     """
     extends = np.zeros(v.size, dtype=bool)
     for extreme in (np.maximum.accumulate(v), np.minimum.accumulate(v)):
         extends[1:] |= extreme[1:] != extreme[:-1]
-    # Where new extremes change nothing, as the memory is known, the stretch goes on.
+    # Once the hysteresis state is known, new extremes do not start a new stretch.
     level = np.floor(np.abs(apart - apart[-1]) / tolerance)
     extends &= level > 0
-    # Every sample at a new extreme is a stretch of its own, with too few samples to count.
+    # Every sample at a new extreme forms a separate stretch, too short to be compared.
     return np.cumsum(extends | np.append(False, extends[:-1]))
 
 
 def _inliers(residual: FloatArray, stretch: NDArray[np.int64], counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which samples, shape (N,), do not lie far off their neighbours in the residual (m)."""
+    """Return the mask, shape (N,), of the counted samples whose residual (m) lies near that of their neighbours."""
     inside = np.zeros(residual.size, dtype=bool)
     at = np.flatnonzero(counted)
     if at.size < FEWEST:
@@ -343,7 +346,7 @@ def _changes(
     stretch: NDArray[np.int64],
     known: NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray, float, float]:
-    """Return the changes of gain and width, their standard deviations, and the error before and after them (m)."""
+    """Return the changes of gain and width, their standard deviations, and the rms errors without and with them (m)."""
     if np.count_nonzero(known) < FEWEST:
         return np.zeros(2), np.full(2, np.inf), axis.quality.held_out_rms, axis.quality.held_out_rms
     bare = replace(axis, effects=())
@@ -375,29 +378,29 @@ def _changes(
     alone = _solved(matrices[:, rest][:, :, rest], vectors[:, rest], own_error, error.size)
     changes, uncertainty = both[0] / scale, both[1] / scale
     if abs(changes[1]) <= BEYOND_CHANCE * uncertainty[1]:
-        # Small loops hardly tell gain from width: where the width need not have changed, it has not.
+        # Small loops hardly separate gain from width: without a significant change of width, fit the gain alone.
         changes[0], uncertainty[0] = alone[0][0] / scale[0], alone[1][0] / scale[0]
     left = float(np.sqrt(np.mean((error - columns @ both[0]) ** 2)))
     return changes[:2], uncertainty[:2], float(np.sqrt(np.mean(error**2))), left
 
 
 def _solved(matrices: FloatArray, vectors: FloatArray, own_error: float, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the solution of normal equations that are sums over parts, and its standard deviations.
+    """Solve normal equations given as sums over parts; return the solution and its standard deviations (jackknife).
 
     Parameters
     ----------
     matrices, vectors : ndarray, shapes (PARTS, c, c) and (PARTS, c)
-        Of columns with a mean square of 1.
+        Normal equations of each part, for columns with a mean square of 1.
     own_error : float, metres
-        Of the model.
+        Held-out error of the model.
     count : int
-        Samples.
+        Number of samples.
     """
     ridge = 1e-9 * count * np.eye(matrices.shape[1])
     matrix, vector = matrices.sum(axis=0) + ridge, vectors.sum(axis=0)
     whole = np.linalg.solve(matrix, vector)
     left_out = [np.linalg.solve(matrix - own, vector - part) for own, part in zip(matrices, vectors, strict=True)]
     chance = np.sqrt((PARTS - 1) * np.var(left_out, axis=0))
-    # The model itself is not known better than its own error; columns that are alike can share it in any proportion.
+    # The model's own error limits the accuracy; collinear columns share that error in any proportion.
     alike = np.sqrt(np.diag(np.linalg.inv(matrix / count)))
     return whole, np.hypot(chance, alike * own_error / BEYOND_CHANCE)

@@ -1,4 +1,4 @@
-"""One basis on one record: the convex problem, its solution, and how well it predicts blocks left out."""
+"""Convex fit of one basis to one or several records, its solution and its held-out error."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,22 +22,22 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fitted hysteresis model.
+    """Fitted hysteresis model and its errors.
 
     Parameters
     ----------
     hysteresis : Hysteresis
+        Fitted model.
     starts : tuple of Start
-        Where the memory starts in each record.
+        Initial state of each record.
     y : ndarray, shape (number fitted,), metres
-        Displacements it was fitted to.
+        Fitted displacements.
     voltage_range : (float, float), volts
-        Covered by them.
+        Lowest and highest voltage of the fitted samples.
     errors : ndarray, shape (number fitted,), metres
-        Model minus measurement, free-run, on the samples fitted.
+        Model minus measured, free-run, of the fitted samples.
     held_out : ndarray, shape (N,), metres
-        Error of every sample given, on blocks left out of the fit: model minus measurement, free-run; NaN where a
-        sample never was left out.
+        Held-out error of every sample, model minus measured, free-run; NaN for samples that are in every fit.
     covered : float
         Share of the model that the samples determine, 0..1.
     """
@@ -52,13 +52,13 @@ class Fitted:
 
     @property
     def held_out_rms(self) -> float:
-        """Error on blocks left out of the fit, metres; every sample counts alike."""
+        """Rms held-out error, metres, with equal weights of all samples."""
         return float(np.sqrt(np.nanmean(self.held_out**2)))
 
 
-# A constraint may be missed by this much, in units of the scaled problem; the least gain is far above it.
+# Tolerance of the constraints, in units of the scaled problem; far below the least gain.
 TOLERANCE = 1e-7
-# The solver's own habit.
+# Default number of iterations between convergence checks of OSQP.
 CHECKED_EVERY = 25
 
 
@@ -75,28 +75,30 @@ def solve_qp(
     Parameters
     ----------
     matrix : ndarray, shape (p, p)
-        M, positive definite.
+        Matrix M, positive definite.
     vector : ndarray, shape (p,)
-        b.
+        Vector b.
     constraints : sparse array, shape (m, p)
-        C.
+        Matrix C.
     bound : ndarray, shape (m,)
+        Lower bounds of C x.
     least_iterations : int
-        The solver does not stop before; convergence is checked each time so many have been done.
+        Least number of iterations, and interval of the convergence checks. Default `CHECKED_EVERY`.
 
     Returns
     -------
     ndarray, shape (p,)
+        Minimiser x.
 
     Raises
     ------
     IdentificationError
-        If the solver does not end with a solution.
+        If the solver does not converge.
     """
     free = solve_free(matrix, vector)
     if np.all(constraints @ free >= bound):
         return free
-    # Without the polishing step: it gains nothing at this tolerance, and writes on standard output.
+    # No polishing step: it does not improve the solution at this tolerance, and it writes to standard output.
     solver = osqp.OSQP()
     solver.setup(
         sp.csc_matrix(np.triu(matrix)), -vector, sp.csc_matrix(constraints), bound, np.full(bound.size, np.inf),
@@ -117,26 +119,26 @@ def solve_free(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     try:
         solution: FloatArray = scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), vector)
     except np.linalg.LinAlgError:
-        raise IdentificationError("the record does not determine the model; drive more of the voltage range") from None
+        raise IdentificationError("the record does not determine the model; cover more of the voltage range") from None
     return solution
 
 
-# The weight with which outliers are found and starts are compared.
+# Roughness weight for the detection of outliers and the comparison of initial histories.
 FIRST_SMOOTHNESS = 0.1
 FOLDS, BLOCKS_OF_FOLD = 5, 8
 # Errors beyond this many (robust) standard deviations count linearly, not squared (Huber).
 HUBER = 1.5
 REWEIGHTINGS = 3
-# Keeps the equations definite where neither record nor roughness says anything.
+# Regularisation that keeps the equations definite where neither record nor roughness determines a parameter.
 RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One basis on one record or several.
+    """Least-squares problem of one basis on one record or several.
 
-    Displacement is in units of `scale`; weights are zero where a sample is not fitted; `judged` are those that others
-    can predict; `rough` is the matrix of the basis's roughness.
+    `y` is in units of `scale` (m), shape (N,); `weights` are zero for samples that are not fitted; `judged` marks the
+    samples that can be held out; `rough` is the roughness matrix, shape (p, p); `gain` is the mean gain (m/V).
     """
 
     basis: Basis
@@ -176,37 +178,37 @@ class Problem:
         return int(np.count_nonzero(self.weights))
 
     def errors(self, x: FloatArray) -> FloatArray:
-        """Return the errors of the fitted samples, metres."""
+        """Return the errors of the fitted samples, model minus measured, metres."""
         fitted = self.weights > 0
         return (self.design.predict(x) - self.y)[fitted] * self.scale
 
     def penalty(self, smoothness: float, count: float) -> FloatArray:
-        """Return the matrix of the roughness penalty on `count` samples, shape (p, p)."""
+        """Return the matrix of the roughness penalty with weight `smoothness` for `count` samples, shape (p, p)."""
         matrix = self.rough * (smoothness * count / 1000)
         matrix[np.diag_indices_from(matrix)] += RIDGE * count
         return matrix
 
     def solve(self, smoothness: float) -> FloatArray:
-        """Fit all samples, with every branch rising."""
+        """Return the parameters, shape (p,), of a fit to all samples in which every branch is monotone."""
         matrix, vector = self.design.normal_equations(self.y, self.weights)
         return self.constrained(matrix + self.penalty(smoothness, self.count), vector)
 
     def constrained(self, matrix: FloatArray, vector: FloatArray) -> FloatArray:
-        """Minimise ``x' M x / 2 - b' x`` with every branch rising."""
+        """Minimise ``x' M x / 2 - b' x`` subject to monotone branches."""
         constraints, bound = self.basis.monotone(self.gain / self.scale)
-        # The displacement at rest is free, that of every record.
+        # The displacement at rest of each record is unconstrained.
         shape = (bound.size, matrix.shape[0])
         constraints = sp.csr_array((constraints.data, constraints.indices, constraints.indptr), shape)
         return solve_qp(matrix, vector, constraints, bound)
 
     def residual(self) -> FloatArray:
-        """Return the errors, shape (N,), in units of `scale`, of a rough fit whose branches may fall."""
+        """Return the errors, shape (N,), in units of `scale`, of a quick fit without monotonicity constraints."""
         matrix, vector = self.design.normal_equations(self.y, self.weights)
         x = solve_free(matrix + self.penalty(FIRST_SMOOTHNESS, self.count), vector)
         return self.design.predict(x) - self.y
 
     def reweighted(self) -> "Problem":
-        """Return the problem with outliers weighed down."""
+        """Return the problem with reduced weights of outliers (Huber)."""
         allowed = (self.weights > 0).astype(np.float64)
         problem = self
         for _ in range(REWEIGHTINGS):
@@ -217,17 +219,17 @@ class Problem:
         return problem
 
     def folds(self) -> list[NDArray[np.int64]]:
-        """Return the samples that are left out together.
+        """Return the sample indices of each fold.
 
-        The first rise is never left out: a record shows it once, and no other part can predict it.
+        The first rise is in every fit: it occurs once in a record, so no other part can predict it.
         """
         return blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise)
 
     def held_out_errors(self, smoothness: float) -> FloatArray:
-        """Return the error (m) of each sample, shape (N,), when it is left out of the fit; NaN where it never is."""
+        """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit."""
         errors = np.full(self.y.size, np.nan)
         for fold, chosen in enumerate(self.folds(), 1):
-            report_progress(f"fits with blocks left out, {fold} of {FOLDS}")
+            report_progress(f"cross-validation, fold {fold} of {FOLDS}")
             weights = self.weights.copy()
             weights[chosen] = 0.0
             part = replace(self, weights=weights)
@@ -235,7 +237,7 @@ class Problem:
         return errors
 
     def scores(self, smoothness: Sequence[float]) -> FloatArray:
-        """Return the robust rms error (m) on blocks left out, one for each smoothness; quick, so branches may fall."""
+        """Return the robust rms held-out error (m) for each smoothness, from fits without monotonicity constraints."""
         matrix, vector = self.design.normal_equations(self.y, self.weights)
         squares, total = np.zeros(len(smoothness)), 0.0
         for chosen in self.folds():
@@ -252,7 +254,7 @@ class Problem:
 
 
 def blocked_folds(allowed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Return the samples, of those `allowed`, that are left out together: blocks spread over the record."""
+    """Return the sample indices of each fold, among those `allowed`; a fold consists of blocks across the record."""
     blocks = np.array_split(np.flatnonzero(allowed), FOLDS * BLOCKS_OF_FOLD)
     return [np.concatenate(blocks[fold::FOLDS]) for fold in range(FOLDS)]
 
@@ -260,19 +262,20 @@ def blocked_folds(allowed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
 def held_out_errors(
     samples: Samples, allowed: NDArray[np.bool_], predict: Callable[[NDArray[np.bool_]], FloatArray]
 ) -> FloatArray:
-    """Return the error (m) of each sample, shape (N,), when it is left out of a fit; NaN where it never is.
+    """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit.
 
     Parameters
     ----------
     samples : Samples
+        Samples of the record.
     allowed : ndarray of bool, shape (N,)
-        Samples that may be left out.
+        Samples that may be held out.
     predict : callable
-        Given the samples to be fitted, bool of shape (N,), returns the displacement of all, shape (N,), metres.
+        Function from the mask of samples to be fitted, shape (N,), to the displacement of all, shape (N,), metres.
     """
     errors = np.full(samples.v.size, np.nan)
     for fold, chosen in enumerate(blocked_folds(allowed), 1):
-        report_progress(f"fits with blocks left out, {fold} of {FOLDS}")
+        report_progress(f"cross-validation, fold {fold} of {FOLDS}")
         kept = samples.fitted.copy()
         kept[chosen] = False
         errors[chosen] = (predict(kept) - samples.y)[chosen]
@@ -280,5 +283,5 @@ def held_out_errors(
 
 
 def noise_rms(errors: FloatArray) -> float:
-    """Return the rms of what changes from sample to sample in `errors`, outliers apart."""
+    """Return the robust rms of the sample-to-sample noise in `errors`, in their unit."""
     return float(1.4826 * np.median(np.abs(np.diff(errors))) / np.sqrt(2))

@@ -1,4 +1,4 @@
-"""The kinds that are linear in their parameters: one convex fit, as smooth and fine as held-out blocks say."""
+"""Convex fits of the kinds that are linear in their parameters; cross-validation selects grid and smoothness."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from slpi_ros.model.axis_model import Start
 
 FloatArray = NDArray[np.float64]
 
-# Vertices of the loop family's grid, and weights of its roughness, that cross-validation chooses from.
+# Candidate numbers of grid vertices and roughness weights of the loop family, for cross-validation.
 VERTICES = (21, 31, 41)
 SMOOTHNESS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PLAY_OPERATORS = 30
-# A long record is thinned to about so many samples to choose start, grid and smoothness by, and to be fitted at last:
-# more of them cost time and memory, and tell nothing new.
+# Numbers of samples to which a long record is thinned: for the choice of initial history, grid and smoothness, and for
+# the final fit. More samples cost time and memory without changing the result.
 SELECTION_SAMPLES, FIT_SAMPLES = 100_000, 1_000_000
-# Every sample moves every play operator, which takes time: this share of them does, for few parameters.
+# Share of these numbers for play operators: every sample moves every operator, and the parameters are few.
 PLAYS_SHARE = 0.2
 
 
@@ -38,19 +38,19 @@ def fit_plays(samples: Sequence[Samples]) -> Fitted:
 
 
 def surfaces(samples: Sequence[Samples]) -> list[Basis]:
-    """Return the loop families that compete."""
+    """Return the candidate loop families, one for each number of vertices, for the voltage range of the samples."""
     low, high = _voltage_range(samples)
     return [SurfaceBasis(np.linspace(low, high, n)) for n in VERTICES]
 
 
 def plays(samples: Sequence[Samples]) -> list[Basis]:
-    """Return the only classical PI model that competes."""
+    """Return the classical PI model, the only candidate, for the voltage range of the samples."""
     low, high = _voltage_range(samples)
     return [PlayBasis(np.linspace(0.0, (high - low) / 2, PLAY_OPERATORS, endpoint=False))]
 
 
 def fit_multi_slope(samples: Sequence[Samples]) -> Fitted:
-    """Fit the MPI model of the amplitude that the records cover, from rest, by plain least squares as published."""
+    """Fit the MPI model for the amplitude of the records, from rest, by unweighted least squares as published."""
     samples = [part.thinned(round(PLAYS_SHARE * FIT_SAMPLES / len(samples))) for part in samples]
     problem = Problem.pose(samples, MultiSlopeBasis.over(*_voltage_range(samples)))
     return _solved(samples, problem, FIRST_SMOOTHNESS, [InitialHistory((), only_wiped=False)] * len(samples))
@@ -67,18 +67,18 @@ def fit_linear(
     *,
     share: float = 1.0,
 ) -> Fitted:
-    """Fit the basis, with the roughness weight, that predicts blocks left out best.
+    """Fit the basis and roughness weight with the lowest held-out error.
 
     Parameters
     ----------
     samples : sequence of Samples
-        Of each record.
+        Samples of each record.
     bases : sequence of Basis
-        Those that compete, the simplest one first.
+        Candidate bases, the simplest first.
     smoothness : sequence of float
-        Roughness weights that compete.
+        Candidate roughness weights; by default the smallest.
     share : float
-        Of the samples to which a long record is thinned otherwise.
+        Factor on `SELECTION_SAMPLES` and `FIT_SAMPLES`, 0..1. Default 1.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def fit_linear(
     Warns
     -----
     InitialHistoryWarning
-        If the beginning of a record does not agree with the rest.
+        If the first samples of a record do not agree with the rest.
     """
     chosen = choose(samples, bases, smoothness, share=share)
     warn_of_rest(samples, chosen.beginnings)
@@ -107,7 +107,7 @@ def fit_linear(
 
 @dataclass(frozen=True)
 class Choice:
-    """The problem, of a thinned record, that predicts blocks left out best."""
+    """Problem (of thinned records), roughness weight and initial histories with the lowest held-out error."""
 
     problem: Problem
     smoothness: float
@@ -117,14 +117,14 @@ class Choice:
 def choose(
     samples: Sequence[Samples], bases: Sequence[Basis], smoothness: Sequence[float], *, share: float = 1.0
 ) -> Choice:
-    """Choose start, basis and roughness weight; parameters and errors as in `fit_linear`."""
+    """Choose initial history, basis and roughness weight; parameters and errors as in `fit_linear`."""
     thin = [part.thinned(round(share * SELECTION_SAMPLES / len(samples))) for part in samples]
-    report_progress("choosing what went before the record")
+    report_progress("choosing the initial history")
     beginnings = [choose_start(part, lambda candidate: Problem.pose([candidate], bases[0])) for part in thin]
     thin = [beginning.of(part) for beginning, part in zip(beginnings, thin, strict=True)]
     candidates = []
     for number, basis in enumerate(bases, 1):
-        report_progress(f"choosing how fine and how smooth, {number} of {len(bases)}")
+        report_progress(f"choosing grid and smoothness, {number} of {len(bases)}")
         problem = Problem.pose(thin, basis).reweighted()
         scores = problem.scores(smoothness)
         k = int(np.argmin(scores))
@@ -136,7 +136,7 @@ def choose(
 def _solved(
     samples: Sequence[Samples], problem: Problem, smoothness: float, beginnings: Sequence[InitialHistory]
 ) -> Fitted:
-    """Solve a problem of samples that have a history before them."""
+    """Solve a problem whose samples begin with the initial history; return the result without that history."""
     report_progress(f"fit to {problem.count} samples")
     x = problem.solve(smoothness)
     predicted = np.split(problem.design.predict(x) * problem.scale, np.cumsum([part.v.size for part in samples])[:-1])

@@ -1,6 +1,6 @@
-"""What a long computation is about, said to whoever listens.
+"""Progress messages of long computations.
 
-Whoever computes calls `report_progress`; who wants to know listens. So no fit has to hand a listener on.
+Computations call `report_progress`; a listener set by `listening` receives the messages through a context variable.
 """
 
 import time
@@ -11,7 +11,7 @@ from typing import TextIO
 
 Listener = Callable[[str], None]
 
-# Shorter work is not worth a word (seconds).
+# Computing time before progress is shown, seconds.
 PATIENCE = 2.0
 _CLEAR = "\r\x1b[K"
 
@@ -19,7 +19,7 @@ _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 def report_progress(what: str) -> None:
-    """Say in a few words what is being done."""
+    """Report the current step, `what`, to the listener of this context, if any."""
     listener = _listener.get()
     if listener:
         listener(what)
@@ -27,7 +27,7 @@ def report_progress(what: str) -> None:
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Hand everything told within to `listener`."""
+    """Pass every progress message of the ``with`` block to `listener`."""
     token = _listener.set(listener)
     try:
         yield
@@ -37,7 +37,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def shown_on(stream: TextIO, clock: Callable[[], float] = time.monotonic) -> Iterator[None]:
-    """Show the latest on one line of a terminal, once the work takes long; write nothing on anything else."""
+    """Show the latest progress message on one line of a terminal after `PATIENCE`; write nothing to other streams."""
     if not stream.isatty():
         yield
         return

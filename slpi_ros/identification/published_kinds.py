@@ -1,4 +1,4 @@
-"""The published SLPI model: a classical PI model for each separated loop, each by its own quadratic program."""
+"""Fits of the published models: SLPI (a classical PI model per separated loop), MPI and SMPI."""
 
 import warnings
 from collections.abc import Sequence
@@ -38,20 +38,20 @@ from slpi_ros.model.axis_model import Start
 FloatArray = NDArray[np.float64]
 
 OPERATORS = 10
-# Spacing of the thresholds (V), where it suits the outer loop: 10 to 40 of it in the span.
+# Spacing of the thresholds (V) for outer loops with a span of 10 to 40 spacings.
 SPACING = 5.0
-# A loop needs this many samples of its own; shorter ones are left to the nearest loop that is identified.
+# Fewest fitted samples of an identified loop; the nearest identified loop replaces a shorter one.
 FEWEST_OF_LOOP = 4
-# The same goes for an inner loop of which less than this share is to be fitted: the rest would be a guess.
+# Least share of fitted samples of an identified inner loop; below, the nearest identified loop replaces it.
 LEAST_SHARE = 0.4
-# Within the dead band lie the peaks of the noise of a measured voltage, in standard deviations; never more than this
-# share of the voltage range.
+# Dead band in standard deviations of the noise of a measured voltage, and its upper limit as a share of the voltage
+# range.
 NOISE_PEAK_TO_PEAK = 8.0
 LARGEST_DEAD_BAND = 0.02
 
 
 def fit_primed(samples: Sequence[Samples]) -> Fitted:
-    """Fit the loops of one record so that those of level 1 and more close."""
+    """Fit the loops of one record with primed play operators, so that loops of level 1 and above close."""
     return _fit(only_one(samples, "slpi-published"), at_rest=False)
 
 
@@ -63,17 +63,17 @@ def fit_at_rest(samples: Sequence[Samples]) -> Fitted:
 def default_thresholds(span: float) -> FloatArray:
     """Return the paper's thresholds 0, 5, ..., 45 V (Tables 2 to 5), shape (10,), volts.
 
-    They are made for an outer loop of 100 V. Where its `span` (V) is below 50 or above 200, they are 0, 5, ..., 45 % of
-    it.
+    These suit an outer loop of 100 V. For a `span` (V) below 50 or above 200, the thresholds are 0, 5, ..., 45 % of
+    the span.
     """
     spacing = SPACING if 10 <= span / SPACING <= 40 else span / 20
     return spacing * np.arange(OPERATORS, dtype=np.float64)
 
 
 def voltage_dead_band(v: FloatArray) -> float:
-    """Return the dead band (V) that the noise of a measured voltage, shape (N,), volts, asks for.
+    """Return the dead band (V) for the noise of a measured voltage, shape (N,), volts.
 
-    Noise is what changes from sample to sample otherwise than smoothly; a commanded voltage has next to none.
+    Noise is estimated from third differences; that of a commanded voltage is nearly zero.
     """
     if v.size < FEWEST:
         return 0.0
@@ -83,7 +83,7 @@ def voltage_dead_band(v: FloatArray) -> float:
 
 
 def least_iterations(samples: int, all_samples: int) -> int:
-    """Return the least number of iterations of the quadratic program of a loop of `samples`, Eq. 9, rounded up."""
+    """Return the least number of iterations for a loop with `samples` of `all_samples` samples, Eq. 9, rounded up."""
     return int(np.ceil(10.0 * np.sqrt(4.0 * samples / all_samples + 1.0)))
 
 
@@ -92,7 +92,7 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
         return _predict(*fit_loops(samples, kept, at_rest=at_rest), samples.v)
 
     loops, offset = fit_loops(samples, samples.fitted, at_rest=at_rest)
-    # The first rise is never left out: a record shows it once.
+    # The first rise is in every fit: it occurs once in a record.
     after_first_rise = np.arange(samples.v.size) > int(np.argmax(samples.v))
     if not np.any(samples.fitted & after_first_rise):
         raise IdentificationError(NEVER_TURNS)
@@ -109,7 +109,7 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
 
 def _predict(loops: SeparatedLoops, offset: float, v: FloatArray) -> FloatArray:
     with warnings.catch_warnings():
-        # Loops too short to be identified are no news here.
+        # Loops too short to be identified are expected here.
         warnings.simplefilter("ignore", UnidentifiedLoopWarning)
         return loops.along(float(v[0]), offset).forward_array(v)
 
@@ -122,16 +122,18 @@ def fit_loops(
     Parameters
     ----------
     samples : Samples
+        Samples of the record.
     fitted : ndarray of bool, shape (N,)
-        Samples whose displacement counts.
+        Samples whose displacement is fitted.
     at_rest : bool
-        As published; else primed.
+        Whether play operators start at rest, as published, instead of primed.
     thresholds : ndarray, shape (n,), volts, optional
-        Of every loop; see `default_thresholds`.
+        Thresholds of every loop; by default those of `default_thresholds`.
 
     Returns
     -------
     SeparatedLoops
+        Identified loops.
     float, metres
         Displacement at rest.
 
@@ -163,13 +165,13 @@ def fit_loops(
         except UsageError:
             raise IdentificationError(
                 f"the loop from {samples.v[loop.vertex]:g} V (sample {loop.vertex}) does not fit the one below it; "
-                "check that voltage and displacement belong together"
+                "check that voltage and displacement belong to the same axis"
             ) from None
     return SeparatedLoops(tuple(identified.values()), dead_band), identified[0].vertex[1]
 
 
 def _run_ins(level: int, thresholds: FloatArray, at_rest: bool) -> list[float | None]:
-    """Return the states in which the operators of a loop may start; see `SingleLoop`."""
+    """Return the candidate initial states of a loop's operators; see `SingleLoop`."""
     if at_rest:
         return [None]
     return [0.0] if level else [*thresholds.tolist(), None]
@@ -181,12 +183,13 @@ class Plays(NamedTuple):
     Parameters
     ----------
     weights : ndarray, shape (n,), metres per volt
+        Weights of the operators.
     start : float, metres
         Displacement at the vertex.
     run_in : float or None, volts
-        As in `SingleLoop`.
+        Initial state of the operators, as in `SingleLoop`.
     rms : float, metres
-        Error of the fit.
+        Rms error of the fit.
     """
 
     weights: FloatArray
@@ -210,17 +213,19 @@ def fit_plays(
     Parameters
     ----------
     drive : ndarray, shape (m,), volts
-        From 0 on.
+        Voltage relative to the vertex of the loop.
     y : ndarray, shape (m,), metres
+        Displacement relative to the vertex.
     used : ndarray of bool, shape (m,)
-        Samples whose displacement counts.
+        Samples whose displacement is fitted.
     thresholds : ndarray, shape (n,), volts
+        Thresholds of the operators.
     run_in : float or None, volts
-        As in `SingleLoop`.
+        Initial state of the operators, as in `SingleLoop`.
     through_zero : bool
-        Whether the displacement is 0 at the start; else that is found too.
+        Whether the displacement at the vertex is 0; otherwise it is a parameter of the fit.
     iterations : int
-        At least so many; see `least_iterations`.
+        Least number of iterations; see `least_iterations`.
     """
     plays = [at_vertex(play(r), run_in).forward_array(drive)[used] for r in thresholds.tolist()]
     design = np.column_stack(plays if through_zero else [*plays, np.ones(np.count_nonzero(used))])
@@ -238,7 +243,7 @@ def fit_plays(
 
 
 class _SingleLoopFit:
-    """One loop in its own coordinates."""
+    """Fit of one loop in coordinates relative to its vertex."""
 
     def __init__(self, loop: Loop, samples: Samples, fitted: NDArray[np.bool_], thresholds: FloatArray) -> None:
         self._loop, self._thresholds = loop, thresholds
@@ -247,12 +252,12 @@ class _SingleLoopFit:
         self._vertex = float(samples.v[loop.vertex]), float(samples.y[loop.vertex])
         self._y = loop.direction * (samples.y[path] - self._vertex[1])
         self._used = fitted[path]
-        # The vertex is where it was measured; only where it was not, it is found.
+        # A measured vertex is fixed; otherwise its displacement is a parameter of the fit.
         self._vertex_known = bool(fitted[loop.vertex])
         self._iterations = least_iterations(self._v.size, samples.v.size)
 
     def solve(self, run_in: float | None) -> Plays:
-        """Fit the loop's operators, which start as `run_in` says."""
+        """Fit the loop's operators from the initial state `run_in` (V)."""
         return fit_plays(
             self._v,
             self._y,
@@ -264,7 +269,7 @@ class _SingleLoopFit:
         )
 
     def loop(self, solution: Plays, below: SingleLoop | None) -> SingleLoop:
-        """Return the loop with a solution's weights, on the loop `below`."""
+        """Return the loop with the fitted weights, relative to the loop `below`; None for the outer loop."""
         loop = self._loop
         vertex = self._vertex[0], self._vertex[1] + loop.direction * solution.start
         return SingleLoop(
@@ -279,24 +284,24 @@ class _SingleLoopFit:
 
 
 def _offset(vertex: tuple[float, float], direction: int, below: SingleLoop) -> tuple[float, float]:
-    """Return how far a vertex (V, m) lies from where the model of the loop `below` leads (V, m)."""
+    """Return the distance (V, m) of a vertex (V, m) from the branch that the model of the loop `below` predicts."""
     v, y = (below.direction * (vertex[k] - below.vertex[k]) for k in (0, 1))
     by_voltage, by_displacement = below.memory(), below.memory()
     if direction == below.direction:
-        # The vertex lies on the way back.
+        # The vertex lies on the returning branch.
         by_voltage.forward(below.span[0])
         by_displacement.inverse(below.span[1])
     missed = v - by_displacement.inverse(y), y - by_voltage.forward(v)
     return below.direction * missed[0], below.direction * missed[1]
 
 
-# Cycles count as of one amplitude when theirs differ by less than this share of the largest.
+# Cycles have the same amplitude if their amplitudes differ by less than this share of the largest.
 SAME_AMPLITUDE = 0.02
 
 
 @dataclass(frozen=True)
 class MultiSlopeBasis(OperatorWeights):
-    """The MPI model: one weight for each operator; parameters as those of `MultiSlope`."""
+    """Basis of the MPI model with one weight for each operator; `origin`, `amplitude`, `thresholds` as `MultiSlope`."""
 
     origin: float
     amplitude: float
@@ -309,7 +314,7 @@ class MultiSlopeBasis(OperatorWeights):
         return cls(low, high - low, thresholds_for(high - low))
 
     def branch_part(self, walk: Walk) -> sp.csr_array:
-        """Return how far each operator has moved along the branch."""
+        """Return the motion (V) of each operator along the branch of each sample, shape (N, size)."""
         upper, lower = np.maximum(walk.v, walk.v_origin), np.minimum(walk.v, walk.v_origin)
         waits = rising_envelope(upper[:, None] - self.origin, self.thresholds) - self._falling(lower)
         moved = np.maximum(0.0, waits) * walk.direction[:, None]
@@ -323,28 +328,29 @@ class MultiSlopeBasis(OperatorWeights):
         return falling_envelope(v[:, None] - self.origin, self.thresholds, self.amplitude)
 
     def shape(self, x: FloatArray, gain: float) -> MultiSlope:
-        """Return the MPI model."""
+        """Return the MPI model with the weights `x` (m/V); `gain` is not used."""
         return MultiSlope(self.origin, self.amplitude, self.thresholds, np.maximum(x[:-1], 0.0))
 
 
 def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the amplitude and the peak displacement of each cycle of a record, in its order.
+    """Return the amplitude and the peak displacement of each cycle of a record, in chronological order.
 
-    A cycle starts within 1 % of the voltage range of the lowest voltage, and goes beyond that. It is left out if its
-    displacement is not known there, or within 1 % of its highest voltage.
+    A cycle starts at a voltage less than 1 % of the range above the lowest, and rises above that band. It is omitted if
+    its displacement is unknown at the start, or within 1 % of its highest voltage.
 
     Parameters
     ----------
     v : ndarray, shape (N,), volts
+        Voltage.
     y : ndarray, shape (N,), metres
-        Not finite where it is not known.
+        Displacement; not finite where unknown.
 
     Returns
     -------
     amplitudes : ndarray, shape (c,), volts
-        Largest voltage of each cycle, above the lowest one of the record.
+        Largest voltage of each cycle, relative to the lowest of the record.
     peaks : ndarray, shape (c,), metres
-        Largest displacement of each cycle, above that at its start.
+        Largest displacement of each cycle, relative to the start of the cycle.
     """
     if not v.size:
         return np.empty(0), np.empty(0)
@@ -360,26 +366,26 @@ def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the knots of ``X_p`` over amplitude for the SMPI model: cycles of nearly equal amplitude are averaged.
+    """Return the knots of ``X_p`` over amplitude for the SMPI model; cycles of nearly equal amplitude are averaged.
 
     Parameters
     ----------
-    v : ndarray, shape (N,), volts
-    y : ndarray, shape (N,), metres
+    v, y : ndarray, shape (N,), volts and metres
+        Voltage and displacement; the latter not finite where unknown.
 
     Returns
     -------
-    voltages : ndarray, shape (m,), volts
-    displacements : ndarray, shape (m,), metres
+    voltages, displacements : ndarray, shape (m,), volts and metres
+        Amplitudes in ascending order, and their mean peak displacements.
 
     Raises
     ------
     IdentificationError
-        If the record holds no cycle, or the peaks do not rise with the amplitude.
+        If the record contains no cycle, or the peaks do not rise with the amplitude.
     """
     amplitudes, peaks = cycle_peaks(v, y)
     if not amplitudes.size:
-        raise IdentificationError("no cycle starts at the lowest voltage; drive from there up and back, per amplitude")
+        raise IdentificationError("no cycle starts at the lowest voltage; drive up and back from there, per amplitude")
     order = np.argsort(amplitudes)
     amplitudes, peaks = amplitudes[order], peaks[order]
     group = np.zeros(amplitudes.size, dtype=np.int64)
@@ -401,36 +407,36 @@ def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class PeakFrequency:
-    """Peak displacement over drive frequency, ``X_p = a f^b`` (MPI paper, Eq. 1).
+    """Peak displacement as a function of excitation frequency, ``X_p = a f^b`` (MPI paper, Eq. 1).
 
     Parameters
     ----------
     a : float, metres
         Peak displacement at 1 Hz.
     b : float
-        Negative when the peak sinks with the frequency.
+        Exponent; negative if the peak decreases with frequency.
     """
 
     a: float
     b: float
 
     def __call__(self, frequency: ArrayLike) -> FloatArray:
-        """Return the peak displacement (m) at `frequency` (Hz), of its shape."""
+        """Return the peak displacement (m) at `frequency` (Hz), in the shape of `frequency`."""
         return self.a * np.asarray(frequency, dtype=np.float64) ** self.b
 
 
 def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
-    """Fit ``X_p = a f^b`` with the least sum of squared errors of the peaks.
+    """Fit ``X_p = a f^b`` to peak displacements by nonlinear least squares.
 
     Parameters
     ----------
-    frequency : array_like, shape (n,), Hz
-    peak : array_like, shape (n,), metres
+    frequency, peak : array_like, shape (n,), hertz and metres
+        Excitation frequencies, at least two of them different, and peak displacements.
 
     Raises
     ------
     IdentificationError
-        If there are not two frequencies, or a value is not positive and finite.
+        If fewer than two frequencies differ, or a value is not positive and finite.
     """
     f, x = np.asarray(frequency, dtype=np.float64), np.asarray(peak, dtype=np.float64)
     if f.ndim != 1 or f.shape != x.shape or np.unique(f).size < 2:
@@ -441,7 +447,7 @@ def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
         bad = ~(np.isfinite(values) & (values > 0))
         if bad.any():
             raise IdentificationError(f"X_p = a f^b: {name} {values[bad][0]:g} {unit} is not positive; leave it out")
-    # In logarithms the fit is linear, but weighs errors of small peaks more: a start only. In units of the mean peak.
+    # Initial guess: the linear fit of logarithms, which overweights small peaks. Peaks are in units of their mean.
     mean = x.mean()
     slope, level = np.polyfit(np.log(f), np.log(x / mean), 1)
     best = least_squares(
@@ -451,12 +457,12 @@ def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
 
 
 def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
-    """Fit the SMPI model to one record.
+    """Fit the SMPI model to one record, given as a sequence of one element.
 
     Raises
     ------
     UsageError
-        If there are several records.
+        If several records are given.
     IdentificationError
         If too few samples belong to cycles of the largest amplitude.
     """
@@ -488,7 +494,7 @@ def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
 
 
 def in_largest_cycles(v: FloatArray) -> NDArray[np.bool_]:
-    """Return which samples belong to a cycle that reaches the highest voltage of a record, shape (N,)."""
+    """Return the mask, shape (N,), of samples in cycles that reach the highest voltage of the record."""
     low, high = float(v.min()), float(v.max())
     chosen = np.zeros(v.size, dtype=bool)
     for first, last in cycles(v, low + BACK * (high - low)):
@@ -507,9 +513,9 @@ def _fit_scaled(samples: Samples, kept: NDArray[np.bool_], largest: NDArray[np.b
     x = problem.solve(FIRST_SMOOTHNESS) * problem.scale
     base = problem.basis.shape(x, problem.gain)
     assert isinstance(base, MultiSlope)
-    # Of all fitted samples: a few peaks say nothing of the samples between them.
+    # From all fitted samples, not only those kept: the peaks are few.
     model = AmplitudeScaled(base, *peak_line(samples.v, np.where(samples.fitted, samples.y, np.nan)))
-    # Displacement at the start: at the low end, where all cycles begin, the model must be right.
+    # Displacement at the start: from the error at the low end, where all cycles begin.
     relative = model.along(float(samples.v[0]), 0.0).forward_array(samples.v)
     low, high = _ends(samples)
     at_low_end = kept & (samples.v <= low + BACK * (high - low))

@@ -1,4 +1,4 @@
-"""What a record is worth, before any fit: its clock, its signals, its drive."""
+"""Assessment of a record before a fit: time stamps, signals and excitation."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -16,35 +16,36 @@ from slpi_ros.io.record import Record
 
 FloatArray = NDArray[np.float64]
 
-# Steps in time that are longer than this many periods: samples are missing; a whole gap.
+# Time steps, in periods, above which samples are missing, and above which the step is a gap.
 _LOST, _GAP = 1.5, 5.0
-# Samples within which the stamps that follow a late one catch up.
+# Number of samples within which stamps recover after a late stamp.
 _CATCHES_UP = 51
-# A voltage is smooth only up to this share of its range: what computed it may be made of pieces.
+# Least size of a voltage outlier as a share of the range; piecewise excitation signals have smaller kinks.
 _LEAST_SPIKE = 0.001
 
 
 @dataclass(frozen=True)
 class ClockQuality:
-    """The stamps of a record.
+    """Quality of the time stamps of a record.
 
     Parameters
     ----------
     samples : int
+        Number of samples.
     duration, period : float, seconds
-        From first to last, and from one to the next in the middle of all.
+        Time from the first to the last sample, and median sample period.
     jitter : float, seconds
-        Standard deviation of the steps, missing samples apart.
+        Standard deviation of the time steps, without those at missing samples.
     lost : int
-        Samples that are missing between others.
+        Number of missing samples.
     gaps : int
-        Steps of more than five periods.
+        Number of steps of more than five periods.
     longest_gap : float, seconds
-        The longest step.
+        Longest step.
     duplicates : int
-        Stamps that come again.
+        Number of repeated stamps.
     unseen : int
-        Gaps within which the voltage moved: it may have turned there.
+        Number of gaps within which the voltage moved, so that reversals may be missing.
     """
 
     samples: int
@@ -60,32 +61,32 @@ class ClockQuality:
 
 @dataclass(frozen=True)
 class SignalQuality:
-    """The readings of a voltage (V) or a displacement (m).
+    """Quality of the readings of a voltage (V) or a displacement (m).
 
     Parameters
     ----------
     low, high : float
-        The range.
+        Lowest and highest reading.
     noise : float
-        Rms of what changes from reading to reading.
+        Rms of the noise from reading to reading.
     digit : float
-        Step between possible readings; 0 for none that could be found.
+        Resolution; 0 if none was found.
     missing : int
-        Readings that are NaN.
+        Number of readings that are NaN.
     stuck : int
-        Readings that repeat the one before for three and more in a row, though the other signal moves.
+        Number of repeated readings in runs of three or more, while the other signal moves.
     longest_stuck : int
-        The longest such row.
+        Length of the longest such run.
     clipped : int
-        Those of them at the lowest or the highest value.
+        Number of stuck readings at the lowest or the highest value.
     stale : int
-        Single readings that repeat an earlier one, though the other signal moves.
+        Number of single readings that repeat an earlier one, while the other signal moves.
     spikes : int
-        Single readings that stand out otherwise.
+        Number of other single outliers.
     mixed : int
-        Readings that come early or late, or mix two: on the way to the next or the one before.
+        Number of readings that are early, late or a mixture of two neighbouring values.
     mixed_size : float
-        How far these are off at most.
+        Typical error of these readings.
     """
 
     low: float
@@ -103,32 +104,32 @@ class SignalQuality:
 
     @property
     def range(self) -> float:
-        """From the lowest to the highest value."""
+        """Difference between the highest and the lowest reading."""
         return self.high - self.low
 
 
 @dataclass(frozen=True)
 class DriveQuality:
-    """What the voltage does.
+    """Properties of the excitation voltage.
 
     Parameters
     ----------
     turns : int
-        Reversals.
+        Number of reversals.
     covered : float
-        Share of all pairs of last turning point and present voltage that were visited.
+        Share of all pairs of last reversal voltage and present voltage that were visited, 0..1.
     samples_per_run : float
-        Samples from one turn to the next, in the middle of all.
+        Median number of samples between reversals.
     speeds : tuple of float, V/s
-        At which swings of one size were run through.
+        Distinct speeds of swings of one size.
     speed_range : (float, float), V/s
-        The slowest and the fastest move from turn to turn, of any size.
+        Slowest and fastest run between reversals, of any size.
     holds : tuple of float, seconds
-        How long the voltage rested, each time that it did.
+        Duration of each hold.
     begins_at_end : bool
-        Whether the record begins at an end of its voltage range, so that the memory is known from there on.
+        Whether the record begins at an end of its voltage range, so that the initial history is known.
     wiped : float or None, seconds
-        When both ends have been visited, which wipes the memory; None if never.
+        Time at which both ends have been visited, which resets the hysteresis state; None if never.
     """
 
     turns: int
@@ -143,16 +144,20 @@ class DriveQuality:
 
 @dataclass(frozen=True)
 class Quality:
-    """What a record of one axis is worth; `findings` says it in words.
+    """Quality of the record of one axis; `findings` describes it in sentences.
 
     Parameters
     ----------
     axis : str
+        Name of the axis.
     clock : ClockQuality
+        Time stamps.
     voltage, displacement : SignalQuality
+        Readings of both signals.
     drive : DriveQuality
+        Excitation voltage.
     notes : tuple of str
-        Those of the record.
+        Notes of the record.
     """
 
     axis: str
@@ -164,30 +169,32 @@ class Quality:
 
 
 def assess(record: Record, axis: str, *, start: float | None = None, stop: float | None = None) -> Quality:
-    """Measure what a record is worth for an identification.
+    """Assess the quality of a record for an identification.
 
     Parameters
     ----------
     record : Record
+        Record to assess.
     axis : str
-        One of its axes.
+        Name of one of its axes.
     start, stop : float, seconds, optional
-        The part to be fitted, as for `identify`; voltage before it belongs to the drive.
+        Part to be fitted, as for `identify`; the voltage before `start` counts for the excitation.
 
     Returns
     -------
     Quality
+        Quality of stamps, signals and excitation.
 
     Raises
     ------
     UsageError
         If the record has no such axis.
     RecordError, IdentificationError
-        If it is no record of a driven axis: too few samples, out of order, without motion, in wrong units.
+        If no fit is possible: too few samples, unordered stamps, no motion, or wrong units.
     """
     samples = select_samples(record, axis, start, stop)
     driving, wiped = samples.v, np.flatnonzero(samples.wiped)[:1]
-    # A long record leaves no room for what is not needed any more.
+    # Free the memory of long records.
     del samples
     t, v, y = record.t, record.voltage[axis], record.displacement[axis]
     part = slice(*part_of(t, start, stop))
@@ -225,9 +232,9 @@ def _clock(t: FloatArray, v: FloatArray, still: float) -> ClockQuality:
 
 
 def _missing(steps: FloatArray) -> int:
-    """Return how many samples are missing, from the steps between stamps in periods, shape (N - 1,).
+    """Return the number of missing samples, from the steps between stamps in periods, shape (N - 1,).
 
-    After a late stamp the next ones come early, and nothing is missing: only a delay that stays counts.
+    Only a lasting delay counts: after a late stamp the next steps are short, and no sample is missing.
     """
     behind = np.cumsum(np.maximum(steps, 0.0) - 1.0)
     stays = minimum_filter1d(behind, _CATCHES_UP, origin=-((_CATCHES_UP - 1) // 2), mode="nearest")
@@ -248,12 +255,12 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     frozen = signal_statistics.frozen(y, v, gain, noise_y, digit_y)
     off_v = signal_statistics.lone_outliers(v, y, 1.0 / gain, max(noise_v, digit_v, _LEAST_SPIKE * np.ptp(v)), noise_y)
     off_y = signal_statistics.lone_outliers(y, v, gain, max(noise_y, digit_y), noise_v)
-    # Of two that stand out at once it is the driver that jumped, and the other one followed.
+    # Simultaneous outliers of both signals are attributed to the voltage, which the displacement follows.
     off_y = np.setdiff1d(off_y, off_v)
     mixed = signal_statistics.mixed_readings(y, v)
     displacement = _signal(y, missing[1], noise_y, digit_y, frozen, off_y, mixed)
     if mixed.size:
-        # By so much does the displacement go on between the readings around it.
+        # Half of the displacement between the neighbouring readings.
         ways = np.abs(y[np.minimum(mixed + 1, y.size - 1)] - y[np.maximum(mixed - 1, 0)]) / 2.0
         displacement = replace(displacement, mixed=int(mixed.size), mixed_size=float(np.median(ways)))
     return _signal(v, missing[0], noise_v, digit_v, stopped, off_v), displacement
@@ -304,29 +311,30 @@ def _drive(t: FloatArray, v: FloatArray, voltage: SignalQuality, wiped: float | 
 
 Level = Literal["ok", "warn", "stop"]
 
-# Fewer lone outliers than this share of the readings are no matter: a fit weighs them down.
+# Share of outliers below which no warning is given; a fit reduces their weights.
 _OUTLIERS = 1e-3
-# Share of the period.
+# Jitter that gives a warning, as a share of the period.
 _JITTER = 0.1
-# Step between readings, in noise: what is coarser hides what the noise would average out.
+# Resolution that gives a warning, in units of the noise; averaging does not improve a coarser one.
 _COARSE = 1.5
-# Shares of the range.
+# Noise that gives a warning, as shares of the range.
 _NOISY_VOLTAGE, _NOISY_DISPLACEMENT = 2e-4, 0.01
-# Share of the pairs of turning point and voltage.
+# Share of visited pairs of reversal voltage and present voltage below which a warning is given.
 _FEW_PAIRS = 0.4
-# What no fit can mend, as a share of the range, and in readings from turn to turn.
+# Limits beyond which no fit is possible: resolution as a share of the range, readings between reversals.
 _USELESS_DIGIT, _USELESS_RUN = 0.05, 4.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence about a record.
+    """One statement about a record.
 
     Parameters
     ----------
     level : {"ok", "warn", "stop"}
-        "stop" where no fit is possible; the text says what to record instead.
+        "stop" if no fit is possible; the text then names the remedy.
     text : str
+        Statement with numbers.
     """
 
     level: Level
@@ -334,7 +342,7 @@ class Finding:
 
 
 def findings(quality: Quality) -> list[Finding]:
-    """Say what the quality of a record means.
+    """Describe the quality of a record and its consequences.
 
     Parameters
     ----------
@@ -344,7 +352,7 @@ def findings(quality: Quality) -> list[Finding]:
     Returns
     -------
     list of Finding
-        On the clock, displacement, voltage and drive, in this order, and what was noted when the record was made.
+        Findings on stamps, displacement, voltage and excitation, in this order, then the notes of the record.
     """
     samples = quality.clock.samples
     return [
@@ -383,7 +391,7 @@ def _clock_findings(clock: ClockQuality) -> Iterator[Finding]:
         yield Finding("warn", text)
     if clock.unseen:
         yield Finding(
-            "warn", f"{clock.unseen} gaps within which the voltage moved: unseen turns leave the memory in doubt"
+            "warn", f"{clock.unseen} gaps within which the voltage moved: unseen reversals leave the memory uncertain"
         )
     if clock.duplicates:
         yield Finding("warn", f"{_of(clock.duplicates, clock.samples)} with the stamp of the one before")
@@ -408,7 +416,7 @@ def _voltage(v: SignalQuality) -> Iterator[Finding]:
     noisy = v.noise > _NOISY_VOLTAGE * v.range
     if noisy or v.noise > 1e-6 * v.range:
         text += f", noise {v.noise * 1e3:.3g} mV rms"
-    yield _warn_if(noisy, text, "small reversals are not to be told from noise")
+    yield _warn_if(noisy, text, "small reversals cannot be distinguished from noise")
 
 
 def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Finding]:

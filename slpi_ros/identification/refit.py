@@ -1,9 +1,9 @@
-"""A model kept up to date: a new record corrects the old model where it visits, and leaves the rest as it was.
+"""Update of a model with a new record: correct the visited region of the model and keep the rest.
 
-The old parameters ``x_old`` are the prior of a convex fit. What a stage does in the course of time is mostly a change
-of gain, and little else: ``x = (1 + s) x_old + e``, where ``s`` is free within some per cent and ``e`` is small and
-smooth. A gain is looked for only where the old model is wrong beyond what it was known to be: a record of small loops
-that agrees with it must not touch the large ones.
+The old parameters ``x_old`` are the prior of a convex fit. A stage changes with time mostly in gain, so that
+``x = (1 + s) x_old + e``, where ``s`` is a few per cent and ``e`` is small and smooth. The gain ``s`` is fitted only
+if the error of the old model exceeds its known error, so that a record of small loops that agrees with the old model
+does not change the large loops.
 """
 
 from collections.abc import Sequence
@@ -45,24 +45,24 @@ FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
 
 @dataclass(frozen=True)
 class AxisChange:
-    """What a new record changed.
+    """Changes of one axis by an update.
 
     Parameters
     ----------
     error_before, error_after : float, metres
-        rms error on the new record, free-run, of the old and of the new model, each from the initial history that suits
-        it best and in the record's own zero.
+        Rms error on the new record, free-run, of the old and of the new model, each from its best initial history and
+        relative to the zero of the record.
     repeatability : float, metres
-        What the old model's error was on blocks left out, or the noise of the sensor if that is more.
+        Held-out error of the old model, or the noise of the sensor if larger.
     drifted : bool
-        Whether the gain, the width or the shape of the loops has changed: neither the initial history nor the zero,
-        a lag or a slow drift explain what the old model gets wrong.
+        Whether gain, width or shape of the loops has changed, so that initial history, zero, lag and slow drift do
+        not explain the error of the old model.
     gain : float
-        Relative change of the outermost loop's height.
+        Relative change of the height of the outermost loop.
     largest : float, metres
         Largest change of a branch.
     match : Match
-        The old model against the new record: moved zero, changes of gain and width, and how surely they are known.
+        Comparison of the old model with the new record: offset, changes of gain and width, and their uncertainties.
     """
 
     error_before: float
@@ -75,20 +75,21 @@ class AxisChange:
 
 
 def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, AxisChange]]:
-    """Update a model with a new record, without forgetting what the record does not visit.
+    """Update a model with a new record, keeping the regions that the record does not visit.
 
     Parameters
     ----------
     model : StageModel
-        Axes of kind ``slpi`` or ``pi``. Effects stay as they are; the hysteresis is fitted to what they leave.
+        Model with axes of kind ``slpi`` or ``pi``. Effects are kept; the hysteresis is fitted to the remainder.
     record : Record
-        Within the voltages of the model. Axes that it does not hold stay as they are.
+        Record within the voltage range of the model. Axes of the model that the record lacks are kept.
 
     Returns
     -------
     StageModel
-        Its memory starts and ends as that of the record.
+        Updated model, with the initial and final hysteresis state of the record.
     dict of axis name to AxisChange
+        Changes of each updated axis.
 
     Raises
     ------
@@ -121,10 +122,10 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
 
 
 def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -> Record:
-    """Return the record as it were if the stage had hysteresis alone."""
+    """Return the record with the contribution of the model's effects removed."""
     if not any(model.axes[axis].effects for axis in shared):
         return record
-    # A drift or hum of the old record is none of the new one.
+    # Drift and hum of the old record do not apply to the new one.
     axes = {name: replace(axis, effects=lasting_effects(axis)) for name, axis in model.axes.items()}
     model = replace(model, axes=axes)
     t, voltage, displacement = record.t, dict(record.voltage), dict(record.displacement)
@@ -139,7 +140,7 @@ def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -
 
 
 def _held(v: FloatArray) -> FloatArray:
-    """Return a voltage, shape (N,), that stays where it was while it is not known."""
+    """Return a voltage, shape (N,), volts, with unknown samples replaced by the last known one."""
     known = np.flatnonzero(np.isfinite(v))
     if not known.size:
         raise IdentificationError("the voltage is never known; record it")
@@ -157,7 +158,7 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
         )
     recorded, samples = samples.v, samples.thinned(FIT_SAMPLES)
     found = match(old, samples)
-    # Where the initial history matters it is not fitted, unless nothing else is left.
+    # Fit only samples independent of the initial history, unless these are too few.
     settled = samples.only(found.known & (np.arange(samples.v.size) >= found.known_from))
     samples = settled if np.count_nonzero(settled.fitted) >= FEWEST else samples.only(found.known)
     history = found.start.history
@@ -186,7 +187,7 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
     hysteresis = basis.shape(x_new, problem.gain)
     end = replace(old, hysteresis=hysteresis, start=start).after(recorded)
     if _same_start(start, old.start, repeatability):
-        # One record more does not know the zero better than those before.
+        # A change of zero within the repeatability is not significant.
         start = old.start
     y = samples.y[samples.fitted]
     new = replace(
@@ -211,14 +212,14 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
 
 
 def require_own(error: float, fitted_anew: float, span: float) -> None:
-    """Refuse a model that has nothing to do with a record.
+    """Raise IdentificationError if a model does not belong to the stage of a record.
 
     Parameters
     ----------
     error, fitted_anew : float, metres
-        rms errors of the model, and of one fitted to the record.
+        Rms errors of the model, and of a model fitted to the record.
     span : float, metres
-        Range of displacements.
+        Displacement range.
     """
     if error > FOREIGN_SHARE * span and error > FOREIGN_TIMES * fitted_anew:
         raise IdentificationError(
@@ -247,9 +248,9 @@ def basis_of(axis: AxisModel) -> tuple[Basis, FloatArray]:
 
 
 def _solved(problem: Problem, x_old: FloatArray, gain_spread: float = 0.0, shape_spread: float = 0.0) -> FloatArray:
-    """Return the parameters after a fit with the old ones as prior, and the displacement at rest, in units of scale.
+    """Return the parameters and the displacement at rest of a fit with prior `x_old`, in units of the problem's scale.
 
-    Without any spread the old ones stay, and only the displacement at rest is found.
+    If `shape_spread` is zero, `x_old` is kept and only the displacement at rest is fitted.
     """
     matrix, vector = problem.design.normal_equations(problem.y, problem.weights)
     size = x_old.size
@@ -265,7 +266,7 @@ def _solved(problem: Problem, x_old: FloatArray, gain_spread: float = 0.0, shape
 
 
 def _precision(rough: FloatArray, x_old: FloatArray, gain_spread: float, shape_spread: float) -> FloatArray:
-    """Return the inverse covariance of the parameters: a smooth deviation, and a common factor (Woodbury)."""
+    """Return the inverse covariance of the prior: smooth deviations plus a common gain factor (Woodbury identity)."""
     shape = (np.eye(x_old.size) + SMOOTH * rough) / shape_spread**2
     if not gain_spread:
         return shape

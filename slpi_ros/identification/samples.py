@@ -1,4 +1,4 @@
-"""The samples of one axis that a fit uses, after the checks that every fit needs."""
+"""Selection and checks of the samples of one axis for a fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,32 +13,32 @@ from slpi_ros.io.record import Record
 
 FloatArray = NDArray[np.float64]
 
-# Fewer samples than this say nothing about a loop.
+# Fewest samples for a fit.
 FEWEST = 50
-# More than this need time and memory, and tell nothing new.
+# Number of samples to which a record is thinned; more samples do not change the result.
 ENOUGH = 1_000_000
 NEVER_TURNS = "the voltage never turns back; drive it up and down over the range to be used"
-# A displacement that falls where the voltage rises does so clearly: this correlation is none of chance.
+# Negative correlation of voltage and displacement above which one sign is wrong.
 CLEARLY = 0.3
-# The memory counts as wiped once the voltage has come this near to both ends of its range (share of the range).
+# The hysteresis state is reset once the voltage has come this near to both ends of its range (share of the range).
 NEAR_END = 0.02
 
 
 @dataclass(frozen=True)
 class Samples:
-    """One axis, in time order, without gaps in the voltage.
+    """Samples of one axis, in time order, without gaps in the voltage.
 
     Parameters
     ----------
     v : ndarray, shape (N,), volts
-        All that moves the memory; without the noise of its measurement.
+        Voltage, including samples that are not fitted, with measurement noise removed.
     y : ndarray, shape (N,), metres
-        Finite where `fitted`.
+        Displacement; finite where `fitted`.
     fitted : ndarray of bool, shape (N,)
         Samples whose displacement is to be fitted.
     history : int
-        How many of the first samples are those of an earlier drive. A long fall to the first one wiped the memory;
-        without any the axis had never been moved.
+        Number of leading samples that form the initial history, which begins with a long fall to the first sample.
+        Default 0: the axis starts at rest.
     """
 
     v: FloatArray
@@ -48,11 +48,11 @@ class Samples:
 
     @property
     def primed(self) -> bool:
-        """Whether a long fall to the first voltage wiped the memory."""
+        """Whether the samples begin with an initial history, so with a long fall to the first voltage."""
         return self.history > 0
 
     def after(self, history: tuple[float, ...]) -> "Samples":
-        """Return the samples with the voltages of an earlier drive before them."""
+        """Return the samples preceded by the voltages (V) of an initial history."""
         before = np.array(history)
         return Samples(
             np.concatenate([before, self.v]),
@@ -62,27 +62,27 @@ class Samples:
         )
 
     def only(self, chosen: NDArray[np.bool_]) -> "Samples":
-        """Return the samples with only those fitted that are `chosen`, shape (N,)."""
+        """Return the samples, fitting only those that are `chosen`, a mask of shape (N,)."""
         return replace(self, fitted=self.fitted & chosen)
 
     def thinned(self, most: int) -> "Samples":
-        """Return every so manieth sample, about `most` of them, and all at which the voltage turns: the same memory."""
+        """Return about `most` evenly spaced samples plus all reversals, which preserves the hysteresis state."""
         kept = self.thinning(most)
         return self if kept.all() else self.at(kept)
 
     def thinning(self, most: int) -> NDArray[np.bool_]:
-        """Return which samples are kept where about `most` are, shape (N,)."""
+        """Return the mask, shape (N,), of the samples that `thinned` keeps."""
         every = max(1, round(self.v.size / most))
         kept = np.zeros(self.v.size, dtype=bool)
         kept[::every] = True
         if every > 1:
-            # Of equal samples in a row both ends: the memory does not tell which one is the turn.
+            # Of equal consecutive samples at a reversal, keep both ends.
             ends = np.array(monotone_runs(self.v)).ravel()
             kept[ends[ends < self.v.size]] = kept[np.maximum(ends - 1, 0)] = True
         return kept
 
     def at(self, kept: NDArray[np.bool_]) -> "Samples":
-        """Return the samples that are `kept`, shape (N,)."""
+        """Return the samples that are `kept`, a mask of shape (N,)."""
         return Samples(self.v[kept], self.y[kept], self.fitted[kept], int(np.count_nonzero(kept[: self.history])))
 
     @property
@@ -93,13 +93,13 @@ class Samples:
 
     @property
     def spread(self) -> tuple[float, float]:
-        """Voltage (V) and displacement (m) covered by the fitted samples, outliers apart."""
+        """Ranges of voltage (V) and displacement (m) of the fitted samples, without outliers."""
         v, y = (np.percentile(x[self.fitted], (1, 99)) for x in (self.v, self.y))
         return float(v[1] - v[0]), float(y[1] - y[0])
 
     @property
     def wiped(self) -> NDArray[np.bool_]:
-        """Which samples come after both ends of the voltage range have been visited, shape (N,)."""
+        """Mask of the samples after both ends of the voltage range have been visited, shape (N,)."""
         low, high = self.v.min(), self.v.max()
         margin = NEAR_END * (high - low)
         own = self.v[self.history :]
@@ -109,31 +109,31 @@ class Samples:
 
     @property
     def mostly_wiped(self) -> bool:
-        """Whether the larger part of the way that is fitted comes after the memory was wiped."""
+        """Whether at least half of the fitted voltage travel comes after the reset of the hysteresis state."""
         own = self.v[self.history :]
         way = np.abs(np.diff(own, prepend=own[0])) * self.fitted[self.history :]
         return bool(way @ self.wiped[self.history :] >= 0.5 * way.sum())
 
     @property
     def judged(self) -> NDArray[np.bool_]:
-        """Which samples can be predicted from others, shape (N,).
+        """Mask of the samples that can be held out, shape (N,).
 
-        What comes before the memory was wiped depends on what moved the axis before, and is seen only once.
+        Samples before the reset of the hysteresis state depend on the initial history and cannot be predicted.
         """
         return self.fitted & self.wiped if self.mostly_wiped else self.fitted
 
 
 def select_samples(record: Record, axis: str, start: float | None, stop: float | None) -> Samples:
-    """Take one axis of a record from ``start <= t < stop`` (s), with the voltage before it.
+    """Select the samples of one axis with ``start <= t < stop`` (s), including all earlier voltages.
 
     Raises
     ------
     UsageError
         If the record has no such axis.
     RecordError
-        If the samples are too few, out of order, or one signal does not vary.
+        If the samples are too few or unordered, or one signal does not vary.
     IdentificationError
-        If the voltage never turns back.
+        If the voltage has no reversal.
     """
     record.require_axis(axis)
     where = f"{record.source}: axis '{axis}'"
@@ -143,7 +143,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
         raise RecordError(
             f"{record.source}: time runs backwards at sample {at} (t = {record.t[at]:.6g} s); sort the record"
         )
-    # In order, so that the part to be used is a slice: a long record leaves no room for copies.
+    # Stamps are ordered, so the selection is a slice and long records are not copied.
     t = record.t
     first, until = part_of(t, start, stop)
     t = t[:until]
@@ -160,7 +160,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     if count < fitted.size:
         y = np.where(fitted, y, 0.0)
     _require_motion(v, y, fitted, where)
-    # A sensor that hangs says nothing, as one that is silent; a reading mixed with another says something wrong.
+    # Stuck and mixed readings are not fitted.
     for bad in (stuck, mixed_readings):
         if fitted.all():
             fitted[bad(y, v)] = False
@@ -171,7 +171,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
 
 
 def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int, int]:
-    """Return the samples ``first:until`` with ``start <= t < stop`` (s) of times in order; UsageError without order."""
+    """Return indices ``first:until`` of ``start <= t < stop`` (s) in ordered times; UsageError unless start < stop."""
     low, high = -np.inf if start is None else start, np.inf if stop is None else stop
     if not low < high:
         raise UsageError(f"start {start} s is not before stop {stop} s; give seconds from the first stamp, in order")
@@ -179,7 +179,7 @@ def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int
 
 
 def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> None:
-    """Raise RecordError unless both signals vary, in their units, and together; IdentificationError without a turn."""
+    """Raise RecordError unless both signals vary, plausibly and together; IdentificationError without a reversal."""
     turns = bool((v[1:] > v[:-1]).any() and (v[1:] < v[:-1]).any())
     if not fitted.all():
         v, y = v[fitted], y[fitted]
@@ -187,7 +187,7 @@ def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], whe
         low, high = float(signal.min()), float(signal.max())
         largest = max(-low, high)
         if largest > most:
-            raise RecordError(f"{where}: {name} of {largest:g} {unit} is none of a stage; check the unit")
+            raise RecordError(f"{where}: {name} of {largest:g} {unit} is not plausible for a stage; check the unit")
         if high - low < least or high - low <= 1e-9 * largest:
             raise RecordError(
                 f"{where}: {name} stays at {signal[0]:g} {unit}; record a drive over the range to be used"

@@ -1,6 +1,6 @@
-"""What is wrong with the readings of a sensor: noise, digits, values that repeat or stand alone.
+"""Statistics of sensor readings: noise, resolution, repeated values, outliers and the repeatability floor.
 
-All tests know the voltage: a displacement may rest while the voltage rests, and turn where the voltage turns.
+All tests take the voltage into account: a displacement may rest or reverse where the voltage does.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from slpi_ros.identification.drive import hold_band, resting, smallest_turn
 
 @dataclass(frozen=True)
 class ErrorMetrics:
-    """How far a model, or a stage, is from what it should be.
+    """Error metrics of a model against a measurement, or of a measurement against a setpoint.
 
     The MPI paper's "mean square error" is `root_mean_square` in all places: Tables 2 and 4, 0.1201 µm (feedforward) and
     0.2949 µm (feedforward and PID). Its unit is µm, and it exceeds the mean absolute error as a root must. A mean
@@ -50,13 +50,14 @@ class ErrorMetrics:
 
 
 def error_metrics(measured: ArrayLike, model: ArrayLike) -> ErrorMetrics:
-    """Compare a model with what was measured, or what was measured with what was desired.
+    """Compute the error metrics of a model against a measurement, or of a measurement against a setpoint.
 
     Parameters
     ----------
     measured : array_like, shape (N,), metres
         The reference; R² is relative to its variation.
     model : array_like, shape (N,), metres
+        Values to compare with the reference.
 
     Raises
     ------
@@ -85,22 +86,22 @@ def error_metrics(measured: ArrayLike, model: ArrayLike) -> ErrorMetrics:
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# False alarms that a clean record may give, of each kind.
+# Expected number of false alarms of each test on a clean record.
 FALSE_ALARMS = 0.01
-# After a turn a piezo moves less per volt than on average; this share of it is left at least.
+# Least gain of a piezo after a reversal, as a share of the mean gain.
 LEAST_GAIN = 0.2
-# So many readings tell as much of noise and digits as all of a long record.
+# Number of readings from which noise and resolution are estimated.
 _ENOUGH = 100_000
-# Readings of a long record that are judged together.
+# Block size, in readings, for long records.
 _BLOCK = 1_000_000
-# A reading is compared with so many before it.
+# Number of preceding readings with which a reading is compared.
 _EARLIER = 3
-# A displacement may turn this many samples away from the voltage, and ring so many after it jumped.
+# Largest delay of a displacement reversal, and duration of ringing after a jump, in samples.
 _TURN_REACH, _RINGING = 5, 200
 
 
 def digit(x: FloatArray) -> float:
-    """Return the step between possible readings, 0 where they are continuous.
+    """Return the resolution of readings `x`, shape (N,), in their unit; 0 if they are continuous.
 
     The largest step of which (nearly) all small differences between sorted readings are multiples.
     """
@@ -116,24 +117,24 @@ def digit(x: FloatArray) -> float:
 
 
 def spread(x: FloatArray) -> float:
-    """Return how far the readings reach, outliers apart."""
+    """Return the range of readings `x`, shape (N,), between the 1st and 99th percentile."""
     low, high = np.percentile(x[:: max(1, x.size // _ENOUGH)], (1, 99))
     return float(high - low) or float(np.ptp(x))
 
 
 def noise(x: FloatArray, *drivers: FloatArray) -> float:
-    """Return the rms of what changes from reading to reading, outliers apart.
+    """Return the robust rms of the noise from reading to reading.
 
-    From what each reading differs from the line, or the curve, through its neighbours; or from the line along a driver,
-    which an uneven rate does not disturb. Where the signal bends, each of them sees more than noise, and a median
-    passes over that; the least one counts. Noise that lasts for several samples is not seen.
+    The least of several estimates: deviations from a line or a cubic through the neighbours, and from a line in a
+    driver, which is insensitive to an uneven rate. The curvature of the signal increases each estimate; medians reduce
+    this effect. Noise correlated over several samples is not detected.
 
     Parameters
     ----------
     x : ndarray, shape (N,), N >= 5
         Readings.
     *drivers : ndarray, shape (N,)
-        What the readings follow: time, or a voltage.
+        Signals that the readings follow: time, or a voltage.
     """
     every = max(1, x.size // _ENOUGH)
     far_before, before, own, after, far_after = (x[first : x.size - 4 + first : every] for first in range(5))
@@ -159,14 +160,14 @@ def _rms(deviation: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Repeats:
-    """Stretches of equal readings in a row.
+    """Runs of equal consecutive readings.
 
     Parameters
     ----------
     first : ndarray of int, shape (M,)
-        The first reading of each.
+        First reading of each run.
     length : ndarray of int, shape (M,)
-        Readings in each, at least 2.
+        Number of readings in each run, at least 2.
     """
 
     first: NDArray[np.int64]
@@ -174,14 +175,14 @@ class Repeats:
 
     @classmethod
     def within(cls, x: FloatArray) -> "Repeats":
-        """Find all in `x`, shape (N,)."""
+        """Find all runs in `x`, shape (N,)."""
         bounds = np.concatenate([[0], np.flatnonzero(x[1:] != x[:-1]) + 1, [x.size]])
         length = np.diff(bounds)
         several = length > 1
         return cls(bounds[:-1][several], length[several])
 
     def spans(self, x: FloatArray) -> FloatArray:
-        """Return how far `x`, shape (N,), moves during each, shape (M,)."""
+        """Return the range of `x`, shape (N,), during each run, shape (M,)."""
         if not self.first.size:
             return np.empty(0)
         # Every second range of reduceat is one of ours, and what lies between is left out.
@@ -191,27 +192,28 @@ class Repeats:
         return np.asarray(high - low)
 
     def where(self, chosen: Mask) -> "Repeats":
-        """Return the `chosen` ones, shape (M,)."""
+        """Return the runs that are `chosen`, a mask of shape (M,)."""
         return Repeats(self.first[chosen], self.length[chosen])
 
     @property
     def readings(self) -> int:
-        """How many readings repeat the one before."""
+        """Number of readings that repeat the preceding one."""
         return int(np.sum(self.length - 1))
 
 
 def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: float) -> Repeats:
-    """Return the repeats of a displacement that are none by chance.
+    """Return the repeats of a displacement that are not due to chance.
 
-    Either it would have had to follow the voltage, or so many equal readings are improbable in the noise.
+    Either the voltage moved so that the displacement had to follow, or equal readings are improbable given the noise.
 
     Parameters
     ----------
     y, v : ndarray, shape (N,), metres and volts
         Displacement and voltage.
     gain : float, metres per volt
+        Mean gain of the stage.
     noise_rms, step : float, metres
-        Of the displacement.
+        Noise and resolution of the displacement.
     """
     repeats = Repeats.within(y)
     moved = repeats.spans(v)
@@ -224,9 +226,9 @@ def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: fl
 
 
 def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the readings that repeat the one before, three and more in a row, though noise should tell them apart.
+    """Return repeated readings, in runs of three or more, of a displacement `y` (m) with noise above its resolution.
 
-    Digits coarser than the noise repeat readings too; of such a displacement, shape (N,), metres, none is returned.
+    If the noise is below the resolution, repeats are expected and none is returned. `v` (V) is the voltage.
     """
     repeats = Repeats.within(y)
     if not np.any(repeats.length > 2):
@@ -241,9 +243,9 @@ def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
 
 
 def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repeats:
-    """Return the repeats of a voltage that it must have missed: the displacement moves on, and then the voltage jumps.
+    """Return the repeats of a voltage during which the displacement moves and after which the voltage jumps.
 
-    Parameters are those of `frozen`. A voltage that rests after a jump is none: the displacement still follows.
+    Parameters as for `frozen`. A hold after a voltage jump is excluded: there the displacement still follows the jump.
     """
     repeats = Repeats.within(v)
     moved = repeats.spans(y) / gain
@@ -255,7 +257,7 @@ def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repe
 
 
 def lone_outliers(y: FloatArray, v: FloatArray, gain: float, noise_y: float, noise_v: float) -> NDArray[np.int64]:
-    """Return the readings that stand off the line of their four neighbours, which they share, unlike the voltage.
+    """Return the readings that deviate from a line through their four neighbours where the voltage does not.
 
     Parameters
     ----------
@@ -301,7 +303,7 @@ def _outliers_of_block(
 
 
 def _after_jumps(v: FloatArray, jump: float) -> Mask:
-    """Return where the voltage has jumped not long ago, shape (N,)."""
+    """Return the mask, shape (N,), of samples within `_RINGING` samples after a voltage jump above `jump` (V)."""
     jumps = np.flatnonzero(np.abs(np.diff(v, prepend=v[0])) > jump)
     last = np.zeros(v.size, np.int64)
     last[jumps] = jumps + _RINGING
@@ -313,9 +315,9 @@ def _off_neighbours(x: FloatArray) -> FloatArray:
 
 
 def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArray[np.int64]:
-    """Return those of the outliers that repeat, but for the noise, one of the readings before.
+    """Return the outliers that repeat one of the preceding readings within the noise.
 
-    Outliers of any size now and then do so by chance; but then they hit a reading after them as often.
+    If outliers match later readings about as often, the matches are due to chance and none is returned.
     """
     near = 3.0 * np.sqrt(2.0) * noise_rms
     reach = np.arange(1, _EARLIER + 1)
@@ -339,10 +341,10 @@ _MIXED_MOST = 1.3
 
 
 def mixed_readings(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the readings of a displacement that come early or late, or mix two.
+    """Return the readings of a displacement that are early, late or a mixture of two neighbouring values.
 
-    Such a reading lies between its own place and that of the next one, or of the one before, as from a link that
-    delivers an old value or parts of two. They all lie off to one side: noise and outliers do not.
+    Such a reading lies between its true value and that of a neighbour, as from a link that delivers an old value or
+    parts of two. All deviate to the same side, unlike noise and outliers.
 
     Parameters
     ----------
@@ -417,13 +419,14 @@ NO_NOISE = 1e-9
 
 @dataclass(frozen=True)
 class Floor:
-    """How well a record repeats itself.
+    """Repeatability floor of a record.
 
     Parameters
     ----------
     rms : float, metres
+        Rms of the differences between repetitions, per reading.
     source : str
-        What it was seen in, with numbers.
+        Data from which it was estimated, with numbers.
     """
 
     rms: float
@@ -431,10 +434,10 @@ class Floor:
 
 
 def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray | None = None) -> Floor:
-    """Find how well a record repeats itself, outliers apart.
+    """Estimate the repeatability floor of a record, without outliers.
 
-    From moves that are made again between the same turns, where there are enough of them; else from holds; else from
-    what changes from sample to sample. What differs slowly and evenly (drift, creep) does not count.
+    Estimated from repeated moves between the same reversals if there are enough; else from holds; else from the
+    sample-to-sample noise. Slow and smooth differences (drift, creep) do not count.
 
     Parameters
     ----------
@@ -443,8 +446,8 @@ def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray |
     y : ndarray, shape (N,), metres
         Displacement; NaN where there is none.
     residual : ndarray, shape (N,), metres, optional
-        What a model leaves of it. It is looked at instead of `y`, so that what the model says about time (drift, hum)
-        does not count.
+        Residual of a model. It replaces `y` in the estimate, so that drift and hum described by the model do not
+        count.
 
     Returns
     -------
@@ -481,7 +484,7 @@ def _seen(t: FloatArray, v: FloatArray, signal: FloatArray, *, alone: bool) -> F
 
 
 def robust_rms(x: FloatArray) -> float:
-    """Return the rms of `x`, shape (N,), outliers apart; that of a Gaussian is not changed."""
+    """Return the rms of `x`, shape (N,), without outliers; unbiased for a Gaussian distribution."""
     size = np.abs(x)
     spread = 1.4826 * float(np.median(size))
     for _ in range(_CUTS):
@@ -491,10 +494,10 @@ def robust_rms(x: FloatArray) -> float:
 
 
 def _repeats(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatArray]:
-    """Yield, for each move that was made before, how it differs, in units of one reading's noise.
+    """Yield the difference of each repeated move from its earlier repetition (m), scaled to the noise of one reading.
 
-    On a move from one turn to the next the stage follows a branch of its own, up to where the loop around it closes:
-    what it has done before the turn before does not matter.
+    Between two reversals the stage follows one branch until the enclosing loop closes; motion before the previous
+    reversal has no influence.
     """
     span = float(np.ptp(v))
     ends = reversals(v, smallest_turn(v, noise(v, t)))
@@ -549,7 +552,7 @@ def _difference(own: Move, other: Move, within: NDArray[np.bool_], same: float) 
 
 
 def _shift(t: FloatArray, v: FloatArray, t_other: FloatArray, v_other: FloatArray) -> float:
-    """Return by how much later (s) the other move passes the voltages of this one."""
+    """Return the delay (s) of the other move at equal voltages."""
     rate = np.gradient(v, np.maximum.accumulate(t) + 1e-12 * np.arange(t.size))
     shift = 0.0
     for _ in range(3):
@@ -559,7 +562,7 @@ def _shift(t: FloatArray, v: FloatArray, t_other: FloatArray, v_other: FloatArra
 
 
 def _holds(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatArray]:
-    """Yield, for each piece of a hold, what is left when a parabola is taken out."""
+    """Yield the residual (m) of a parabola fitted to each piece of a hold."""
     starts, stops = resting(t, v, hold_band(v, noise(v, t), digit(v)))
     every = max(1, starts.size // _ENOUGH_PIECES)
     for start, stop in zip(starts[::every].tolist(), stops[::every].tolist(), strict=True):
@@ -573,7 +576,7 @@ def _holds(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatAr
 
 
 def _without(x: FloatArray, *columns: FloatArray) -> FloatArray:
-    """Return what is left of `x`, shape (n,), when a sum of columns is taken out; as large as it was before."""
+    """Return the residual of a robust fit of `columns` to `x`, shape (n,), corrected for the degrees of freedom."""
     design = np.column_stack(columns)
     size = np.sqrt((design**2).sum(axis=0))
     design = design[:, size > 0.0] / size[size > 0.0]
@@ -595,9 +598,9 @@ _DEAD_BAND = 2.0
 
 
 def voltage_noise(t: FloatArray, v: FloatArray) -> float:
-    """Return the noise (V rms) of a measured voltage, shape (N,), volts; 0 for a commanded one, which has next to none.
+    """Return the noise (V rms) of a measured voltage, shape (N,), volts; 0 for a commanded voltage.
 
-    Noise changes from sample to sample; differences of a high order pass over what does so smoothly.
+    Noise is estimated from high-order differences, which suppress smooth signals.
     """
     if v.size <= max(_ORDERS):
         return 0.0
@@ -618,10 +621,10 @@ def _central_binomial(order: int) -> float:
 
 
 def without_noise(t: FloatArray, v: FloatArray) -> FloatArray:
-    """Return a voltage, shape (N,), without the noise of its measurement; a commanded one as it is.
+    """Return a voltage, shape (N,), volts, with measurement noise removed; a commanded voltage is unchanged.
 
-    Each reading gives way to a parabola through those around it, as many as lie on it but for their noise. What still
-    turns back by no more than the noise is flattened.
+    Each reading is replaced by a parabola over the largest window that fits within the noise. Remaining reversals
+    within the noise are flattened.
     """
     noise = voltage_noise(t, v)
     if not noise:

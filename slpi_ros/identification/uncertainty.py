@@ -1,8 +1,7 @@
-"""How well a record determines the model's curves: a bootstrap of the errors of its blocks.
+"""Uncertainty of a model's curves by a wild block bootstrap.
 
-Whole blocks of the errors change their sign, or not, by chance (wild bootstrap): errors of neighbours are alike, and
-what the record shows only once stays in every resample. The errors are those on blocks left out, which no fit has made
-small.
+Whole blocks of errors keep or change their sign at random, since neighbouring errors are correlated; parts that occur
+once in the record stay in every resample. The errors are held-out errors, which no fit has reduced.
 """
 
 from collections.abc import Sequence
@@ -32,17 +31,19 @@ _CURVE_POINTS = 101
 
 @dataclass(frozen=True)
 class CurveUncertainty:
-    """How far the model's curves move with the errors of the record.
+    """Uncertainty of a model's curves due to the errors of the record.
 
-    Of a thinned record: all of a long record knows the curves better. What no sample shows, and the roughness penalty
-    decides, is not in it.
+    Computed on a thinned record, so an upper bound for long records. Regions that no sample visits, which the
+    roughness penalty determines, are not included.
 
     Parameters
     ----------
     axis, kind : str
+        Name of the axis and kind of the model.
     resamples : int
-        Fits.
+        Number of bootstrap fits.
     v : ndarray, shape (n,), volts
+        Voltages of the branches.
     rising, falling : ndarray, shape (n,), metres
         Branches of the outermost loop, from the displacement at its low end.
     rising_std, falling_std : ndarray, shape (n,), metres
@@ -63,7 +64,7 @@ class CurveUncertainty:
     maximum: float
 
     def line(self) -> str:
-        """Say it in nm."""
+        """Return the uncertainty as one line of text, in nanometres."""
         loop = np.concatenate([self.rising_std, self.falling_std])
         return (
             f"curves known to {self.rms * 1e9:.2g} nm rms on the record's path, {self.maximum * 1e9:.2g} nm at worst; "
@@ -80,23 +81,26 @@ def curve_uncertainty(
     stop: float | None = None,
     resamples: int = RESAMPLES,
 ) -> CurveUncertainty:
-    """Fit a kind of model many times, to a thinned record with other errors.
+    """Estimate the uncertainty of a model's curves by bootstrap fits to a thinned record.
 
     Parameters
     ----------
     record : Record or sequence of Record
+        One record, or several that are fitted together.
     axis, kind, start, stop
-        As for `slpi_ros.identify`; kinds ``slpi`` and ``pi``.
+        As for `slpi_ros.identify`; kinds ``slpi`` and ``pi`` only.
     resamples : int
+        Number of bootstrap fits. Default 50.
 
     Returns
     -------
     CurveUncertainty
+        Standard deviations of the outermost loop and of the predicted displacement.
 
     Raises
     ------
     UsageError
-        If the kind has no uncertainty.
+        If the uncertainty of this kind is not available.
     SlpiError
         If the record does not allow a fit.
     """
@@ -131,13 +135,13 @@ def curve_uncertainty(
 
 
 def require_known_uncertainty(kind: str) -> None:
-    """Raise UsageError when there is no uncertainty of models of this kind."""
+    """Raise UsageError if the uncertainty of this kind of model is not available."""
     if kind not in _KINDS:
         raise UsageError(f"the uncertainty of kind '{kind}' is not known; choose one of {', '.join(_KINDS)}")
 
 
 def _solutions(problem: Problem, smoothness: float, resamples: int) -> list[FloatArray]:
-    """Return the parameters of fits to the model's own prediction, with the errors of whole blocks turned about."""
+    """Return the parameters of fits to the model's prediction plus held-out errors with random signs per block."""
     rng = np.random.default_rng(0)
     design, weights = problem.design, problem.weights
     matrix, _ = design.normal_equations(problem.y, weights)

@@ -1,1 +1,1 @@
-"""Everything that reads or writes: bags, tables, messages, documents."""
+"""Reading and writing of bags, tables, messages and documents."""

@@ -1,4 +1,4 @@
-"""Voltage and displacement from topics of their own, brought onto one clock."""
+"""Alignment of voltage and displacement from separate topics to one clock."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from slpi_ros.io.record import FloatArray, Record
 
 TimeArray = NDArray[np.int64]
 
-# Where neighbours are this many periods apart, nothing is known between them.
+# Gap length, in periods, within which values are not interpolated.
 _GAP = 10.0
-# Names for columns that no message names.
+# Axis names for columns without names.
 _AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
 class Signals:
-    """A topic, decoded.
+    """Decoded messages of one topic.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Signals:
 
 @dataclass(frozen=True)
 class SeparateTopics:
-    """Two topics that hold together what ``stage_state`` holds alone.
+    """Names and interpretation of separate topics for voltage and displacement, instead of ``stage_state``.
 
     Either may be of type ``sensor_msgs/JointState``, ``std_msgs/Float64``, ``std_msgs/Float64MultiArray`` or
     ``geometry_msgs/Vector3Stamped``, in volts and metres. Of a JointState, displacement is ``position``, and voltage
@@ -68,9 +68,9 @@ class SeparateTopics:
     voltage, displacement : str
         Names, as for a single topic.
     clock : {"displacement", "voltage"}
-        Whose messages become samples. With "displacement", nothing measured is changed: its messages get the voltage
-        of their time, and a voltage that turns unseen between two of them becomes a sample of its own, whose
-        displacement is NaN. With "voltage", displacement is interpolated linearly.
+        Signal whose messages become samples. With "displacement", the voltage is resampled at the displacement's
+        times; a voltage reversal between two displacements becomes an additional sample with displacement NaN. With
+        "voltage", displacement is interpolated linearly.
     held : bool
         A commanded voltage stays as it is until the next message. With the clock "voltage", a sample then lies in the
         middle between its message and the next. False for a measured voltage, which is interpolated linearly.
@@ -92,18 +92,18 @@ class _Series:
 
 
 def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axes: Sequence[str], path: Path) -> Record:
-    """Make a record of two topics.
+    """Combine the signals of two topics into a record.
 
     Parameters
     ----------
     voltage, displacement : Signals
-        What the topics hold.
+        Decoded messages of both topics.
     topics : SeparateTopics
-        How to bring them together.
+        Topic names, clock and interpretation of the voltage.
     axes : sequence of str
-        Those to take, by name and in the order of columns without names; empty for all.
+        Axes to read, by name, or in the order of columns without names; empty for all.
     path : Path
-        Where they came from.
+        The bag, for messages.
 
     Returns
     -------
@@ -248,7 +248,7 @@ _Aligned = tuple[TimeArray, dict[str, FloatArray], dict[str, FloatArray]]
 
 
 def _on_displacement(voltage: _Series, displacement: _Series, held: bool) -> _Aligned:
-    """Give every displacement the voltage of its time."""
+    """Resample the voltage at the times of the displacement."""
     known = (displacement.time >= voltage.time[0]) & (displacement.time <= voltage.time[-1])
     time = displacement.time[known]
     y = {axis: column[known] for axis, column in displacement.columns.items()}
@@ -281,7 +281,7 @@ def _unseen_turns(voltage: _Series, current: NDArray[np.intp]) -> NDArray[np.int
 
 
 def _on_voltage(voltage: _Series, displacement: _Series, held: bool) -> _Aligned:
-    """Give every voltage the displacement of its time."""
+    """Interpolate the displacement at the times of the voltage."""
     time, v = voltage.time, dict(voltage.columns)
     if held:
         time = time[:-1] + np.diff(time) // 2

@@ -1,4 +1,4 @@
-"""Writing files: all of it or nothing."""
+"""Atomic writing of files."""
 
 import os
 from collections.abc import Iterator
@@ -11,14 +11,14 @@ from slpi_ros.errors import SlpiError
 
 @contextmanager
 def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = SlpiError) -> Iterator[TextIO]:
-    """Open a text file to write, which appears under its name when the block has ended without an error.
+    """Open a text file for writing; it replaces `path` only if the ``with`` block ends without an error.
 
     Parameters
     ----------
     path : path-like
-        Where; a file of the same name is replaced.
+        File to write; an existing file is replaced.
     failure : type
-        What to raise.
+        Exception type to raise. Default `SlpiError`.
 
     Yields
     ------
@@ -46,7 +46,7 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:
-    """Make a folder, and those above it, unless it is there; before long work, so that its end is not in vain.
+    """Create a folder and its parents if missing, and check that it is writable.
 
     Raises
     ------

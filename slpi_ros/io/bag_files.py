@@ -1,4 +1,4 @@
-"""Bags on disk: finding one and its topic, translating errors of damaged ones, watching a folder for new ones."""
+"""Bags on disk: locating bags and topics, translating errors of damaged bags, watching a folder for new bags."""
 
 import errno
 import os
@@ -31,7 +31,7 @@ def partial_path(path: str | os.PathLike[str]) -> Path:
 
 
 def locate(path: Path) -> list[Path]:
-    """Return what a bag reader can open: a folder with metadata, or bag files, in order if there are several.
+    """Return the paths to open for a bag: a folder with metadata, or its bag files in order.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def _parts(files: list[Path], folder: Path) -> list[Path]:
 
 @contextmanager
 def unpacked(file: Path) -> Iterator[Path]:
-    """Provide a lone bag file that its recorder compressed as a whole; any other is provided as it is."""
+    """Provide a bag file, decompressed to a temporary file if the recorder compressed it as a whole."""
     if file.suffix != ".zstd":
         yield file
         return
@@ -87,7 +87,7 @@ def unpacked(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def translated(source: Path) -> Iterator[None]:
-    """Turn whatever a damaged bag makes its reader raise into a RecordError of one line."""
+    """Translate every exception raised while reading a damaged bag into a one-line RecordError."""
     try:
         _require_whole(source)
         yield
@@ -124,7 +124,7 @@ def _require_whole(source: Path) -> None:
 
 
 def _remedy(source: Path) -> str:
-    """Say what can be tried with a bag that does not open."""
+    """Return the remedy for a bag that cannot be opened."""
     if source.is_dir():
         return "rebuild metadata.yaml with `ros2 bag reindex`, or give its .mcap or .db3 file alone"
     if source.suffix == ".zstd":
@@ -135,12 +135,12 @@ def _remedy(source: Path) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """Return what the error says, short and without line breaks."""
+    """Return the message of an error, at most 200 characters on one line."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str], source: Path) -> str:
-    """Return the full name of the topic that is meant.
+    """Resolve a topic name to the full name of a topic in the bag.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def absolute_name(topic: str) -> str:
 
 
 class BagWatch:
-    """Watches a folder for bags that are complete; one that is still being written is not.
+    """Watch a folder for newly completed bags; bags still being written are ignored.
 
     A rosbag2 folder is complete once it holds ``metadata.yaml``, which its writer adds last; a lone mcap file once it
     ends as such files do. Lone sqlite3 files do not tell, and are left out.

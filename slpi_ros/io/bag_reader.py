@@ -1,7 +1,7 @@
-"""Recordings of a stage from bags: rosbag2 folders or lone files, mcap or sqlite3, compressed or not.
+"""Reading of records from bags: rosbag2 folders or single files, mcap or sqlite3, compressed or not.
 
-Only this module and ``bag_writer`` import rosbags, and no rosbags exception leaves them. rosbags finds the files and
-topics of a bag; their messages are decoded a whole block at once where all in it are alike.
+Only this module and ``bag_writer`` import rosbags; rosbags exceptions do not propagate beyond them. rosbags locates
+the files and topics of a bag; blocks of messages with equal layout are decoded at once.
 """
 
 import os
@@ -79,7 +79,7 @@ def read_bags(
     Parameters
     ----------
     paths : iterable of path
-        At least one, none of them twice.
+        Paths of the bags: at least one, without duplicates.
     topic, axes
         As for `read_bag`.
 
@@ -142,7 +142,7 @@ def read_desired(path: _Path, record: Record, topic: str | None = None) -> dict[
 
 
 class _Bag:
-    """A bag that is open for reading; its files stay unpacked until the end of ``with``."""
+    """Bag opened for reading; a context manager that removes decompressed files at its end."""
 
     def __init__(self, sources: Sequence[Path], path: Path) -> None:
         self._sources = sources
@@ -214,12 +214,12 @@ def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tupl
 
 
 def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int = 0) -> Signals | None:
-    """Decode the messages of a topic, a whole block at once where all in it are alike.
+    """Decode the messages of a topic; blocks of messages with equal layout are decoded at once.
 
     Parameters
     ----------
     blocks : iterable of MessageBlock
-        Each is let go as soon as it is decoded.
+        Blocks of serialised messages; each is released after decoding.
     msgtype : str
         One of `MESSAGE_TYPES`.
     expected : int
@@ -265,7 +265,7 @@ class _Part:
 
 
 class _Columns:
-    """Columns that grow by parts; of a long recording there is no room for two copies."""
+    """Growing columns, preallocated so that long records are not copied."""
 
     def __init__(self, expected: int) -> None:
         self.count = 0

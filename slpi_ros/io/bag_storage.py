@@ -1,4 +1,4 @@
-"""Raw messages of one topic from an MCAP or SQLite file, as blocks.
+"""Reading of the raw messages of one topic from an MCAP or SQLite file, in blocks.
 
 MCAP files are read a chunk at a time, without touching single messages: ten times as fast as by rosbags. Format:
 https://mcap.dev/spec. A file is a sequence of records; most are chunks, which hold records in turn, and behind each
@@ -27,7 +27,7 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 @dataclass(frozen=True)
 class MessageBlock:
-    """Consecutive messages of a topic.
+    """Block of consecutive serialised messages of one topic.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class MessageBlock:
 
 
 def is_compressed(rows: ByteArray) -> bool:
-    """Say whether any of the messages, shape (n, L), was compressed by the recorder: CDR begins otherwise."""
+    """Return whether any message, shape (n, L), begins with the zstd signature instead of a CDR header."""
     magic = np.frombuffer(_ZSTD_MAGIC, np.uint8)
     return rows.shape[1] >= magic.size and bool((rows[:, : magic.size] == magic).all(axis=1).any())
 
@@ -70,7 +70,7 @@ def _unpacked(message: bytes) -> bytes:
 
 
 def decompressed(data: bytes, compression: str) -> bytes:
-    """Return what was compressed, by one of the compressions of MCAP and rosbag2.
+    """Decompress data compressed by one of the methods of MCAP and rosbag2: "", "zstd" or "lz4".
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Bags out: a rosbag2 folder, mcap or sqlite3, that is there as a whole or not at all.
+"""Atomic writing of rosbag2 folders, mcap or sqlite3.
 
 No rosbags exception leaves this module.
 """
@@ -30,10 +30,10 @@ _WRITE_ERRORS = (OSError, sqlite3.Error, WriterError)
 
 
 class BagWriter:
-    """A bag being written; a context manager.
+    """Write a rosbag2 folder; a context manager.
 
-    Until it is complete the bag is in ``.NAME.partial`` beside its place, so a folder of that name is always
-    a whole bag. An exception inside ``with`` discards it; without ``with``, call ``close`` or ``discard``.
+    An incomplete bag is in ``.NAME.partial`` next to the final path, so a folder at the final path is always a
+    complete bag. An exception inside ``with`` discards the bag; without ``with``, call ``close`` or ``discard``.
 
     Parameters
     ----------
@@ -165,12 +165,12 @@ class BagWriter:
         self.message_count += 1
 
     def close(self) -> None:
-        """Complete the bag and put it in its place.
+        """Complete the bag and move it to its final path.
 
         Raises
         ------
         RecordError
-            If the disk does not take it; what is there stays in the partial folder.
+            If the bag cannot be written; the data written so far remain in the partial folder.
         """
         try:
             self._writer.close()
@@ -180,8 +180,8 @@ class BagWriter:
             raise self._failure(error) from error
 
     def discard(self) -> None:
-        """Give up: remove everything written so far."""
-        # a full disk lets even this fail; there is nothing left to lose
+        """Abort writing and remove everything written so far."""
+        # Aborting may fail on a full disk; the files are removed below in any case.
         with suppress(*_WRITE_ERRORS):
             self._writer.abort()
         shutil.rmtree(self.partial, ignore_errors=True)
@@ -243,5 +243,5 @@ def write_bag(
 
 @cache
 def typestore() -> Any:
-    """Return the message types that are known here: those of ROS 2 Jazzy."""
+    """Return the type store of the supported message types, those of ROS 2 Jazzy."""
     return get_typestore(Stores.ROS2_JAZZY)

@@ -1,4 +1,4 @@
-"""The columns of a table: unit and axis from a name, however it is written, and the choice among them."""
+"""Interpretation of column names (quantity, unit, axis) and choice of the columns of a record."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,7 +23,7 @@ class Quantity:
     prefixes : tuple of str
         How names of its columns begin, in lower case.
     others : frozenset of str
-        Endings of names that are units too, but none of this quantity, in lower case.
+        Name endings that are units of other quantities, in lower case.
     """
 
     name: str
@@ -113,7 +113,7 @@ _PARTS = re.compile(r"[^\s_.,-]+")
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table, and what its name says.
+    """Column of a table, with the axis and unit from its name.
 
     Parameters
     ----------
@@ -383,7 +383,7 @@ def _axis_names(moved: Sequence[Column], axes: Sequence[str], source: str) -> tu
 
 
 def _require_one_role(time: Column, moved: Sequence[Column], driven: Iterable[Column], source: str) -> None:
-    """Refuse a column that is more than one thing; only a voltage may be that of several axes."""
+    """Raise UsageError if a column has more than one role; one voltage column may serve several axes."""
     names = [time.name, *(column.name for column in moved), *{column.name for column in driven}]
     for name in names:
         if names.count(name) > 1:

@@ -1,4 +1,4 @@
-"""The messages this package reads or writes as bytes: JointState, JointTrajectory, and what bags may hold instead."""
+"""Decoding and encoding of serialised messages: JointState, JointTrajectory and other types of recorded signals."""
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -227,15 +227,18 @@ SMALLEST_POINT = 24
 
 @dataclass(frozen=True)
 class TrajectoryArrays:
-    """The contents of a JointTrajectory.
+    """Decoded JointTrajectory.
 
     Parameters
     ----------
     start_ns : int, nanoseconds
-        The header's stamp.
+        Header stamp.
     names : tuple of str, length K
+        Joint names.
     time_from_start_ns : ndarray of int64, shape (N,), nanoseconds
-    positions : ndarray, shape (N, K)
+        Time of each point from the start.
+    positions : ndarray, shape (N, K), metres
+        Positions of the joints at each point.
     """
 
     start_ns: int
@@ -269,9 +272,9 @@ class _PointLayout:
 
 
 def decode_trajectory(data: bytes) -> TrajectoryArrays | None:
-    """Decode a serialised JointTrajectory; None where its points differ in layout, or it is none.
+    """Decode a serialised JointTrajectory; return None if its points differ in layout or the message is invalid.
 
-    A million points as objects would take many seconds; points that hold equally many numbers are one array.
+    Points of equal layout are decoded as one array, which is much faster than point by point.
     """
     try:
         return _decode(data)

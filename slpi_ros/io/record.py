@@ -1,4 +1,4 @@
-"""The aligned recording that identification works on: one clock, one voltage and one displacement per axis."""
+"""Record of a stage: voltage and displacement of each axis with common time stamps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -22,13 +22,13 @@ class Record:
     voltage : mapping of axis name to ndarray, shape (N,), volts
         Applied voltage.
     displacement : mapping of axis name to ndarray, shape (N,), metres
-        Measured displacement; NaN where the sensor gave nothing.
+        Measured displacement; NaN where the sensor gave no reading.
     source : str
-        Where it came from, for messages and for the model document.
+        Origin of the record, for messages and for the model document.
     hardware_id : str
-        The stage, as its driver names it; "" when the record does not say.
+        Identifier of the stage, as given by its driver; "" if unknown.
     notes : tuple of str
-        What a reader should know about how the record was made.
+        Remarks on how the record was made. Default none.
 
     Raises
     ------

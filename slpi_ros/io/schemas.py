@@ -1,4 +1,4 @@
-"""The JSON Schemas of every document on a topic or on disk, and the check against them."""
+"""JSON Schemas of all documents on topics or on disk, and validation against them."""
 
 import json
 import textwrap
@@ -74,7 +74,7 @@ def _validator(name: str) -> Any:
 
 
 def _items(validator: Any, schema: Any, values: Any, parent: Any) -> Iterator[Any]:
-    """Check the items of an array; where the least and the largest float are allowed, so are all between."""
+    """Check the items of an array; of an array of floats, check only the minimum and the maximum first."""
     check = Draft202012Validator.VALIDATORS["items"]
     floats = isinstance(values, list) and len(values) > 2 and all(type(value) is float for value in values)
     if not floats or any(True for _ in check(validator, schema, [min(values), max(values)], parent)):

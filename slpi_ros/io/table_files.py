@@ -1,4 +1,4 @@
-"""A text file with columns of numbers: fast where it is clean, precise about where it is not."""
+"""Reading of text tables and MATLAB files, with errors that name the line and column."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Tables in and out: measured data to import, and the command tables of the command line."""
+"""Import of measured data from tables; reading and writing of the command line's tables."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,7 +26,7 @@ def import_table(
     displacement_unit: str | None = None,
     axes: Sequence[str] = (),
 ) -> Record:
-    """Read measured data from any source; the names of the columns say what they are.
+    """Import measured data from a table, identifying columns and units by name or option.
 
     A unit in a name is honoured, as in ``time_ms``, ``Voltage (mV)``, ``x [nm]`` or ``displacement in nm``; case
     counts only where it decides. Without one, values are seconds, volts and micrometres.
@@ -60,7 +60,7 @@ def import_table(
     Raises
     ------
     RecordError
-        If the file, a column, its unit or a value is not what it should be.
+        If the file, a column, its unit or a value is invalid.
     UsageError
         If an option is wrong, contradicts the name of a column, or gives one column two roles.
     """
@@ -122,7 +122,7 @@ def _column_summary(column: Column, values: FloatArray, unit: str) -> str:
 
 
 def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Read a command table, in which every value counts.
+    """Read a command table, in which every value must be finite.
 
     Parameters
     ----------

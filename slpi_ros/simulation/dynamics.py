@@ -340,7 +340,7 @@ class Ageing:
     pivot: float = 0.0
 
     def path(self, t: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the relative change from the start, shape (N,), at times `t` (s) and voltages `v` (V), shape (N,) each."""
+        """Return the relative change from the start, shape (N,), for times `t` (s) and voltages `v` (V)."""
         match self.form:
             case "ramp":
                 course = t - t[0]

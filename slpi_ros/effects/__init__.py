@@ -1,1 +1,1 @@
-"""What a stage does beside its hysteresis: eleven effects, each with the same verbs."""
+"""Models of the eleven effects other than hysteresis; each implements the `Effect` protocol."""

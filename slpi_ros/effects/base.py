@@ -1,4 +1,4 @@
-"""What every effect is: its verbs, what it may look at, its candidates for a fit, and checks of its parameters."""
+"""The `Effect` protocol, its context and fit candidates, and validation of effect parameters."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
@@ -15,28 +15,28 @@ from slpi_ros.errors import ModelError
 FloatArray = NDArray[np.float64]
 
 Side = Literal["voltage", "displacement"]
-# When an effect can be undone: sample by sample; where the whole path is known; on the record's clock only; never.
+# When an effect can be inverted: sample by sample; with the whole path known; on the record's clock only; never.
 Removable = Literal["always", "path", "record", "never"]
-# Neighbours of a spectrum's peak that belong to it, on either side.
+# Number of spectral bins on either side of a peak that are attributed to the peak.
 LINE_WIDTH = 12
 
 
 @dataclass(frozen=True)
 class EffectContext:
-    """What an effect may look at besides the signal it changes.
+    """Signals other than the input that an effect may depend on.
 
     Parameters
     ----------
     t : ndarray, shape (N,), seconds
-        From the first stamp, not decreasing.
+        Time from the first stamp, non-decreasing.
     u : ndarray, shape (N,), volts, optional
-        Voltage that drives the hysteresis.
+        Voltage that drives the hysteresis; None if not known.
     middle : callable, optional
-        Displacement (m) half-way between the two branches of the largest loop, at voltages (V).
+        Maps voltage (V) to the mid-line of the largest loop (m), the mean of its rising and falling branch.
     others : mapping of axis name to ndarray, shape (N,), metres
-        Motion of the other axes from their start, before coupling.
+        Displacement of the other axes relative to their start, before coupling.
     records : tuple of EffectContext
-        Of each record, where signals hold several records, one behind the other; empty for one.
+        One context per record where the signals are several concatenated records; empty for a single record.
     """
 
     t: FloatArray
@@ -46,7 +46,7 @@ class EffectContext:
     records: "tuple[EffectContext, ...]" = ()
 
     def split(self, signal: NDArray[Any]) -> list[NDArray[Any]]:
-        """Return the parts of a signal, shape (N, ..), that belong to each record."""
+        """Split a signal, shape (N, ..), into its records and return the list of parts."""
         return (
             np.split(signal, np.cumsum([record.t.size for record in self.records[:-1]])) if self.records else [signal]
         )
@@ -58,7 +58,7 @@ Effected = TypeVar("Effected")
 def by_record(
     apply: Callable[[Effected, FloatArray, EffectContext], FloatArray],
 ) -> Callable[[Effected, FloatArray, EffectContext], FloatArray]:
-    """Let an effect that remembers begin anew with every record."""
+    """Decorate `apply` of an effect with memory so that its state restarts at every record."""
 
     @wraps(apply)
     def applied(effect: Effected, signal: FloatArray, around: EffectContext) -> FloatArray:
@@ -71,79 +71,79 @@ def by_record(
 
 
 class StreamingEffect(Protocol):
-    """An effect sample by sample; it remembers what it needs of the past."""
+    """Streaming (sample by sample) evaluation of an effect, including its state."""
 
     def start(self, x: float) -> None:
-        """Be at rest at the input `x` (V or m), as after a long time."""
+        """Initialise the state to equilibrium at the constant input `x` (V or m)."""
 
     def forward(self, dt: float, x: float) -> float:
-        """Move to the input `x`, `dt` (s) later; return the output."""
+        """Advance the state by `dt` (s) to the input `x` and return the output."""
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the input that gives the wanted output `dt` (s) from now, or as near as is stable; nothing moves."""
+        """Return the input for the output `wanted` after `dt` (s), or the nearest stable one; state unchanged."""
 
     def snapshot(self) -> Any:
-        """Return the whole state, JSON-like: numbers and tuples of them."""
+        """Return the complete state as JSON-compatible numbers and tuples of numbers."""
 
     def restore(self, state: Any) -> None:
-        """Take over a state from `snapshot`."""
+        """Replace the state by one returned by `snapshot`."""
 
 
 class DrivenStreamingEffect(StreamingEffect, Protocol):
-    """A follower that also looks at the voltage that drives the hysteresis."""
+    """A streaming effect that also depends on the voltage that drives the hysteresis."""
 
     def attach(self, middle: Callable[[float], float]) -> None:
-        """Tell where the middle of the largest loop is: displacement (m) at a voltage (V)."""
+        """Set the function that maps voltage (V) to the mid-line of the largest loop (m)."""
 
     def drive(self, dt: float, u: float) -> None:
-        """Note the voltage `u` (V), `dt` (s) after the last one."""
+        """Record the voltage `u` (V), applied `dt` (s) after the previous one."""
 
 
 class Effect(Protocol):
-    """One effect: a frozen dataclass whose fields are its parameters, SI units, and their `uncertainty`."""
+    """One effect: a frozen dataclass whose fields are its parameters in SI units and their `uncertainty`."""
 
     name: ClassVar[str]
     removable: ClassVar[Removable]
 
     @property
     def side(self) -> Side:
-        """What it acts on."""
+        """Signal on which the effect acts: voltage or displacement."""
 
     @property
     def uncertainty(self) -> Mapping[str, float]:
-        """Standard deviation by parameter, in the parameter's unit."""
+        """Standard deviation by parameter name, in the unit of the parameter."""
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return what becomes of a signal, shape (N,), volts or metres; it begins at rest."""
+        """Return the output of the effect for an input signal, shape (N,), volts or metres, starting at equilibrium."""
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the signal that becomes the given one, shape (N,), volts or metres; the whole path is known."""
+        """Return the input signal for an output signal, shape (N,), volts or metres, using the whole path."""
 
     @classmethod
     def fit(cls, left: "ResidualView") -> "Iterator[Candidate | Effect]":
-        """Yield what it may be in a record: forms for a fit to judge, linear in their gains, or effects as they are."""
+        """Yield candidates for a fit: forms that are linear in their gains, or effects with fixed parameters."""
 
     def describe(self) -> str:
-        """Say in one sentence what it is, with numbers."""
+        """Describe the effect with its parameter values in one sentence."""
 
     def streaming(self) -> StreamingEffect | None:
-        """Return what follows it sample by sample; None: nothing can be done so."""
+        """Return the streaming evaluation of the effect, or None if it cannot be compensated sample by sample."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One form of an effect.
+    """One form of an effect for the identification, linear in its gains.
 
     Parameters
     ----------
     columns : ndarray, shape (N, k), metres
-        What it would add, linear in k gains.
+        Contribution to the displacement for a unit value of each of the k gains.
     effect : callable
-        Returns the effect for gains of shape (k,), or None where they make none.
+        Returns the effect for gains of shape (k,), or None if the gains are not admissible.
     positive : int
-        Number of the last columns whose gains may not be negative; `effect` is given those alone, if there are any.
+        Number of trailing columns whose gains must be non-negative; if not 0, `effect` receives only these gains.
     starting : int
-        Number of the first columns that tell how a record began; their gains are each record's own.
+        Number of leading columns that describe the state before a record; they have separate gains in every record.
     """
 
     columns: FloatArray
@@ -153,7 +153,7 @@ class Candidate:
 
 
 class ResidualView(Protocol):
-    """A hysteresis with the effects found so far, and what they leave of a record of N samples."""
+    """The hysteresis and effects identified so far, and the residual of a record of N samples."""
 
     @property
     def t(self) -> FloatArray:
@@ -173,26 +173,26 @@ class ResidualView(Protocol):
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Samples that count, shape (N,)."""
+        """Mask of the samples used in the fit, shape (N,)."""
 
     @property
     def residual(self) -> FloatArray:
-        """What is left of the measured displacement, shape (N,), metres."""
+        """Residual, measured - model, shape (N,), metres."""
 
     @property
     def others(self) -> Mapping[str, FloatArray]:
-        """Motion of the other axes from their start, shape (N,), metres."""
+        """Displacement of the other axes relative to their start, shape (N,), metres."""
 
     @property
     def around(self) -> EffectContext:
-        """What effects may look at."""
+        """Context passed to the effects."""
 
     def respond(self, u: FloatArray) -> FloatArray:
-        """Return the displacement of the hysteresis, shape (N,), metres, for another voltage."""
+        """Return the displacement of the hysteresis, shape (N,), metres, for the voltage `u`, shape (N,), volts."""
 
 
 def usual_step(t: FloatArray) -> float:
-    """Return the median time (s) from one sample to the next."""
+    """Return the median sampling interval (s)."""
     return float(np.median(np.diff(t)))
 
 
@@ -202,19 +202,19 @@ def longest(around: EffectContext) -> float:
 
 
 def wave(phase: FloatArray) -> FloatArray:
-    """Return the two columns, shape (N, 2), whose sum is any sine of that phase (rad); see `amplitude_and_phase`."""
+    """Return sine and cosine of a phase (rad), shape (N, 2), as a basis of any sinusoid; see `amplitude_and_phase`."""
     return np.column_stack([np.sin(phase), np.cos(phase)])
 
 
 def amplitude_and_phase(gains: FloatArray) -> tuple[float, float]:
-    """Return amplitude and phase (rad) of the sine that two gains of `wave` make."""
+    """Return amplitude and phase (rad) of the sinusoid with two gains for the columns of `wave`."""
     return float(np.hypot(gains[0], gains[1])), float(np.arctan2(gains[1], gains[0]))
 
 
 def strongest_lines(
     power: FloatArray, at: NDArray[np.floating[Any]], count: int, width: int = LINE_WIDTH
 ) -> list[float]:
-    """Return where (as `at`, shape (n,)) a spectrum, shape (n,), is highest, strongest first."""
+    """Return the positions of the highest peaks of a spectrum, shape (n,), in units of `at`, strongest first."""
     power, found = power.copy(), []
     for _ in range(count):
         k = int(np.argmax(power))
@@ -226,7 +226,7 @@ def strongest_lines(
 
 
 def rhythms(left: ResidualView, count: int, lowest: float) -> list[float]:
-    """Return the frequencies (Hz), from `lowest` on, that are strongest in what is left."""
+    """Return the strongest frequencies (Hz) in the residual, at or above `lowest` (Hz)."""
     dt, around = usual_step(left.t), left.around
     size = 4 * scipy.fft.next_fast_len(round(longest(around) / dt) + 1)
     frequency = np.fft.rfftfreq(size, dt)
@@ -243,33 +243,33 @@ Rule = tuple[str, bool, str]
 
 
 def require(effect: Any, *rules: Rule) -> None:
-    """Refuse parameters that make no sense.
+    """Raise an error if a parameter is not finite or violates a rule.
 
     Parameters
     ----------
     effect : Effect
-        A frozen dataclass; every number in it has to be finite.
+        A frozen dataclass whose parameters must all be finite.
     rules : (str, bool, str)
-        Name of a parameter, whether it holds, and what is needed.
+        Name of a parameter, whether the rule holds, and the requirement as text.
 
     Raises
     ------
     ModelError
-        It names the first bad one.
+        If a parameter is invalid; the message names the first one.
     """
     require_finite(effect)
     require_rules(effect, *rules)
 
 
 def require_finite(effect: Any) -> None:
-    """Refuse numbers that are not finite; ModelError."""
+    """Raise ModelError if a parameter is not finite."""
     for name, value in parameters_of(effect).items():
         if not all(isfinite(number) for number in numbers_in(value)):
             raise ModelError(f"effect '{effect.name}': {name} is {value}; give finite numbers")
 
 
 def require_rules(effect: Any, *rules: Rule) -> None:
-    """Refuse parameters for which a rule does not hold, and uncertainties of no parameter; ModelError."""
+    """Raise ModelError if a parameter violates a rule or an uncertainty belongs to no parameter."""
     for name, holds, need in rules:
         if not holds:
             raise ModelError(f"effect '{effect.name}': {name} is {getattr(effect, name)}; it must be {need}")
@@ -283,12 +283,12 @@ def require_rules(effect: Any, *rules: Rule) -> None:
 
 
 def parameters_of(effect: Any) -> dict[str, Any]:
-    """Return the parameters of an effect by name."""
+    """Return the parameters of an effect by name, without `uncertainty`."""
     return {item.name: getattr(effect, item.name) for item in fields(effect) if item.name != "uncertainty"}
 
 
 def numbers_in(value: Any) -> Iterator[float]:
-    """Yield the numbers of a parameter: itself, those of a tuple, or those of a mapping."""
+    """Yield the numbers in a parameter: a scalar, the elements of a tuple, or the values of a mapping."""
     if isinstance(value, Mapping):
         yield from value.values()
     elif isinstance(value, tuple):

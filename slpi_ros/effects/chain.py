@@ -1,4 +1,4 @@
-"""The effects around the hysteresis of one axis, along whole paths."""
+"""Batch evaluation and inversion of the effects around the hysteresis of one axis."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,22 +18,22 @@ Middle = Callable[[FloatArray], FloatArray]
 
 _PLACES = list(EFFECTS)
 _COUPLING = _PLACES.index(CrossCoupling.name)
-# Rate dependence looks at the voltage that its own inverse leads to: so often it is tried again.
+# Number of fixed-point iterations for the voltage on which the inverse rate dependence depends.
 _TRIALS = 6
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Effects in the order in which they act.
+    """The effects of one axis, grouped in the order in which they act.
 
     Parameters
     ----------
     before : tuple of Effect
-        They act on the voltage.
+        Effects on the voltage.
     own : tuple of Effect
-        Behind the hysteresis, before other axes come in.
+        Effects on the displacement before the contributions of other axes.
     shared : tuple of Effect
-        Coupling to other axes and what comes behind it.
+        Coupling to other axes, and the effects that act after it.
     """
 
     before: tuple[Effect, ...]
@@ -42,7 +42,7 @@ class Chain:
 
     @classmethod
     def of(cls, effects: tuple[Effect, ...]) -> "Chain":
-        """Return the chain of an axis's effects, in whatever order they come."""
+        """Return the chain of the effects of an axis, given in any order."""
         ordered = in_order(effects)
         behind = [effect for effect in ordered if effect.side == "displacement"]
         return cls(
@@ -53,29 +53,29 @@ class Chain:
 
     @property
     def rate_dependence(self) -> RateDependence | None:
-        """The effect that looks at the hysteresis's voltage; None: there is none."""
+        """The rate dependence that requires the voltage of the hysteresis, or None if there is none."""
         first = self.own[0] if self.own else None
         return first if isinstance(first, RateDependence) else None
 
     @property
     def coercivity(self) -> RateDependence | None:
-        """The effect through which the hysteresis sees the voltage; None: there is none."""
+        """The rate dependence of coercivity form, which acts on the voltage, or None if there is none."""
         last = self.before[-1] if self.before else None
         return last if isinstance(last, RateDependence) else None
 
     @property
     def gains(self) -> Mapping[str, float]:
-        """How much of which other axis comes in, metres per metre."""
+        """Coupling gains by name of the other axis, metres per metre."""
         return next((effect.gains for effect in self.shared if isinstance(effect, CrossCoupling)), {})
 
     @property
     def delay(self) -> float:
-        """By how much the displacement answers later, seconds."""
+        """Delay from voltage to displacement, seconds."""
         return next((effect.seconds for effect in self.before if isinstance(effect, Delay)), 0.0)
 
     @property
     def clipped(self) -> tuple[float, float]:
-        """Lowest and highest voltage (V) that the amplifier lets through."""
+        """Lowest and highest voltage (V) of the amplifier, infinite without saturation."""
         found = (effect for effect in self.before if isinstance(effect, Saturation))
         return next(((effect.lower, effect.upper) for effect in found), (-np.inf, np.inf))
 
@@ -87,11 +87,11 @@ class Chain:
         Parameters
         ----------
         own : ndarray, shape (N,), metres
-            Before other axes come in.
+            Displacement before the contributions of other axes.
         around : EffectContext
-            Its `u` is not needed.
+            Context of the effects; `u` is not used.
         inverse : callable
-            The inverse hysteresis from its start: metres to volts.
+            Maps displacement (m) to voltage (V) by the inverse hysteresis from its initial state.
         """
         rate, coercivity = self.rate_dependence, self.coercivity
         h = backward(self.own[1:] if rate else self.own, own, around)
@@ -113,7 +113,7 @@ class Chain:
 
 
 def reaching(effects: Sequence[Effect], v: FloatArray, around: EffectContext) -> tuple[FloatArray, FloatArray]:
-    """Return what effects let a command reach the hysteresis, and what goes round it: shape (N,), volts and metres."""
+    """Return hysteresis voltage and parallel reversible displacement, shape (N,) each, volts and metres."""
     u, reversible_bypass = v, np.zeros_like(v)
     for effect in effects:
         if effect.side == "voltage":
@@ -124,26 +124,26 @@ def reaching(effects: Sequence[Effect], v: FloatArray, around: EffectContext) ->
 
 
 def forward(effects: tuple[Effect, ...], signal: FloatArray, around: EffectContext) -> FloatArray:
-    """Return what effects make of a signal, shape (N,)."""
+    """Return a signal, shape (N,), after all effects have been applied in order."""
     for effect in effects:
         signal = effect.apply(signal, around)
     return signal
 
 
 def backward(effects: tuple[Effect, ...], signal: FloatArray, around: EffectContext) -> FloatArray:
-    """Return the signal, shape (N,), of which effects make the given one."""
+    """Return the input signal, shape (N,), for an output signal, by inverting all effects in reverse order."""
     for effect in reversed(effects):
         signal = effect.invert(signal, around)
     return signal
 
 
 def loop_middle(forward_array: Callable[[FloatArray], FloatArray], low: float, high: float) -> tuple[FloatArray, ...]:
-    """Return voltages and the middle of the largest loop there.
+    """Return the mid-line of the largest loop within a voltage range.
 
     Parameters
     ----------
     forward_array : callable
-        The hysteresis from its start: volts to metres.
+        Maps voltage (V) to displacement (m) by the hysteresis from its initial state.
     low, high : float, volts
         Ends of the loop.
 
@@ -151,7 +151,7 @@ def loop_middle(forward_array: Callable[[FloatArray], FloatArray], low: float, h
     -------
     voltages : ndarray, shape (K,), volts
     middle : ndarray, shape (K,), metres
-        Half-way between the rising and the falling branch.
+        Mean of the rising and the falling branch.
     """
     rise = np.linspace(low, high, 201)
     y = forward_array(np.concatenate([[high], rise, rise[::-1]]))[1:]

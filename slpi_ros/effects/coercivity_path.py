@@ -1,4 +1,4 @@
-"""The coercivity along whole paths, in machine code; `coercivity` has it sample by sample."""
+"""Compiled batch evaluation of the coercivity; `rate_dependence` contains the streaming version."""
 
 from math import exp
 
@@ -12,10 +12,10 @@ FloatArray = NDArray[np.float64]
 
 @compiled
 def settled_rate(t: FloatArray, v: FloatArray, settling: float) -> FloatArray:
-    """Return the rate (V/s) that a path, shape (N,), volts, has of late, from rest, at times `t`, shape (N,), s."""
+    """Return the low-pass filtered rate (V/s) of a path, shape (N,), volts, from rest, at times `t`, shape (N,), s."""
     settled, now, last = np.empty_like(v), 0.0, v.size - 1
     for k in range(v.size):
-        # From the sample before to the one after; a follower knows only the one before.
+        # The rate before the present sample; the streaming version has no access to the present one.
         before, after = max(k - 1, 0), min(k + 1, last)
         dt = t[after] - t[before]
         rate = abs(v[after] - v[before]) / dt if dt > 0.0 else 0.0
@@ -26,7 +26,7 @@ def settled_rate(t: FloatArray, v: FloatArray, settling: float) -> FloatArray:
 
 @compiled
 def play(v: FloatArray, half_width: FloatArray) -> FloatArray:
-    """Return what is seen of a path, shape (N,), through a play of changing half-width, shape (N,), volts."""
+    """Return the output of a play operator for a path `v` and a varying half-width, shape (N,) each, volts."""
     seen, now = np.empty_like(v), v[0] if v.size else 0.0
     for k in range(v.size):
         now = min(max(now, v[k] - half_width[k]), v[k] + half_width[k])

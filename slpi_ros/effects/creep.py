@@ -1,4 +1,4 @@
-"""Creep: after every move the stage goes on, slower and slower."""
+"""Creep: slow relaxation of the displacement after a move."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,36 +23,36 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.filters import Hold, Uniform, hold
 
-# What settles sooner (s) is called a lag.
+# Shortest time constant (s) of creep; shorter ones are modelled as lag.
 FASTEST = 0.1
-# Creep is a few per cent of a move: no relaxation is more than this share of it, nor are all within a second.
+# Upper bounds on the gains: of each relaxation, and of the sum of those with time constants within a second.
 LARGEST, SOON, LARGEST_SOON = 0.15, 1.0, 0.12
-# Relaxations that are looked for: so many single ones; several at once, up to a share of the record. With less than a
-# share of the largest one they are left out.
+# Candidates: number of single relaxations; sets of several (number, longest time constant as share of the record).
+# Gains below this share of the largest gain are dropped.
 SINGLE, SEVERAL, LEAST_SHARE = 7, ((2, 0.1), (2, 0.5), (3, 0.3), (4, 0.7)), 0.02
-# The logarithmic law, every decade alike: relaxations of equal gain, so many in each decade, from the longer of these
-# times (s) and so many samples, to these shares of the longest record; so few relaxations are no law.
+# Logarithmic law, equal gains: relaxations per decade, from the longer of a time (s) and a number of samples, to a
+# share of the longest record, and the smallest number of relaxations.
 LAW_PER_DECADE, LAW_FROM, LAW_SAMPLES, LAW_TO, LAW_FEWEST = 2, (0.0, FASTEST), 3.0, (0.3, 3.0), 4
-# What settles within this share of the record may have begun before it; of what is slower nobody knows.
+# Relaxations with a time constant below this share of the record may have an identifiable state at its start.
 SOON_SETTLED = 0.025
 
 
 @dataclass(frozen=True)
 class Creep:
-    """Relaxations in parallel, ``y = h + sum_k g_k z_k`` with ``tau_k dz_k/dt = (h - h_0) - z_k``.
+    """Parallel first-order relaxations, ``y = h + sum_k g_k z_k`` with ``tau_k dz_k/dt = (h - h_0) - z_k``.
 
-    ``h_0`` is the displacement at the start: what rests does not creep.
+    ``h_0`` is the displacement at the start, where all relaxations are in equilibrium.
 
     Parameters
     ----------
-    time_constants : tuple of float, length K >= 1, seconds
+    time_constants : tuple of float, length K >= 1, seconds, ``tau_k``
     gains : tuple of float, length K
-        Shares of the motion ``h - h_0`` that come later.
+        Shares ``g_k`` of the motion ``h - h_0`` that follow with a time constant.
     initial : float, metres
-        How far the stage had moved just before the record: `apply`, which replays one, goes on with what creeps of
-        that. What drives a stage begins at rest.
-    uncertainty : mapping of str to float
-        Of single elements as ``gains.0``.
+        Displacement step just before the record, default 0. Only `apply` continues the creep of this step; streaming
+        starts at equilibrium.
+    uncertainty : mapping of parameter name to standard deviation, optional
+        Standard deviations; those of single elements have keys such as ``gains.0``.
     """
 
     name: ClassVar[str] = "creep"
@@ -65,7 +65,7 @@ class Creep:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be undone."""
+        """Validate the parameters, including invertibility."""
         require(
             self,
             ("time_constants", 1 <= len(self.time_constants) <= 100, "1 to 100 numbers"),
@@ -108,7 +108,7 @@ class Creep:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield single relaxations from quick to slow, and several at once."""
+        """Yield single relaxations from fast to slow, and combinations of several."""
         step, most = usual_step(left.t), longest(left.around)
         shortest = max(10 * step, FASTEST)
         if shortest < 0.5 * most:
@@ -143,13 +143,13 @@ class Creep:
         return cls(tuple(taus[seen].tolist()), plausible(taus[seen].tolist(), gains[seen].tolist()))
 
     def describe(self) -> str:
-        """Say how much and how slow."""
+        """Describe the magnitude and the time constants."""
         slow, fast = max(self.time_constants), min(self.time_constants)
         span = f"{fast:.3g} s" if slow == fast else f"{fast:.3g} to {slow:.3g} s"
         return f"after a move the stage creeps on by {sum(self.gains) * 100:.3g} % of it, with time constants of {span}"
 
     def streaming(self) -> "StreamingCreep":
-        """Return the creep sample by sample."""
+        """Return the streaming creep."""
         return StreamingCreep(self)
 
     def _holds(self, dt: float) -> list[Hold]:
@@ -157,7 +157,7 @@ class Creep:
 
 
 class StreamingCreep:
-    """Creep sample by sample."""
+    """Streaming (sample by sample) creep."""
 
     def __init__(self, creep: Creep) -> None:
         self._creep = creep
@@ -165,11 +165,11 @@ class StreamingCreep:
         self._over(0.0)
 
     def start(self, x: float) -> None:
-        """Be at rest at `x` (m)."""
+        """Initialise to equilibrium at `x` (m)."""
         self._origin, self._input, self._states = x, 0.0, [0.0] * len(self._creep.gains)
 
     def forward(self, dt: float, x: float) -> float:
-        """Move to the displacement `x` (m), `dt` (s) later; return it with creep (m)."""
+        """Advance by `dt` (s) to the displacement `x` (m) and return the displacement with creep (m)."""
         if dt != self._dt:
             self._over(dt)
         moved, last = x - self._origin, self._input
@@ -182,13 +182,13 @@ class StreamingCreep:
         return x + crept
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the displacement before creep (m) for one with creep (m)."""
+        """Return the displacement before creep (m) for a displacement with creep `wanted` (m)."""
         if dt != self._dt:
             self._over(dt)
         return self._origin + (wanted - self._origin - self._crept()) / (1.0 + self._now)
 
     def resume(self, other: "StreamingCreep", x: float) -> None:
-        """Creep on as another one does, from the displacement `x` (m); what is of another time constant is at rest."""
+        """Copy the relaxations of equal time constant from `other`, at the displacement `x` (m); the others are 0."""
         moved = other._input
         known = dict(zip(other._creep.time_constants, other._states, strict=True))
         self._origin, self._input = x - moved, moved
@@ -199,11 +199,11 @@ class StreamingCreep:
         return self._origin, self._input, *self._states
 
     def restore(self, state: tuple[float, ...]) -> None:
-        """Take over a state from `snapshot`."""
+        """Replace the state by one returned by `snapshot`."""
         self._origin, self._input, *self._states = state
 
     def _crept(self) -> float:
-        """Return how far it creeps (m) whatever the motion in this step."""
+        """Return the part of the creep (m) that is independent of the motion in the present step."""
         crept = self._before * self._input
         for share, z in zip(self._kept, self._states, strict=True):
             crept += share * z
@@ -217,7 +217,7 @@ class StreamingCreep:
 
 
 def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[float, ...]:
-    """Return gains, lowered where they are too large for creep."""
+    """Return the gains, reduced to the upper bounds for creep."""
     gains = [min(gain, LARGEST) for gain in gains]
     soon = sum(gain for tau, gain in zip(time_constants, gains, strict=True) if tau < SOON)
     share = min(1.0, LARGEST_SOON / soon) if soon > 0.0 else 1.0
@@ -225,9 +225,9 @@ def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[
 
 
 def settling(time_constants: Sequence[float], around: EffectContext, used: NDArray[np.bool_]) -> FloatArray:
-    """Return how creep from before each record may settle in it, shape (N, k): a column for each that soon ends.
+    """Return the decay in each record of creep from before it, shape (N, k), one column per identifiable relaxation.
 
-    Where it follows the logarithmic law there is one column, as after one move before the record.
+    For the logarithmic law there is a single column, as for one move before the record.
     """
     whole = []
     for own in range(max(len(around.records), 1)):

@@ -1,4 +1,4 @@
-"""Cross coupling: part of another axis's motion."""
+"""Cross coupling: displacement of an axis caused by the motion of other axes."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -12,14 +12,14 @@ from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removabl
 
 @dataclass(frozen=True)
 class CrossCoupling:
-    """An axis moves along with others, ``y = x + sum_j gain_j m_j``, ``m_j`` their own motion from the start.
+    """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j relative to its start.
 
     Parameters
     ----------
     gains : mapping of axis name to float
-        Metres per metre. An axis that is not known to move rests.
-    uncertainty : mapping of str to float
-        Of single axes as ``gains.y``.
+        Gain by axis name, metres per metre. An axis with unknown motion is taken as stationary.
+    uncertainty : mapping of parameter name to standard deviation, optional
+        Standard deviations; those of single axes have keys such as ``gains.y``.
     """
 
     name: ClassVar[str] = "cross_coupling"
@@ -30,7 +30,7 @@ class CrossCoupling:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be taken apart again."""
+        """Validate the parameters, including invertibility."""
         require(
             self,
             ("gains", 1 <= len(self.gains) <= 100, "for at least one axis"),
@@ -42,21 +42,21 @@ class CrossCoupling:
         )
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement with the part of the other axes, shape (N,), metres."""
+        """Return the displacement including the coupled motion, shape (N,), metres."""
         return signal + self.part(signal, around)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement without the part of the other axes, shape (N,), metres."""
+        """Return the displacement without the coupled motion, shape (N,), metres."""
         return signal - self.part(signal, around)
 
     def part(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return what the other axes add, shape (N,), metres."""
+        """Return the coupled motion, shape (N,), metres."""
         known = (gain * around.others[axis] for axis, gain in self.gains.items() if axis in around.others)
         return sum(known, np.zeros_like(signal))
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield the motion of all other axes."""
+        """Yield a candidate with the motion of all other axes."""
         if left.others:
             yield Candidate(np.column_stack(list(left.others.values())), partial(cls._of, tuple(left.others)))
 
@@ -65,12 +65,12 @@ class CrossCoupling:
         return cls(dict(zip(axes, gains.tolist(), strict=True)))
 
     def describe(self) -> str:
-        """Say how much of which axis."""
+        """Describe the coupling gains by axis."""
         parts = [f"{gain * 100:.3g} % of axis {axis}" for axis, gain in self.gains.items()]
-        return f"the axis moves along with {' and '.join(parts)}"
+        return f"the axis follows {' and '.join(parts)}"
 
     def streaming(self) -> None:
-        """Return None: one axis alone cannot know how the others move; the stage takes the axes apart."""
+        """Return None: decoupling requires the setpoints of all axes and is done by the stage model."""
         return
 
 
@@ -78,17 +78,17 @@ Motion = TypeVar("Motion", float, FloatArray)
 
 
 class Coupling:
-    """What each axis takes from the own motion of the others: ``(I + G) m`` are the motions to be seen.
+    """Linear coupling of all axes of a stage: the observed motions are ``(I + G) m``, with ``m`` the own motions.
 
     Parameters
     ----------
     gains : mapping of axis name to mapping of axis name to float
-        ``gains[x][y]``: metres that x moves for one metre of y. Axes that are none of the mapping's rest.
+        ``gains[x][y]``: displacement of x per metre of y. Axes that are not in the mapping have no coupling.
 
     Attributes
     ----------
     on : bool
-        Whether any axis takes anything.
+        Whether any gain is not zero.
     """
 
     def __init__(self, gains: Mapping[str, Mapping[str, float]]) -> None:
@@ -100,18 +100,18 @@ class Coupling:
         self._solutions: dict[tuple[str, ...], list[list[float]]] = {}
 
     def part(self, name: str, motions: Mapping[str, Motion]) -> Motion | float:
-        """Return what an axis takes from the others' own motions, metres; an axis that is not given rests."""
+        """Return the displacement (m) caused by the own motions of the others; absent ones are stationary."""
         return sum((gain * motions[other] for other, gain in self._gains[name].items() if other in motions), 0.0)
 
     def decouple(self, seen: Mapping[str, Motion], resting: Mapping[str, Motion]) -> dict[str, Motion]:
-        """Return the own motions that add up to the ones to be seen.
+        """Return the own motions (m) that produce the observed motions.
 
         Parameters
         ----------
         seen : mapping of axis name to float or ndarray, shape (N,), metres
-            Wanted motions from the start.
+            Desired observed motions relative to the start.
         resting : mapping of axis name to float or ndarray, shape (N,), metres
-            Own motions of axes that stay where they are.
+            Own motions of the axes that are held in position.
         """
         left = {name: motion - self.part(name, resting) for name, motion in seen.items()}
         rows = self._solution(tuple(seen))

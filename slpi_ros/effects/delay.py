@@ -1,4 +1,4 @@
-"""Delay: the displacement answers later, or the stamps of the two signals are apart."""
+"""Delay: transport delay of the displacement, or an offset between the stamps of the two signals."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,13 +22,13 @@ from slpi_ros.effects.base import (
 
 @dataclass(frozen=True)
 class Delay:
-    """Transport delay, or an offset between the stamps of voltage and displacement.
+    """Transport delay, or offset between the stamps of voltage and displacement.
 
     Parameters
     ----------
     seconds : float, seconds
-        Negative where the displacement's stamps are early, or those of the voltage late.
-    uncertainty : mapping of str to float
+        Delay from voltage to displacement; negative if the displacement is stamped too early or the voltage too late.
+    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "delay"
@@ -39,21 +39,21 @@ class Delay:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what is no delay."""
+        """Validate the parameters."""
         require(self, ("seconds", abs(self.seconds) <= 100, "from -100 to 100 s"))
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Shift the signal, shape (N,), to later; the first value is held before."""
+        """Delay the signal, shape (N,), volts or metres; the first value is held before the start."""
         return np.interp(around.t - self.seconds, around.t, signal) if signal.size else signal.copy()
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Shift the signal, shape (N,), to earlier: a preview of the path; its end is held."""
+        """Advance the signal, shape (N,), volts or metres, using its future samples; the last value is held."""
         return np.interp(around.t + self.seconds, around.t, signal) if signal.size else signal.copy()
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield shifts by a part of a sample and by some, either way."""
+        """Yield delays of both signs, from a fraction of a sampling interval to several."""
         dt = usual_step(left.t)
         for seconds in (-4.0 * dt, 0.5 * dt, 2.0 * dt, 8.0 * dt):
             column = left.respond(cls(seconds).apply(left.u, left.around)) - left.h
@@ -64,11 +64,11 @@ class Delay:
         return cls(seconds * float(gains[0]))
 
     def describe(self) -> str:
-        """Say how long it is."""
+        """Describe the delay."""
         if self.seconds < 0:
             return f"the displacement is stamped {-self.seconds * 1e3:.3g} ms too early for its voltage"
-        return f"the displacement answers {self.seconds * 1e3:.3g} ms after the voltage"
+        return f"the displacement follows {self.seconds * 1e3:.3g} ms after the voltage"
 
     def streaming(self) -> None:
-        """Return None: without the path ahead there is no preview."""
+        """Return None: a delay cannot be compensated sample by sample without future reference samples."""
         return

@@ -1,4 +1,4 @@
-"""Linear filters over one step or an even grid: first-order hold of a lag, second-order mode, resampling."""
+"""Linear filters: first-order hold of a lag, second-order mode, and resampling to a uniform grid."""
 
 from dataclasses import dataclass
 from math import cos, exp, expm1, sin, sqrt
@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Below this ratio of step to time constant, series keep the digits that differences lose.
+# Below this ratio of step to time constant a series is used, because differences lose precision.
 _SMALL = 1e-3
-# Stamps that stray by less than this share of a step are even.
+# Stamps are uniform if their intervals deviate by less than this share of the median interval.
 EVEN = 0.01
-# The grid has at most so many points for each sample.
+# Largest number of grid points per sample.
 FINEST = 4
 
 
 class Hold(NamedTuple):
-    """``z1 = now u1 + before u0 + kept z0`` over one step; the three add up to 1."""
+    """Coefficients of one step ``z1 = now u1 + before u0 + kept z0``, with sum 1."""
 
     now: float
     before: float
@@ -26,7 +26,7 @@ class Hold(NamedTuple):
 
 
 def hold(dt: float, time_constant: float) -> Hold:
-    """Return how a lag goes on over a step `dt` (s); where no time passes, its output stays."""
+    """Return the coefficients of a first-order lag over `dt` (s); for ``dt = 0`` the output is unchanged."""
     x = dt / time_constant
     moved = -expm1(-x)
     now = x / 2 - x**2 / 6 + x**3 / 24 - x**4 / 120 if x < _SMALL else 1 - moved / x
@@ -35,14 +35,14 @@ def hold(dt: float, time_constant: float) -> Hold:
 
 @dataclass(frozen=True)
 class Mode:
-    """``y'' + 2 z w y' + w^2 y = w^2 h``.
+    """Second-order mode ``y'' + 2 z w y' + w^2 y = w^2 h``.
 
     Parameters
     ----------
     omega : float, rad/s
-        ``w``, undamped.
+        Undamped angular frequency ``w``.
     damping : float
-        ``z``, from above 0 to below 1.
+        Damping ratio ``z``, from above 0 to below 1.
     """
 
     omega: float
@@ -50,48 +50,48 @@ class Mode:
 
     @property
     def lag(self) -> float:
-        """How much later than its input the mode follows a ramp, seconds."""
+        """Steady-state delay of the response to a ramp, seconds."""
         return 2 * self.damping / self.omega
 
     def free(self, dt: float) -> tuple[float, float, float, float]:
-        """Return the matrix, row by row, that moves position and velocity on over `dt` (s) without input."""
+        """Return the state transition matrix of position and velocity over `dt` (s), row by row."""
         decay_rate, rate = self.damping * self.omega, self.omega * sqrt(1 - self.damping**2)
         decay = exp(-decay_rate * dt)
         cosine, sine = decay * cos(rate * dt), decay * sin(rate * dt) / rate
         return cosine + decay_rate * sine, sine, -(self.omega**2) * sine, cosine - decay_rate * sine
 
     def ringing(self, dt: float) -> tuple[float, float]:
-        """Return sum and product of the two poles ``exp(s dt)``."""
+        """Return sum and product of the two discrete poles ``exp(s dt)``."""
         decay = exp(-self.damping * self.omega * dt)
         return 2 * decay * cos(self.omega * sqrt(1 - self.damping**2) * dt), decay * decay
 
     def transfer(self, dt: float) -> tuple[FloatArray, FloatArray]:
-        """Return numerator and denominator, shape (3,) each, of the mode sampled every `dt` (s)."""
+        """Return numerator and denominator, shape (3,) each, of the mode discretised with step `dt` (s)."""
         m11, m12, m21, m22 = self.free(dt)
         late = self.lag / dt
-        # Position and velocity after a step: by the input before it, and by the input at its end.
+        # Response of position and velocity to the input at the start and at the end of a step.
         position = late - m11 * (1 + late) + m12 / dt, 1 - late + m11 * late - m12 / dt
         velocity = -1 / dt - m21 * (1 + late) + m22 / dt, 1 / dt + m21 * late - m22 / dt
         total, product = self.ringing(dt)
         middle = position[0] - m22 * position[1] + m12 * velocity[1]
         numerator = np.array([position[1], middle, m12 * velocity[0] - m22 * position[0]])
         denominator = np.array([1.0, -total, product])
-        # Rounding must not change what the mode makes of a rest.
+        # Remove rounding errors from the static gain.
         return numerator * (denominator.sum() / numerator.sum()), denominator
 
 
 @dataclass(frozen=True)
 class Uniform:
-    """An even grid over some stamps.
+    """A uniform grid that covers a sequence of stamps.
 
     Parameters
     ----------
     t : ndarray, shape (N,), seconds
-        The stamps, not decreasing.
+        Stamps, non-decreasing.
     grid : ndarray, shape (M,), seconds
-        The same as `t` where that is even.
+        Grid points; equal to `t` if the stamps are uniform.
     dt : float, seconds
-        Step of the grid; 0 where no time passes.
+        Grid step; 0 if all stamps are equal.
     """
 
     t: FloatArray
@@ -100,7 +100,7 @@ class Uniform:
 
     @classmethod
     def over(cls, t: FloatArray) -> "Uniform":
-        """Return the grid over stamps `t`, shape (N,), seconds: at their median step, and not too fine."""
+        """Return the grid for stamps `t`, shape (N,), seconds, with their median interval where that is fine enough."""
         span = float(t[-1] - t[0]) if t.size else 0.0
         if span <= 0.0:
             return cls(t, t, 0.0)
@@ -113,9 +113,9 @@ class Uniform:
         return cls(t, np.linspace(t[0], t[-1], points), span / (points - 1))
 
     def on(self, signal: FloatArray) -> FloatArray:
-        """Return a signal, shape (N,), on the grid, shape (M,)."""
+        """Resample a signal from the stamps, shape (N,), to the grid, shape (M,)."""
         return signal if self.grid is self.t else np.interp(self.grid, self.t, signal)
 
     def off(self, signal: FloatArray) -> FloatArray:
-        """Return a signal on the grid, shape (M,), at the stamps, shape (N,)."""
+        """Resample a signal from the grid, shape (M,), to the stamps, shape (N,)."""
         return signal if self.grid is self.t else np.interp(self.t, self.grid, signal)

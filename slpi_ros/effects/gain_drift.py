@@ -1,4 +1,4 @@
-"""Gain drift: the sensitivity of the stage itself changes slowly."""
+"""Gain drift: slow change of the sensitivity of the stage."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -9,31 +9,30 @@ import numpy as np
 
 from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 
-# Knots that are tried, as shares of the record: even ones, and early ones, as a stage changes most after a rest.
+# Knots of the candidates, as shares of the record: uniform, and concentrated at the start after a rest.
 KNOTS = (*(tuple(np.linspace(0.0, 1.0, count + 1)[1:].tolist()) for count in (1, 2, 4, 8)), (0.05, 0.15, 0.4, 1.0))
 
 
 @dataclass(frozen=True)
 class GainDrift:
-    """A factor on the displacement that depends on time only, ``y = origin + (1 + g(t)) (x - origin)``.
+    """A time-dependent factor on the displacement, ``y = origin + (1 + g(t)) (x - origin)``.
 
-    ``g`` is 0 at the record's start, linear between knots, and keeps its last value after the last one: a sensitivity
-    that has changed by the record's end stays changed. So `apply` and `invert` use the record's clock, and `streaming`
-    the last value.
+    ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. `apply` and `invert` use
+    the record's clock; `streaming` uses the value at the end of the record.
 
-    The change of the active material scales hysteresis, creep and resonance alike: it acts behind them. Another axis
-    sees the scaled motion: it acts before the coupling.
+    The change acts after hysteresis, creep and resonance, which it scales alike, and before the coupling, through which
+    other axes receive the scaled motion.
 
     Parameters
     ----------
     times : tuple of float, length K >= 1, seconds
-        Knots, strictly increasing, after the record's start.
+        Knots from the record's start, more than 0, strictly increasing.
     gains : tuple of float, length K
-        ``g`` at the knots.
+        Relative change of sensitivity ``g`` at the knots.
     origin : float, metres
-        The displacement that a change of the sensitivity leaves where it is.
-    uncertainty : mapping of str to float
-        Of single elements as ``gains.0``.
+        Displacement that is independent of the sensitivity.
+    uncertainty : mapping of parameter name to standard deviation, optional
+        Standard deviations; those of single elements have keys such as ``gains.0``.
     """
 
     name: ClassVar[str] = "gain_drift"
@@ -46,7 +45,7 @@ class GainDrift:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what is no curve, or leaves no motion."""
+        """Validate the parameters."""
         rising = all(a < b for a, b in zip((0.0, *self.times), self.times, strict=False))
         require(
             self,
@@ -66,15 +65,15 @@ class GainDrift:
         return self.origin + self.factor(around.t) * (signal - self.origin)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement with the sensitivity of the record's start, shape (N,), metres."""
+        """Return the displacement with the initial sensitivity, shape (N,), metres."""
         return self.origin + (signal - self.origin) / self.factor(around.t)
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield curves of one knot and of more.
+        """Yield curves with one knot and with several.
 
-        Each has a column for the changing sensitivity and one for a shift, from which the origin follows. An origin
-        outside the record's displacements would turn any thermal drift into a gain drift: it is kept inside.
+        Each candidate has a column for the sensitivity and one for a shift, which determine the origin. The origin is
+        limited to the record's displacements, because otherwise any thermal drift could be fitted as a gain drift.
         """
         t, low, high = left.t - left.t[0], float(left.h.min()), float(left.h.max())
         moved = left.h - 0.5 * (low + high)
@@ -85,13 +84,13 @@ class GainDrift:
 
     @classmethod
     def _through(cls, times: FloatArray, low: float, high: float, found: FloatArray) -> "GainDrift":
-        """Return the curve of gains ``a`` and shifts ``b``, shape (2 K,), of which ``b = -origin a`` fits best."""
+        """Return the curve for gains ``a`` and shifts ``b``, shape (2 K,), that best satisfies ``b = -origin a``."""
         gains, shifts = found.reshape(2, -1)
         origin = 0.5 * (low + high) - float(gains @ shifts) / max(float(gains @ gains), 1e-300)
         return cls(tuple(times.tolist()), tuple(gains.tolist()), min(max(origin, low), high))
 
     def describe(self) -> str:
-        """Say how far, in which time, and when most of it."""
+        """Describe the magnitude, the duration and the half time."""
         t = np.linspace(0.0, self.times[-1], 1001)
         change = self.factor(t) - 1.0
         largest = change[int(np.argmax(np.abs(change)))]
@@ -103,30 +102,30 @@ class GainDrift:
         )
 
     def streaming(self) -> "StreamingGainDrift":
-        """Return the sensitivity of the record's end, sample by sample."""
+        """Return the sensitivity at the end of the record as a streaming effect."""
         return StreamingGainDrift(self.origin, 1.0 + self.gains[-1])
 
 
 class StreamingGainDrift:
-    """A constant factor on the displacement; there is nothing to remember."""
+    """Streaming (sample by sample) constant sensitivity factor, without state."""
 
     def __init__(self, origin: float, factor: float) -> None:
         self._origin, self._factor = origin, factor
 
     def start(self, x: float) -> None:
-        """Be at rest at `x` (m)."""
+        """Do nothing: the effect has no state."""
 
     def forward(self, dt: float, x: float) -> float:
         """Return the displacement (m) with the changed sensitivity."""
         return self._origin + self._factor * (x - self._origin)
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the displacement (m) with the sensitivity of the record's start."""
+        """Return the displacement (m) with the initial sensitivity."""
         return self._origin + (wanted - self._origin) / self._factor
 
     def snapshot(self) -> tuple[()]:
-        """Return nothing."""
+        """Return an empty state."""
         return ()
 
     def restore(self, state: tuple[()]) -> None:
-        """Take over nothing."""
+        """Do nothing: the effect has no state."""

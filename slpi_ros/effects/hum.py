@@ -1,4 +1,4 @@
-"""Hum: mains, or another disturbance that is periodic in time."""
+"""Hum: mains interference or another disturbance that is periodic in time."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,21 +21,21 @@ from slpi_ros.effects.base import (
     wave,
 )
 
-# So many lines of a spectrum are tried, from this frequency (Hz) on: slower is drift or creep.
+# Number of spectral peaks that are tried, and lowest frequency (Hz); slower disturbances are drift or creep.
 LINES, SLOWEST = 4, 2.0
 
 
 @dataclass(frozen=True)
 class Hum:
-    """A sine in time, ``y = x + amplitude sin(2 pi frequency t + phase)``.
+    """A sinusoid in time, ``y = x + amplitude sin(2 pi frequency t + phase)``.
 
     Parameters
     ----------
     frequency : float, hertz
     amplitude : float, metres
     phase : float, radians
-        At the record's start.
-    uncertainty : mapping of str to float
+        Phase at the record's start.
+    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "hum"
@@ -48,7 +48,7 @@ class Hum:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what is no hum."""
+        """Validate the parameters."""
         require(
             self,
             ("frequency", 0 < self.frequency <= 1e7, "more than 0 Hz, at most 1e7 Hz"),
@@ -65,12 +65,12 @@ class Hum:
         return signal - self.wave(around.t)
 
     def wave(self, t: FloatArray) -> FloatArray:
-        """Return the hum alone, shape (N,), metres, at times (s)."""
+        """Return the sinusoid, shape (N,), metres, at times `t`, shape (N,), seconds."""
         return self.amplitude * np.sin(2 * pi * self.frequency * t + self.phase)
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield the strongest lines in the spectrum of what is left."""
+        """Yield the strongest frequencies in the spectrum of the residual."""
         for frequency in rhythms(left, LINES, SLOWEST):
             yield Candidate(wave(2 * np.pi * frequency * left.t), partial(cls._at, frequency))
 
@@ -79,9 +79,9 @@ class Hum:
         return cls(frequency, *amplitude_and_phase(gains))
 
     def describe(self) -> str:
-        """Say how large and how fast it is."""
-        return f"the reading hums with {self.amplitude * 1e9:.3g} nm at {self.frequency:.4g} Hz"
+        """Describe amplitude and frequency."""
+        return f"the measured displacement contains hum of {self.amplitude * 1e9:.3g} nm at {self.frequency:.4g} Hz"
 
     def streaming(self) -> None:
-        """Return None: its phase belongs to the record's clock."""
+        """Return None: the phase refers to the record's clock, so that hum cannot be predicted in operation."""
         return

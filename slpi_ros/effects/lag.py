@@ -1,4 +1,4 @@
-"""Lag of the amplifier: the piezo's voltage follows the command with a time constant."""
+"""Lag of the amplifier: first-order response of the piezo voltage to the command."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,8 +21,8 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.filters import Hold, Uniform, hold
 
-# The exact inverse of the first-order hold lets the command alternate from sample to sample after every turn. Taking
-# this share of the old input's weight for the new one's damps that to a third with each sample; ramps stay exact.
+# The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
+# of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
 DAMPING = 1 / 8
 
 
@@ -32,8 +32,8 @@ class Lag:
 
     Parameters
     ----------
-    time_constant : float, seconds
-    uncertainty : mapping of str to float
+    time_constant : float, seconds, ``tau``
+    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "lag"
@@ -44,12 +44,12 @@ class Lag:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what is no lag."""
+        """Validate the parameters."""
         require(self, ("time_constant", 0 < self.time_constant <= 1e4, "more than 0 s, at most 10000 s"))
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the lagged voltage, shape (N,), volts; exact where the command is linear between samples."""
+        """Return the lagged voltage, shape (N,), volts; exact if the command is linear between samples."""
         grid = Uniform.over(around.t)
         now, before, kept = hold(grid.dt, self.time_constant)
         return grid.off(_filter(np.array([now, before]), np.array([1.0, -kept]), grid.on(signal)))
@@ -61,13 +61,13 @@ class Lag:
             return signal.copy()
         real = hold(grid.dt, self.time_constant)
         now, before, kept = _damped(real)
-        # The law of the follower, which looks at the voltage really reached, as one filter.
+        # The update law of `StreamingLag.inverse`, which uses the voltage actually reached, as one filter.
         law = np.convolve([now, before], [1.0, -kept]) + kept * np.array([0.0, real.now, real.before])
         return grid.off(_filter(np.array([1.0, -kept, 0.0]), law, grid.on(signal)))
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield lags of a part of a sample and of many."""
+        """Yield lags from a fraction of a sampling interval to many."""
         for samples in (0.5, 2.0, 8.0, 32.0):
             tau = samples * usual_step(left.t)
             column = left.respond(cls(tau).apply(left.u, left.around)) - left.h
@@ -78,16 +78,16 @@ class Lag:
         return cls(tau * float(gains[0])) if gains[0] > 0 else None
 
     def describe(self) -> str:
-        """Say how slow it is."""
+        """Describe the time constant."""
         return f"the piezo's voltage lags behind the command with a time constant of {self.time_constant * 1e3:.3g} ms"
 
     def streaming(self) -> "StreamingLag":
-        """Return the lag sample by sample."""
+        """Return the streaming lag."""
         return StreamingLag(self.time_constant)
 
 
 class StreamingLag:
-    """A lag sample by sample."""
+    """Streaming (sample by sample) first-order lag."""
 
     def __init__(self, time_constant: float) -> None:
         self._time_constant = time_constant
@@ -95,29 +95,29 @@ class StreamingLag:
         self._dt, self._hold = 0.0, hold(0.0, time_constant)
 
     def start(self, x: float) -> None:
-        """Be at rest at `x` (V)."""
+        """Initialise to equilibrium at `x` (V)."""
         self._input = self._output = x
 
     def forward(self, dt: float, x: float) -> float:
-        """Move to the command `x` (V), `dt` (s) later; return the lagged voltage (V)."""
+        """Advance by `dt` (s) to the command `x` (V) and return the lagged voltage (V)."""
         now, before, kept = self._over(dt)
         self._output = now * x + before * self._input + kept * self._output
         self._input = x
         return self._output
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the command (V) for a lagged voltage (V); where no time passes, that voltage itself."""
+        """Return the command (V) for the lagged voltage `wanted` (V); for ``dt = 0`` return `wanted`."""
         if dt <= 0.0:
             return wanted
         now, before, kept = _damped(self._over(dt))
         return (wanted - kept * self._output - before * self._input) / now
 
     def snapshot(self) -> tuple[float, float]:
-        """Return command and lagged voltage."""
+        """Return command and lagged voltage (V)."""
         return self._input, self._output
 
     def restore(self, state: tuple[float, float]) -> None:
-        """Take over a state from `snapshot`."""
+        """Replace the state by one returned by `snapshot`."""
         self._input, self._output = state
 
     def _over(self, dt: float) -> Hold:
@@ -132,6 +132,6 @@ def _damped(real: Hold) -> Hold:
 
 
 def _filter(numerator: FloatArray, denominator: FloatArray, signal: FloatArray) -> FloatArray:
-    """Filter a signal, shape (N,), that was at rest before; the filter leaves what rests as it is."""
+    """Filter a signal, shape (N,), that was constant before its start; a constant signal is unchanged."""
     start = signal[:1]
     return np.asarray(start + lfilter(numerator, denominator, signal - start), dtype=np.float64)

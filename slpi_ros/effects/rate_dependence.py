@@ -1,7 +1,7 @@
-"""Rate dependence: loops widen as the drive gets faster, more than a linear filter makes them.
+"""Rate dependence: loops that widen with the rate by more than a linear filter explains.
 
-It has two forms. What is lost to friction shows on the displacement: loops wider about their middle, and a backlash.
-Where the thresholds themselves grow, the hysteresis sees the voltage through a play (see `coercivity`).
+There are two forms: a loss on the displacement (wider loops and a backlash), and growing thresholds, for which the
+hysteresis receives the voltage through a play operator (see `coercivity`).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,27 +29,27 @@ from slpi_ros.hysteresis.reversals import monotone_runs
 
 CoercivityState = tuple[float, float, float, float]
 
-# The reversible part is nearly linear over a coercivity: so many chords lead to where it has a value.
+# Number of secant steps for inverting the reversible part, which is nearly linear over a coercivity.
 CHORDS = 8
-# A command at the end of the play, to rounding, is not inside.
+# Tolerance for a command at the end of the play, for rounding.
 INSIDE = 1 - 1e-9
 
 
 def reversible(v: FloatArray, gains: Sequence[float]) -> FloatArray:
-    """Return the reversible part, shape (N,), metres, at voltages, shape (N,), volts."""
+    """Return the reversible displacement, shape (N,), metres, at voltages `v`, shape (N,), volts."""
     return np.asarray(np.polynomial.polynomial.polyval(v, [0.0, *gains]), dtype=np.float64)
 
 
 class StreamingCoercivity:
-    """The play sample by sample.
+    """Streaming (sample by sample) play operator with rate-dependent half-width.
 
-    The command for a desired displacement depends on its own rate: taken from the commands, that would run away. The
-    inverse takes the rate from the voltage that comes out; where that rests, from a command inside the play.
+    The inverse takes the rate from the voltage at the hysteresis, or from the command if that voltage rests; with the
+    rate of the commands alone, the recursion would be unstable.
 
     Parameters
     ----------
     half_width : callable
-        Of the play, volts, at a rate, V/s.
+        Half-width of the play (V) as a function of the rate (V/s).
     settling, reversible
         As in `RateDependence`.
     """
@@ -59,12 +59,12 @@ class StreamingCoercivity:
         self.start(0.0)
 
     def start(self, x: float) -> None:
-        """Be at rest at `x` (V)."""
+        """Initialise to equilibrium at `x` (V)."""
         self._v = self._u = x
         self._rate = self._rate_out = 0.0
 
     def forward(self, dt: float, x: float) -> float:
-        """Move to the command `x` (V), `dt` (s) later; return the voltage (V) that the hysteresis sees."""
+        """Advance by `dt` (s) to the command `x` (V) and return the voltage (V) at the hysteresis."""
         way, before = x - self._v, self._u
         self._rate = self._settled(dt, self._rate, way)
         half_width = self._half_width(self._rate)
@@ -75,18 +75,18 @@ class StreamingCoercivity:
         return self._u
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the command (V) for a voltage (V) at the hysteresis."""
+        """Return the command (V) for the voltage `wanted` (V) at the hysteresis."""
         way = wanted - self._u
         return self.ahead(wanted, copysign(1.0, way)) if way else self._v
 
     def ahead(self, u: float, direction: float) -> float:
-        """Return the command (V) that moves the hysteresis on at `u` (V), in a direction, -1 or 1."""
+        """Return the command (V) at which the hysteresis moves on from `u` (V) in `direction`, -1 or 1."""
         return u + direction * self._half_width(self._rate_out)
 
     def within(self, reversible_bypass: float) -> tuple[float | None, float]:
-        """Return the command (V) that leads a displacement (m) round the resting hysteresis; None: that must move.
+        """Return the command (V) for a reversible displacement (m), hysteresis at rest; None if beyond the play.
 
-        The other number is the direction of the command from the middle of the play, -1 or 1.
+        The second value is the direction of the command from the middle of the play, -1 or 1.
         """
         low, high = (self.between(self.ahead(self._u, side), self._u) for side in (-1.0, 1.0))
         direction = 1.0 if reversible_bypass > 0.5 * (low + high) else -1.0
@@ -99,19 +99,19 @@ class StreamingCoercivity:
 
     @property
     def reversible_bypass(self) -> float:
-        """Displacement (m) that goes round the hysteresis."""
+        """Reversible displacement (m) in parallel with the hysteresis."""
         return self.between(self._v, self._u)
 
     def between(self, v: float, u: float) -> float:
-        """Return what goes round the hysteresis (m) at a command `v` (V) where that sees `u` (V)."""
+        """Return the reversible displacement (m) at a command `v` (V) if the hysteresis is at `u` (V)."""
         return sum(gain * (v**power - u**power) for power, gain in enumerate(self._reversible, start=1))
 
     def snapshot(self) -> CoercivityState:
-        """Return both voltages and their rates."""
+        """Return command and hysteresis voltage (V) and their rates (V/s)."""
         return self._v, self._u, self._rate, self._rate_out
 
     def restore(self, state: CoercivityState) -> None:
-        """Take over a state from `snapshot`."""
+        """Replace the state by one returned by `snapshot`."""
         self._v, self._u, self._rate, self._rate_out = state
 
     def _settled(self, dt: float, before: float, way: float) -> float:
@@ -121,19 +121,19 @@ class StreamingCoercivity:
         return rate + (before - rate) * (exp(-dt / self._settling) if self._settling else 0.0)
 
 
-# Share of the latest rate in the smoothed one.
+# Weight of the latest rate in the exponential average.
 SMOOTHING = 0.5
-# Time over which rates of voltage and displacement are compared, seconds.
+# Averaging time for comparing the rates of voltage and displacement, seconds.
 COMPARISON = 0.02
 
 RateState = tuple[float | None, float, float, float | None, float, float, float]
 
 
 class StreamingRateDependence:
-    """Rate dependence sample by sample; it looks at the voltage too.
+    """Streaming (sample by sample) rate dependence on the displacement, which also uses the voltage.
 
-    The voltage for a desired displacement depends on its own rate: taken from the voltages, that would run away. The
-    inverse therefore takes the rate from the desired displacements, and only slowly learns how the two compare.
+    The inverse takes the rate from the desired displacements, with a slowly updated ratio of voltage to displacement;
+    with the rate of its own voltages, the recursion would be unstable.
 
     Parameters
     ----------
@@ -150,18 +150,18 @@ class StreamingRateDependence:
         self.start(0.0)
 
     def attach(self, middle: Callable[[float], float]) -> None:
-        """Tell where the middle of the largest loop is: displacement (m) at a voltage (V)."""
+        """Set the function that maps voltage (V) to the mid-line of the largest loop (m)."""
         self._middle = middle
 
     def start(self, x: float) -> None:
-        """Be at rest at `x` (m); the next voltage is the one it rests at."""
+        """Initialise to equilibrium at `x` (m); the next voltage is taken as the rest voltage."""
         self._u: float | None = None
         self._rate = self._direction = self._desired_rate = self._volts = self._metres = 0.0
         self._desired: float | None = x
         self._asked: float | None = None
 
     def drive(self, dt: float, u: float) -> None:
-        """Note the voltage `u` (V), `dt` (s) after the last one."""
+        """Record the voltage `u` (V), applied `dt` (s) after the previous one."""
         way = 0.0 if self._u is None else u - self._u
         if dt > 0.0:
             self._rate += SMOOTHING * (way / dt - self._rate)
@@ -172,14 +172,14 @@ class StreamingRateDependence:
         self._u = u
 
     def forward(self, dt: float, x: float) -> float:
-        """Return the displacement (m) of the wider loops for one of the loops at rest (m)."""
+        """Return the displacement (m) of the widened loops for a displacement `x` (m) of the quasi-static loops."""
         if self._u is None or not self._rate:
             return x
         behind = self._backlash * self._direction
         return x + self._speed(self._rate) * (self._widening * (x - self._middle(self._u)) - behind)
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the displacement (m) of the loops at rest for one of the wider loops (m)."""
+        """Return the displacement (m) of the quasi-static loops for one of the widened loops, `wanted` (m)."""
         self._asked = wanted
         if self._u is None or self._desired is None or dt <= 0.0:
             return wanted
@@ -191,16 +191,16 @@ class StreamingRateDependence:
         return back / (1 + speed * self._widening)
 
     def snapshot(self) -> RateState:
-        """Return voltage, rate, direction, and what is known of the desired displacements."""
+        """Return voltage, rate, direction, and the history of the desired displacements."""
         return self._u, self._rate, self._direction, self._desired, self._desired_rate, self._volts, self._metres
 
     def restore(self, state: RateState) -> None:
-        """Take over a state from `snapshot`."""
+        """Replace the state by one returned by `snapshot`."""
         self._u, self._rate, self._direction, self._desired, self._desired_rate, self._volts, self._metres = state
         self._asked = None
 
     def _turned(self, way: float) -> float:
-        """Return the direction after a way (V)."""
+        """Return the direction (-1 to 1) after a voltage change `way` (V)."""
         if not way:
             return self._direction
         toward = copysign(1.0, way)
@@ -210,7 +210,7 @@ class StreamingRateDependence:
         return float((abs(rate) / self._reference_rate) ** self._exponent)
 
     def _compare(self, dt: float, way: float) -> None:
-        """Note the last desired displacement, and how its rate compares with that of the voltage."""
+        """Record the last desired displacement and update the ratio of its rate to that of the voltage."""
         if self._asked is None or self._desired is None:
             self._desired_rate = 0.0
             return
@@ -221,55 +221,55 @@ class StreamingRateDependence:
         self._metres = kept * self._metres + abs(went)
 
     def _volts_per_metre(self) -> float:
-        """Return by how many volts the voltage goes on for each metre: as in the middle of the loop, and as of late."""
+        """Return the voltage per metre of displacement, from the middle of the loop and from recent samples."""
         u = self._u or 0.0
         slope = 1 / max((self._middle(u + 1.0) - self._middle(u - 1.0)) / 2, 1e-15)
         seen = self._volts / self._metres if self._metres > 0.0 else slope
         return min(max(seen, slope / 3), 3 * slope)
 
 
-# Powers, and ways as shares of the voltage range, that are looked for.
+# Exponents, and transition lengths as shares of the voltage range, of the candidates.
 EXPONENTS, TRANSITIONS = (0.2, 0.5, 0.8), (0.01, 0.04, 0.12)
 
-# Where thresholds grow, the search goes on from one law, with little and much coercivity (share of the voltage range).
+# Coercivities (share of the voltage range) at which the search for growing thresholds starts.
 COERCIVE_EXPONENT, COERCIVE_ONSET, SETTLING, COERCIVITIES = 0.3, 0.1, 2e-3, (0.02, 0.06)
-# Gains of the reversible part.
+# Number of gains of the reversible part.
 POWERS, MOST_POWERS = 3, 6
 
-# Samples over which the rate is smoothed where the whole path is known.
+# Number of samples over which the rate is smoothed in batch evaluation.
 WINDOW = 7
 
 
 @dataclass(frozen=True)
 class RateDependence:
-    """``y = h + (|du/dt| / r)^e (widening (h - m(u)) - backlash z)``, or a coercivity ``c (|dv/dt| / r)^e``.
+    """Either ``y = h + (|du/dt| / r)^e (widening (h - m(u)) - backlash z)``, or a coercivity ``c (|dv/dt| / r)^e``.
 
-    In the first form ``m`` is the middle of the largest loop, and ``z`` the direction of the voltage ``u``, -1 to
-    1: after a turn it comes round with the way, ``dz = (sign(du) - z) |du| / transition``. In the second form the
-    hysteresis sees ``u = play(v)`` of half-width ``c (s / r)^e``, where ``s`` follows ``|dv/dt|``, and the reversible
-    part ``R(v) - R(u)``, ``R(v) = g1 v + g2 v^2 + ..``, goes round it. An instance is of one form.
+    In the first form ``m`` is the mid-line of the largest loop, and ``z`` the direction of ``u``, from -1 to 1, with
+    ``dz = (sign(du) - z) |du| / transition``. In the second form the voltage of the hysteresis is ``u = play(v)`` with
+    half-width ``c (s / r)^e``, where ``s`` is the low-pass filtered ``|dv/dt|``; the reversible part ``R(v) - R(u)``,
+    ``R(v) = g1 v + g2 v^2 + ..``, acts in parallel. An instance has one form.
 
     Parameters
     ----------
     widening : float
-        How much wider the loops are at the reference rate.
+        Relative widening of the loops at the reference rate.
     backlash : float, metres
-        By how much the stage stays behind at the reference rate.
+        Displacement lost behind the direction of motion at the reference rate.
     exponent : float
-        ``e``.
+        Exponent ``e`` of the rate.
     reference_rate : float, V/s
-        ``r``.
+        Reference rate ``r``.
     transition : float, volts
-        Way after a turn within which the direction comes round, to 1/e; of the first form.
+        Voltage change after a reversal in which the direction changes, to 1/e; first form only.
     coercivity : float, volts
-        ``c``; 0 for the first form.
+        Coercivity ``c`` at the reference rate; 0 selects the first form.
     onset : float, V/s
-        The coercivity grows as ``(1 + s / onset)^e - 1``: with a small exponent, as a logarithm. 0: as ``s^e``.
+        Rate above which the coercivity follows ``(1 + s / onset)^e - 1``, nearly logarithmic; 0 selects ``s^e``.
     settling : float, seconds
-        Time constant with which the coercivity gets used to another rate.
+        Time constant of the rate filter for the coercivity.
     reversible : tuple of float, m/V, m/V^2, ..
-        Gains of the part that the coercivity does not hold back.
-    uncertainty : mapping of str to float
+        Gains of the reversible part, which the coercivity does not affect.
+    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "rate_dependence"
@@ -287,7 +287,7 @@ class RateDependence:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be undone."""
+        """Validate the parameters, including invertibility."""
         require(
             self,
             ("widening", 0 <= self.widening <= 10, "from 0 to 10"),
@@ -304,12 +304,12 @@ class RateDependence:
 
     @property
     def side(self) -> Side:
-        """Where it acts: on the voltage where thresholds grow."""
+        """Signal on which the effect acts: the voltage for growing thresholds, else the displacement."""
         return "voltage" if self.coercivity else "displacement"
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement of the wider loops, shape (N,), metres; or the voltage at the hysteresis, volts."""
+        """Return the displacement of the widened loops, shape (N,), metres, or the voltage at the hysteresis, volts."""
         if self.coercivity:
             from slpi_ros.effects.coercivity_path import play, settled_rate
 
@@ -318,9 +318,9 @@ class RateDependence:
         return signal + speed * (self.widening * (signal - middle) - self.backlash * direction)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement of the loops at rest, shape (N,), metres, for the voltage that drives them.
+        """Return the displacement of the quasi-static loops, shape (N,), metres, given the voltage in `around`.
 
-        Or the command, shape (N,), volts, for the voltage at the hysteresis, whose rate is taken for its own.
+        In the coercivity form return the command, shape (N,), volts, using the rate of the voltage at the hysteresis.
         """
         if self.coercivity:
             from slpi_ros.effects.coercivity_path import settled_rate
@@ -332,12 +332,12 @@ class RateDependence:
         return np.asarray(back / (1 + speed * self.widening), dtype=np.float64)
 
     def reversible_bypass(self, v: FloatArray, u: FloatArray) -> FloatArray:
-        """Return what goes round the hysteresis, shape (N,), metres, at commands `v` where that sees `u`, volts."""
+        """Return the reversible displacement, shape (N,), m, at commands `v` and hysteresis voltages `u`, volts."""
         return reversible(v, self.reversible) - reversible(u, self.reversible)
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield several powers of the rate: on the displacement with quick and slow turns, and as coercivity."""
+        """Yield candidates with several exponents: losses with short and long transitions, and coercivities."""
         reference = float(np.sqrt(np.mean(np.gradient(left.u, left.t) ** 2)))
         yield from cls._losing(left, reference)
         yield from cls._coercive(left, reference)
@@ -373,7 +373,7 @@ class RateDependence:
         return replace(one, widening=wider, backlash=behind * one.backlash) if gains.max() > 0 else None
 
     def describe(self) -> str:
-        """Say how much at which rate."""
+        """Describe the magnitude at the reference rate and the dependence on the rate."""
         if self.coercivity:
             return (
                 f"at {self.reference_rate:.3g} V/s the coercivity is {self.coercivity:.3g} V larger than at rest, "
@@ -392,7 +392,7 @@ class RateDependence:
         return f"as the power {self.exponent:.2g} of 1 + rate / {self.onset:.3g} V/s, nearly their logarithm"
 
     def streaming(self) -> StreamingRateDependence | StreamingCoercivity:
-        """Return the effect sample by sample."""
+        """Return the streaming rate dependence."""
         if self.coercivity:
             return StreamingCoercivity(self._growth, self.settling, self.reversible)
         return StreamingRateDependence(
@@ -400,7 +400,7 @@ class RateDependence:
         )
 
     def _drive(self, around: EffectContext) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the loop's middle (m), the speed to the power and the direction, shape (N,) each."""
+        """Return the mid-line (m), the rate to the power ``e``, and the direction, shape (N,) each."""
         if around.u is None or around.middle is None:
             raise ModelError("effect 'rate_dependence' needs the voltage that drives the hysteresis, and its loop")
         return around.middle(around.u), self._speed(around.t, around.u), self._direction(around.u)

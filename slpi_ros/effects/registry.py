@@ -1,4 +1,4 @@
-"""The effects by name: how each is written in a document and read back."""
+"""Registry of the effects by name, and their conversion to and from documents."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields
@@ -19,7 +19,7 @@ from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.thermal_drift import ThermalDrift
 from slpi_ros.errors import ModelError
 
-# In the order in which they act.
+# Listed in the order in which the effects act.
 EFFECTS: dict[str, type[Any]] = {
     kind.name: kind
     for kind in (
@@ -36,7 +36,7 @@ def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     Raises
     ------
     ModelError
-        If one comes twice.
+        If an effect occurs twice.
     """
     ordered = tuple(sorted(effects, key=lambda effect: _PLACE[effect.name]))
     for one, other in zip(ordered, ordered[1:], strict=False):
@@ -46,7 +46,7 @@ def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
 
 
 def to_document(effect: Effect) -> dict[str, Any]:
-    """Return an effect as it stands in a document: JSON, SI units."""
+    """Return an effect as a JSON document in SI units."""
     return {
         "name": effect.name,
         "parameters": {name: _plain(value) for name, value in parameters_of(effect).items()},
@@ -60,7 +60,7 @@ def from_document(document: Any) -> Effect:
     Raises
     ------
     ModelError
-        If there is no such effect, or its parameters make no sense.
+        If the effect is unknown or its parameters are invalid.
     """
     name = _member(document, "name")
     if not isinstance(name, str) or name not in EFFECTS:
@@ -89,7 +89,7 @@ def _plain(value: Any) -> Any:
 
 
 def _read(effect: str, item: Any, value: Any) -> Any:
-    """Read one parameter as what its field holds: a number, several of them, or some by name."""
+    """Convert one parameter to the type of its field: a number, a tuple of numbers, or a mapping of numbers."""
     holds = get_origin(item.type) or item.type
     if holds is tuple:
         if not isinstance(value, list | tuple):

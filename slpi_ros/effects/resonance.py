@@ -1,4 +1,4 @@
-"""Resonance: a lightly damped flexure mode that rings after every turn."""
+"""Resonance: a lightly damped flexure mode that is excited by every reversal."""
 
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -24,20 +24,20 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.filters import Mode, Uniform
 
-# Taps are so far apart at least, times 1 / w: nearer ones would only be larger.
+# Smallest tap spacing, times 1 / w; smaller spacings give larger taps without benefit.
 SPACING = 0.5
-# Farther apart than this, times 1 / w, they would no longer see the ringing.
+# Largest tap spacing, times 1 / w; larger spacings cannot cancel the oscillation.
 WIDEST = 3.0
 
 
 @dataclass(frozen=True)
 class Unringing:
-    """The input that a mode needs is ``sum_k taps[k] y(t + preview - k spacing)``.
+    """Finite-impulse-response inverse of a mode, ``sum_k taps[k] y(t + preview - k spacing)``.
 
     Parameters
     ----------
     taps : tuple of float
-        Their sum is 1. Zeros on the mode's poles, and one more that takes the remaining delay away.
+        Taps with sum 1: zeros at the poles of the mode, and one more that compensates the remaining delay.
     spacing : float, seconds
     """
 
@@ -51,7 +51,7 @@ class Unringing:
 
     @classmethod
     def of(cls, mode: Mode, spacing: float, preview: float = 0.0) -> "Unringing":
-        """Return the taps for a spacing (s), where the desired displacement is known a `preview` (s) ahead."""
+        """Return the taps for a spacing (s), if the desired displacement is known a `preview` (s) in advance."""
         zeros = (1.0, 0.0, 0.0)
         if spacing * mode.omega < WIDEST:
             total, product = mode.ringing(spacing)
@@ -65,7 +65,7 @@ class Unringing:
 
 
 class StreamingResonance:
-    """A mode sample by sample."""
+    """Streaming (sample by sample) second-order mode."""
 
     def __init__(self, mode: Mode) -> None:
         self._mode = mode
@@ -74,16 +74,16 @@ class StreamingResonance:
         self.start(0.0)
 
     def start(self, x: float) -> None:
-        """Be at rest at `x` (m)."""
+        """Initialise to equilibrium at `x` (m)."""
         self._input = self._position = x
         self._velocity = 0.0
         self._asked: float | None = None
-        # Age (s) and value (m) of the desired displacements so far, the latest last; before the oldest it was at rest.
+        # Age (s) and value (m) of the stored desired displacements, newest last; constant before the oldest.
         self._desired: deque[tuple[float, float]] = deque([(0.0, x)])
         self._now = 0.0
 
     def forward(self, dt: float, x: float) -> float:
-        """Move to the input `x` (m), `dt` (s) later; return where the stage is (m)."""
+        """Advance by `dt` (s) to the input `x` (m) and return the position of the stage (m)."""
         if dt > 0.0:
             if dt != self._dt:
                 self._dt, self._free = dt, self._mode.free(dt)
@@ -98,14 +98,14 @@ class StreamingResonance:
         return self._position
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the input (m) for a wanted place (m)."""
+        """Return the input (m) for the desired position `wanted` (m)."""
         self._asked = wanted
         if max(dt, self._shortest.spacing) != self._unringing.spacing:
             self._unringing = Unringing.of(self._mode, dt) if dt > self._shortest.spacing else self._shortest
         taps, spacing = self._unringing.taps, self._unringing.spacing
         later, value, at = self._now + dt, wanted, self._now + dt - spacing
         needed, k = taps[0] * wanted, 1
-        # From the latest one to the oldest; between them they are taken as linear.
+        # From the newest sample to the oldest, with linear interpolation.
         for earlier, before in reversed(self._desired):
             while at >= earlier:
                 share = (at - earlier) / (later - earlier) if later > earlier else 0.0
@@ -123,14 +123,14 @@ class StreamingResonance:
         return self._input, self._position, self._velocity, ages, tuple(y for _, y in self._desired)
 
     def restore(self, state: tuple[float | tuple[float, ...], ...]) -> None:
-        """Take over a state from `snapshot`."""
+        """Replace the state by one returned by `snapshot`."""
         self._input, self._position, self._velocity, ages, desired = state  # type: ignore[assignment]
         self._now = 0.0
         self._desired = deque((-age, y) for age, y in zip(ages, desired, strict=True))  # type: ignore[arg-type]
         self._asked = None
 
     def _remember(self, dt: float) -> None:
-        """Keep the last desired displacement as long as a tap needs it; the position where none was given."""
+        """Store the last desired displacement, or the position if none was given, as long as a tap requires it."""
         self._now += dt
         desired = self._desired
         if dt <= 0.0:
@@ -142,7 +142,7 @@ class StreamingResonance:
             desired.popleft()
 
 
-# Modes that are looked for: from this frequency (Hz) to this share of the sampling rate, at so many lines.
+# Modes of the candidates: lowest frequency (Hz), highest as share of the sampling rate, number of spectral peaks.
 LOWEST, HIGHEST, LINES = 10.0, 0.45, 4
 DAMPINGS = (0.02, 0.08)
 
@@ -151,16 +151,16 @@ DAMPINGS = (0.02, 0.08)
 class Resonance:
     """A second-order mode, ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``.
 
-    The exact inverse of the sampled mode is unstable. This one places zeros on the mode's poles, which ends the ringing
-    after every turn, follows ramps without error, and is a sum of a few earlier desired displacements: bounded.
+    The exact inverse of the sampled mode is unstable. This inverse has zeros at the poles of the mode, which cancels
+    the oscillation after reversals; it follows ramps without error and is bounded, as a finite sum of past setpoints.
 
     Parameters
     ----------
     frequency : float, hertz
-        Undamped.
+        Undamped natural frequency.
     damping : float
         Damping ratio ``z``, from above 0 to below 1.
-    uncertainty : mapping of str to float
+    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "resonance"
@@ -172,7 +172,7 @@ class Resonance:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what is no mode."""
+        """Validate the parameters."""
         require(
             self,
             ("frequency", 1e-3 <= self.frequency <= 1e7, "from 0.001 to 1e7 Hz"),
@@ -181,7 +181,7 @@ class Resonance:
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement with ringing, shape (N,), metres; exact where the input is linear between samples."""
+        """Return the displacement with the resonance, shape (N,), metres; exact for an input linear between samples."""
         grid = Uniform.over(around.t)
         if not grid.dt:
             return np.full_like(signal, signal[0]) if signal.size else signal.copy()
@@ -190,7 +190,7 @@ class Resonance:
         return grid.off(moved[0] + lfilter(numerator, denominator, moved - moved[0]))
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement that rings to the given one, shape (N,), metres."""
+        """Return the input of the mode, shape (N,), metres, for the displacement `signal`, shape (N,), metres."""
         grid = Uniform.over(around.t)
         if not grid.dt:
             return signal.copy()
@@ -198,14 +198,14 @@ class Resonance:
         taps = Unringing.of(self.mode, between * grid.dt, preview=between * grid.dt).taps
         desired, left = grid.on(signal), (len(taps) - 2) * between
         padded = np.pad(desired, (left, 0), mode="edge")
-        # The path goes on at its end as it came.
+        # The path is extrapolated by reflection at its end.
         padded = np.pad(padded, (0, between), mode="reflect", reflect_type="odd")
         parts = (tap * padded[left + (1 - k) * between :][: desired.size] for k, tap in enumerate(taps))
         return grid.off(sum(parts, np.zeros_like(desired)))
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield modes where the spectrum of what is left has lines, and all over it."""
+        """Yield modes at the strongest frequencies of the residual, and on a logarithmic grid."""
         highest = HIGHEST / usual_step(left.t)
         found = [frequency for frequency in rhythms(left, LINES, LOWEST) if frequency < highest]
         for frequency in (*found, *np.geomspace(min(2 * LOWEST, highest), highest, 10).tolist()):
@@ -219,14 +219,14 @@ class Resonance:
         return mode if gains[0] > 0 else None
 
     def describe(self) -> str:
-        """Say where it rings."""
-        return f"the stage rings at {self.frequency:.4g} Hz after turns, with a damping ratio of {self.damping:.3g}"
+        """Describe frequency and damping."""
+        return f"the stage rings at {self.frequency:.4g} Hz after reversals, with a damping ratio of {self.damping:.3g}"
 
     def streaming(self) -> StreamingResonance:
-        """Return the mode sample by sample."""
+        """Return the streaming mode."""
         return StreamingResonance(self.mode)
 
     @property
     def mode(self) -> Mode:
-        """The mode as equations of motion."""
+        """The mode as a differential equation."""
         return Mode(2 * pi * self.frequency, self.damping)

@@ -1,4 +1,4 @@
-"""Saturation: the amplifier clips below what it is commanded."""
+"""Saturation: the amplifier output is limited to a voltage range."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from slpi_ros.effects.base import EffectContext, FloatArray, Removable, ResidualView, Side, require_rules
 
-# Voltages are sorted into so many bins; the stage stands still where it moves by less than this share of the usual.
+# Number of voltage bins; a bin is clipped if its gain is below this share of the median gain.
 BINS, STILL = 200, 0.35
 
 
 @dataclass(frozen=True)
 class Saturation:
-    """The voltage at the piezo never leaves a range.
+    """Limits of the voltage at the piezo.
 
     Parameters
     ----------
     lower, upper : float, volts
-        Infinite where there is no limit.
-    uncertainty : mapping of str to float
+        Limits; infinite (the default) for no limit.
+    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "saturation"
@@ -34,7 +34,7 @@ class Saturation:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse a range without voltages."""
+        """Validate the parameters."""
         require_rules(
             self,
             ("lower", not isnan(self.lower) and self.lower < inf, "a voltage, or -inf for none"),
@@ -42,16 +42,16 @@ class Saturation:
         )
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the voltage, shape (N,), volts, within the range."""
+        """Return the voltage, shape (N,), volts, clipped to the limits."""
         return np.clip(signal, self.lower, self.upper)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the voltage, shape (N,), volts, within the range: more is not to be had."""
+        """Return the voltage, shape (N,), volts, clipped to the limits; a clipped voltage cannot be recovered."""
         return np.clip(signal, self.lower, self.upper)
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator["Saturation"]:
-        """Yield limits where the displacement stands still although the voltage goes on."""
+        """Yield limits at which the displacement remains constant while the voltage changes."""
         low, width = float(left.u.min()), float(np.ptp(left.u)) / BINS
         middle, dv, dy = outward_steps(left.u, left.y, left.used)
         place = np.clip(((middle - low) / width).astype(np.int64), 0, BINS - 1)
@@ -66,28 +66,28 @@ class Saturation:
                 yield cls(lower + shift * width, upper - shift * width)
 
     def describe(self) -> str:
-        """Say where it clips."""
+        """Describe the limits."""
         below, above = f"below {self.lower:.4g} V", f"above {self.upper:.4g} V"
         where = [text for text, limit in ((below, self.lower), (above, self.upper)) if not isinf(limit)]
         return f"the amplifier clips {' and '.join(where) or 'nowhere'}"
 
     def streaming(self) -> "StreamingSaturation":
-        """Return the limits sample by sample."""
+        """Return the streaming limits."""
         return StreamingSaturation(self.lower, self.upper)
 
 
 def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return steps away from the middle of the voltage's range: a stage that is clipped stands still there.
+    """Return the steps away from the middle of the voltage range; with a clipped amplifier these have no displacement.
 
     Returns
     -------
     middle, dv : ndarray, shape (M,), volts
-        Where each step is, and how far it goes.
+        Mean voltage and size of each step.
     dy : ndarray, shape (M,), metres
-        How far the stage goes.
+        Displacement of each step.
     """
     low, high = float(v.min()), float(v.max())
-    # Steps over a few samples stand out of the noise.
+    # Steps over several samples improve the signal-to-noise ratio.
     every = max(1, round((high - low) / BINS / 4 / max(float(np.mean(np.abs(np.diff(v)))), 1e-12)))
     middle, dv, dy = 0.5 * (v[every:] + v[:-every]), v[every:] - v[:-every], y[every:] - y[:-every]
     outward = (dv > 0) == (middle > 0.5 * (low + high))
@@ -96,25 +96,25 @@ def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tupl
 
 
 class StreamingSaturation:
-    """Limits sample by sample; there is nothing to remember."""
+    """Streaming (sample by sample) limits, without state."""
 
     def __init__(self, lower: float, upper: float) -> None:
         self.lower, self.upper = lower, upper
 
     def start(self, x: float) -> None:
-        """Be at rest at `x` (V)."""
+        """Do nothing: the effect has no state."""
 
     def forward(self, dt: float, x: float) -> float:
-        """Return the voltage (V) within the range."""
+        """Return the voltage (V) clipped to the limits."""
         return min(max(x, self.lower), self.upper)
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the voltage (V) within the range."""
+        """Return the voltage (V) clipped to the limits."""
         return min(max(wanted, self.lower), self.upper)
 
     def snapshot(self) -> tuple[()]:
-        """Return nothing."""
+        """Return an empty state."""
         return ()
 
     def restore(self, state: tuple[()]) -> None:
-        """Take over nothing."""
+        """Do nothing: the effect has no state."""

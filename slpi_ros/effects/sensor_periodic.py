@@ -1,4 +1,4 @@
-"""Periodic error of the sensor: an interferometer's nonlinearity."""
+"""Periodic error of the sensor, such as the nonlinearity of an interferometer."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,26 +21,26 @@ from slpi_ros.effects.base import (
     wave,
 )
 
-# Periods (m) that are looked for, so many of them, in so many bins of displacement.
+# Shortest and longest period (m), number of spectral peaks, and number of displacement bins of the candidates.
 SHORTEST, LONGEST, LINES, BINS = 50e-9, 2e-6, 4, 2**14
 
-# Newton's method squares the error with each step, once it is small.
+# Newton's method converges quadratically once the error is small.
 _STEPS = 60
 _CLOSE = 1e-12
 
 
 @dataclass(frozen=True)
 class SensorPeriodic:
-    """What the sensor adds as the stage moves, ``y = x + amplitude sin(2 pi x / period + phase)``.
+    """Periodic sensor error, ``y = x + amplitude sin(2 pi x / period + phase)``.
 
     Parameters
     ----------
     period : float, metres
-        Half or a quarter of the wavelength.
+        Period in displacement; half or a quarter of the wavelength for an interferometer.
     amplitude : float, metres
-        Less than ``period / 2 pi``, so that readings rise with the displacement.
-    phase : float, radians
-    uncertainty : mapping of str to float
+        Less than ``period / 2 pi``, so that the reading increases with the displacement.
+    phase : float, radians, at displacement 0
+    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "sensor_periodic"
@@ -53,7 +53,7 @@ class SensorPeriodic:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be undone."""
+        """Validate the parameters, including invertibility."""
         require(
             self,
             ("period", 1e-12 <= self.period <= 1e3, "from 1e-12 to 1000 m"),
@@ -62,11 +62,11 @@ class SensorPeriodic:
         )
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return what the sensor reads, shape (N,), metres."""
+        """Return the sensor reading, shape (N,), metres."""
         return signal + self.amplitude * np.sin(2 * pi / self.period * signal + self.phase)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return where the stage is, shape (N,), metres, for what the sensor reads."""
+        """Return the displacement, shape (N,), metres, for the sensor reading."""
         k, amplitude, phase = 2 * pi / self.period, self.amplitude, self.phase
         low, high, x = signal - amplitude, signal + amplitude, signal.copy()
         for _ in range(_STEPS):
@@ -81,7 +81,7 @@ class SensorPeriodic:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield the strongest lines in the spectrum of what is left, as it lies over the displacement."""
+        """Yield the strongest lines of the spectrum of the residual over the displacement."""
         width = float(np.ptp(left.h)) / BINS
         place = ((left.h[left.used] - float(left.h.min())) / width).astype(np.int64)
         power = np.abs(np.fft.rfft(np.bincount(place, left.residual[left.used], 4 * BINS)[: 4 * BINS])) ** 2
@@ -93,37 +93,37 @@ class SensorPeriodic:
     @classmethod
     def _of(cls, period: float, gains: FloatArray) -> "SensorPeriodic":
         amplitude, phase = amplitude_and_phase(gains)
-        # A larger one could not be undone.
+        # A larger amplitude would not be invertible.
         return cls(period, min(amplitude, 0.9 * period / (2 * np.pi)), phase)
 
     def describe(self) -> str:
-        """Say how large it is and how often it repeats."""
+        """Describe amplitude and period."""
         return (
             f"the sensor errs by {self.amplitude * 1e9:.3g} nm, again and again with every "
             f"{self.period * 1e9:.4g} nm of displacement"
         )
 
     def streaming(self) -> "StreamingSensorError":
-        """Return the error sample by sample."""
+        """Return the streaming sensor error."""
         return StreamingSensorError(self)
 
 
 class StreamingSensorError:
-    """The error of a sensor sample by sample; there is nothing to remember."""
+    """Streaming (sample by sample) sensor error, without state."""
 
     def __init__(self, sensor: SensorPeriodic) -> None:
         self._sensor = sensor
         self._k = 2 * pi / sensor.period
 
     def start(self, x: float) -> None:
-        """Be at rest at `x` (m)."""
+        """Do nothing: the effect has no state."""
 
     def forward(self, dt: float, x: float) -> float:
-        """Return what the sensor reads (m) at `x` (m)."""
+        """Return the sensor reading (m) at the displacement `x` (m)."""
         return x + self._sensor.amplitude * sin(self._k * x + self._sensor.phase)
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return where the stage has to be (m) for a reading (m)."""
+        """Return the displacement (m) for the reading `wanted` (m)."""
         k, amplitude, phase = self._k, self._sensor.amplitude, self._sensor.phase
         low, high, x = wanted - amplitude, wanted + amplitude, wanted
         for _ in range(_STEPS):
@@ -137,8 +137,8 @@ class StreamingSensorError:
         return x
 
     def snapshot(self) -> tuple[()]:
-        """Return nothing."""
+        """Return an empty state."""
         return ()
 
     def restore(self, state: tuple[()]) -> None:
-        """Take over nothing."""
+        """Do nothing: the effect has no state."""

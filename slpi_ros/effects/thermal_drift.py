@@ -1,4 +1,4 @@
-"""Thermal drift: a slow change that does not follow the voltage."""
+"""Thermal drift: slow change of the displacement, independent of the voltage."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -9,20 +9,20 @@ import numpy as np
 
 from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 
-# Knots of the lines that may fit a record.
+# Numbers of knots of the candidates.
 KNOTS = (2, 3, 5, 8, 13)
 
 
 @dataclass(frozen=True)
 class ThermalDrift:
-    """A displacement that depends on time only, linear between knots and held beyond them.
+    """A displacement that depends on time only, linear between knots and constant outside.
 
     Parameters
     ----------
     times : tuple of float, length K >= 1, seconds
-        Knots, strictly increasing, from the record's start.
-    values : tuple of float, length K, metres
-    uncertainty : mapping of str to float
+        Knots from the record's start, strictly increasing.
+    values : tuple of float, length K, metres, displacement at the knots
+    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "thermal_drift"
@@ -34,7 +34,7 @@ class ThermalDrift:
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what is no curve."""
+        """Validate the parameters."""
         rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
         require(
             self,
@@ -54,10 +54,10 @@ class ThermalDrift:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield lines of few knots and of more."""
+        """Yield piecewise linear curves with an increasing number of knots."""
         for knots in KNOTS:
             times = np.linspace(left.t[0], left.t[-1], knots)
-            # The displacement at rest takes up a constant.
+            # A constant is part of the displacement at rest.
             hats = np.column_stack([np.interp(left.t, times, row) for row in np.eye(knots)[1:]])
             yield Candidate(hats, partial(cls._through, times))
 
@@ -66,10 +66,10 @@ class ThermalDrift:
         return cls(tuple(times.tolist()), (0.0, *gains.tolist()))
 
     def describe(self) -> str:
-        """Say how far in which time."""
+        """Describe the range and the duration."""
         way, span = max(self.values) - min(self.values), self.times[-1] - self.times[0]
-        return f"whatever the voltage, the stage drifts over {way * 1e6:.3g} um within {span:.3g} s of this record"
+        return f"whatever the voltage, the stage drifts by {way * 1e6:.3g} um within {span:.3g} s of this record"
 
     def streaming(self) -> None:
-        """Return None: it belongs to the record's clock."""
+        """Return None: drift refers to the record's clock, so that it cannot be predicted in operation."""
         return

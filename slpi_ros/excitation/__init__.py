@@ -1,1 +1,1 @@
-"""Voltages that drive a stage so that it can be identified."""
+"""Voltage signals for the identification of a stage."""

@@ -1,4 +1,4 @@
-"""The drive that identifies everything well in the least time."""
+"""The default voltage signal for the identification of hysteresis and effects."""
 
 from collections.abc import Iterator
 from itertools import cycle
@@ -7,40 +7,39 @@ import numpy as np
 
 from slpi_ros.excitation.legs import FloatArray, Path, Room
 
-# Ranges of travel per second, and how many times as fast moves are, in turn: a 100 V stage moves at 70 V/s on average
-# and at most at about 250 V/s. What depends on time then differs between moves; hysteresis does not.
+# Mean speed in voltage ranges per second, and the sequence of relative speeds: for a 100 V stage a mean of 70 V/s and
+# at most about 250 V/s. Different speeds separate time-dependent effects from hysteresis.
 PACE = 0.8
 SPEEDS = (0.6, 1.0, 1.8)
 FAST, SLOW = 1.8, 0.6
-# Smaller moves take as long as one over this share of the range: several samples each.
+# Shorter moves take the time of a move over this share of the range, for several samples each.
 SHORTEST = 0.05
-# Each of the holds lasts this share of the drive.
+# Duration of each hold as a share of the total duration.
 HOLD = 0.025
-# Reversal curves from each end, and as many loops in each nest. Where there is no time for the usual number, moves are
-# hurried, and where that is not enough, there are fewer; where there is time for more than the most, moves are slow.
+# Number of reversal curves from each end and of loops in each nest: usual, smallest, largest. If time is short, moves
+# become faster, then their number is reduced; if time remains beyond the largest number, moves become slower.
 FEWEST_LEVELS, USUAL_LEVELS, MOST_LEVELS = 2, 4, 100
-# Where the nests of loops within loops close in, shares of the range.
+# Centres of the nested loops, shares of the range.
 NESTS = (0.3, 0.7)
 
 
 def calibration(room: Room, rng: np.random.Generator) -> Path:
-    """Visit the Preisach plane evenly, at several speeds and with holds.
+    """Cover the Preisach plane uniformly, at several speeds and with holds.
 
-    A sweep over the whole range comes first, so that the record knows its memory whatever was before. Then come
-    reversal curves: rising ones from minima spread over the range, falling ones from maxima spread over it, in random
-    order, so that what drifts is not taken for what depends on voltage; then loops within loops. The longer the drive,
-    the more of each.
+    A sweep over the whole range comes first, to set a known memory. Reversal curves follow in random order, rising from
+    minima and falling from maxima over the whole range, so that drift is not correlated with voltage; then nested
+    loops. A longer duration gives more of each.
 
     Parameters
     ----------
     room : Room
     rng : numpy.random.Generator
-        Moves each reversal within its share of the range, and chooses the order.
+        Random generator for the position of each reversal within its part of the range, and for the order.
 
     Returns
     -------
     Path
-        From the low end to the low end.
+        Path that starts and ends at the low end.
     """
     seed = int(rng.integers(2**63))
 
@@ -56,7 +55,7 @@ def calibration(room: Room, rng: np.random.Generator) -> Path:
 
 
 def sweep(room: Room) -> Path:
-    """Go over the whole range once, from the low end up and down again: whatever was before is forgotten then."""
+    """Return one sweep over the whole range, up and down, which removes the initial history."""
     plan = _Plan(room, np.random.default_rng(0))
     plan.sweep()
     return plan.path
@@ -69,12 +68,12 @@ class _Plan:
         self.path = Path()
 
     def sweep(self) -> None:
-        """Rest, rise, rest, fall, rest."""
+        """Append a hold, a rise, a hold, a fall and a hold."""
         self._rise_and_fall()
         self._rest()
 
     def of(self, levels: int) -> Path:
-        # Whatever moved the stage before is forgotten after the fall; the rise from rest is seen only once.
+        # The fall removes the initial history; the first rise from rest occurs only once.
         self._rise_and_fall()
         self._move(1.0, FAST)
         for minimum in self._spread(levels):
@@ -102,7 +101,7 @@ class _Plan:
             self._through(centre + (1.0 - centre) * span, centre - centre * span)
 
     def _spread(self, levels: int) -> FloatArray:
-        """Return shares of the range, one in each of as many equal parts, in random order."""
+        """Return shares of the range in random order, one from each of `levels` equal parts."""
         return self._rng.permutation((np.arange(levels) + self._rng.uniform(0.1, 0.9, levels)) / levels)
 
     def _through(self, *shares: float) -> None:
@@ -112,7 +111,7 @@ class _Plan:
     def _move(self, share: float, speed: float) -> None:
         span = abs(share - self.path.at)
         seconds = max(span, SHORTEST) / (PACE * speed)
-        # Where the slew limit is low, corners are gentle anyway, and a straight move is the quicker one.
+        # Under a low slew limit raised cosines have no advantage, and straight moves are faster.
         self.path.to(share, seconds, straight=seconds < self._room.quickest(span))
 
     def _rest(self) -> None:

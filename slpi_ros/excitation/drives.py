@@ -1,4 +1,4 @@
-"""Drives of a whole stage: calibration, or for one effect; every axis in its turn."""
+"""Excitation drives of a stage: calibration, sweep, or one for a single effect, one axis at a time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from slpi_ros.excitation.legs import FEWEST_STEPS, FloatArray, Path, Room
 
 CALIBRATION, SWEEP = "calibration", "sweep"
 DRIVES = (CALIBRATION, SWEEP, *EFFECTS)
-# What a drive that is not made for one effect is good for.
+# Purpose of the drives that are not specific to an effect.
 _WHY = {
     CALIBRATION: "A sweep over the whole range that makes the memory known, reversal curves from both ends and loops "
     "within loops, at several speeds and with holds: they visit all that a path may visit.",
@@ -24,18 +24,18 @@ _WHY = {
 
 @dataclass(frozen=True)
 class Drive:
-    """Voltages of all axes of a stage.
+    """Voltage signals of all axes of a stage.
 
     Parameters
     ----------
     t : ndarray, shape (N,), seconds
         From 0, evenly spaced.
     voltage : dict of axis name to ndarray, shape (N,), volts
-        Each begins and ends where the axis rests.
+        Voltages, which start and end at the rest voltage of the axis.
     rooms : dict of axis name to Room
-        What each axis was allowed, with the duration of the whole drive.
+        Limits and rate of each axis, with the duration of the whole drive.
     why : str
-        One sentence: what it is good for.
+        Purpose of the drive in one sentence.
     """
 
     t: FloatArray
@@ -66,21 +66,21 @@ def excite(
     seed: int = 0,
     drive: str = CALIBRATION,
 ) -> Drive:
-    """Draw the voltages by which to identify a stage.
+    """Return the voltage signals for the identification of a stage.
 
-    One axis moves at a time, and the axes share the duration: coupling between them, which would look like hysteresis
-    when they move together, shows on those that rest.
+    The axes move one after the other and share the duration: the cross coupling, which would resemble hysteresis during
+    simultaneous motion, appears on the axes at rest.
 
     Parameters
     ----------
     axes : sequence of str
-        Names, in the order in which they move.
+        Names of the axes in the order of their motion.
     voltage_min, voltage_max : float or sequence of float, volts
-        Never left; one value, or one for each axis.
+        Voltage limits; one value, or one for each axis.
     slew_limit : float or sequence of float, V/s
-        Fastest change; 0: none.
+        Largest rate of change; 0 for no limit.
     start : float or sequence of float, volts, optional
-        Where the axes rest before and after they move; by default at `voltage_min`.
+        Rest voltage before and after the motion; by default `voltage_min`.
     duration : float, seconds
         Time of the last sample.
     rate : float, hertz
@@ -88,7 +88,7 @@ def excite(
     seed : int
         The same seed gives the same drive.
     drive : str
-        One of `DRIVES`: ``calibration``, ``sweep``, or the effect that is to be separated from others.
+        One of `DRIVES`: ``calibration``, ``sweep``, or the name of the effect to be identified.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def excite(
     Raises
     ------
     UsageError
-        If a value makes no sense, or the duration is too short for what is to be shown.
+        If a value is invalid, or the duration is too short.
     """
     _check(axes, drive)
     lows, highs, slews = (
@@ -129,7 +129,7 @@ def calibration_drive(
 
 
 def _turn(room: Room, rest: float, drive: str, rng: np.random.Generator) -> FloatArray:
-    """Return the voltages of one axis while it moves, shape (room.steps + 1,), volts, from where it rests and back."""
+    """Return the voltages (V) of one axis during its motion, shape (room.steps + 1,), from and to the rest voltage."""
     if not room.low <= rest <= room.high:
         raise UsageError(f"drive: it starts at {rest:g} V; give a voltage within {room.low:g} to {room.high:g} V")
     start = (rest - room.low) / room.span
@@ -167,7 +167,7 @@ def _check(axes: Sequence[str], drive: str) -> None:
 
 
 def _each(name: str, given: float | Sequence[float], axes: Sequence[str]) -> list[float]:
-    """Return one value for each axis."""
+    """Return one value per axis."""
     values = [given] * len(axes) if isinstance(given, int | float) else list(given)
     if len(values) != len(axes):
         raise UsageError(f"drive: {len(values)} values of {name} for {len(axes)} axes; give one, or one for each")
@@ -185,20 +185,20 @@ def _why(drive: str) -> str:
 
 
 class Playback:
-    """Gives one set of voltages after the other; all that it ever gives is within the limits of the drive.
+    """Playback of a drive sample by sample, within the limits of the drive.
 
     Parameters
     ----------
     drive : Drive
-    repeat : bool
-        Begin again at the end, until stopped.
+    Drive to be played.
+        Restart at the end until stopped; False by default.
 
     Attributes
     ----------
     drive : Drive
         As given.
     stopping : bool
-        Whether the axes are on their way back to where they rest.
+        Whether the axes are returning to their rest voltages after `stop`.
     """
 
     def __init__(self, drive: Drive, *, repeat: bool = False) -> None:
@@ -209,21 +209,21 @@ class Playback:
 
     @property
     def done(self) -> bool:
-        """Whether the last voltages have been given."""
+        """Whether the last sample has been returned."""
         return self._next == len(self._samples)
 
     @property
     def samples_left(self) -> FloatArray:
-        """Voltages still to be given, shape (n, axes), volts."""
+        """Remaining voltages, shape (n, axes), volts."""
         return self._samples[self._next :]
 
     @property
     def seconds_left(self) -> float:
-        """How long that takes, seconds."""
+        """Remaining time, seconds."""
         return len(self.samples_left) / self.drive.rate
 
     def next(self) -> list[float]:
-        """Return the voltages of the next sample, volts, in the order of the drive's axes; at the end the last ones."""
+        """Return the voltages (V) of the next sample in the order of the drive's axes; after the end the last ones."""
         sample: list[float] = self._samples[min(self._next, len(self._samples) - 1)].tolist()
         if not self.done:
             self._next += 1
@@ -232,7 +232,7 @@ class Playback:
         return sample
 
     def stop(self) -> bool:
-        """Turn back to where the axes rest; return whether that is news."""
+        """Start the return to the rest voltages; return False if it has already been started."""
         if self.stopping:
             return False
         self.stopping = True
@@ -240,14 +240,14 @@ class Playback:
         return True
 
     def _way_back(self, present: FloatArray) -> FloatArray:
-        """Return the voltages after the `present` ones, shape (n, axes), volts: all axes move at once."""
+        """Return the voltages (V) from `present` to the rest voltages, shape (n, axes), all axes moving at once."""
         ways = [
             _Way(room, (now - room.low) / room.span, (voltage[0] - room.low) / room.span)
             for room, now, voltage in zip(
                 self.drive.rooms.values(), present.tolist(), self.drive.voltage.values(), strict=True
             )
         ]
-        # A few steps more: seconds become whole steps.
+        # A margin for rounding to whole steps.
         seconds = max(way.seconds for way in ways) + FEWEST_STEPS / self.drive.rate
         return np.column_stack([way.voltages(seconds)[1:] for way in ways])
 

@@ -1,4 +1,4 @@
-"""For each effect the drive that separates it from the others, where a calibration drive could not."""
+"""Excitation drives that separate one effect from the others, for cases in which the calibration drive cannot."""
 
 import math
 from collections.abc import Callable
@@ -10,26 +10,26 @@ from slpi_ros.errors import UsageError
 from slpi_ros.excitation.calibration import PACE
 from slpi_ros.excitation.legs import FEWEST_STEPS, STEEPEST, Path, Room
 
-# Share of the drive for the first hold and the full loop that wipes the memory.
+# Shares of the duration for the initial hold and for the full loop that wipes the memory.
 WIPED = 0.15
-# No move is faster than so many ranges per second at its steepest, even without a slew limit; steps are small instead.
+# Largest speed in ranges per second at the steepest point, even without a slew limit.
 FASTEST = 5.0
 
 
 @dataclass(frozen=True)
 class EffectDrive:
-    """A drive made for one effect.
+    """An excitation drive for one effect.
 
     Parameters
     ----------
     effect : str
-        Its name in the package's vocabulary.
+        Name of the effect.
     why : str
-        One sentence: what the drive does, and why that separates the effect from others.
+        One sentence: the motion, and why it separates the effect from others.
     draw : callable
-        Draws the drive, given an empty path and the room; see `path`.
+        Appends the legs of the drive to an empty path for a room; see `path`.
     least_axes : int
-        How many axes it takes.
+        Smallest number of axes.
     """
 
     effect: str
@@ -38,7 +38,7 @@ class EffectDrive:
     least_axes: int = 1
 
     def path(self, room: Room) -> Path:
-        """Return the drive, from the low end to the low end; a full loop comes first, so that the memory is known."""
+        """Return the drive, starting and ending at the low end, with an initial full loop that sets a known memory."""
         path = Path()
         full = max(WIPED * room.duration / 3, _brisk(1.0))
         path.hold(WIPED * room.duration / 3)
@@ -50,7 +50,7 @@ class EffectDrive:
 
 
 def for_effect(name: str) -> EffectDrive:
-    """Return the drive that separates an effect from the others.
+    """Return the excitation drive for an effect.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def for_effect(name: str) -> EffectDrive:
     Raises
     ------
     UsageError
-        If there is no such effect.
+        If there is no drive for this effect.
     """
     if name not in EFFECTS:
         raise UsageError(f"no drive for the effect '{name}'; choose one of {', '.join(EFFECTS)}")
@@ -68,12 +68,12 @@ def for_effect(name: str) -> EffectDrive:
 
 
 def _brisk(span: float) -> float:
-    """Return the seconds of a move over a `span` of the range (share) that no stage should mind."""
+    """Return a duration (s), safe for any stage, of a move over a `span` of the range (share)."""
     return abs(span) * STEEPEST / FASTEST
 
 
 def _left(room: Room) -> float:
-    """Return the time (s) after the memory is wiped."""
+    """Return the time (s) that remains after the memory is wiped."""
     return (1.0 - WIPED) * room.duration
 
 
@@ -82,19 +82,19 @@ def _go(path: Path, share: float) -> None:
 
 
 def _loops(path: Path, low: float, high: float, seconds: float, count: int, *, straight: bool = False) -> None:
-    """Run `count` loops between two shares of the range, each with two legs of some seconds."""
+    """Append `count` loops between two shares of the range, with legs of `seconds` each."""
     for _ in range(count):
         path.to(high, seconds, straight=straight)
         path.to(low, seconds, straight=straight)
 
 
 def _tempos(slowest: float, quickest: float, count: int) -> list[float]:
-    """Return evenly graded durations of a leg (s), the slowest first."""
+    """Return `count` geometrically spaced leg durations (s), the slowest first."""
     return [float(seconds) for seconds in np.geomspace(max(slowest, quickest), quickest, count)]
 
 
 def _at_tempos(path: Path, room: Room, low: float, high: float, *, straight: bool) -> None:
-    """Run one loop slowly to fast, about the same time at each tempo, at least twice at each."""
+    """Append one loop at increasing speeds, with about the same time and at least two repeats at each speed."""
     count = 6
     each = _left(room) / count
     span = high - low
@@ -114,7 +114,7 @@ def _lag(path: Path, room: Room) -> None:
 
 def _rate_dependence(path: Path, room: Room) -> None:
     spans, doublings, loops = (0.6, 0.3, 0.15), 3, 2
-    # Loops of one span take 2 (1 + 2 + 4) quickest legs.
+    # Loops of one span take 2 (1 + 2 + 4) times the shortest leg.
     quickest = _left(room) / (len(spans) * loops * 2 * (2**doublings - 1))
     quickest = max(quickest, room.quickest(spans[0]), _brisk(spans[0]))
     for span in spans:
@@ -148,7 +148,7 @@ def _resonance(path: Path, room: Room) -> None:
             for to in (level + step, level):
                 path.to(to, 0.0, straight=True)
                 path.hold(ring)
-    # The sweep: each half-wave is by a sample shorter than the one before, two loops of each take 0.3 of the time.
+    # In the sweep each half-wave is one sample shorter than the previous one; two loops of each take 0.3 of the time.
     _go(path, 0.5)
     longest = int(math.sqrt(0.3 * _left(room) * room.rate / 2))
     for steps in range(longest, FEWEST_STEPS - 1, -1):
@@ -166,7 +166,7 @@ def _cross_coupling(path: Path, room: Room) -> None:
 
 
 def _thermal_drift(path: Path, room: Room) -> None:
-    # Of a cycle 0.6 is motion.
+    # Motion takes 0.6 of each cycle.
     shortest = 2 * max(room.quickest(1.0), _brisk(1.0)) / 0.6
     repeats = min(max(int(_left(room) / shortest), 3), 8)
     each = _left(room) / repeats

@@ -1,4 +1,4 @@
-"""What every drive is made of: moves and holds, one after the other, within what an axis may do."""
+"""Building blocks of excitation drives: moves and holds in sequence, within the limits of an axis."""
 
 import math
 from dataclasses import dataclass
@@ -10,28 +10,28 @@ from slpi_ros.errors import UsageError
 
 FloatArray = NDArray[np.float64]
 
-# The steepest part of a raised cosine is so many times as steep as the whole.
+# Ratio of largest to mean slope of a raised cosine.
 STEEPEST = math.pi / 2
-# A raised cosine of fewer steps is none.
+# Smallest number of steps of a raised cosine.
 FEWEST_STEPS = 3
-# A drive of more samples is a mistake.
+# Largest number of samples of a drive.
 MOST_STEPS = 10_000_000
-# No stage takes more, volts: a larger one is a slip.
+# Largest magnitude of a voltage limit, volts.
 MOST_VOLTAGE = 10_000.0
 
 
 @dataclass(frozen=True)
 class Leg:
-    """One move; without a way to go, a hold.
+    """One move, or a hold if the target is the current position.
 
     Parameters
     ----------
     to : float
-        Where it ends, as a share of the voltage range, 0..1.
+        Target as a share of the voltage range, 0..1.
     seconds : float
-        How long it is to take. The slew limit may ask for more.
+        Desired duration, which the slew limit may extend.
     straight : bool
-        At constant speed, with sharp corners; else as a raised cosine, at rest at both ends.
+        True: constant speed with sharp corners. False: a raised cosine, with zero speed at both ends.
     """
 
     to: float
@@ -41,23 +41,23 @@ class Leg:
 
 @dataclass(frozen=True)
 class Room:
-    """What one axis may do.
+    """Voltage limits, duration, sampling rate and slew limit of one axis.
 
     Parameters
     ----------
     low, high : float, volts
-        Never left.
+        Voltage limits.
     duration : float, seconds
-        Time of the last sample, from 0.
+        Time of the last sample; the first is at 0.
     rate : float, hertz
         Samples per second.
     slew_limit : float, V/s
-        Fastest change from one sample to the next; 0: none.
+        Largest rate of change between samples; 0 for no limit.
 
     Raises
     ------
     UsageError
-        If a value makes no sense.
+        If a value is invalid.
     """
 
     low: float
@@ -67,7 +67,7 @@ class Room:
     slew_limit: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what leaves no room."""
+        """Validate the parameters."""
         if not -math.inf < self.low < self.high < math.inf:
             raise UsageError(f"drive: limits {self.low} V and {self.high} V; the first must be the lower one")
         if max(-self.low, self.high) > MOST_VOLTAGE:
@@ -103,21 +103,21 @@ class Room:
 
 
 class Path:
-    """Legs, each beginning where the one before it ends.
+    """A sequence of legs.
 
     Parameters
     ----------
     start : float
-        Where the first one begins, as a share of the voltage range.
+        Initial position as a share of the voltage range.
 
     Attributes
     ----------
     start : float
         As given.
     at : float
-        Where the last one ends.
+        Position at the end of the last leg.
     legs : list of Leg
-        In order.
+        Legs in order.
     """
 
     def __init__(self, start: float = 0.0) -> None:
@@ -125,29 +125,29 @@ class Path:
         self.legs: list[Leg] = []
 
     def to(self, share: float, seconds: float, *, straight: bool = False) -> None:
-        """Move to a share of the range in some seconds, if the slew limit allows."""
+        """Append a move to a share of the range in `seconds`, or longer if the slew limit requires it."""
         self.legs.append(Leg(share, seconds, straight))
         self.at = share
 
     def hold(self, seconds: float) -> None:
-        """Stay."""
+        """Append a hold of `seconds` at the current position."""
         self.to(self.at, seconds)
 
     def wanted_steps(self, room: Room) -> FloatArray:
-        """Return the number of steps that each leg takes when none is hurried, shape (n,)."""
+        """Return the number of steps for the desired duration of each leg, shape (n,)."""
         wanted = np.array([leg.seconds * room.rate for leg in self.legs])
         return np.asarray(np.maximum(wanted, self.fewest_steps(room)), dtype=np.float64)
 
     def fewest_steps(self, room: Room) -> NDArray[np.int64]:
-        """Return the number of steps that each leg takes at least, shape (n,)."""
+        """Return the smallest number of steps of each leg, shape (n,)."""
         spans = np.diff(self._turns).tolist()
         fewest = [room.fewest_steps(span, leg.straight) for span, leg in zip(spans, self.legs, strict=True)]
         return np.array(fewest, dtype=np.int64)
 
     def voltages(self, room: Room) -> FloatArray:
-        """Move along all legs in just the room's duration.
+        """Return the voltages along all legs, with the duration of the room.
 
-        Time that is left over, or missing, is shared out: long legs get or give more of it than short ones.
+        A difference to the desired durations is distributed over the legs in proportion to their duration.
 
         Parameters
         ----------
@@ -156,7 +156,7 @@ class Path:
         Returns
         -------
         ndarray, shape (room.steps + 1,), volts
-            Every turn falls on a sample.
+            Voltages; every reversal coincides with a sample.
 
         Raises
         ------
@@ -185,8 +185,8 @@ class Path:
 
 
 def _shared_out(steps: int, weights: FloatArray) -> NDArray[np.int64]:
-    """Share out whole steps by weights; return the running totals, shape (len(weights),)."""
-    # Where nobody asks for more, all get the same.
+    """Distribute whole steps in proportion to weights; return the cumulative sums, shape (len(weights),)."""
+    # Equal shares if all weights are zero.
     total = np.cumsum(weights + 1e-9)
     return np.asarray(np.rint(steps * total / total[-1]), dtype=np.int64)
 

@@ -1,1 +1,1 @@
-"""The turning-point engine and the hysteresis models that are shapes on it."""
+"""The reversal-memory engine and the hysteresis models that define branch shapes for it."""

@@ -1,4 +1,4 @@
-"""Find the branch on which each sample of a voltage lies: the stack of turning points moves alike for all models."""
+"""Assign each sample of a voltage to its branch, using the stack of reversals, which is the same for all models."""
 
 from typing import NamedTuple
 
@@ -10,12 +10,12 @@ from slpi_ros.hysteresis.turning_points import END, Curve, Memory
 
 FloatArray = NDArray[np.float64]
 
-# What `Piece.origin` says of branches that started before the first sample.
+# Values of `Piece.origin` for branches that started before the first sample.
 AT_REST, LONG_FALL = -1, -2
 
 
 class Piece(NamedTuple):
-    """Samples ``start:stop`` on the branch that started at sample `origin`, or `AT_REST`, or is the `LONG_FALL`."""
+    """Samples ``start:stop`` on one branch, which started at sample `origin`, or is `AT_REST` or the `LONG_FALL`."""
 
     start: int
     stop: int
@@ -27,27 +27,27 @@ _IDENTITY = Curve.of(np.array([[0.0, END], [0.0, END]]))
 
 
 class _Straight:
-    """A shape without hysteresis: enough to move the stack."""
+    """A shape without hysteresis, used only to update the stack of reversals."""
 
     def __init__(self, symmetric_rest: bool) -> None:
         self.symmetric_rest = symmetric_rest
 
     def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return the identity."""
+        """Return the identity curve."""
         return _IDENTITY
 
     def first_rise(self, v_rest: float) -> Curve:
-        """Return the identity."""
+        """Return the identity curve."""
         return self.branch(1, v_rest)
 
 
 def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> list[Piece]:
-    """Cut a voltage into the branches that its samples lie on.
+    """Divide a voltage signal into pieces that each lie on one branch.
 
     Parameters
     ----------
     v : ndarray, shape (N,), volts
-        The axis rests at the first value, which may be repeated.
+        Voltage; the first value, which may be repeated, is the rest voltage.
     symmetric_rest : bool
         As in `slpi_ros.hysteresis.turning_points.Shape`.
     primed : bool
@@ -56,7 +56,7 @@ def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> list[
     Returns
     -------
     list of Piece
-        In order; together they hold every sample but those still at rest.
+        Pieces in order; together they cover all samples except the initial ones at rest.
     """
     if not v.size:
         return []

@@ -1,6 +1,6 @@
-"""Functions in machine code, for loops over samples that no array operation expresses.
+"""Compilation of sample loops that cannot be written as array operations.
 
-Numba takes a good half second to load: modules that use this one are imported only where a whole path is worked on.
+Importing Numba takes about 0.5 s: import modules that depend on this one only for batch evaluation.
 """
 
 from collections.abc import Callable
@@ -12,10 +12,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """Return a function that is compiled at its first call.
+    """Return a function that is compiled by Numba at its first call.
 
-    The machine code is kept beside the source, else in ``NUMBA_CACHE_DIR`` or the user's cache folder; where none of
-    these can be written to, every process compiles it anew.
+    The machine code is cached beside the source, or in ``NUMBA_CACHE_DIR`` or the user's cache folder; if none of these
+    is writable, every process compiles the function.
     """
     for kept in (True, False):
         try:

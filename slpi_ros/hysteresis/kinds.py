@@ -1,4 +1,4 @@
-"""The kinds of hysteresis models by name, and their parameters in a model document."""
+"""Registry of the hysteresis models by kind, and conversion of their parameters to and from documents."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +11,7 @@ from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
 
-# Causal models are shapes on the engine; path models need the whole path in advance.
+# Causal models define shapes for the engine; path models require the whole path in advance.
 CausalModel = LoopFamily | PrandtlIshlinskii | MultiSlope
 PathModel = SeparatedLoops | AmplitudeScaled
 Hysteresis = CausalModel | PathModel
@@ -26,7 +26,7 @@ DESCRIPTIONS = {
 
 
 def to_document(model: Hysteresis) -> dict[str, Any]:
-    """Return the parameters of a model, SI units, for a model document."""
+    """Return the parameters of a model in SI units for a model document."""
     match model:
         case PrandtlIshlinskii():
             return _plays_document(model)
@@ -54,12 +54,12 @@ def to_document(model: Hysteresis) -> dict[str, Any]:
 
 
 def from_document(kind: str, parameters: Mapping[str, Any]) -> Hysteresis:
-    """Build a model from the parameters of a valid model document.
+    """Construct a model from the parameters of a validated model document.
 
     Raises
     ------
     ModelError
-        If the kind is not known or the parameters contradict each other.
+        If the kind is unknown or the parameters are inconsistent.
     """
     match kind:
         case "slpi":

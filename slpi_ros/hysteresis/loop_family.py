@@ -1,9 +1,9 @@
 """The SLPI loop family: one Prandtl-Ishlinskii model per loop vertex, interpolated between vertices.
 
-All branches come from one Everett function ``E(alpha, beta)``, ``beta <= alpha``: the displacement between the turning
-points ``alpha`` and ``beta``. A falling branch from ``alpha`` is ``y_a - E(alpha, v)``, a rising one from ``beta`` is
-``y_a + E(v, beta)``, so every loop closes. At a grid vertex the branch is a classical PI model with thresholds at the
-grid's spacing; between vertices it is interpolated.
+All branches follow from one Everett function ``E(alpha, beta)``, ``beta <= alpha``: the displacement between the
+reversals ``alpha`` and ``beta``. A falling branch from ``alpha`` is ``y_a - E(alpha, v)``, a rising one from ``beta``
+is ``y_a + E(v, beta)``, so every loop closes. At a grid vertex the branch is a classical PI model with thresholds at
+the grid's spacing; between vertices it is interpolated.
 """
 
 from bisect import bisect_left, bisect_right
@@ -17,14 +17,14 @@ from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.turning_points import END, FAR, Curve
 
 FloatArray = NDArray[np.float64]
-# A vertex (V, counted in the direction of its branches), the knots of the branch from it, and how they change with
-# every volt that a branch starts before it, as far as the vertex before.
+# A vertex (V, with the sign of the branch direction), the knots of its branch, and their derivative with respect to the
+# start voltage of a branch up to the previous vertex.
 Gap = tuple[float, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
 class LoopFamily:
-    """An Everett function on a grid of voltages, and the curve of the first rise.
+    """An Everett function on a voltage grid, and the curve of the first rise.
 
     Parameters
     ----------
@@ -34,14 +34,14 @@ class LoopFamily:
         ``everett[i, j] = E(grid[i], grid[j])`` for ``j < i``; zero on the diagonal; above the diagonal not used.
         Strictly increasing with ``i`` and strictly decreasing with ``j``.
     rise : ndarray, shape (n,), metres
-        Displacement of the first rise at the grid's vertices, strictly increasing; its offset does not matter.
+        Displacement of the first rise at the vertices, strictly increasing; a constant offset has no effect.
     edge_gain : float, metres per volt
-        Slope of the first rise outside the grid, and of branches longer than the grid, positive.
+        Slope of the first rise outside the grid and of branches beyond it, positive.
 
     Raises
     ------
     ModelError
-        If the arrays do not fit each other or a branch would not rise strictly.
+        If the arrays have inconsistent shapes or a branch is not strictly increasing.
     """
 
     grid: FloatArray
@@ -54,7 +54,7 @@ class LoopFamily:
     _gaps: dict[int, list[Gap]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the arrays and prepare the knots of the branches from every vertex."""
+        """Validate the arrays and compute the knots of the branches from all vertices."""
         for name in ("grid", "everett", "rise"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         n = self.grid.size
@@ -84,15 +84,15 @@ class LoopFamily:
         object.__setattr__(self, "_gaps", {1: rising, -1: list(_gaps(-self.grid[::-1], rows[::-1], edges[-1]))})
 
     def _edge(self, u: FloatArray, f: FloatArray) -> FloatArray:
-        """Return the knots, shape (2, n + 1), of the branch that starts where the grid ends, and of all beyond."""
+        """Return the knots, shape (2, n + 1), of branches that start at the end of the grid or beyond."""
         return np.array([np.append(u, u[-1] + END), np.append(f, f[-1] + END * self.edge_gain)])
 
     def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return the branch that starts at `v_turn` (V): a row or a column of the Everett function, interpolated.
+        """Return the branch that starts at `v_turn` (V): an interpolated row or column of the Everett function.
 
-        Beyond the grid the displacement between two turning points depends only on how far apart they are, as for the
-        classical PI model: loops there are like those at the grid's end. A fall from far away, which wipes the memory,
-        comes along the last of them.
+        Beyond the grid the displacement between two reversals depends only on their distance, as for the classical PI
+        model, with the loops of the grid's end. A fall from far above, which wipes the memory, follows the last of
+        these.
         """
         n = self.grid.size
         if direction < 0 and v_turn - self.grid[-1] > FAR / 2:
@@ -103,7 +103,7 @@ class LoopFamily:
         vertex, knots, change = self._gaps[direction][ahead - 1]
         knots = knots + change * (vertex - direction * v_turn)
         curve = Curve.of(knots if knots[0, 1] > 0.0 else knots[:, 1:])
-        # A turn next to a vertex may leave, for rounding, no room between the grid's end and the knot after it.
+        # For a reversal next to a vertex, rounding may merge the grid's end and the following knot.
         at = len(curve.u) - ahead - 2
         if curve.u[at] < curve.u[at + 1] and curve.f[at] < curve.f[at + 1]:
             return curve
@@ -114,13 +114,13 @@ class LoopFamily:
         return Curve.of(np.array([np.append(0.0, above + u), np.append(0.0, self.edge_gain * above + f)]))
 
     def _first_vertex_ahead(self, v_turn: float, direction: int) -> int:
-        """Index, counted in `direction`, of the first vertex at or ahead of `v_turn`."""
+        """Return the index, counted in `direction`, of the first vertex at or beyond `v_turn`."""
         if direction > 0:
             return bisect_left(self._vertices, v_turn)
         return len(self._vertices) - bisect_right(self._vertices, v_turn)
 
     def first_rise(self, v_rest: float) -> Curve:
-        """Return the first rise from `v_rest` (V)."""
+        """Return the curve of the first rise from `v_rest` (V)."""
         ahead = self.grid[self.grid > v_rest]
         u = np.concatenate([[0.0], ahead - v_rest])
         rise = np.interp(v_rest + u, self.grid, self.rise) + self.edge_gain * self._outside(v_rest + u)
@@ -128,15 +128,15 @@ class LoopFamily:
         return Curve.of(np.array([np.append(u, u[-1] + END), np.append(f, f[-1] + END * self.edge_gain)]))
 
     def _outside(self, v: FloatArray) -> FloatArray:
-        """How far `v` (V) lies above the grid, or (negative) below it."""
+        """Return the distance (V) of `v` (V) from the grid: positive above, negative below, 0 inside."""
         return v - np.clip(v, self.grid[0], self.grid[-1])
 
 
 def _gaps(vertices: FloatArray, lines: Sequence[FloatArray], edge: FloatArray) -> Iterator[Gap]:
-    """Return every gap between neighbouring vertices, whose branches are `lines` on the grid and `edge` beyond it."""
+    """Yield the intervals between vertices, whose branches are `lines` on the grid and `edge` beyond."""
     for k in range(1, vertices.size):
         own, before = vertices[k:] - vertices[k], vertices[k:] - vertices[k - 1]
-        # One column for the turning point itself.
+        # The first column is the reversal itself.
         knots = np.column_stack([np.zeros(2), [own, lines[k]], edge[:, -k - 1 :]])
         change = np.zeros_like(knots)
         change[:, 1 : before.size + 1] = ([before, lines[k - 1][1:]] - knots[:, 1 : before.size + 1]) / before[0]

@@ -1,4 +1,4 @@
-"""The multi-slope (MPI) model, and the simplified one (SMPI) that scales it to the amplitude of each cycle.
+"""The multi-slope (MPI) model, and the simplified (SMPI) model, which is scaled to the amplitude of each cycle.
 
 `MultiSlope` is a sum of the generalized play operators of the MPI paper, Eq. 2, with one set of weights for one
 amplitude ``V_p``; its branches are shapes on the engine.
@@ -29,34 +29,34 @@ FloatArray = NDArray[np.float64]
 
 # Slopes and constants of the falling envelope, Eq. 2.
 STEEP, GENTLE, AMPLITUDE_SHARE, THRESHOLD_SHARE = 1.2, 0.8, 0.2, 0.6
-# The amplitude that the paper gives more operators, volts; a measured one is never exact.
+# Amplitude for which the paper uses 13 operators, volts, and the tolerance for a measured amplitude.
 FULL_AMPLITUDE, NEAR_FULL = 120.0, 0.5
-# Below this share of the base amplitude (in displacement: of the peak line there) a path is back at the low end.
+# A path is at the low end below this share of the base amplitude (for displacement: of its peak displacement).
 BACK = 0.01
 
 Volts = TypeVar("Volts", float, FloatArray)
 
 
 def thresholds_for(amplitude: float) -> FloatArray:
-    """Return the paper's thresholds for the amplitude `amplitude` (V): 13 at 120 V, else 11, from 0 to it, volts."""
+    """Return the thresholds (V) of the paper for an amplitude (V), from 0 to `amplitude`: 13 at 120 V, else 11."""
     full = abs(amplitude - FULL_AMPLITUDE) < NEAR_FULL
     return np.linspace(0.0, amplitude, 13 if full else 11)
 
 
 def rising_envelope(u: ArrayLike, thresholds: ArrayLike) -> FloatArray:
-    """Return ``u - r``, what an operator follows upwards, volts; arguments in volts, broadcast."""
+    """Return the rising envelope ``u - r`` of an operator, volts; arguments in volts, broadcast."""
     return np.subtract(u, thresholds, dtype=np.float64)
 
 
 def falling_envelope(u: ArrayLike, thresholds: ArrayLike, amplitude: float) -> FloatArray:
-    """Return the inner minimum of Eq. 2, what an operator follows downwards; not below the rising envelope.
+    """Return the falling envelope, the inner minimum of Eq. 2, limited from below by the rising envelope.
 
     Its slope is 1 below ``u = -5 r``, 1.2 up to ``0.5 V_p + 1.5 r``, 0.8 up to ``V_p + 8 r``, and 1 beyond.
 
     Parameters
     ----------
     u, thresholds : array_like, volts
-        Broadcast.
+        Voltage above `MultiSlope.origin`, and thresholds, broadcast against each other.
     amplitude : float, volts
 
     Returns
@@ -72,27 +72,27 @@ def falling_envelope(u: ArrayLike, thresholds: ArrayLike, amplitude: float) -> F
 class MultiSlope:
     """A weighted sum of the operators of Eq. 2, ``y = sum_k w_k f_k``.
 
-    The operators start at the low end, as after a fall from far above: a memory that was never moved describes
-    voltages at or above its rest; a primed one describes all voltages.
+    The operators start at the low end, as after a fall from far above. A memory without motion describes voltages at or
+    above its rest voltage; a primed one describes all voltages.
 
-    There is no linear term: the branch from a turning point begins level until the first operator moves, except at the
-    range's two ends. There the inverse jumps: every displacement is some voltage's, but no small step from there is.
+    There is no linear term: a branch is flat from its reversal until the first operator moves, except at the ends of
+    the range. There the inverse is discontinuous: every displacement has a voltage, but not every small step.
 
     Parameters
     ----------
     origin : float, volts
-        Lowest voltage of the range, where ``u = 0``.
+        Lowest voltage of the range, at which ``u = 0``.
     amplitude : float, volts
-        ``V_p``, highest voltage of the range above `origin`.
+        Highest voltage of the range relative to `origin`, ``V_p``.
     thresholds : ndarray, shape (n,), volts
         ``0 <= r_1 < r_2 < ...``
     weights : ndarray, shape (n,), metres per volt
-        Not negative, not all zero.
+        Non-negative, with at least one positive.
 
     Raises
     ------
     ModelError
-        If the parameters contradict each other.
+        If the parameters are inconsistent.
     """
 
     origin: float
@@ -105,7 +105,7 @@ class MultiSlope:
     _bends: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the operators, and keep those that have a weight and where they bend."""
+        """Validate the parameters and store the operators of positive weight and their breakpoints."""
         for name in ("thresholds", "weights"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         r, w = self.thresholds, self.weights
@@ -126,28 +126,28 @@ class MultiSlope:
         object.__setattr__(self, "_bends", np.concatenate([-5.0 * r, half + 1.5 * r, self.amplitude + 8.0 * r]))
 
     def stroke(self, upper: float, lower: float) -> float:
-        """Return the Everett function ``E(upper, lower)``, the displacement (m) between two turning points (V)."""
+        """Return the Everett function ``E(upper, lower)``, the displacement (m) between two reversals (V)."""
         rising = rising_envelope(upper - self.origin, self._r)
         falling = falling_envelope(lower - self.origin, self._r, self.amplitude)
         return float(self._w @ np.maximum(0.0, rising - falling))
 
     def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return the branch that starts in `direction` at the turning point `v_turn` (V)."""
+        """Return the branch that starts in `direction` at the reversal `v_turn` (V)."""
         u_turn = v_turn - self.origin
         return self._rise_from(u_turn) if direction > 0 else self._fall_from(u_turn)
 
     def first_rise(self, v_rest: float) -> Curve:
-        """Return the first rise from rest at `v_rest` (V): the operators lie on their falling envelopes."""
+        """Return the first rise from `v_rest` (V), with all operators on their falling envelopes."""
         return self._rise_from(v_rest - self.origin)
 
     def _rise_from(self, turn: float) -> Curve:
-        """Each operator waits until its rising envelope reaches it."""
+        """Return a rising branch: each operator is constant until its rising envelope reaches it."""
         starts = np.maximum(turn, falling_envelope(turn, self._r, self.amplitude) + self._r)
         u = np.unique(np.append(starts, turn))
         return self._curve(u - turn, self._w @ np.maximum(0.0, u - starts[:, None]))
 
     def _fall_from(self, turn: float) -> Curve:
-        """Each operator waits until its falling envelope reaches it, and bends with the envelope."""
+        """Return a falling branch: each operator is constant until it meets its falling envelope, then follows that."""
         r, top = self._r, rising_envelope(turn, self._r)
         gentle = (top - AMPLITUDE_SHARE * self.amplitude - THRESHOLD_SHARE * r) / GENTLE
         starts = np.minimum(turn, np.maximum(top / STEEP, gentle))
@@ -157,17 +157,17 @@ class MultiSlope:
         return self._curve(turn - u, self._w @ fallen)
 
     def _curve(self, u: FloatArray, f: FloatArray) -> Curve:
-        """Return the curve through the knots; beyond them every operator moves with slope 1."""
-        # Rounding must not make a branch fall.
+        """Return the curve through the knots, extended with slope 1 per operator."""
+        # Prevent decreasing branches due to rounding.
         f = np.maximum.accumulate(f)
         return Curve.of(np.array([np.append(u, u[-1] + END), np.append(f, f[-1] + END * self._w.sum())]))
 
 
 def cycles(x: FloatArray, back: float) -> list[tuple[int, int]]:
-    """Cut a path, shape (N,), N >= 1, into cycles: the first lowest sample of each stretch up to `back` ends one.
+    """Divide a path, shape (N,), N >= 1, into cycles that end at the first minimum of each section up to `back`.
 
-    Each is given by its first and its last sample, which is the first of the next one. What comes before the first
-    return and after the last one counts as a cycle.
+    Each cycle is given by its first and last sample; the last one is the first sample of the next cycle. The parts
+    before the first and after the last return also count as cycles.
     """
     low = np.concatenate([[False], x <= back, [False]])
     stretches = np.flatnonzero(low[1:] != low[:-1]).reshape(-1, 2)
@@ -177,21 +177,21 @@ def cycles(x: FloatArray, back: float) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class AmplitudeScaled:
-    """An MPI model and the line of peak displacements ``X_p`` over amplitude.
+    """An MPI model scaled by the peak displacement ``X_p`` as a piecewise linear function of the amplitude.
 
     Parameters
     ----------
     base : MultiSlope
-        The model of one amplitude, which is ``base.amplitude``.
+        Model of the amplitude ``base.amplitude``.
     peak_voltages : ndarray, shape (m,), volts
-        Amplitudes above ``base.origin``, positive, strictly increasing, m >= 1.
+        Amplitudes relative to ``base.origin``, positive, strictly increasing, m >= 1.
     peak_displacements : ndarray, shape (m,), metres
-        ``X_p`` at them, positive, strictly increasing.
+        Peak displacement ``X_p`` at these amplitudes, positive, strictly increasing.
 
     Raises
     ------
     ModelError
-        If the knots of ``X_p`` do not fit each other or do not rise.
+        If the peaks have inconsistent shapes or are not increasing.
     """
 
     base: MultiSlope
@@ -199,7 +199,7 @@ class AmplitudeScaled:
     peak_displacements: FloatArray
 
     def __post_init__(self) -> None:
-        """Check the line of peaks."""
+        """Validate the peaks."""
         for name in ("peak_voltages", "peak_displacements"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         v, x = self.peak_voltages, self.peak_displacements
@@ -212,23 +212,23 @@ class AmplitudeScaled:
             raise ModelError("SMPI: no operator of the base model moves within its amplitude; lower the thresholds")
 
     def peak(self, amplitude: float) -> float:
-        """Return ``X_p`` (m) at an amplitude (V): linear from (0, 0) through the knots, and on beyond the last one."""
+        """Return ``X_p`` (m) at an amplitude (V): linear from (0, 0) through the knots and beyond the last."""
         v, x = np.append(0.0, self.peak_voltages), np.append(0.0, self.peak_displacements)
         beyond = max(0.0, amplitude - float(v[-1]))
         return float(np.interp(amplitude, v, x) + beyond * (x[-1] - x[-2]) / (v[-1] - v[-2]))
 
     def along(self, start_voltage: float, start_displacement: float) -> "KnownPath":
-        """Return the model on a known path that starts from rest at a voltage (V) and displacement (m)."""
+        """Return the model for known paths that start from rest at a voltage (V) and displacement (m)."""
         return KnownPath(self, start_voltage, start_displacement)
 
 
 @dataclass(frozen=True)
 class KnownPath:
-    """The SMPI model on paths known as a whole: a cycle's amplitude shows at its peak, but scales it from its start.
+    """The SMPI model on completely known paths, as the amplitude of a cycle is known only at its peak.
 
-    A cycle starts at the low end, at the point where the one before it ended. Every call begins at the start.
-    A path by displacement is cut where it comes back to the displacement of the origin, as near as a path by voltage
-    must come back to the origin: both are cut alike if they do come back, or stay clearly away.
+    A cycle starts at the low end, at the end point of the previous cycle. Every call starts from the initial point. A
+    displacement path is divided where it returns to the displacement of the origin, with the same relative tolerance as
+    a voltage path that returns to the origin, so that both divisions agree except close to the tolerance.
 
     Parameters
     ----------
@@ -247,12 +247,12 @@ class KnownPath:
         Raises
         ------
         UsageError
-            If a voltage is not finite, or none of a stage.
+            If a voltage is not finite or out of range.
         """
         v = np.asarray(v, dtype=np.float64)
         require_finite(v)
         if v.size and np.max(np.abs(v)) > FAR:
-            raise UsageError(f"voltage {v[np.argmax(np.abs(v))]} V is none that a stage can be given")
+            raise UsageError(f"voltage {v[np.argmax(np.abs(v))]} V is out of range; leave such samples out")
         origin, y = self.model.base.origin, np.empty_like(v)
         present = (self.start_voltage, self.start_displacement)
         for start, stop in cycles(np.append(self.start_voltage, v), origin + self._least_amplitude):
@@ -268,7 +268,7 @@ class KnownPath:
         Raises
         ------
         UsageError
-            If a displacement is not finite, or none that the model can take.
+            If a displacement is not finite or cannot be reached by the model.
         """
         y = np.asarray(y, dtype=np.float64)
         require_finite(y)
@@ -285,17 +285,17 @@ class KnownPath:
 
     @property
     def _least_amplitude(self) -> float:
-        """Smallest amplitude of a cycle (V); what stays below it belongs to a neighbouring cycle."""
+        """Smallest amplitude of a cycle (V); smaller ones are merged with a neighbouring cycle."""
         return BACK * self.model.base.amplitude
 
     def _displacement_of_origin(self, y: FloatArray) -> float:
-        """Return where `y` comes back to the origin from its peak (m): the start, unless that is not the low end."""
+        """Return the displacement (m) of the origin after the peak of `y`: the start value, if that is the low end."""
         present = (self.start_voltage, self.start_displacement)
         cycle = _Cycle(self.model, self._amplitude_for(float(y.max(initial=present[1])), *present), *present)
         return present[1] + cycle.stroke(present[0]) - cycle.stroke(self.model.base.origin)
 
     def _amplitude_for(self, peak: float, v_start: float, y_start: float) -> float:
-        """Return the amplitude (V) of the cycle from a start (V, m) whose largest displacement is `peak` (m)."""
+        """Return the amplitude (V) of the cycle from a start (V, m) with the peak displacement `peak` (m)."""
 
         def missing(amplitude: float) -> float:
             return peak - y_start - _Cycle(self.model, amplitude, v_start, y_start).stroke(v_start)
@@ -307,18 +307,18 @@ class KnownPath:
         while missing(most) > 0.0:
             most *= 2.0
             if most > FAR:
-                raise UsageError(f"displacement {peak} m is none that this model can take; leave such samples out")
+                raise UsageError(f"displacement {peak} m cannot be reached by this model; leave such samples out")
         return float(brentq(missing, least, most, xtol=1e-14 * self.model.base.amplitude, rtol=1e-15))
 
 
 class _Cycle:
-    """One cycle of known amplitude: the base model, its two coordinates scaled, at rest where the cycle starts."""
+    """One cycle of known amplitude: the base model with both coordinates scaled, starting at rest."""
 
     def __init__(self, model: AmplitudeScaled, amplitude: float, v_start: float, y_start: float) -> None:
         self._base = model.base
         self._stretch = model.base.amplitude / amplitude
         self._scale = model.peak(amplitude) / model.peak(model.base.amplitude)
-        # The memory counts displacement from the start: while no operator moves, it stays there to the last bit.
+        # Displacement is relative to the start, so that it is exactly constant while no operator moves.
         self._v_rest, self._y_start = self._of_base(v_start), y_start
 
     def stroke(self, v: float) -> float:
@@ -330,7 +330,7 @@ class _Cycle:
         return self._y_start + self._scale * Memory(self._base, self._v_rest).forward_array(self._of_base(v))
 
     def inverse(self, y: FloatArray, lower: float, upper: float) -> tuple[FloatArray, float]:
-        """Return the voltages (V) for the displacements `y` (m), and the displacement reached at the end."""
+        """Return the voltages (V) for the displacements `y` (m), and the displacement (m) reached by the last one."""
         memory = Memory(self._base, self._v_rest)
         limits = self._of_base(lower), self._of_base(upper)
         of_base = memory.inverse_array((y - self._y_start) / self._scale, *limits)
@@ -338,5 +338,5 @@ class _Cycle:
         return np.clip(v, lower, upper), self._y_start + self._scale * memory.displacement
 
     def _of_base(self, v: Volts) -> Volts:
-        """Convert voltages of the cycle to those of the base model."""
+        """Convert voltages of the cycle to voltages of the base model."""
         return self._base.origin + (v - self._base.origin) * self._stretch

@@ -1,4 +1,4 @@
-"""The play operator and the classical Prandtl-Ishlinskii (PI) model: branches of one shape everywhere.
+"""The play operator and the classical Prandtl-Ishlinskii (PI) model, whose branches all have the same shape.
 
 SLPI paper, Eq. 1 (play operator), Eq. 8 (PI model), Eq. 10-12 (analytic inverse, as corrected in the documentation).
 """
@@ -18,8 +18,8 @@ FloatArray = NDArray[np.float64]
 class PrandtlIshlinskii:
     """A weighted sum of play operators, ``P[v] = sum_i w_i p_i[v]``; the one with threshold 0 is the linear term.
 
-    At rest every operator is in the middle of its play, and moves after ``r_i``; in a primed memory it is at the end,
-    as after a long fall, and moves up after ``2 r_i``.
+    At rest every operator is in the middle of its play and moves after ``r_i``; in a primed memory it is at the upper
+    end of its play, as after a long fall, and moves up after ``2 r_i``.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class PrandtlIshlinskii:
     Raises
     ------
     ModelError
-        If thresholds and weights do not fit, or the sum of the first weights is negative somewhere.
+        If thresholds and weights are inconsistent, or a cumulative sum of the weights is negative.
     """
 
     thresholds: FloatArray
@@ -40,7 +40,7 @@ class PrandtlIshlinskii:
     _first: Curve = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the operators and lay out the two shapes that all branches have."""
+        """Validate the parameters and compute the two shapes of all branches."""
         for name in ("thresholds", "weights"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         r, w = self.thresholds, self.weights
@@ -50,22 +50,22 @@ class PrandtlIshlinskii:
             raise ModelError("PI: thresholds must be finite, not negative and rise strictly; weights must be finite")
         if np.min(np.cumsum(w)) < 0:
             raise ModelError(
-                "PI: the sum of the first weights must not be negative, else a branch falls where the voltage rises"
+                "PI: every cumulative sum of the weights must be at least 0, else rising branches would decrease"
             )
         object.__setattr__(self, "_branch", self._curve(2.0))
         object.__setattr__(self, "_first", self._curve(1.0))
 
     @property
     def invertible(self) -> bool:
-        """Whether every voltage change moves the output: the linear weight is positive and stays so in every sum."""
+        """Whether the output is strictly monotone: all cumulative sums of the weights are positive."""
         return bool(self.thresholds[0] == 0 and np.min(np.cumsum(self.weights)) > 0)
 
     def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return ``F(u) = sum_i w_i max(u - 2 r_i, 0)``, the same from everywhere."""
+        """Return the branch ``F(u) = sum_i w_i max(u - 2 r_i, 0)``, independent of the reversal."""
         return self._branch
 
     def first_rise(self, v_rest: float) -> Curve:
-        """Return the first rise of a virgin model, ``F(u) = sum_i w_i max(u - r_i, 0)``."""
+        """Return the first rise from rest, ``F(u) = sum_i w_i max(u - r_i, 0)``."""
         return self._first
 
     def inverse(self) -> "PrandtlIshlinskii":
@@ -90,7 +90,7 @@ class PrandtlIshlinskii:
         return PrandtlIshlinskii(thresholds[moving], weights[moving])
 
     def _curve(self, plays: float) -> Curve:
-        """Return the curve on which operator i moves after `plays` times its threshold."""
+        """Return the curve in which operator i starts to move at `plays` times its threshold."""
         knots = plays * self.thresholds
         slopes = np.cumsum(self.weights)
         if knots[0] > 0:
@@ -101,7 +101,7 @@ class PrandtlIshlinskii:
 
 
 def play(threshold: float) -> PrandtlIshlinskii:
-    """Return the play operator of `threshold` (V): ``p = max(v - r, min(v + r, p))``, Eq. 1. It has no inverse.
+    """Return the play operator of `threshold` (V): ``p = max(v - r, min(v + r, p))``, Eq. 1; it is not invertible.
 
     Parameters
     ----------

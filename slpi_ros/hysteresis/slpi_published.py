@@ -1,8 +1,8 @@
 """The Separated Level-loop Prandtl-Ishlinskii (SLPI) model as published: one classical PI model for each single loop.
 
-SLPI paper, sections 3.3 and 3.4. A path known in advance is separated into loops, each is evaluated by its own PI
-model in coordinates that start at the loop's vertex, and the loops are linked again where they were sewn, from the
-outer loop inwards. The inverse is rebuilt in the same way from the analytic inverses ("rollback").
+SLPI paper, sections 3.3 and 3.4. A known path is separated into loops; each is evaluated by its own PI model in
+coordinates relative to its vertex; the loops are linked at the points of separation, starting with the outer loop. The
+inverse is constructed in the same way from the analytic inverses ("rollback").
 """
 
 import warnings
@@ -19,20 +19,20 @@ from slpi_ros.hysteresis.turning_points import Memory
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Column ``sp`` of a separated record.
+# Values of column ``sp`` of a separated record.
 NO_VERTEX, SUSPECTED, TRUE_VERTEX = 0, 1, 2
-# A loop of a path counts as identified when level and direction are the same, and vertex and span within this share
-# of the outer loop's span: a path of displacements turns at slightly other places than the path of voltages did.
+# A loop of a path matches an identified loop if level and direction are equal and vertex and span differ by at most
+# this share of the outer loop's span: the reversals of a desired path differ slightly from those of the record.
 SAME_LOOP = 0.2
-# A path starts where the axis rests if it starts as near as this (share of the outer loop's span).
+# Tolerance for the start of a path at the rest point (share of the outer loop's span).
 NEAR_START = 0.01
-# How far away a loop of another level, or of the other direction, is (share of the outer loop's span). More for two
-# levels than for one would be wrong: how levels count depends on how a record is cut.
+# Distance assigned to a loop of different level or direction (share of the outer loop's span). It is independent of the
+# difference in level, because the level depends on how a record is divided.
 OTHER_LOOP = 0.5
 
 
 class UnidentifiedLoopWarning(UserWarning):
-    """A path holds loops that were not identified; the nearest identified ones are used for them."""
+    """A path contains loops that were not identified; the nearest identified loops are used instead."""
 
 
 @dataclass(frozen=True)
@@ -42,20 +42,20 @@ class Loop:
     Parameters
     ----------
     level : int
-        0 for the outer loop; else one more than that of the loop its vertex lies on.
+        0 for the outer loop, else one more than the level of the loop that contains its vertex.
     vertex : int
-        Sample from which it starts.
+        Sample at which the loop starts.
     direction : int
-        Of the first move from the vertex: -1 where the vertex lies on a rising branch, +1 on a falling one.
+        Direction of the first move from the vertex: -1 on a rising branch, +1 on a falling one.
     samples : ndarray of int, shape (m,)
-        Samples that belong to this loop and to no other, in order. The vertex belongs to the loop it lies on, but for
-        that of the outer loop, sample 0.
+        Samples of this loop only, in order. A vertex belongs to the loop that contains it, except for the vertex of the
+        outer loop, sample 0.
     sewn : ndarray of int, shape (n,)
-        Those samples at which inner loops were taken out: their vertices.
+        Those samples that are vertices of separated inner loops.
     closed : bool
-        Whether the voltage came back to the vertex. The outer loop counts as open: nothing forgets it.
+        Whether the voltage returned to the vertex. The outer loop is open by definition.
     below : int
-        Number of the loop that its vertex lies on; 0 for the outer loop too, which lies on none.
+        Number of the loop that contains the vertex; 0 for the outer loop.
     """
 
     level: int
@@ -68,7 +68,7 @@ class Loop:
 
     @property
     def path(self) -> IntArray:
-        """Samples of the single loop as sewn together, shape (m + 1 or 2,): vertex, samples, and the vertex again."""
+        """Samples of the joined loop, shape (m + 1 or 2,): vertex, samples, and the vertex again."""
         own = self.samples[self.samples != self.vertex]
         return np.concatenate([[self.vertex], own, [self.vertex] if self.closed else []]).astype(np.int64)
 
@@ -80,17 +80,17 @@ class Separation:
     Parameters
     ----------
     voltage : ndarray, shape (N,), volts
-        Without the reversals within the dead band.
+        Voltage without the reversals within the dead band.
     displacement : ndarray, shape (N,), metres
     phase : ndarray of int, shape (N,)
-        ``tr``: +1 boost (rising), -1 back (falling); that of a turning point is the phase it starts.
+        ``tr``: +1 boost (rising), -1 back (falling); a reversal has the phase that starts there.
     level : ndarray of int, shape (N,)
         ``lv``: the number of suspected vertices at that time. A loop of the outer loop's back phase counts one more
         than one of its boost phase; `Loop.level` is the depth of nesting instead.
     vertex : ndarray of int, shape (N,)
         ``sp``: 0 none, 1 suspected, 2 true vertex.
     loops : tuple of Loop
-        The outer loop first, then in the order of their vertices.
+        The outer loop first, then the others in the order of their vertices.
     """
 
     voltage: FloatArray
@@ -113,12 +113,12 @@ def separate(voltage: FloatArray, displacement: FloatArray | None = None, *, dea
     Parameters
     ----------
     voltage : ndarray, shape (N,), volts
-        The record starts at rest, at the vertex of the outer loop. A desired displacement in its place gives the loops
-        of a desired path.
+        Voltage, starting at rest at the vertex of the outer loop. For a desired path, pass the desired displacement
+        instead.
     displacement : ndarray, shape (N,), metres, optional
-        Only carried along.
+        Measured displacement, stored in the result without being used.
     dead_band : float, volts
-        Smaller reversals than this are noise of the measurement.
+        Reversals of at most this size are treated as measurement noise; 0 by default.
 
     Returns
     -------
@@ -148,9 +148,9 @@ def separate(voltage: FloatArray, displacement: FloatArray | None = None, *, dea
 def _judge(
     v: FloatArray, phase: IntArray, level: IntArray, vertex: IntArray
 ) -> tuple[list[tuple[int, int]], list[int]]:
-    """Find the closed loops, each as its vertex and the sample that closes it, and the vertices still suspected.
+    """Find the closed loops, as pairs of vertex and closing sample, and the remaining suspected vertices.
 
-    The columns `phase`, `level` and `vertex` of the `Separation` are filled in.
+    The columns `phase`, `level` and `vertex` of the `Separation` are written in place.
     """
     suspects: list[int] = []
     closed: list[tuple[int, int]] = []
@@ -176,9 +176,9 @@ def _judge(
 
 
 def _loops(closed: list[tuple[int, int]], suspects: list[int], falls_first: bool, phase: IntArray) -> tuple[Loop, ...]:
-    """Assign every sample to the innermost loop around it."""
-    # The first vertex still suspected is the outer loop's own turn, and every second one from there that of an open
-    # loop. A record that falls at first suspects its very start too.
+    """Assign every sample to the innermost loop that contains it."""
+    # The first remaining suspected vertex is the reversal of the outer loop, and every second one after it starts an
+    # open loop. In a record that starts with a fall, the first sample is suspected, too.
     opened = [(vertex, phase.size) for vertex in suspects[2 if falls_first else 1 :: 2]]
     spans = sorted(closed + opened)
     owner = np.zeros(phase.size, dtype=np.int64)
@@ -213,18 +213,18 @@ class SingleLoop:
     level, direction : int
         As in `slpi_ros.hysteresis.slpi_published.Loop`.
     vertex : (float, float), volts and metres
-        Where the loop starts.
+        Start of the loop.
     span : (float, float), volts and metres
-        From the vertex to the farthest point of the loop, both positive.
+        Distance from the vertex to the farthest point of the loop, both positive.
     offset : (float, float), volts and metres
-        How far the vertex lies from where the model of the loop below leads at the same displacement or voltage: every
-        loop keeps its own place, so that the error of one is no error of those on it.
+        Distance of the vertex from the model of the containing loop at the same displacement or voltage: every loop
+        keeps its measured position, so that errors do not propagate to inner loops.
     model : PrandtlIshlinskii
-        In coordinates that are zero at the vertex and positive along the loop.
+        Model in coordinates that are zero at the vertex and increase along the loop.
     run_in : float or None, volts
         None: the play operators start at rest, as published; an inner loop then misses its vertex by ``sum w_i r_i``.
-        0: they start primed, and must travel ``2 r`` before they move, as after a reversal; the loop closes.
-        More: primed that much below the vertex, and driven up to it: an outer loop may start in mid-memory.
+        0: they start primed and move after ``2 r``, as after a reversal; the loop closes. Positive: primed that far
+        below the vertex and driven up to it, for an outer loop that starts with history.
     """
 
     level: int
@@ -236,12 +236,12 @@ class SingleLoop:
     run_in: float | None
 
     def memory(self) -> Memory:
-        """Return the loop's own memory, at its vertex."""
+        """Return the memory of the loop at its vertex."""
         return at_vertex(self.model, self.run_in)
 
 
 def at_vertex(model: PrandtlIshlinskii, run_in: float | None) -> Memory:
-    """Return the memory of a single loop at its vertex, 0 V and 0 m; see `SingleLoop` for `run_in` (V)."""
+    """Return the memory of a single loop at its vertex, 0 V and 0 m; for `run_in` (V) see `SingleLoop`."""
     if run_in is None:
         return Memory(model)
     risen = Memory(model, -run_in, primed=True).forward(0.0)
@@ -257,9 +257,9 @@ class SeparatedLoops:
     Parameters
     ----------
     loops : tuple of SingleLoop
-        At least one of level 0.
+        Identified loops, at least one of level 0.
     dead_band : float, volts
-        Smaller reversals of the voltage are noise of its measurement.
+        Reversals of at most this size are treated as measurement noise.
 
     Raises
     ------
@@ -271,7 +271,7 @@ class SeparatedLoops:
     dead_band: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the loops."""
+        """Validate the loops."""
         if not self.dead_band >= 0.0:
             raise ModelError(f"published SLPI: dead band of {self.dead_band} V; give 0 or more")
         if not any(loop.level == 0 for loop in self.loops):
@@ -287,7 +287,7 @@ class SeparatedLoops:
                 raise ModelError(f"published SLPI: loop {number} has no linear weight and so no inverse")
 
     def along(self, voltage: float, displacement: float) -> "KnownPath":
-        """Return the model on paths known in advance, each from rest at `voltage` (V) and `displacement` (m)."""
+        """Return the model for known paths, each starting from rest at `voltage` (V) and `displacement` (m)."""
         return KnownPath(self, (voltage, displacement))
 
     @property
@@ -301,11 +301,11 @@ class SeparatedLoops:
         Parameters
         ----------
         level, direction : int
-            Another level, and the other direction, weigh as much as half the outer loop's span each.
+            Level and direction; a different value adds half the outer loop's span each to the distance.
         vertex, span : float
-            In volts (`coordinate` 0) or metres (1).
+            Position of the vertex and span, volts (`coordinate` 0) or metres (`coordinate` 1).
         coordinate : int
-            Which of the two.
+            Coordinate of `vertex` and `span`: 0 voltage, 1 displacement.
         """
         scale = self.outer_span[coordinate]
 
@@ -318,20 +318,20 @@ class SeparatedLoops:
     def matches(
         self, loop: SingleLoop, level: int, direction: int, vertex: float, span: float, coordinate: int
     ) -> bool:
-        """Whether `loop` is the loop that the other parameters (as in `nearest`) describe."""
+        """Return whether `loop` matches the loop described by the other parameters, which are those of `nearest`."""
         tolerance = SAME_LOOP * self.outer_span[coordinate]
         apart = max(abs(loop.vertex[coordinate] - vertex), abs(loop.span[coordinate] - span))
         return (loop.level, loop.direction) == (level, direction) and apart <= tolerance
 
 
 class KnownPath:
-    """The published SLPI model on paths that are known from beginning to end.
+    """The published SLPI model on completely known paths.
 
     Parameters
     ----------
     model : SeparatedLoops
     start : (float, float), volts and metres
-        Where the axis rests before every path.
+        Rest point before every path.
     """
 
     def __init__(self, model: SeparatedLoops, start: tuple[float, float]) -> None:
@@ -344,7 +344,7 @@ class KnownPath:
         Warns
         -----
         UnidentifiedLoopWarning
-            If the path holds loops that were never identified.
+            If the path contains loops that were not identified.
         """
         return self._through(v, 0)
 
@@ -354,16 +354,16 @@ class KnownPath:
         Warns
         -----
         UnidentifiedLoopWarning
-            If the path holds loops that were never identified.
+            If the path contains loops that were not identified.
         """
         return np.clip(self._through(y, 1), lower, upper)
 
     def _through(self, x: FloatArray, coordinate: int) -> FloatArray:
-        """Drive one coordinate (0 voltage, 1 displacement) through `x`: the outer loop first, then those on it."""
+        """Evaluate one coordinate (0 voltage, 1 displacement) along `x`, from the outer loop to the inner ones."""
         if not x.size:
             return np.empty_like(x)
         require_finite(x)
-        # The path begins where the axis rests; a step from there that is next to nothing is no loop.
+        # The path starts at the rest point; a negligible first step is not treated as a loop.
         path = np.concatenate([[self._start[coordinate]], x])
         answer = np.full_like(path, self._start[1 - coordinate])
         if abs(path[1] - path[0]) < NEAR_START * self._model.outer_span[coordinate]:
@@ -389,7 +389,7 @@ class KnownPath:
 
 
 def _unidentified(loop: Loop, place: tuple[int, int, float, float], count: int, coordinate: int) -> str:
-    """Describe the loops of a path that were not identified, and the first of them."""
+    """Return a message on the unidentified loops of a path with their number and the first of them."""
     unit, factor = ("V", 1.0) if coordinate == 0 else ("um", 1e6)
     level, _, vertex, span = place
     return (

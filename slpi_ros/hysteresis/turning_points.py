@@ -1,14 +1,14 @@
-"""The hysteresis engine: a stack of turning points and the branch on top of it, driven by voltage or by displacement.
+"""The hysteresis engine: a stack of reversals and the current branch, driven by voltage or by displacement.
 
 Every rate-independent operator with return-point memory obeys Madelung's laws:
 
-1. a branch is determined by the turning point it starts from;
-2. it heads for the turning point before that one and passes through it: the loop closes;
-3. once a loop is closed both its turning points are forgotten, and the older branch goes on.
+1. a branch is determined by the reversal at which it starts;
+2. it passes through the preceding reversal, where the loop closes;
+3. a closed loop removes both its reversals from the memory, and the previous branch continues.
 
 Models differ only in the *shape* of a branch, ``y = y_a + s F(s (v - v_a))`` with ``s = +1`` rising or ``-1`` falling.
-``F`` is continuous, strictly increasing and piecewise linear, ``F(0) = 0``; so is its inverse: one stack serves both
-directions, exactly and causally.
+``F`` is continuous, strictly increasing and piecewise linear, ``F(0) = 0``, and therefore invertible: one stack serves
+both directions, exactly and causally.
 """
 
 from bisect import bisect_right
@@ -25,19 +25,19 @@ from slpi_ros.hysteresis.reversals import count_before, monotone_runs, require_f
 
 FloatArray = NDArray[np.float64]
 
-# No voltage may lie farther than this from rest (V); the last knot of every branch lies `END` beyond the others.
+# Largest distance of a voltage from rest (V); the last knot of every branch lies `END` beyond the others.
 FAR = 1e5
 END = 4 * FAR
-# Curves kept for turning points on the stack: turning points can be many, and curves are large.
+# Number of cached branch curves; reversals can be numerous and curves are large.
 KEPT_CURVES = 64
-# A monotone run shorter than this is quicker sample by sample than through numpy.interp.
+# Monotone runs with fewer samples are evaluated in a loop, which is faster than numpy.interp for these.
 SHORT_RUN = 64
 
 
 class Curve(NamedTuple):
-    """A branch shape ``F`` as knots (V, m), strictly increasing from ``u[0] = f[0] = 0``, the last one `END` beyond.
+    """A branch shape ``F`` as knots (V, m), strictly increasing from ``u[0] = f[0] = 0``, the last at distance `END`.
 
-    The same knots twice: as lists, which are quick to search one by one, and as an array, shape (2, k).
+    The knots are stored as lists for a fast scalar search and as an array, shape (2, k).
     """
 
     u: list[float]
@@ -52,17 +52,17 @@ class Curve(NamedTuple):
 
 
 class Shape(Protocol):
-    """The shapes of a hysteresis model's branches: all that the engine needs to know of it."""
+    """Branch shapes of a hysteresis model, as required by the engine."""
 
     @property
     def symmetric_rest(self) -> bool:
-        """Whether rest lies in the middle of the memory (virgin: the first turn closes at its mirror image).
+        """Whether rest is the middle of the memory: the first loop then closes at the mirror image of its reversal.
 
-        If not, rest is the low end of the memory: a fall from it is an ordinary branch that returns to it.
+        If not, rest is the low end of the memory: a fall from rest is an ordinary branch that returns to rest.
         """
 
     def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return the shape of the branch that starts in `direction` at the turning point `v_turn` (V)."""
+        """Return the shape of the branch that starts in `direction` at the reversal `v_turn` (V)."""
 
     def first_rise(self, v_rest: float) -> Curve:
         """Return the shape of the first rise from rest at `v_rest` (V)."""
@@ -70,7 +70,7 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class MemoryState:
-    """A snapshot of a `Memory`: direction (0 at rest), present point and turning points, oldest first (V and m)."""
+    """State of a `Memory`: direction (0 at rest), current point, and reversals, oldest first (V and m)."""
 
     direction: int
     voltage: float
@@ -80,22 +80,22 @@ class MemoryState:
 
 
 class Memory:
-    """Turning-point memory of one axis, driven by voltage (`forward`) or by displacement (`inverse`).
+    """Reversal memory of one axis, driven by voltage (`forward`) or by displacement (`inverse`).
 
     Parameters
     ----------
     shape : Shape
-        The model.
+        Branch shapes of the model.
     rest_voltage : float, volts
     rest_displacement : float, metres
-        Where the axis is at the start.
+        Initial point.
     primed : bool
-        False: the axis has never been moved. True: it came there by a long fall, which wiped its memory.
+        False: no previous motion. True: the initial point was reached by a long fall that wiped the memory.
     """
 
     __slots__ = (
         *("_shape", "_rest", "_far", "_turns", "_turn_curves", "_direction", "_v", "_y"),
-        # the present branch: origin, curve, closing point, and how far samples may follow it without a second look
+        # current branch: origin, curve, closing point, and the range within which samples need no stack update
         *("_v0", "_y0", "_curve", "_u", "_f", "_close", "_reach_u", "_reach_f"),
     )
 
@@ -104,7 +104,7 @@ class Memory:
     ) -> None:
         self._shape = shape
         self._rest = (rest_voltage, rest_displacement)
-        # What `FAR` is for voltages; half of it leaves room for the loops, whose branches differ a little out there.
+        # Displacement that corresponds to `FAR`, halved as a margin for the different branches of inner loops.
         far_out = (shape.first_rise(rest_voltage), shape.branch(1, rest_voltage), shape.branch(-1, rest_voltage))
         self._far = (FAR, min(float(np.interp(FAR / 2, *curve.knots)) for curve in far_out))
         self.restore(MemoryState(0, rest_voltage, rest_displacement, (), ()))
@@ -115,12 +115,12 @@ class Memory:
 
     @property
     def voltage(self) -> float:
-        """Present voltage, volts."""
+        """Current voltage, volts."""
         return self._v
 
     @property
     def displacement(self) -> float:
-        """Present displacement, metres."""
+        """Current displacement, metres."""
         return self._y
 
     @property
@@ -130,26 +130,26 @@ class Memory:
 
     @property
     def depth(self) -> int:
-        """Number of turning points on the stack."""
+        """Number of reversals on the stack."""
         return len(self._turns[0])
 
     def snapshot(self) -> MemoryState:
-        """Return the whole state, for `restore`."""
+        """Return the complete state for `restore`."""
         return MemoryState(self._direction, self._v, self._y, tuple(self._turns[0]), tuple(self._turns[1]))
 
     def restore(self, state: MemoryState) -> None:
-        """Replace the state by one from `snapshot`."""
+        """Replace the state by one returned by `snapshot`."""
         self._direction = state.direction
         self._v, self._y = state.voltage, state.displacement
         self._turns: tuple[list[float], list[float]] = (list(state.turn_voltages), list(state.turn_displacements))
-        # The curve of the branch that ended at each turning point, where it is known: most are entered again.
+        # Cached curve of the branch that ended at each reversal, as most branches are continued later.
         self._turn_curves: list[Curve | None] = [None] * len(state.turn_voltages)
         self._enter_branch()
 
     # The stack
 
     def _turn_to(self, direction: int) -> None:
-        """Push the present point as a turning point when the direction changes."""
+        """Push the current point as a reversal if the direction changes."""
         if direction == self._direction:
             return
         if self._direction:
@@ -162,16 +162,16 @@ class Memory:
         self._enter_branch()
 
     def _close_loop(self) -> None:
-        """Pop the two turning points of the loop that has just closed and continue on the older branch."""
+        """Remove the two reversals of the closed loop and continue on the previous branch."""
         older = self._turn_curves[-2] if len(self._turn_curves) > 1 else None
         for turns in (*self._turns, self._turn_curves):
             del turns[-2:]
         self._enter_branch(older)
 
     def _enter_branch(self, known: Curve | None = None) -> None:
-        """Look up the branch from the last turning point in the present direction, and where it closes.
+        """Set the branch from the last reversal in the current direction, and its closing point.
 
-        `known` is its curve, if that has been looked up before.
+        `known` is the cached curve of this branch, if available.
         """
         s, shape = self._direction, self._shape
         v_turns, y_turns = self._turns
@@ -185,13 +185,13 @@ class Memory:
             self._curve = known or (shape.branch(s, self._v0) if falls_from_low_end else shape.first_rise(self._v0))
             self._close = (s * inf, s * inf) if s else self._rest
         self._u, self._f, _ = self._curve
-        # Beyond its closing point, or far away, a branch may not be followed without a second look.
+        # Beyond the closing point or the largest voltage the stack must be checked again.
         (v_rest, y_rest), (v_far, y_far) = self._rest, self._far
         self._reach_u = min(s * self._close[0], s * v_rest + v_far) - s * self._v0
         self._reach_f = min(s * self._close[1], s * y_rest + y_far) - s * self._y0
 
     def _first_closing(self, s: int) -> tuple[float, float]:
-        """Return the point where the branch from the very first turning point meets the one that leaves rest."""
+        """Return the point where the branch from the first reversal meets the branch that leaves rest."""
         v_rest, y_rest = self._rest
         if self._shape.symmetric_rest:
             return 2.0 * v_rest - self._turns[0][0], 2.0 * y_rest - self._turns[1][0]
@@ -205,7 +205,7 @@ class Memory:
         Raises
         ------
         UsageError
-            If `v` is not finite or absurdly large; the memory is unchanged.
+            If `v` is not finite or out of range; the memory is unchanged.
         """
         s = self._direction
         if s * (v - self._v) > 0.0 and s * (v - self._v0) < self._reach_u:
@@ -213,7 +213,7 @@ class Memory:
         return self._turn_or_close_at_voltage(v)
 
     def _follow_to_voltage(self, v: float) -> float:
-        """Move on along the present branch."""
+        """Advance along the current branch."""
         s, u_knots, f_knots = self._direction, self._u, self._f
         u = s * (v - self._v0)
         i = bisect_right(u_knots, u, 1)
@@ -223,9 +223,9 @@ class Memory:
         return y
 
     def _turn_or_close_at_voltage(self, v: float) -> float:
-        """Push a reversal or pop closed loops on the way to `v`, where needed, and move there."""
+        """Push a reversal or remove closed loops as required, and move to `v`."""
         if not abs(v - self._rest[0]) < self._far[0]:
-            raise UsageError(f"voltage {v} V is none that a stage can be given; leave such samples out")
+            raise UsageError(f"voltage {v} V is out of range; leave such samples out")
         if v == self._v:
             return self._y
         s = 1 if v > self._v else -1
@@ -237,14 +237,14 @@ class Memory:
     # Inverse: displacement to voltage
 
     def inverse(self, y: float, lower: float = -inf, upper: float = inf) -> float:
-        """Move to the displacement `y` (m), or as near as the voltages from `lower` to `upper` (V) allow.
+        """Move to the displacement `y` (m), or as near as `lower` and `upper` (V) allow; return that voltage (V).
 
-        The memory follows the voltage returned (V): while a displacement is out of reach the axis waits at the limit.
+        The memory follows the returned voltage: for an unreachable displacement it stays at the limit.
 
         Raises
         ------
         UsageError
-            If `y` is not finite or absurdly large; the memory is unchanged.
+            If `y` is not finite or out of range; the memory is unchanged.
         """
         s = self._direction
         if s * (y - self._y) > 0.0 and s * (y - self._y0) < self._reach_f:
@@ -252,12 +252,12 @@ class Memory:
         return self._turn_or_close_at_displacement(y, lower, upper)
 
     def _follow_to_displacement(self, y: float, lower: float, upper: float) -> float:
-        """Move on along the present branch, at most to a voltage limit."""
+        """Advance along the current branch, at most to a voltage limit."""
         s, u_knots, f_knots = self._direction, self._u, self._f
         f = s * (y - self._y0)
         i = bisect_right(f_knots, f, 1)
         if i == len(f_knots):
-            raise UsageError(f"displacement {y} m is none that this model can take; leave such samples out")
+            raise UsageError(f"displacement {y} m cannot be reached by this model; leave such samples out")
         u_a, f_a = u_knots[i - 1], f_knots[i - 1]
         v = self._v0 + s * (u_a + (f - f_a) * ((u_knots[i] - u_a) / (f_knots[i] - f_a)))
         if lower <= v <= upper:
@@ -267,9 +267,9 @@ class Memory:
         return self._v
 
     def _turn_or_close_at_displacement(self, y: float, lower: float, upper: float) -> float:
-        """Push a reversal or pop closed loops on the way to `y`, where needed, and move there within the limits."""
+        """Push a reversal or remove closed loops as required, and move to `y` within the limits."""
         if not abs(y - self._rest[1]) < self._far[1]:
-            raise UsageError(f"displacement {y} m is none that a stage can take; leave such samples out")
+            raise UsageError(f"displacement {y} m is out of range; leave such samples out")
         if not lower <= self._v <= upper:
             self._turn_or_close_at_voltage(min(max(self._v, lower), upper))
         if y == self._y:
@@ -286,7 +286,7 @@ class Memory:
             self._close_loop()
         return self._follow_to_displacement(y, lower, upper)
 
-    # Batches: between two reversals the map is one monotone piecewise-linear function
+    # Batch evaluation: between two reversals the model is one monotone piecewise linear function
 
     def forward_array(self, v: FloatArray) -> FloatArray:
         """Move through the voltages `v`, shape (N,), volts; return the displacements, shape (N,), metres."""
@@ -297,8 +297,8 @@ class Memory:
     ) -> FloatArray:
         """Move through the displacements `y`, shape (N,), metres; return the voltages, shape (N,), volts.
 
-        `lower` and `upper` (V) bound the voltage as in `inverse`. The displacements that these allow, shape (N,),
-        metres, are written to `reached`, if given.
+        `lower` and `upper` (V) limit the voltage as in `inverse`. The displacements reached within these limits, shape
+        (N,), metres, are written to `reached`, if given.
         """
         if reached is not None:
             reached[:] = y
@@ -307,11 +307,11 @@ class Memory:
     def split_at_closures(
         self, x: FloatArray, start: int, stop: int, coordinate: int, lower: float = -inf, upper: float = inf
     ) -> Iterator[tuple[int, int]]:
-        """Cut the monotone run ``start:stop`` of a drive where loops close, and move the stack along.
+        """Divide the monotone run ``start:stop`` of `x` at loop closures, and update the stack.
 
-        `coordinate` tells what `x`, shape (N,), is: 0 voltage (V), 1 displacement (m). The pieces lie each on
-        one branch and end before a loop that closes beyond a voltage limit (V). The caller must `advance_to` the last
-        sample of a piece before it takes the next.
+        `coordinate` is the unit of `x`, shape (N,): 0 voltage (V), 1 displacement (m). Each piece lies on one branch
+        and ends before a loop that closes beyond a voltage limit (V). The caller must `advance_to` the last sample of a
+        piece before requesting the next piece.
         """
         s = 1 if x[stop - 1] > x[start - 1] else -1
         limit = upper if s > 0 else lower
@@ -329,25 +329,25 @@ class Memory:
             start = cut
 
     def advance_to(self, v: float, y: float) -> None:
-        """Set the present point (V, m), which must lie ahead on the present branch."""
+        """Set the current point (V, m), which must lie ahead on the current branch."""
         self._v, self._y = v, y
 
     def _through(
         self, x: FloatArray, coordinate: int, lower: float, upper: float, reached: FloatArray | None
     ) -> FloatArray:
-        """Drive one coordinate (0 voltage, 1 displacement) through `x`; return the other, and write to `reached`."""
+        """Evaluate the model along one coordinate `x` (0 voltage, 1 displacement), writing to `reached`."""
         x = np.ascontiguousarray(x, dtype=np.float64)
         if not x.size:
             return np.empty_like(x)
         rest, far = self._rest[coordinate], self._far[coordinate]
-        # Two passes without a copy; NaN fails both comparisons.
+        # Minimum and maximum avoid a copy; NaN fails both comparisons.
         if not (rest - far < x.min() and x.max() < rest + far):
             require_finite(x)
             at = int(np.argmax(np.abs(x - rest)))
-            raise UsageError(f"sample {at} is {x[at]} {'Vm'[coordinate]}, none of a stage; leave such samples out")
+            raise UsageError(f"sample {at} is {x[at]} {'Vm'[coordinate]}, out of range; remove such samples")
         out = np.empty_like(x)
         for start, stop in monotone_runs(x):
-            # Otherwise the axis is held at a voltage limit, away from the desired displacement.
+            # Otherwise the axis is held at a voltage limit and has not reached the desired displacement.
             on_path = start and x[start - 1] == (self._y if coordinate else self._v)
             if stop - start >= SHORT_RUN and on_path:
                 start = self._along_branches(x, out, start, stop, coordinate, lower, upper)
@@ -358,7 +358,7 @@ class Memory:
     def _along_branches(
         self, x: FloatArray, out: FloatArray, start: int, stop: int, coordinate: int, lower: float, upper: float
     ) -> int:
-        """Evaluate the run ``start:stop`` branch by branch; return where it ends, earlier at a voltage limit."""
+        """Evaluate the run ``start:stop`` branch by branch; return its end, which is earlier at a voltage limit."""
         done = start
         for begin, end in self.split_at_closures(x, start, stop, coordinate, lower, upper):
             drive, response = self._knots(coordinate, float(x[end - 1]))
@@ -375,13 +375,13 @@ class Memory:
         return done
 
     def _knots(self, coordinate: int, farthest: float) -> tuple[FloatArray, FloatArray]:
-        """Return the branch up to `farthest` as ascending knots of the driven and of the answering coordinate."""
+        """Return the branch up to `farthest` as ascending knots of input and output coordinate."""
         s = self._direction
         origin = (self._v0, self._y0)
         reach = s * (farthest - origin[coordinate])
         drive, response = self._curve.knots[:, :-1][:: 1 - 2 * coordinate]
         if reach > drive[-1]:
-            # The last knot is too far away for exact arithmetic.
+            # The last knot is too distant for exact arithmetic.
             (*_, d0, d1), (*_, r0, r1) = self._curve[1::-1] if coordinate else self._curve[:2]
             drive, response = np.append(drive, reach), np.append(response, r0 + (reach - d0) * ((r1 - r0) / (d1 - d0)))
         return (origin[coordinate] + s * drive)[::s], (origin[1 - coordinate] + s * response)[::s]
@@ -389,7 +389,7 @@ class Memory:
     def _sample_by_sample(
         self, run: list[float], coordinate: int, lower: float, upper: float, reached: FloatArray | None
     ) -> list[float]:
-        """Move through a monotone run and return the responses; quick where samples stay on the branch of the last."""
+        """Evaluate a monotone run sample by sample; fast while samples stay on one branch."""
         responses: list[float] = []
         while len(responses) < len(run):
             x = run[len(responses)]
@@ -403,7 +403,7 @@ class Memory:
     def _follow_run(
         self, run: list[float], responses: list[float], coordinate: int, lower: float, upper: float
     ) -> None:
-        """Append the responses of the samples that stay on the present branch and within the voltage limits."""
+        """Append the outputs of the samples on the current branch within the voltage limits."""
         s, origin = self._direction, (self._v0, self._y0)
         reach = self._reach_f if coordinate else self._reach_u
         drive, response = (self._f, self._u) if coordinate else (self._u, self._f)

@@ -1,1 +1,1 @@
-"""Tables, plots and pages."""
+"""HTML pages, charts and text summaries of results."""

@@ -1,6 +1,6 @@
-"""Interactive charts, drawn by the plotly.js bundle that every page carries.
+"""Interactive charts, drawn by the plotly.js bundle that every page contains.
 
-Input is in SI; the quantities of a panel convert it to the unit shown.
+Input is in SI units; `Quantity` converts it to the displayed unit.
 """
 
 import base64
@@ -15,21 +15,21 @@ from numpy.typing import NDArray
 
 MEASURED, DESIRED, NOISE = "#8a97a5", "#1b2733", "#c9d2da"
 COLOURS = ("#c8553d", "#d99a26", "#2a7f62", "#3b6ea5")
-# Samples that do not count: their time, the measurement, and the model.
+# Colours of unused samples: their time span, the measurement, and the model.
 UNUSED_SHADE, UNUSED_MEASURED, UNUSED_MODEL = "#fbeccb", "#e6cc94", "#b98a2f"
 BEFORE, AFTER = COLOURS[0], COLOURS[2]
-# Of causes, in order of their weight; none is like BEFORE or AFTER.
+# Colours of causes, in the order of their weight; distinct from BEFORE and AFTER.
 CAUSES = ("#3b6ea5", "#d99a26", "#8d5fb0", "#1f9aa6", "#b5467d", "#7a6a53")
-# From few to many, and from little to much: dark on white, told apart by everyone.
+# Sequential colour scales for counts and errors: dark on white, suitable for colour blindness.
 SCALE = ((0.0, "#c3d8ea"), (0.5, "#5b8db8"), (1.0, "#173a5c"))
 ERROR_SCALE = ((0.0, "#c9e4d8"), (0.5, "#e0b04a"), (1.0, "#a8321c"))
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Points of a line, and dots of a cloud: each dot is an element of the page.
+# Largest number of points of a line, and of dots of a scatter plot, each of which is an element of the page.
 LINE_POINTS, CLOUD_POINTS = 5000, 1500
-# Pixels between panels, and what the names around the outer ones need.
+# Spacing between panels, and margins for the axis titles, pixels.
 _GAP = {"row": 80, "column": 62}
 _MARGIN = {"l": 75, "r": 15, "t": 46, "b": 56}
 _WIDTH = 1085
@@ -44,21 +44,21 @@ _SMALL = {"size": 13}
 
 
 def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
-    """Return the samples of thinned lines: the extremes of each signal in each stretch, and both ends.
+    """Return the sample indices of thinned lines: the extremes of each signal in each interval, and both ends.
 
-    Where a signal is NaN for as long as a stretch, one NaN is kept too, so that the line is interrupted there.
+    Of NaN sequences at least as long as an interval, one NaN is kept, so that the line is interrupted.
 
     Parameters
     ----------
     *signals : ndarray, shape (N,)
-        Drawn over one axis, from the same samples; NaN where there is nothing to draw.
+        Signals with a common horizontal axis; NaN for missing values.
     most : int
-        About as many as may be kept.
+        Approximate largest number of samples to be kept.
 
     Returns
     -------
     ndarray of int, shape (K,)
-        In order.
+        Indices in increasing order.
     """
     size = signals[0].size
     if size <= most:
@@ -79,14 +79,14 @@ def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
 
 
 def _holes(signal: FloatArray, length: int) -> IntArray:
-    """Return the first sample of each row of `length` or more NaN in a signal, shape (N,)."""
+    """Return the first sample of each sequence of at least `length` NaN in a signal, shape (N,)."""
     missing = np.pad(np.isnan(signal), 1).astype(np.int8)
     first, after = np.flatnonzero(np.diff(missing) > 0), np.flatnonzero(np.diff(missing) < 0)
     return first[after - first >= length]
 
 
 def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArray:
-    """Return the samples of a thinned scatter plot, shape (N,) each: its outline along `x`, and some inside."""
+    """Return the sample indices of a thinned scatter plot, shape (N,) each: its envelope along `x`, and some inside."""
     finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if finite.size <= most:
         return finite
@@ -98,16 +98,16 @@ def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArr
 
 @dataclass(frozen=True)
 class Quantity:
-    """What an axis of a panel shows.
+    """Quantity, unit and number format of a panel axis.
 
     Parameters
     ----------
-    name, unit : str
+    name, unit : str, as displayed
     scale : float
-        From SI to the unit.
+        Factor from SI to the displayed unit; 1 by default.
     digits : str
-        How a value is written, as in d3-format.
-    logarithmic : bool
+        Number format of values, as in d3-format.
+    logarithmic : bool, whether the axis is logarithmic
     """
 
     name: str
@@ -122,7 +122,7 @@ class Quantity:
         return f"{self.name} ({self.unit})" if self.unit else self.name
 
     def shown(self, values: FloatArray) -> dict[str, str]:
-        """Return values, SI, in the unit, packed as plotly.js reads them."""
+        """Return SI values in the displayed unit, in the encoding of plotly.js."""
         packed = np.ascontiguousarray(np.asarray(values) * self.scale, dtype="<f4")
         return {"dtype": "f4", "bdata": base64.b64encode(packed.tobytes()).decode()}
 
@@ -142,7 +142,7 @@ class Panel:
     ----------
     x, y : Quantity
     share : float
-        Its part of the width (in a row) or the height (in a column), relative to the others.
+        Share of the width (in a row) or height (in a column), relative to the other panels.
     """
 
     x: Quantity
@@ -152,16 +152,16 @@ class Panel:
 
 @dataclass
 class Chart:
-    """Panels in a row or a column, with one legend: a name that is switched off there goes from every panel.
+    """Panels in a row or a column with a common legend, which shows or hides a name in all panels.
 
     Parameters
     ----------
     panels : sequence of Panel
     arrangement : {"row", "column"}
-        Panels in a row share their vertical axis, those in a column their horizontal one, where they show the same
-        quantity: zooming in one zooms the others.
+        Panels in a row share the vertical axis, panels in a column the horizontal one, if they show the same quantity,
+        so that they zoom together.
     height : int
-        Pixels.
+        Height of the chart, pixels.
     """
 
     panels: Sequence[Panel]
@@ -173,30 +173,30 @@ class Chart:
     _legend: set[str] = field(default_factory=set, init=False)
 
     def line(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, width: float = 1.4) -> None:
-        """Add a line through points, shape (N,) each, SI; NaN interrupts it, and a point between two NaN is a dot."""
+        """Add a line through points, shape (N,) each, SI; NaN interrupts it, an isolated point is drawn as a dot."""
         style: dict[str, Any] = {"mode": "lines", "line": {"color": colour, "width": width}}
         if _alone(y).any():
             style |= {"mode": "lines+markers", "marker": {"color": colour, "size": width}}
         self._add(panel, name, x, y, {"type": "scatter", **style})
 
     def dots(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, faint: bool = False) -> None:
-        """Add points, shape (N,) each, SI; `faint` ones belong to a line of the same name, which comes later."""
+        """Add points, shape (N,) each, SI; `faint` points belong to a line of the same name, which is added later."""
         style = {"mode": "markers", "marker": {"color": colour, "size": 3, "opacity": 0.3 if faint else 0.55}}
         self._add(panel, name, x, y, {"type": "scatter", **style}, keyed=not faint)
 
     def steps(self, panel: int, name: str, edges: FloatArray, counts: FloatArray, colour: str) -> None:
-        """Add a histogram on its side: `counts`, shape (n,), of the classes between `edges`, shape (n + 1,), SI."""
+        """Add a horizontal histogram: `counts`, shape (n,), of the bins between `edges`, shape (n + 1,), SI."""
         style = {"mode": "lines", "line": {"color": colour, "width": 1.2, "shape": "vh"}, "fill": "tozerox"}
         self._add(panel, name, np.append(counts, 0.0), edges, {"type": "scatter", **style})
 
     def cells(self, panel: int, edges: FloatArray, values: FloatArray, shade: Quantity, scale: Sequence[Any]) -> None:
-        """Add a map: `values`, shape (n, n), SI, of squares between `edges`, shape (n + 1,); NaN stays empty.
+        """Add a map of `values`, shape (n, n), SI, in cells between `edges`, shape (n + 1,); NaN cells are empty.
 
-        The first index runs upwards, the second one to the right.
+        The first index is vertical (upwards), the second one horizontal.
         """
         x, y = self.panels[panel].x, self.panels[panel].y
         start, stop = self._domain(panel)
-        # The few largest values would leave one colour to all others.
+        # Limit the colour scale, so that a few large values do not dominate it.
         most = float(np.nanpercentile(values, 98)) if np.isfinite(values).any() else 1.0
         texts = {"x": x.name, "y": y.name, "z": shade.name}
         lines = [f"{texts[k]} %{{{k}:{q.digits}}} {q.unit}" for k, q in (("x", x), ("y", y), ("z", shade))]
@@ -216,7 +216,7 @@ class Chart:
         )  # fmt: skip
 
     def band(self, panel: int, half_width: float) -> None:
-        """Shade the heights between plus and minus a value, SI; nothing for 0."""
+        """Shade the range between plus and minus `half_width`, SI; 0 adds nothing."""
         if not half_width > 0.0:
             return
         y = self.panels[panel].y
@@ -230,7 +230,7 @@ class Chart:
         )  # fmt: skip
 
     def span(self, panel: int, name: str, start: float, stop: float, colour: str) -> None:
-        """Shade from one place along the horizontal axis to another, SI; all of a name have one entry in the legend."""
+        """Shade the interval from `start` to `stop` on the horizontal axis, SI; equal names share one legend entry."""
         x = self.panels[panel].x
         numbers = self._anchors(panel)
         self._shapes.append(
@@ -244,7 +244,7 @@ class Chart:
         self._legend.add(name)
 
     def show(self, panel: int, low: float, high: float) -> None:
-        """Show first only what lies between two heights, SI."""
+        """Set the initial vertical range, SI."""
         y = self.panels[panel].y
         ends = np.array([low, high]) * y.scale
         self._ranges[panel] = (np.log10(ends) if y.logarithmic else ends).tolist()
@@ -271,7 +271,7 @@ class Chart:
         return {"xaxis": f"x{number}", "yaxis": f"y{number}"}
 
     def _domain(self, panel: int) -> tuple[float, float]:
-        """Return the part of the width (in a row) or the height (in a column, from below) that a panel takes."""
+        """Return the range (0..1) of the width (in a row) or of the height (in a column, from below) of a panel."""
         length = _WIDTH - 90 if self.arrangement == "row" else self.height - _MARGIN["t"] - _MARGIN["b"]
         gap = _GAP[self.arrangement] / length
         shares = np.array([part.share for part in self.panels])
@@ -281,7 +281,7 @@ class Chart:
         return (start, stop) if self.arrangement == "row" else (1.0 - stop, 1.0 - start)
 
     def to_json(self) -> str:
-        """Return what plotly.js reads, with no character that HTML takes for its own."""
+        """Return the plotly.js figure as JSON, with characters that are special in HTML escaped."""
         layout: dict[str, Any] = {
             "height": self.height, "margin": _MARGIN, "shapes": self._shapes, "dragmode": "zoom",
             "hovermode": "closest" if self.arrangement == "row" else "x unified",
@@ -298,7 +298,7 @@ class Chart:
         return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
     def _axes(self, panel: int) -> dict[str, Any]:
-        """Return the layout of a panel's axes."""
+        """Return the layout of the axes of a panel."""
         shown, first = self.panels[panel], self.panels[0]
         number = str(panel + 1) if panel else ""
         across: dict[str, Any] = {**_GRID, "title": {"text": shown.x.title, "font": _SMALL}, "anchor": f"y{number}"}
@@ -327,11 +327,11 @@ class Chart:
 
 
 def _alone(y: FloatArray) -> NDArray[np.bool_]:
-    """Return which points, shape (N,), are finite, but none beside them."""
+    """Return a mask of the finite points, shape (N,), without a finite neighbour."""
     finite = np.pad(np.isfinite(y), 1)
     return np.asarray(finite[1:-1] & ~finite[:-2] & ~finite[2:])
 
 
 def _plain(name: str) -> str:
-    """Return a name as plotly.js shows it unchanged: it reads a few tags."""
+    """Return a name that plotly.js displays unchanged, without interpreting tags."""
     return html.escape(name, quote=False)

@@ -1,4 +1,4 @@
-"""The page and the files of a diagnosis: error of the model, its causes, and the next experiment."""
+"""The page and the files of a diagnosis: error of the model, its causes, and the suggested next experiment."""
 
 import json
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from slpi_ros.reports.views import Curve, Motion
 
 FloatArray = NDArray[np.float64]
 
-# With effects, errors up to so many times the floor are noise; steps that differ less than this are one (relative).
+# With effects, errors up to this multiple of the floor count as noise; relative difference of equal steps.
 _NOISE_ONLY = 1.5
 _SAME = 0.01
 
@@ -34,13 +34,13 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
     Parameters
     ----------
     folder : Path
-        Made if need be.
-    diagnosis : Diagnosis
+        Created if it does not exist.
+    diagnosis : Diagnosis, the result to be shown
 
     Raises
     ------
     SlpiError
-        If it cannot be written.
+        If the file cannot be written.
     """
     page = Page(f"Diagnosis of {diagnosis.source or 'a record'}")
     page.contents(tuple(diagnosis.axes))
@@ -73,26 +73,26 @@ def _figures(found: AxisDiagnosis) -> dict[str, str]:
         "its hysteresis refitted": _nm(found.before_rms),
     }
     if found.effects:
-        figures["with the effects found"] = _nm(found.after_rms)
+        figures["with the identified effects"] = _nm(found.after_rms)
         if found.before_rms > 0.0:
-            figures["reduction by them"] = f"{1.0 - found.after_rms / found.before_rms:.0%}"
+            figures["reduction by the effects"] = f"{1.0 - found.after_rms / found.before_rms:.0%}"
     return figures | {"noise floor, rms": _nm(found.floor_rms)}
 
 
 def _show_causes(page: Page, found: AxisDiagnosis) -> None:
     """Add the share of each cause in the error, its evidence, and the table of held-out errors."""
-    page.section("What the error is made of")
+    page.section("Causes of the error")
     page.shares(_shares(found))
     for named in found.effects:
         page.subsection(named.name)
         page.definitions(_cause(named))
-    page.table(("Model", "error, rms (nm)", "times the floor", "gain"), *_steps(found))
+    page.table(("Model", "error, rms (nm)", "times the floor", "reduction"), *_steps(found))
 
 
 def _show_records(page: Page, found: AxisDiagnosis) -> None:
-    """Add the table of records, where there are several."""
+    """Add a table of errors by record if there are several records."""
     if len(found.records) > 1:
-        page.section("Record by record")
+        page.section("Errors by record")
         rows = [
             [
                 each.source,
@@ -106,12 +106,12 @@ def _show_records(page: Page, found: AxisDiagnosis) -> None:
             "Offset: by how much the zero has moved against the given model. Errors, rms, without it; left out: by a "
             "fit to the other records."
         )
-        header = ("Record", "offset (um)", "given model", "extended model", "left out")
+        header = ("Record", "offset (µm)", "given model", "extended model", "left out")
         page.table(header, rows, None, caption)
 
 
 def _shares(found: AxisDiagnosis) -> list[Share]:
-    """Return the parts of the mean square error before any effect."""
+    """Return the contributions to the mean square error before any effect."""
     parts = [
         Share(named.name, max(named.share_of_residual, 0.0), colour)
         for named, colour in zip(found.effects, _colours(len(found.effects)), strict=True)
@@ -134,13 +134,13 @@ def _cause(named: NamedEffect) -> dict[str, str]:
         "p-value": f"{named.p_value:.2g}",
     }
     if named.alternatives:
-        said["Alternatives"] = f"{', '.join(named.alternatives)}: this record does not tell them apart"
+        said["Alternatives"] = f"{', '.join(named.alternatives)}: this record does not distinguish these effects"
     parameters = _parameters(to_document(named.effect))
     return said | ({"Parameters (SI)": parameters} if parameters else {})
 
 
 def _parameters(document: Mapping[str, object]) -> str:
-    """Return parameters with their standard deviations."""
+    """Return parameters with their standard deviations as text."""
     parameters, uncertainty = document.get("parameters"), document.get("uncertainty")
     if not isinstance(parameters, Mapping) or not isinstance(uncertainty, Mapping):
         return ""
@@ -164,19 +164,19 @@ def _value(value: object) -> str:
 
 
 def _steps(found: AxisDiagnosis) -> tuple[list[list[str]], int, str]:
-    """Return the rows of the table of held-out errors, which of them is best, and what it says."""
+    """Return the rows of the table of held-out errors, the index of the best row, and the caption."""
 
     def row(name: str, error: float, gain: str = "") -> list[str]:
         times = f"{error / found.floor_rms:.2f}" if found.floor_rms > 0.0 else ""
         return [name, f"{error * 1e9:.1f}", times, gain]
 
-    rows = [row("given, as it is", found.given_rms), row("its hysteresis, refitted", found.before_rms)]
+    rows = [row("given model", found.given_rms), row("its hysteresis, refitted", found.before_rms)]
     error = found.before_rms
     for named in found.effects:
         error *= 1.0 - named.gain_percent / 100.0
-        rows.append(row(f"and {named.name}", error, f"{named.gain_percent:.1f} %"))
+        rows.append(row(f"with {named.name}", error, f"{named.gain_percent:.1f} %"))
     if abs(found.after_rms - error) > _SAME * error:
-        rows.append(row("all fitted together", found.after_rms))
+        rows.append(row("all effects, fitted jointly", found.after_rms))
     best = len(rows) - 1
     caption = f"Free-run errors; all but that of the given model are held out. Floor: {found.floor_source}."
     return [*rows, row("noise floor", found.floor_rms)], best, caption
@@ -188,7 +188,7 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
     t, v, y = traces.t, traces.voltage, traces.measured
     page.section("Measured - model")
     if not t.size:
-        page.text("The record holds no sample: there is nothing to draw.")
+        page.text("The record holds no sample: there are no charts.")
         return
     motion = Motion.of(t, v)
     models = [Curve(BEFORE_NAME, traces.before, BEFORE)]
@@ -202,7 +202,7 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
         "frequency": views.over_frequency(t, left, parts, motion, found.floor_rms),
     }
     captions = {
-        "time": "Displacement and measured - model over time; the grey band is plus and minus the noise floor.",
+        "time": "Displacement and measured - model over time; the grey band is plus or minus the noise floor.",
         "motion": "Measured - model over voltage (lines: means for rising and falling voltage) and over its speed.",
         "frequency": "Measured - model over the time since the last reversal or stop, with means, and its spectrum.",
     }
@@ -213,19 +213,19 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
             "A line with an effect's name is its part of the residual without effects: its contribution to the "
             "displacement without the part that the refitted hysteresis had absorbed."
         )
-    page.section("The models over the data")
+    page.section("Model and measurement")
     loops, said = views.loops(v, y, models, motion)
     page.chart(
         f"{name}-loops",
         loops,
-        f"Displacement over voltage; beside it displacement - the straight line through it. {said}",
+        f"Displacement over voltage; right: deviation of the displacement from its straight-line fit. {said}",
     )
 
 
 def _parts(traces: Traces) -> list[Curve]:
-    """Return the part of each effect in the residual of the model without effects.
+    """Return the contribution of each effect to the residual of the model without effects.
 
-    The hysteresis fitted alone absorbs a part of the effects; that part is taken from those that it is correlated with.
+    The part absorbed by the hysteresis fitted alone is subtracted from the effects with which it is correlated.
     """
     effects = {name: values - np.mean(values) for name, values in traces.contributions.items()}
     if not effects:
@@ -247,12 +247,12 @@ def _nm(metres: float) -> str:
 
 
 def make_room(folder: Path) -> None:
-    """Make the folder of a diagnosis; call it before long work, so that the results can be written.
+    """Create the folder of a diagnosis; call this before long computations, so that an unusable folder fails early.
 
     Raises
     ------
     SlpiError
-        If the files cannot be written there.
+        If the files cannot be written to the folder.
     """
     make_folder(folder)
     for name in (DOCUMENT, EXTENDED_MODEL, PAGE):
@@ -261,24 +261,24 @@ def make_room(folder: Path) -> None:
 
 
 def write_files(folder: Path, diagnosis: Diagnosis) -> None:
-    """Write ``diagnosis.json``, ``extended_model.json`` and ``report.html`` into `folder`, each whole or not at all.
+    """Write ``diagnosis.json``, ``extended_model.json`` and ``report.html`` into `folder`, each atomically.
 
     Parameters
     ----------
     folder : Path
-        Made if need be.
-    diagnosis : Diagnosis
+        Created if it does not exist.
+    diagnosis : Diagnosis, the result to be written
 
     Raises
     ------
     SlpiError
-        If a file cannot be written, or a figure is not finite.
+        If a file cannot be written, or a value is not finite.
     """
     make_room(folder)
     try:
         texts = {DOCUMENT: format_diagnosis(diagnosis), EXTENDED_MODEL: format_model(diagnosis.extended)}
     except ValueError as error:
-        raise SlpiError(f"{diagnosis.source}: no sound diagnosis: {error}; record a longer drive") from None
+        raise SlpiError(f"{diagnosis.source}: no valid diagnosis: {error}; record a longer drive") from None
     for name, text in texts.items():
         with all_or_nothing(folder / name) as file:
             file.write(text)
@@ -286,14 +286,14 @@ def write_files(folder: Path, diagnosis: Diagnosis) -> None:
 
 
 def format_diagnosis(diagnosis: Diagnosis) -> str:
-    """Return the text of a diagnosis document, ``msg_schemas/diagnosis.schema.json``.
+    """Return the JSON text of a diagnosis, as defined by ``msg_schemas/diagnosis.schema.json``.
 
     Raises
     ------
     ModelError
-        If it does not follow the schema.
+        If the document violates the schema.
     ValueError
-        If a figure is not finite.
+        If a value is not finite.
     """
     document = diagnosis.to_document()
     validate(document, "diagnosis", "the new diagnosis")
@@ -301,7 +301,7 @@ def format_diagnosis(diagnosis: Diagnosis) -> str:
 
 
 def describe_diagnosis(diagnosis: Diagnosis) -> list[str]:
-    """Return lines of text: for each axis the verdict, the causes, and the next experiment."""
+    """Return lines of text: for each axis the verdict, the causes, and the suggested next experiment."""
     lines = []
     for name, found in diagnosis.axes.items():
         told = [f"verdict: {found.verdict.replace('_', ' ')}", found.summary]

@@ -22,13 +22,13 @@ from slpi_ros.reports.views import Curve, Motion
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Held-out errors up to so many times the noise are noise; from the other one on there is something to be found.
+# Held-out errors up to the first multiple of the noise count as noise; from the second on, diagnosis is advised.
 _NOISE_ONLY, _MORE_THAN_NOISE = 1.5, 3.0
 
 
 @dataclass(frozen=True)
 class _Traces:
-    """One axis: time (s), voltage (V), displacement as measured and as simulated (m), and what was fitted."""
+    """Signals of one axis: time (s), voltage (V), measured and simulated displacement (m), and the mask of the fit."""
 
     t: FloatArray
     v: FloatArray
@@ -52,21 +52,21 @@ def write_report(
     Parameters
     ----------
     folder : Path
-        Made if need be.
+        Created if it does not exist.
     record : Record
-        What the model is shown on; of several bags the first.
-    model : StageModel
+        Record on which the model is shown; the first one of several bags.
+    model : StageModel, the identified model
     held_out : mapping of axis name to CrossValidationReport, optional
-        Held-out errors, for the tables.
+        Held-out errors by axis.
     found : mapping of axis name to sequence of Finding, optional
-        The quality of the record; found anew by default.
+        Findings on the quality of the record; determined from the record by default.
     start, stop : float, seconds, optional
-        The part of the record that was fitted, as for `slpi_ros.identify`; the rest is drawn, but counts nowhere.
+        Fitted part of the record, as for `slpi_ros.identify`; the rest is drawn but not evaluated.
 
     Raises
     ------
     SlpiError
-        If it cannot be written, or the record does not hold the model's axes.
+        If the file cannot be written, or the record does not contain the model's axes.
     """
     page = Page(f"Model of {record.source}")
     page.contents(tuple(model.axes))
@@ -94,7 +94,7 @@ def write_report(
             v, y = record.voltage[name][driven], record.displacement[name][driven]
             _show(page, name, _Traces(t, v, y, simulated[name], fitted), floor)
         else:
-            page.text("The record holds no voltage of this axis: there is nothing to draw.")
+            page.text("The record contains no voltage of this axis: there are no charts.")
     path = folder / "report.html"
     page.write(path)
     return path
@@ -108,19 +108,19 @@ def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None)
     beside = ""
     if held_out is not None:
         error, floor = held_out.overall.rms, held_out.floor.rms
-        noise, floor_is = "that floor", f"the repeatability floor is {_nm(floor)} rms"
+        noise, floor_is = "the floor", f"the repeatability floor is {_nm(floor)} rms"
         if np.isfinite(held_out.overall.classical_rms) and held_out.kind != CLASSICAL:
             beside = f" Classical PI: {_nm(held_out.overall.classical_rms)}."
     share = f"{error / _stroke(axis):.3%}" if _stroke(axis) > 0.0 else "?"
     said = f"Axis {name}: the held-out error is {_nm(error)} rms ({share} of the stroke)"
     if not floor > 0.0:
-        return f"{said}; the record shows no noise to compare with.{beside}", "warn"
+        return f"{said}; the record has no noise for comparison.{beside}", "warn"
     if error <= _NOISE_ONLY * floor:
-        return f"{said}; {floor_is}, so hardly anything but noise is left.{beside}", "good"
+        return f"{said}; {floor_is}, so the error is close to the noise.{beside}", "good"
     said = f"{said}; {floor_is}, and the error is {error / floor:.1f} times {noise}."
     if error <= _MORE_THAN_NOISE * floor:
         return said + beside, "warn"
-    return f"{said} 'slpi diagnose' looks for the cause.{beside}", "bad"
+    return f"{said} 'slpi diagnose' finds the cause.{beside}", "bad"
 
 
 def _figures(axis: AxisModel, held_out: CrossValidationReport | None) -> dict[str, str]:
@@ -129,7 +129,7 @@ def _figures(axis: AxisModel, held_out: CrossValidationReport | None) -> dict[st
         figures = {
             "held-out error, rms": _nm(held_out.overall.rms),
             "repeatability floor, rms": _nm(held_out.floor.rms),
-            "classical PI there, rms": _nm(held_out.overall.classical_rms),
+            "classical PI held-out, rms": _nm(held_out.overall.classical_rms),
         }
     else:
         figures = {
@@ -138,9 +138,9 @@ def _figures(axis: AxisModel, held_out: CrossValidationReport | None) -> dict[st
             "samples fitted": f"{quality.samples:,}",
         }
     return figures | {
-        "maximum error where fitted": _nm(quality.maximum),
+        "maximum error of the fit": _nm(quality.maximum),
         "stroke": f"{_stroke(axis) * 1e6:.4g} µm",
-        "of the model covered": f"{quality.covered:.0%}",
+        "model covered": f"{quality.covered:.0%}",
     }
 
 
@@ -154,7 +154,7 @@ def _nm(metres: float) -> str:
 
 
 def _findings(record: Record, name: str, start: float | None, stop: float | None) -> list[Finding]:
-    """Return the findings on a record; the reason where it cannot be assessed."""
+    """Return the findings on a record, or the reason why it cannot be assessed."""
     try:
         return findings(assess(record, name, start=start, stop=stop))
     except SlpiError as error:
@@ -177,7 +177,7 @@ def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> No
         ("", "samples", "rms (nm)", "times the floor", "maximum (nm)", "classical PI, rms (nm)", "PI / model"),
         rows,
         best=0,
-        caption="Free-run, on blocks left out of the fit; the classical PI model on the same blocks. "
+        caption="Free-run held-out errors; the classical PI model on the same blocks. "
         f"Floor: {_nm(floor.rms)} rms, {floor.source}.",
     )
     curves = [Curve(held_out.kind, -held_out.error, AFTER)]
@@ -187,7 +187,7 @@ def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> No
     page.chart(
         f"{name}-held-out",
         chart,
-        f"Measured - model, each block predicted by a fit without it, and the histogram. {said}",
+        f"Measured - model, each block predicted by a fit to the other blocks, and the histogram. {said}",
     )
 
 
@@ -200,14 +200,14 @@ def _row(part: Slice, floor: float) -> list[str]:
 
 
 def _part(t: FloatArray, fitted: Mask) -> str:
-    """Return a sentence on which samples were fitted."""
+    """Return a sentence on the fitted samples."""
     if not fitted.any():
-        return "Nothing of this record was fitted."
+        return "No sample of this record was fitted."
     first, last = t[fitted][[0, -1]].tolist()
     return (
-        f"Fitted were the samples from {first:.6g} s to {last:.6g} s, of {t[0]:.6g} s to {t[-1]:.6g} s. The others are "
-        f"drawn as '{views.UNUSED}'; no figure, no histogram and no map counts them. Voltage before the part that "
-        "was fitted still moves the memory."
+        f"Fitted: the samples from {first:.6g} s to {last:.6g} s, of {t[0]:.6g} s to {t[-1]:.6g} s. The others are "
+        f"drawn as '{views.UNUSED}'; figures, histograms and maps exclude these. The voltage before the part that "
+        "was fitted still determines the initial history."
     )
 
 
@@ -216,12 +216,12 @@ def _show(page: Page, name: str, traces: _Traces, noise: float) -> None:
     t, v, y, fitted = traces.t, traces.v, traces.y, traces.fitted
     motion, left = Motion.of(t, v), y - traces.simulated
     models = [Curve("model", traces.simulated, AFTER)]
-    page.section("The record and the model, free-run from its start")
+    page.section("Record and free-run model")
     loops, said = views.loops(v, y, models, motion, fitted)
-    beside = "Displacement over voltage; beside it displacement - the straight line through it, so that the loops open."
+    beside = "Displacement over voltage; right: deviation from its straight-line fit."
     page.chart(f"{name}-loops", loops, f"{beside} {said}")
     over_time, said = views.over_time(t, y, models, noise, fitted=fitted)
-    page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus and minus the noise. {said}")
+    page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus or minus the noise. {said}")
     page.section("Measured - model")
     over_voltage, said = views.over_voltage(v, left, motion, noise, fitted)
     how = "Over rising and falling voltage, and the histogram."
@@ -229,6 +229,6 @@ def _show(page: Page, name: str, traces: _Traces, noise: float) -> None:
     page.chart(
         f"{name}-coverage",
         views.coverage(v, np.where(fitted, left, np.nan), motion),
-        "Fitted samples by the voltage at which their branch began and their own voltage, and the rms error there. "
-        "Branches above the diagonal rise, those below it fall. White: no data; there the model extrapolates smoothly.",
+        "Number of fitted samples by start voltage of the branch and present voltage, and the rms error. "
+        "Rising branches are above the diagonal, falling ones below. White: no data; the model extrapolates smoothly.",
     )

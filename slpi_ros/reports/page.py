@@ -1,4 +1,4 @@
-"""One self-contained HTML page of text, tables, pictures and interactive charts; it loads nothing."""
+"""A self-contained HTML page of text, tables, pictures and interactive charts, without external resources."""
 
 import base64
 import html
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 
 Severity = Literal["good", "warn", "bad"]
 
-# A browser that shows a page must load nothing, whatever the page holds.
+# Content policy that prevents the browser from loading external resources, whatever the page contains.
 _CONTENT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; "
     "base-uri 'none'; form-action 'none'"
 )
 _HINT = (
-    "Drag over a chart to zoom, double-click to see all again; click a name in a legend to hide or show it, "
-    "double-click to see it alone; point at a curve for its values."
+    "Drag over a chart to zoom, double-click to reset the view; click a name in a legend to hide or show it, "
+    "double-click to show only that curve; hover over a curve for its values."
 )
 
 
 @dataclass(frozen=True)
 class Share:
-    """A part of a whole, 0..1, and how it is shown."""
+    """A part of a whole, 0..1, with name and colour."""
 
     name: str
     share: float
@@ -41,7 +41,7 @@ class Share:
 
 @dataclass
 class Page:
-    """A page that grows from top to bottom.
+    """A page to which elements are appended from top to bottom.
 
     Parameters
     ----------
@@ -59,18 +59,18 @@ class Page:
             self._parts.append(f"<nav>{''.join(links)}</nav>")
 
     def heading(self, text: str, axis: str | None = None) -> None:
-        """Add a heading, to which `contents` leads if it is that of an axis."""
+        """Add a heading; with `axis`, it is the target of a link in `contents`."""
         target = "" if axis is None else f' id="{html.escape(f"axis-{axis}")}"'
         self._parts.append(f"<h2{target}>{html.escape(text)}</h2>")
 
     def verdict(self, axis: str, text: str, severity: Severity, word: str = "") -> None:
-        """Add the sentence that sums up an axis, after a word; its element has the id ``verdict-<axis>``."""
+        """Add the summary sentence of an axis, after an optional word; its element has the id ``verdict-<axis>``."""
         name, before = html.escape(f"verdict-{axis}"), f"<b>{html.escape(word.replace('_', ' '))}</b> " if word else ""
         said = f' data-verdict="{html.escape(word)}"' if word else ""
         self._parts.append(f'<p class="verdict {severity}" id="{name}"{said}>{before}{html.escape(text)}</p>')
 
     def tiles(self, figures: Mapping[str, str]) -> None:
-        """Add key figures, by name."""
+        """Add key figures by name."""
         tiles = (
             f"<div><b>{html.escape(text)}</b><span>{html.escape(name)}</span></div>" for name, text in figures.items()
         )
@@ -82,7 +82,7 @@ class Page:
         self._parts.append(f'<ul class="findings">{"".join(items)}</ul>')
 
     def shares(self, parts: Sequence[Share]) -> None:
-        """Add a bar of parts of a whole, with their names and shares."""
+        """Add a bar of the parts of a whole, with names and shares."""
         bar = (f'<div style="flex:{part.share:.4f} 0 0;background:{part.colour}"></div>' for part in parts)
         keys = (
             f'<li><i style="background:{part.colour}"></i>{html.escape(part.name)} <b>{part.share:.0%}</b></li>'
@@ -91,7 +91,7 @@ class Page:
         self._parts.append(f'<div class="shares">{"".join(bar)}</div><ul class="keys">{"".join(keys)}</ul>')
 
     def chart(self, name: str, chart: Chart, caption: str) -> None:
-        """Add an interactive chart, whose element has `name` as its id, with its caption."""
+        """Add an interactive chart with its caption; the id of its element is `name`."""
         if not self._has_charts:
             self._parts.append(f'<p class="hint">{_HINT}</p><noscript><p>The charts need JavaScript.</p></noscript>')
         self._has_charts = True
@@ -102,11 +102,11 @@ class Page:
         )
 
     def section(self, text: str) -> None:
-        """Add a heading below a heading."""
+        """Add a second-level heading."""
         self._parts.append(f"<h3>{html.escape(text)}</h3>")
 
     def subsection(self, text: str) -> None:
-        """Add a heading below that."""
+        """Add a third-level heading."""
         self._parts.append(f"<h4>{html.escape(text)}</h4>")
 
     def text(self, text: str) -> None:
@@ -125,7 +125,7 @@ class Page:
     def table(
         self, header: Sequence[str], rows: Sequence[Sequence[str] | str], best: int | None = None, caption: str = ""
     ) -> None:
-        """Add a table; row `best` stands out, and a row that is a text is the heading of those below it."""
+        """Add a table; row `best` is highlighted, and a row given as text is a group heading."""
         below = f"<caption>{html.escape(caption)}</caption>" if caption else ""
         head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
         body = []
@@ -147,12 +147,12 @@ class Page:
         )
 
     def write(self, path: Path) -> None:
-        """Write the page, all of it or nothing.
+        """Write the page atomically.
 
         Raises
         ------
         SlpiError
-            If it cannot be written.
+            If the file cannot be written.
         """
         title = html.escape(self.title)
         scripts = ("plotly-cartesian.min.js", "page.js") if self._has_charts else ()
@@ -173,7 +173,7 @@ def _asset(name: str) -> str:
 
 
 def png(figure: "Figure") -> bytes:
-    """Return a figure as a PNG file's bytes."""
+    """Return a figure as the content of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()

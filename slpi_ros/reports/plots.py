@@ -1,4 +1,4 @@
-"""Pictures for pages without interactive charts: loops, tracking, errors; µm and nm on the axes."""
+"""Pictures for pages without interactive charts: loops, tracking and errors; axes in µm and nm."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,11 +21,11 @@ class Run:
     Parameters
     ----------
     name : str
-        How the stage was driven.
+        Name of the model or control scheme.
     t : ndarray, shape (N,), seconds
     desired : ndarray, shape (N,), metres
     displacement : ndarray, shape (N,), metres
-        Achieved.
+        Measured or true displacement.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Run:
 
 
 def loops(v: FloatArray, y: FloatArray, simulated: FloatArray) -> Figure:
-    """Draw displacement over voltage, measured and simulated, and measured - model beside it.
+    """Draw measured and simulated displacement over voltage, and measured - model in a second panel.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def tracking(runs: Mapping[str, Run]) -> Figure:
 
 
 def linearity(runs: Mapping[str, Run]) -> Figure:
-    """Draw achieved over desired displacement, one panel for each run."""
+    """Draw achieved over desired displacement, one panel per run."""
     figure, drawn = panels(1, len(runs), (11, 3.9), sharex=True, sharey=True)
     for panel, colour, run in zip(drawn, COLOURS, runs.values(), strict=False):
         panel.plot(run.desired * 1e6, run.displacement * 1e6, color=colour, linewidth=0.9)
@@ -82,13 +82,13 @@ def linearity(runs: Mapping[str, Run]) -> Figure:
 
 
 def panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
-    """Return a figure of a size (inches), and its panels row by row; `options` as in ``Figure.subplots``."""
+    """Return a figure of a size (inches) and its panels, row by row; `options` are those of ``Figure.subplots``."""
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options).ravel()
 
 
 def label(panel: Axes, x: str, y: str) -> None:
-    """Name the axes of a panel and give it a grid."""
+    """Label the axes of a panel and add a grid."""
     panel.set_xlabel(x)
     panel.set_ylabel(y)
     panel.grid(color="#e4e9ee", linewidth=0.7)

@@ -1,4 +1,4 @@
-"""Models and changes of models as lines of text."""
+"""Text summaries of models and of changes between models."""
 
 from collections.abc import Iterable
 
@@ -12,7 +12,7 @@ from slpi_ros.model.stage_model import StageModel
 
 
 def describe_model(model: StageModel) -> list[str]:
-    """Return lines of text on a model, in µm and nm."""
+    """Return a text summary of a model, in µm and nm."""
     head = f"stage '{model.hardware_id}'" if model.hardware_id else "stage of unknown hardware id"
     lines = [f"{head}, identified {model.created or 'at an unknown time'}"]
     for name, axis in model.axes.items():
@@ -21,24 +21,23 @@ def describe_model(model: StageModel) -> list[str]:
 
 
 def describe_axis(axis: AxisModel) -> list[str]:
-    """Return lines of text on one axis."""
+    """Return a text summary of one axis."""
     quality, start, end = axis.quality, axis.start, axis.end
     (v_low, v_high), (y_low, y_high) = axis.voltage_range, axis.displacement_range
-    began = "a memory taken for wiped" if start.history else "rest"
+    began = "a memory assumed wiped" if start.history else "rest"
     stroke = y_high - y_low
     return [
         f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {_parts(axis.hysteresis)}",
         f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} um "
-        f"({quality.covered:.0%} of the model covered)",
-        f"memory starts where the record did: {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um",
-        f"and ends where the record did, at {end.voltage:.4g} V, {end.displacement * 1e6:.4g} um, "
-        f"with {len(end.history)} turning voltages"
+        f"({quality.covered:.0%} model covered)",
+        f"memory at the start of the record: {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um",
+        f"memory at the end of the record: at {end.voltage:.4g} V, {end.displacement * 1e6:.4g} um, "
+        f"with {len(end.history)} reversals"
         if end
-        else "the memory at the end of the record is not known",
+        else "memory at the end of the record: unknown",
         f"error on the record: {quality.rms * 1e9:.1f} nm rms ({quality.rms / stroke:.3%} of the displacement range), "
         f"{quality.maximum * 1e9:.1f} nm at most",
-        f"held-out error: {quality.held_out_rms * 1e9:.1f} nm rms; "
-        f"sensor noise about {quality.floor_rms * 1e9:.1f} nm rms",
+        f"held-out error: {quality.held_out_rms * 1e9:.1f} nm rms; sensor noise {quality.floor_rms * 1e9:.1f} nm rms",
         f"from {quality.samples} samples of {quality.source}",
         *(f"{effect.name}: {effect.describe()}" for effect in axis.effects),
         *(() if axis.effects else ("effects: none",)),
@@ -46,20 +45,20 @@ def describe_axis(axis: AxisModel) -> list[str]:
 
 
 def describe_start(model: StageModel, axes: Iterable[str], start_memory: StartMemory) -> str:
-    """Return one line that says from which memory, voltage and displacement a drive of some axes is taken to start."""
+    """Return one line with the assumed initial memory, voltage and displacement of some axes."""
     told = []
     for name in axes:
         axis = model.axes[name]
         start = axis.initial(start_memory)
         known = {"end": "end of the record", "start": "start of the record", "wiped": "memory wiped"}[start_memory]
         if start_memory == "end" and axis.end is None:
-            known = "start of the record, as the model does not know its end"
+            known = "start of the record, as the model does not contain the end"
         told.append(f"axis {name} at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um ({known})")
     return f"assumed before the first sample: {'; '.join(told)}"
 
 
 def describe_change(axis: str, change: AxisChange) -> list[str]:
-    """Return lines of text on what a refit changed in one axis, in nm."""
+    """Return a text summary, in nm, of the change of one axis found by a refit."""
     found = change.match
     same = max(abs(found.gain_change), found.gain_uncertainty)
     zero = (
@@ -74,17 +73,17 @@ def describe_change(axis: str, change: AxisChange) -> list[str]:
     else:
         verdict = f"no change beyond repeatability; the loops are the same within {same:.2%}"
     if change.match.known_from:
-        verdict += "; the initial history of the new record is not known and was not judged"
+        verdict += "; the initial history of the new record is unknown and was not evaluated"
     return [
         f"axis {axis}: {verdict}: the old model's error on the new record is {change.error_before * 1e9:.1f} nm rms, "
-        f"it was known to {change.repeatability * 1e9:.1f} nm",
+        f"repeatability {change.repeatability * 1e9:.1f} nm",
         f"axis {axis}: gain {change.gain:+.2%}, branches moved by up to {change.largest * 1e9:.1f} nm; "
         f"error on the new record now {change.error_after * 1e9:.1f} nm rms",
     ]
 
 
 def _parts(model: Hysteresis) -> str:
-    """Return the elements of a model as text."""
+    """Return the number of elements of a model as text."""
     match model:
         case LoopFamily():
             return f"{model.grid.size} loop vertices"

@@ -1,4 +1,4 @@
-"""The page and the files of a verification: errors on records that the model has not seen, pass or fail."""
+"""The page and the files of a verification: errors on records not used for the fit, pass or fail."""
 
 import json
 from collections.abc import Sequence
@@ -42,17 +42,17 @@ FloatArray = NDArray[np.float64]
 DOCUMENT, PAGE = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
 COLOUR = {**dict(zip(CAUSES, (*COLOURS, AFTER), strict=False)), "model": BEFORE, "noise": NOISE}
-# Smaller shares of the tracking error are not told.
+# Smaller shares of the tracking error are not reported.
 _SMALLEST_SHARE = 0.01
 
 
 def make_room(folder: Path) -> None:
-    """Make the folder of a verification; call it before long work, so that the results can be written.
+    """Create the folder of a verification; call this before long computations, so that an unusable folder fails early.
 
     Raises
     ------
     SlpiError
-        If the files cannot be written there.
+        If the files cannot be written to the folder.
     """
     make_folder(folder)
     for name in (DOCUMENT, PAGE):
@@ -61,13 +61,13 @@ def make_room(folder: Path) -> None:
 
 
 def write_files(folder: Path, found: Verification) -> None:
-    """Write ``verification.json`` and ``report.html`` into `folder`, each whole or not at all.
+    """Write ``verification.json`` and ``report.html`` into `folder`, each atomically.
 
     Parameters
     ----------
     folder : Path
-        Made if need be.
-    found : Verification
+        Created if it does not exist.
+    found : Verification, the result to be written
 
     Raises
     ------
@@ -94,12 +94,12 @@ def write_files(folder: Path, found: Verification) -> None:
 
 
 def format_verification(found: Verification) -> str:
-    """Return the text of a verification document, ``msg_schemas/verification.schema.json``.
+    """Return the JSON text of a verification, as defined by ``msg_schemas/verification.schema.json``.
 
     Raises
     ------
     ModelError
-        If it does not follow the schema.
+        If the document violates the schema.
     """
     document = found.to_document()
     validate(document, "verification", "the new verification")
@@ -107,7 +107,7 @@ def format_verification(found: Verification) -> str:
 
 
 def describe_verification(found: Verification) -> list[str]:
-    """Return lines of text: for each axis pass or fail, and the errors by record, level, speed and region, nm."""
+    """Return lines of text: for each axis pass or fail, and the errors (nm) by record, level, speed and region."""
     lines = []
     for name, axis in found.axes.items():
         told = [("pass: " if axis.passed else "fail: ") + _summary(name, axis).removeprefix(f"Axis {name}: ")]
@@ -123,14 +123,14 @@ def describe_verification(found: Verification) -> list[str]:
 
 
 def _summary(name: str, axis: AxisVerification) -> str:
-    """Return the error and its limit in a sentence, and what to do where an axis fails."""
+    """Return a sentence with the error and its limit, and the remedy for an axis that fails."""
     failed = [record for record in axis.records if not record.passed]
     several = f" on the worst of {len(axis.records)} records" if len(axis.records) > 1 else ""
     said = f"Axis {name}: {_error(axis.worst)}{several}."
     if not failed:
         moved = [record for record in axis.records if record.zero_moved]
         return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")
-    return f"{said} 'slpi diagnose' looks for the cause, 'slpi refit' corrects the model."
+    return f"{said} 'slpi diagnose' finds the cause, 'slpi refit' corrects the model."
 
 
 def _error(record: RecordVerification) -> str:
@@ -142,33 +142,33 @@ def _error(record: RecordVerification) -> str:
 
 
 def _notes(record: RecordVerification) -> list[str]:
-    """Return what was assumed about a record's start, and what was found beside the error."""
+    """Return the assumptions about a record's start, and findings other than the error."""
     start = (
-        "the start is unknown: the initial history and the offset are those that best explain the record"
+        "the start is unknown: the initial history and the offset are fitted to the record"
         if record.known_from is None
-        else f"the start is unknown: judged from {record.known_from:.4g} s on, where it adds nothing but a constant"
+        else f"the start is unknown: evaluated from {record.known_from:.4g} s on, where only a constant depends on it"
     )
     notes = [start]
     if record.zero_moved:
-        notes.append(f"the zero has moved by {_um(record.offset)} µm, which does not count as an error")
+        notes.append(f"the zero has moved by {_um(record.offset)} µm, which is not counted as an error")
     if not record.passed:
-        notes.append(f"against the model the gain is {record.gain:+.2%}, the width of the loops {record.width:+.2%}")
+        notes.append(f"relative to the model, gain {record.gain:+.2%}, loop width {record.width:+.2%}")
     if record.outside:
-        notes.append(f"{record.outside} voltages lie outside of what the model was identified on: extrapolated there")
+        notes.append(f"{record.outside} voltages lie outside the identified range, where the model extrapolates")
     return notes
 
 
 def _tracking_notes(tracking: Tracking) -> list[str]:
-    """Return how well a compensator did, and the causes of its error."""
+    """Return the tracking error of a compensated path and its causes."""
     error = tracking.error
     told = sorted(tracking.shares.items(), key=lambda item: -item[1])
     shares = [f"{cause} {share:.0%}" for cause, share in told if abs(share) >= _SMALLEST_SHARE]
     notes = [
         f"measured - desired is {_nm(error.rms)} rms, {_nm(error.maximum)} at most; of its mean square: "
         f"{', '.join(shares) or 'nothing'}",
-        f"largest part, {tracking.blame}: {CAUSES[tracking.blame]}",
+        f"largest contribution, {tracking.blame}: {CAUSES[tracking.blame]}",
     ]
-    notes += [f"the displacement follows {tracking.delay * 1e3:.3g} ms later"] if tracking.delay else []
+    notes += [f"the displacement lags by {tracking.delay * 1e3:.3g} ms"] if tracking.delay else []
     notes += [f"effects: {', '.join(tracking.effects)}"] if tracking.effects else []
     return notes
 
@@ -231,17 +231,17 @@ def _show_record(page: Page, name: str, record: RecordVerification) -> None:
     motion = Motion.of(t, v)
     models = [Curve("model", record.model, AFTER)]
     over_time, said = views.over_time(t, y, models, record.floor_rms, fitted=record.judged)
-    not_judged = "" if record.judged.all() else " Shaded: before the memory is known."
-    page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus and minus the floor.{not_judged} {said}")
+    not_judged = "" if record.judged.all() else " Shaded: not evaluated, before the initial history is known."
+    page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus or minus the floor.{not_judged} {said}")
     over_voltage, said = views.over_voltage(v, y - record.model, motion, record.floor_rms, record.judged)
     page.chart(f"{name}-residual", over_voltage, f"Over rising and falling voltage, and the histogram. {said}")
     loops, said = views.loops(v, y, models, motion, record.judged)
-    beside = "Displacement over voltage; beside it displacement - the straight line through it."
+    beside = "Displacement over voltage; right: deviation from its straight-line fit."
     page.chart(f"{name}-loops", loops, f"{beside} {said}")
 
 
 def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
-    """Add where the error of a compensated path comes from."""
+    """Add the causes of the error along a compensated path."""
     page.subsection("Measured - desired displacement")
     shares = {cause: share for cause, share in tracking.shares.items() if share >= _SMALLEST_SHARE}
     whole = sum(shares.values())

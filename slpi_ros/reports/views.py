@@ -1,6 +1,6 @@
-"""The charts of models over a record: displacement and residual over voltage, time, speed and frequency.
+"""Charts of models and a record: displacement and residual over voltage, time, speed and frequency.
 
-A residual is measured - model.
+All residuals are measured - model.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,40 +48,40 @@ SPEED = Quantity("speed of the voltage", "V/s", digits=".4~g")
 SINCE = Quantity("time since the last reversal or stop", "s", digits=".3~g", logarithmic=True)
 FREQUENCY = Quantity("frequency", "Hz", digits=".4~g", logarithmic=True)
 DENSITY = Quantity("spectral density", "nm/√Hz", 1e9, ".3~g", logarithmic=True)
-# In the legends.
+# Legend entry of samples that were not fitted.
 UNUSED = "not used"
 
-# Samples to each side over which the speed is taken.
+# Number of samples on either side from which the speed is computed.
 _REACH = 3
-# A branch ends this near to its reversal (share of the voltage range): what rests there has stopped before it reverses.
+# Distance from a reversal (share of the voltage range) at which the voltage is considered stopped.
 _ARRIVED = 1e-3
 _FEWEST_ARRIVALS = 5
-# Points of one branch of a loop, cells on each side of the map, and classes of a histogram.
+# Number of points per branch, of cells per side of the map, and of histogram bins.
 _POINTS_OF_RUN, _CELLS, _HISTOGRAM_CLASSES = 25, 40, 80
-# A line is interrupted across a gap of so many of its sampling periods.
+# Lines are interrupted at gaps longer than this multiple of the sampling period.
 _PAUSE = 5.0
-# A chart first shows this inner part (percent) of the errors, and so much more (share of it) on both sides.
+# Initial view: central percentage of the errors, and margin on both sides (share of that range).
 _INNER, _AROUND = (0.25, 99.75), 0.35
-# Classes over which means are taken, and the fewest samples of a mean.
+# Number of classes for means, and smallest number of samples per class.
 _CLASSES, _FEWEST = 40, 5
-# Welch windows in a record, the longest window, and the points that are drawn of a spectrum.
+# Number of Welch windows per record, longest window, and number of points drawn of a spectrum.
 _WINDOWS, _LONGEST_WINDOW, _SPECTRUM_POINTS = 8, 1 << 14, 400
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What the drive does at each sample.
+    """Speed, reversals and branches of a voltage signal, by sample.
 
     Parameters
     ----------
     speed : ndarray, shape (N,), volts per second
-        Negative where the voltage falls.
+        Rate of change, negative for a falling voltage.
     since_turn : ndarray, shape (N,), seconds
-        Since the last reversal or stop of the voltage.
+        Time since the last reversal or stop of the voltage.
     branch_from : ndarray, shape (N,), volts
-        Where the branch of the hysteresis began on which the sample lies.
+        Voltage at the start of the present hysteresis branch.
     runs : ndarray of int, shape (M + 1,)
-        Samples of the reversals, with the first and the last sample.
+        Sample indices of the reversals, with the first and the last sample.
     """
 
     speed: FloatArray
@@ -91,7 +91,7 @@ class Motion:
 
     @classmethod
     def of(cls, t: FloatArray, v: FloatArray) -> "Motion":
-        """Return the motion of a finite voltage, shape (N,), volts, over time, shape (N,), seconds."""
+        """Return the motion of a finite voltage `v`, shape (N,), volts, over time `t`, shape (N,), seconds."""
         if v.size < _FEWEST_ARRIVALS or not np.ptp(v) > 0.0:
             return cls(np.zeros(v.size), t - t[:1], v.copy(), np.array([0, max(v.size - 1, 0)]))
         noise_rms = noise(v, t)
@@ -104,7 +104,7 @@ class Motion:
 
 
 def _arrivals(v: FloatArray, runs: IntArray) -> IntArray:
-    """Return the sample at which each run first reaches its end."""
+    """Return the sample at which each run first reaches its final value."""
     near = _ARRIVED * float(np.ptp(v))
     return np.array(
         [start + int(np.argmax(np.abs(v[start : stop + 1] - v[stop]) <= near)) for start, stop in pairwise(runs)],
@@ -113,7 +113,7 @@ def _arrivals(v: FloatArray, runs: IntArray) -> IntArray:
 
 
 def _monotone_between(v: FloatArray, runs: IntArray) -> FloatArray:
-    """Return the voltage made monotone between reversals."""
+    """Return the voltage, made monotone between reversals."""
     clean = v.copy()
     for start, stop in pairwise(runs):
         further = np.maximum if v[stop] > v[start] else np.minimum
@@ -130,7 +130,7 @@ def _speed(t: FloatArray, v: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Curve:
-    """A signal over the samples of a record, shape (N,), metres, and how it is shown."""
+    """A signal over the samples of a record, shape (N,), metres, with its name and colour."""
 
     name: str
     values: FloatArray
@@ -140,24 +140,24 @@ class Curve:
 def loops(
     v: FloatArray, y: FloatArray, models: Sequence[Curve], motion: Motion, fitted: Mask | None = None
 ) -> tuple[Chart, str]:
-    """Draw displacement over voltage, and beside it displacement - the straight line through it.
+    """Draw displacement over voltage, and the deviation from a straight-line fit in a second panel.
 
     Parameters
     ----------
     v : ndarray, shape (N,), volts
     y : ndarray, shape (N,), metres
-        Measured.
+        Measured displacement.
     models : sequence of Curve
         Simulated displacements.
     motion : Motion
     fitted : ndarray of bool, shape (N,), optional
-        All by default; others have colours of their own.
+        Mask of fitted samples, by default all; the others have different colours.
 
     Returns
     -------
     Chart
     str
-        Which share of a long record is drawn, or "".
+        Note on the share of branches that are drawn of a long record, or "".
     """
     chart = Chart([Panel(VOLTAGE, DISPLACEMENT), Panel(VOLTAGE, OPENED)], height=470)
     kept, said = _some_runs(v, y, motion)
@@ -186,7 +186,7 @@ def _add_loops(
     at: NDArray[np.int64],
     chosen: Mask,
 ) -> None:
-    """Add curves, each of a width, where they are `chosen`, over voltages `across`, and curve - straight `line`."""
+    """Add curves with line widths at the `chosen` samples over `across`, and their deviation from `line`."""
     for curve, width in curves:
         values = np.where(chosen, curve.values, np.nan)[at]
         chart.line(0, curve.name, across, values, curve.colour, width=width)
@@ -205,7 +205,7 @@ def _straight(v: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _some_runs(v: FloatArray, y: FloatArray, motion: Motion) -> tuple[FloatArray, str]:
-    """Return the samples drawn, NaN between runs that do not follow each other, and a note where runs are left out."""
+    """Return the samples to be drawn, with NaN between non-adjacent runs, and a note if runs are omitted."""
     count = motion.runs.size - 1
     most = LINE_POINTS // _POINTS_OF_RUN
     if count <= most:
@@ -232,20 +232,20 @@ def over_time(
     ----------
     t : ndarray, shape (N,), seconds
     y : ndarray, shape (N,), metres
-        Measured.
+        Measured displacement.
     models : sequence of Curve
     noise : float, metres
-        Shaded; 0 for none.
+        Half-width of the shaded noise band; 0 for none.
     parts : sequence of Curve
-        Parts of the first model's residual.
+        Contributions to the first model's residual.
     fitted : ndarray of bool, shape (N,), optional
-        All by default; others are shaded.
+        Mask of fitted samples, by default all; the others are shaded.
 
     Returns
     -------
     Chart
     str
-        How many samples lie beyond what is shown first, or "".
+        Note on the number of samples outside the initial view, or "".
     """
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, ERROR, 1.2)], "column", 540)
     for start, stop in _rows(np.zeros(t.size, dtype=bool) if fitted is None else ~fitted):
@@ -258,7 +258,7 @@ def over_time(
         chart.line(0, model.name, t[kept], model.values[kept], model.colour, width=1.0)
     first, *others = zip(models, left, strict=True)
     chart.line(1, first[0].name, t[kept], first[1][kept], first[0].colour, width=0.8)
-    # Drawn above the residual that they are parts of, and below the smaller ones.
+    # Drawn above the total residual and below the smaller residuals.
     for part in parts:
         some = thin_line(part.values, most=LINE_POINTS // 2)
         chart.line(1, part.name, t[some], part.values[some], part.colour, width=1.1)
@@ -269,14 +269,14 @@ def over_time(
 
 
 def _rows(chosen: Mask) -> list[tuple[int, int]]:
-    """Return the first sample of each row of those that are `chosen`, shape (N,), and the one after it, if any."""
+    """Return first and end sample of each sequence of `chosen` samples, shape (N,)."""
     steps = np.diff(np.pad(chosen, 1).astype(np.int8))
     first, after = np.flatnonzero(steps > 0), np.flatnonzero(steps < 0)
     return list(zip(first.tolist(), np.minimum(after, chosen.size - 1).tolist(), strict=True))
 
 
 def over_voltage(v: FloatArray, left: FloatArray, motion: Motion, noise: float, fitted: Mask) -> tuple[Chart, str]:
-    """Draw a residual, shape (N,), metres, over voltage (V), by direction, and its histogram where `fitted`."""
+    """Draw a residual, shape (N,), metres, over voltage (V), by direction, and the histogram of `fitted` samples."""
     chart = Chart([Panel(VOLTAGE, ERROR, 3.0), Panel(SAMPLES, ERROR, 1.0)], height=420)
     for name, colour, chosen in (
         (UNUSED, UNUSED_MEASURED, ~fitted),
@@ -293,7 +293,7 @@ def over_voltage(v: FloatArray, left: FloatArray, motion: Motion, noise: float, 
 
 
 def held_out(t: FloatArray, models: Sequence[Curve], noise: float) -> tuple[Chart, str]:
-    """Draw held-out residuals, one for each of `models`, over time (s), and their histograms."""
+    """Draw held-out residuals of `models` over time (s), and their histograms."""
     chart = Chart([Panel(TIME, ERROR, 3.0), Panel(SAMPLES, ERROR, 1.0)], height=420)
     steps = np.abs(np.diff(t))
     gaps = 1 + np.flatnonzero(steps > _PAUSE * np.median(steps) if steps.size else steps)
@@ -325,9 +325,9 @@ def histogram(chart: Chart, panel: int, curve: Curve) -> None:
 
 
 def coverage(v: FloatArray, left: FloatArray, motion: Motion) -> Chart:
-    """Draw the samples of a residual (m; NaN is not counted) on the Everett plane, and its rms there.
+    """Draw the number of residual samples (m; NaN excluded) on the Everett plane, and their rms.
 
-    The plane spans all voltages `v`, shape (N,).
+    The plane covers the range of the voltages `v`, shape (N,).
     """
     chart = Chart([Panel(BEGAN, NOW), Panel(BEGAN, NOW)], height=490)
     low, high = float(v.min()), float(v.max())
@@ -344,7 +344,7 @@ def coverage(v: FloatArray, left: FloatArray, motion: Motion) -> Chart:
 
 
 def focus(chart: Chart, panels: Sequence[int], errors: Sequence[FloatArray], chosen: Mask | slice = slice(None)) -> str:
-    """Zoom to nearly all of the `chosen` errors, shape (N,) each, metres; return how many samples lie beyond."""
+    """Zoom to nearly all of the `chosen` errors, shape (N,) each, metres; return the number of samples outside."""
     values = np.concatenate([error[chosen][np.isfinite(error[chosen])] for error in errors])
     if not values.size:
         return ""
@@ -356,11 +356,11 @@ def focus(chart: Chart, panels: Sequence[int], errors: Sequence[FloatArray], cho
     for panel in panels:
         chart.show(panel, low, high)
     each = " of each" if len(errors) > 1 else ""
-    return f"{beyond} samples{each} lie beyond what is shown first; double-click shows all."
+    return f"{beyond} samples{each} lie outside the initial view; double-click shows all."
 
 
 def over_motion(v: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], motion: Motion) -> tuple[Chart, str]:
-    """Draw residuals over voltage and over its speed: samples, and their means for rising and falling voltage.
+    """Draw residuals over voltage and over its speed, with means for rising and falling voltage.
 
     Parameters
     ----------
@@ -368,14 +368,14 @@ def over_motion(v: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], 
     curves : sequence of Curve
         Residuals.
     parts : sequence of Curve
-        Parts of them; only their means are drawn.
+        Contributions to the residuals; only their means are drawn.
     motion : Motion
 
     Returns
     -------
     Chart
     str
-        How many samples lie beyond what is shown first, or "".
+        Note on the number of samples outside the initial view, or "".
     """
     chart = Chart([Panel(VOLTAGE, ERROR), Panel(SPEED, ERROR)], height=430)
     ways = [np.flatnonzero(motion.speed > 0.0), np.flatnonzero(motion.speed < 0.0)]
@@ -416,7 +416,7 @@ def _add(
     parts: Sequence[Curve],
     means: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
 ) -> None:
-    """Add dots of curves, and above them the means of curves and parts."""
+    """Add the dots of curves, with means of curves and parts on top."""
     for curve in curves:
         kept = thin_cloud(x, curve.values)
         chart.dots(panel, curve.name, x[kept], curve.values[kept], curve.colour, faint=True)
@@ -425,7 +425,7 @@ def _add(
 
 
 def _means(x: FloatArray, values: FloatArray, *, alike: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Return centres of classes along `x`, shape (N,), and means, shape (M,); `alike`: of equally many samples."""
+    """Return class centres along `x`, shape (N,), and means, shape (M,); `alike`: classes of equal sample count."""
     finite = np.isfinite(values)
     x, values = x[finite], values[finite]
     if x.size < _FEWEST:
@@ -439,7 +439,7 @@ def _means(x: FloatArray, values: FloatArray, *, alike: bool = False) -> tuple[F
 
 
 def _joined(lines: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """Return lines as one, with NaN between them."""
+    """Return the lines concatenated, with NaN between them."""
     gap = np.array([np.nan])
     x, y = zip(*lines, strict=True)
     return np.concatenate([part for one in x for part in (one, gap)]), np.concatenate(
@@ -448,7 +448,7 @@ def _joined(lines: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray,
 
 
 def _rate(t: FloatArray) -> float:
-    """Return the median sampling rate, hertz; 0 where there is none."""
+    """Return the median sampling rate, hertz; 0 if it is undefined."""
     period = float(np.median(np.diff(t))) if t.size > 1 else 0.0
     return 1.0 / period if period > 0.0 else 0.0
 
@@ -462,7 +462,7 @@ def _spectrum(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray
     window = int(np.clip(2 * even.size // _WINDOWS, 2 * _WINDOWS, min(even.size, _LONGEST_WINDOW)))
     frequency, power = signal.welch(even, rate, nperseg=window)
     frequency, power = frequency[1:], power[1:]
-    # Averaged over classes that are equally wide on a logarithmic axis.
+    # Averages over classes of equal width on a logarithmic axis.
     edges = np.unique(np.geomspace(1, frequency.size, _SPECTRUM_POINTS).astype(np.int64)) - 1
     counts = np.diff(np.append(edges, frequency.size))
     return (

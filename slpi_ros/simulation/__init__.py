@@ -1,1 +1,1 @@
-"""A simulated stage whose physics is none of the compensator's models."""
+"""A simulated stage with physics that are independent of the compensator's models."""

@@ -1,4 +1,4 @@
-"""A piezo stage by the equation of Bouc and Wen, whose small loops do not close."""
+"""A piezo stage with the Bouc-Wen equation, whose minor loops do not close."""
 
 import math
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ FloatArray = NDArray[np.float64]
 class BoucWen:
     """Displacement ``y = d v - h`` with ``dh = a d dv - b h |dv| - c |h| dv``: exponent 1, rate-independent.
 
-    Between two turns the equation is linear wherever ``h`` keeps its sign, and solved in closed form. It has no
-    return-point memory: a loop inside another does not come back to where it began.
+    Between two reversals the equation is linear where the sign of ``h`` is constant, and is solved in closed form. It
+    has no return-point memory: a minor loop does not return to its start.
 
     Parameters
     ----------
     gain : float, m/V
-        ``d``.
+        Slope of the linear part, ``d``.
     share : float
-        ``a``, of the gain that the hysteretic variable takes away after a turn, more than 0 and below 1.
+        Initial slope of the hysteretic variable after a reversal, ``a``, as a share of `gain`, between 0 and 1.
     softening, asymmetry : float, 1/V
-        ``b`` and ``c``; ``b`` is more than the size of ``c``.
+        Constants ``b`` and ``c``; ``b`` exceeds the magnitude of ``c``.
     offset : float, metres
         Displacement at rest at 0 V.
 
@@ -36,7 +36,7 @@ class BoucWen:
     Raises
     ------
     UsageError
-        If the values describe no stage.
+        If the parameters are invalid.
     """
 
     gain: float = 0.25e-6
@@ -46,17 +46,17 @@ class BoucWen:
     offset: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no stage."""
+        """Validate the parameters."""
         if not (self.gain > 0 and 0 < self.share < 1 and self.softening > abs(self.asymmetry)):
             raise UsageError(f"stage: {self} is none; give more softening than asymmetry, and a share between 0 and 1")
 
     def run(self, v: FloatArray) -> FloatArray:
-        """Drive the stage from rest at 0 V.
+        """Return the displacement for a voltage signal, starting from rest at 0 V.
 
         Parameters
         ----------
         v : ndarray, shape (N,), volts
-            Straight from one sample to the next.
+            Voltage, linear between samples.
 
         Returns
         -------
@@ -70,7 +70,7 @@ class BoucWen:
         return self.offset + self.gain * v - hysteretic
 
     def _move(self, h: float, dv: float) -> float:
-        """Return the hysteretic variable (m) after a straight move by `dv` volts."""
+        """Return the hysteretic variable (m) after a linear voltage change `dv` (V)."""
         # A fall is the mirror image of a rise.
         way, left = (1.0, dv) if dv >= 0 else (-1.0, -dv)
         h *= way

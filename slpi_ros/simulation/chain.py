@@ -1,4 +1,4 @@
-"""A stage of which everything that may go wrong can be chosen: amplifier, walls, creep, flexure, surroundings."""
+"""A stage with selectable physics: amplifier, rate dependence, creep, flexure mode, and environmental disturbances."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,12 +17,12 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Flexure:
-    """A lightly damped mode.
+    """A lightly damped second-order mode.
 
     Parameters
     ----------
     frequency : float, hertz
-        Undamped.
+        Undamped natural frequency.
     damping : float
         Damping ratio, 0 to below 1.
     """
@@ -33,13 +33,13 @@ class Flexure:
 
 @dataclass(frozen=True)
 class SlowDomains:
-    """Domains that follow the fast displacement each in its own time.
+    """Slow domains, each of which follows the fast displacement with its own time constant.
 
     Parameters
     ----------
     time_constants : tuple of float, seconds
     gains : tuple of float
-        What each adds in the end, as a share of the fast displacement.
+        Final contribution of each domain, as a share of the fast displacement.
     """
 
     time_constants: tuple[float, ...]
@@ -48,18 +48,18 @@ class SlowDomains:
 
 @dataclass(frozen=True)
 class Physics:
-    """What an axis has beside its hysteresis; each part may be absent.
+    """Physics of an axis other than its hysteresis; each part is optional.
 
     Parameters
     ----------
     amplifier : Amplifier, optional
     viscosity : Viscosity, optional
-        Its ``coercivity`` only with a stage of relays.
+        Rate dependence; the form ``coercivity`` requires a Preisach stage.
     creep : SlowDomains, optional
     flexure : Flexure, optional
     ageing : Ageing, optional
     coupling : mapping of axis name to float
-        Share of another axis's motion from its start that shows on this one.
+        Share of the motion of another axis, relative to its start, that is added to this axis.
     temperature : Temperature, optional
     interferometer : Interferometer, optional
     hum : Hum, optional
@@ -77,23 +77,23 @@ class Physics:
 
 
 def own_motion(base: StageParameters | BoucWen, physics: Physics, t: FloatArray, command: FloatArray) -> FloatArray:
-    """Drive one axis from rest at 0 V.
+    """Return the displacement of one axis for a voltage command, starting from rest at 0 V.
 
     Parameters
     ----------
     base : StageParameters or BoucWen
-        Its hysteresis; the dynamics and the sensor of StageParameters are left out.
+        Hysteresis of the axis; dynamics and sensor of StageParameters are not used.
     physics : Physics
-        Everything else, of which what comes before the coupling is used.
+        Other physics; only the parts before the coupling are used.
     t : ndarray, shape (N,), seconds
-        In order.
+        Non-decreasing times.
     command : ndarray, shape (N,), volts
-        What the record says.
+        Voltage command, as recorded.
 
     Returns
     -------
     ndarray, shape (N,), metres
-        Displacement of the axis by itself.
+        Displacement of the axis before coupling.
     """
     v = physics.amplifier.run(t, command) if physics.amplifier else command
     y = _hysteresis(base, physics.viscosity, t, v) - base.offset
@@ -109,23 +109,23 @@ def own_motion(base: StageParameters | BoucWen, physics: Physics, t: FloatArray,
 
 
 def sensed(physics: Physics, t: FloatArray, motion: Mapping[str, FloatArray], axis: str) -> FloatArray:
-    """Return what the sensor of one axis shows, but for its noise.
+    """Return the sensor reading of one axis without noise.
 
     Parameters
     ----------
     physics : Physics
-        Of this axis.
+        Physics of this axis.
     t : ndarray, shape (N,), seconds
-        In order; drift and hum count from its first.
+        Non-decreasing times; drift and hum start at the first one.
     motion : mapping of axis name to ndarray, shape (N,), metres
-        From `own_motion`, of every axis.
+        Displacement of every axis from `own_motion`.
     axis : str
-        This one.
+        Name of this axis.
 
     Returns
     -------
     ndarray, shape (N,), metres
-        The reading.
+        Sensor reading.
     """
     y = motion[axis]
     for other, gain in physics.coupling.items():

@@ -1,4 +1,4 @@
-"""What makes a stage depend on time: the amplifier before the hysteresis, creep and a flexure mode behind it."""
+"""Dynamics of a stage: the amplifier before the hysteresis; rate dependence; creep and a flexure mode after it."""
 
 import math
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from slpi_ros.simulation.parameters import StageParameters
 
 FloatArray = NDArray[np.float64]
 
-# Seconds. In less time an input jumps: its slope would cost the state its last digits.
+# Shortest step (s); in a shorter one the input jumps, because its slope would cause a loss of precision.
 SHORTEST_STEP = 1e-12
 
 
 class Relaxation:
-    """Elements that each follow one common input with a time constant of their own, ``tau_j dz_j/dt = u - z_j``.
+    """First-order elements with a common input and individual time constants, ``tau_j dz_j/dt = u - z_j``.
 
-    The update is exact, for steps of any length, where the input is linear between two samples (first-order hold).
+    The update is exact for steps of any length if the input is linear between samples (first-order hold).
 
     Parameters
     ----------
     time_constants : ndarray, shape (n,), seconds
-        More than 0.
+        Time constants, more than 0.
     """
 
     def __init__(self, time_constants: FloatArray) -> None:
@@ -32,24 +32,24 @@ class Relaxation:
         self.rest()
 
     def rest(self) -> None:
-        """Return to rest: input and elements at 0."""
+        """Reset the input and all elements to 0."""
         self._input = 0.0
         self._state: FloatArray = np.zeros_like(self._rate)
 
     def step(self, duration: float, value: float) -> FloatArray:
-        """Let time pass while the input goes to a value.
+        """Advance the elements while the input changes linearly to a value.
 
         Parameters
         ----------
         duration : float, seconds
-            0 or more; in less than `SHORTEST_STEP` the input jumps and the elements stay.
+            Step, 0 or more; below `SHORTEST_STEP` the input jumps and the elements are unchanged.
         value : float
-            The input at the end of the step.
+            Input at the end of the step.
 
         Returns
         -------
         ndarray, shape (n,), in the unit of the input
-            The elements at the end of the step.
+            Elements at the end of the step.
         """
         if duration >= SHORTEST_STEP:
             x = duration * self._rate
@@ -66,20 +66,19 @@ class Amplifier:
     Parameters
     ----------
     delay : float, seconds
-        By which the command comes late; less than 0: the displacement is stamped late. Before the first sample the
-        command was what it is there.
+        Delay of the command; a negative value means that the displacement is stamped late. Before the first sample the
+        command is constant.
     lag : float, seconds
         Time constant; 0 for none.
     lower, upper : float, volts
-        What it can give at least and at most.
+        Limits of the output.
     softness : float, volts
-        Width of the bend before either limit: within about this distance of it, the output falls behind already; 0 for
-        a sharp one.
+        Distance from a limit at which the output starts to saturate; 0 for a sharp limit.
 
     Raises
     ------
     UsageError
-        If no command gets through.
+        If the parameters are invalid.
     """
 
     delay: float = 0.0
@@ -89,13 +88,13 @@ class Amplifier:
     softness: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no amplifier."""
+        """Validate the parameters."""
         if not self.lower < self.upper or self.lag < 0 or self.softness < 0 or not math.isfinite(self.delay):
             raise UsageError(f"stage: {self} gives nothing; limits must be in order, lag and softness 0 or more")
 
     @property
     def clips(self) -> bool:
-        """Whether there is a limit."""
+        """Whether any limit is finite."""
         return math.isfinite(self.lower) or math.isfinite(self.upper)
 
     def run(self, t: FloatArray, command: FloatArray) -> FloatArray:
@@ -104,14 +103,14 @@ class Amplifier:
         Parameters
         ----------
         t : ndarray, shape (N,), seconds
-            In order.
+            Non-decreasing times.
         command : ndarray, shape (N,), volts
-            Linear between samples.
+            Command, linear between samples.
 
         Returns
         -------
         ndarray, shape (N,), volts
-            At the same times.
+            Voltage at the piezo, at the same times.
         """
         return self._clip(self._lag(t, np.interp(t - self.delay, t, command) if self.delay else command))
 
@@ -127,7 +126,7 @@ class Amplifier:
         return below + self._bent(self.lower - below)
 
     def _bent(self, beyond: FloatArray) -> FloatArray:
-        """Return how much of a voltage is lost that goes so far beyond a limit, volts."""
+        """Return the voltage (V) lost to saturation, for a voltage that exceeds a limit by `beyond` (V)."""
         if not self.softness:
             return np.maximum(beyond, 0.0)
         return self.softness * np.logaddexp(0.0, beyond / self.softness)
@@ -136,13 +135,13 @@ class Amplifier:
 class FlexureMode:
     """A second-order mode, ``d2x/dt2 + 2 z w dx/dt + w^2 x = w^2 u``, with a static gain of 1.
 
-    The update is exact, for steps of any length, where the input is linear between two samples (first-order hold): the
-    steady answer to the ramp is known, and what differs from it decays by the closed form of the matrix exponential.
+    The update is exact for steps of any length if the input is linear between samples (first-order hold): the steady-
+    state response to the ramp is known, and the deviation decays by the closed-form matrix exponential.
 
     Parameters
     ----------
     frequency : float, hertz
-        Undamped, ``w / 2 pi``.
+        Undamped natural frequency, ``w / 2 pi``.
     damping : float
         Damping ratio ``z``, from 0 to below 1.
     """
@@ -153,23 +152,23 @@ class FlexureMode:
         self.rest()
 
     def rest(self) -> None:
-        """Return to rest at 0."""
+        """Reset position and velocity to 0."""
         self._input = self._position = self._velocity = 0.0
 
     def step(self, duration: float, value: float) -> float:
-        """Let time pass while the input goes to a value.
+        """Advance the mode while the input changes linearly to a value.
 
         Parameters
         ----------
         duration : float, seconds
-            0 or more; in less than `SHORTEST_STEP` the input jumps and the mass stays.
+            Step, 0 or more; below `SHORTEST_STEP` the input jumps and the position is unchanged.
         value : float, metres
-            The input at the end of the step.
+            Input at the end of the step.
 
         Returns
         -------
         float, metres
-            Position of the mass at the end of the step.
+            Position at the end of the step.
         """
         if duration >= SHORTEST_STEP:
             slope = (value - self._input) / duration
@@ -180,7 +179,7 @@ class FlexureMode:
         return self._position
 
     def _ringing(self, duration: float, position: float, velocity: float) -> tuple[float, float]:
-        """Return position and velocity of the free motion from the given ones."""
+        """Return position and velocity after a free oscillation over `duration` (s)."""
         decay_rate = self._damping * self._omega
         ringing_rate = self._omega * math.sqrt(1 - self._damping**2)
         decay = math.exp(-decay_rate * duration)
@@ -195,25 +194,26 @@ _ELEMENTS_PER_DECADE = 2
 
 
 class Creep:
-    """Log-time creep: a chain of relaxations whose time constants are evenly spaced in log time.
+    """Logarithmic creep: parallel relaxations with logarithmically spaced time constants.
 
-    The displacement is ``y = h + sum_j g_j z_j`` with ``tau_j dz_j/dt = h - z_j``, exact where ``h`` is linear between
-    samples. All ``g_j`` are alike, so that after a step of ``h`` the displacement grows by `gain` of it in each decade
-    between `shortest` and `longest`. Under periodic drive the peaks fall as ``f^b``, with ``b`` near ``-gain / ln 10``.
+    The displacement is ``y = h + sum_j g_j z_j`` with ``tau_j dz_j/dt = h - z_j``, exact if ``h`` is linear between
+    samples. All ``g_j`` are equal, so that after a step of ``h`` the displacement grows by `gain` times the step per
+    decade of time between `shortest` and `longest`. Under a periodic input the peaks fall as ``f^b``, with ``b`` near
+    ``-gain / ln 10``.
 
     Parameters
     ----------
     gain : float
-        Creep in one decade of time, as a share of ``h``.
+        Creep per decade of time, as a share of ``h``.
     shortest, longest : float, seconds
-        Between these the time constants lie; longer than the first, the creep is over.
+        Shortest and longest time constant; after the longest one the creep is complete.
 
     Attributes
     ----------
     time_constants : ndarray, shape (n,), seconds
-        Two or more for each decade.
+        Time constants, at least two per decade.
     gains : ndarray, shape (n,)
-        Shares of ``h``; their sum is `gain` times the number of decades.
+        Shares of ``h``, with a sum of `gain` times the number of decades.
     """
 
     def __init__(self, gain: float, shortest: float, longest: float) -> None:
@@ -224,50 +224,50 @@ class Creep:
         self._chain = Relaxation(self.time_constants)
 
     def rest(self) -> None:
-        """Forget the past, as after a long time at 0."""
+        """Reset to equilibrium at 0."""
         self._chain.rest()
 
     def step(self, duration: float, value: float) -> float:
-        """Let time pass while the hysteresis goes to a value.
+        """Advance the creep while the hysteresis displacement changes linearly to a value.
 
         Parameters
         ----------
         duration : float, seconds
-            0 or more.
+            Step, 0 or more.
         value : float, metres
             Displacement without creep at the end of the step.
 
         Returns
         -------
         float, metres
-            Displacement with creep.
+            Displacement with creep at the end of the step.
         """
         return value + float(self.gains @ self._chain.step(duration, value))
 
     def after_ramp(self, duration: float) -> float:
-        """Return what a ramp from rest has become at its end, as a multiple of its end without creep.
+        """Return the ratio of the displacement with creep to that without, at the end of a ramp from rest.
 
         Parameters
         ----------
         duration : float, seconds
-            Of the ramp, more than 0.
+            Duration of the ramp, more than 0.
 
         Returns
         -------
         float
-            1 plus the creep.
+            The ratio, 1 or more for positive creep.
         """
         chain = Relaxation(self.time_constants)
         return 1.0 + float(self.gains @ chain.step(duration, 1.0))
 
 
 class Dynamics:
-    """Amplifier lag, creep and flexure mode of one axis; each may be absent.
+    """Amplifier lag, creep and flexure mode of one axis; each is optional.
 
     Parameters
     ----------
     parameters : StageParameters
-        Of which `amplifier_lag`, the ones of creep and those of the resonance are used.
+        Only `amplifier_lag` and the parameters of creep and resonance are used.
     """
 
     def __init__(self, parameters: StageParameters) -> None:
@@ -278,60 +278,60 @@ class Dynamics:
         self.rest()
 
     def rest(self) -> None:
-        """Forget the past and the time."""
+        """Reset all states and the clock."""
         self._time: float | None = None
         for part in (self._amplifier, self._creep, self._mode):
             if part:
                 part.rest()
 
     def advance(self, t: float) -> float:
-        """Set the clock.
+        """Set the clock and return the time step.
 
         Parameters
         ----------
         t : float, seconds
-            Not before the last one.
+            Time of the sample, non-decreasing.
 
         Returns
         -------
         float, seconds
-            Time passed since the last call; 0 for the first one after rest.
+            Time since the previous call; 0 for the first call after a reset.
 
         Raises
         ------
         UsageError
-            If the time is not finite or before the last one.
+            If the time is not finite or decreases.
         """
         last = t if self._time is None else self._time
         if not last <= t < math.inf:
-            raise UsageError(f"stage: time {t} s after {last} s; times must be finite and never go back")
+            raise UsageError(f"stage: time {t} s after {last} s; times must be finite and non-decreasing")
         self._time = t
         return t - last
 
     def amplify(self, duration: float, command: float) -> float:
-        """Return the voltage at the piezo (V) once the command (V) has been reached in `duration` (s)."""
+        """Return the voltage at the piezo (V) after the command has changed to `command` (V) in `duration` (s)."""
         return float(self._amplifier.step(duration, command)[0]) if self._amplifier else command
 
     def follow(self, duration: float, displacement: float) -> float:
-        """Return where the stage is (m) once the hysteresis has gone to `displacement` (m) in `duration` (s)."""
+        """Return the stage position (m) after the hysteresis has moved to `displacement` (m) in `duration` (s)."""
         crept = self._creep.step(duration, displacement) if self._creep else displacement
         return self._mode.step(duration, crept) if self._mode else crept
 
 
 @dataclass(frozen=True)
 class Ageing:
-    """A sensitivity that is not the same all along: the piezo depolarises, runs itself in, or warms up and cools down.
+    """Time-dependent sensitivity: depolarisation, run-in, or warm-up of the piezo.
 
     Parameters
     ----------
     change : float
-        Largest relative change of the sensitivity within the record, with its sign.
+        Largest relative change of the sensitivity within the record, signed.
     form : {"ramp", "settling", "cycles", "sine"}
-        A straight line in time; an exponential approach in time; one in the voltage travelled; a slow sine.
+        Linear in time; exponential in time; exponential in the accumulated voltage change; sinusoidal.
     constant : float
         Time constant of ``settling`` (s), travel constant of ``cycles`` (V), period of ``sine`` (s).
     pivot : float, metres
-        Displacement from rest that keeps its place.
+        Displacement, relative to rest, that is independent of the sensitivity.
     """
 
     change: float
@@ -340,7 +340,7 @@ class Ageing:
     pivot: float = 0.0
 
     def path(self, t: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the relative change, shape (N,), at times (s) with voltages (V), shape (N,) each; 0 at the start."""
+        """Return the relative change from the start, shape (N,), for times `t` (s) and voltages `v` (V)."""
         match self.form:
             case "ramp":
                 course = t - t[0]
@@ -353,26 +353,26 @@ class Ageing:
         return np.asarray(self.change * course / max(float(np.max(np.abs(course))), 1e-300), dtype=np.float64)
 
     def scaled(self, t: FloatArray, v: FloatArray, y: FloatArray) -> FloatArray:
-        """Return what becomes of a displacement from rest, shape (N,), metres."""
+        """Return the displacement with the changed sensitivity, shape (N,), metres."""
         return self.pivot + (1.0 + self.path(t, v)) * (y - self.pivot)
 
 
 @dataclass(frozen=True)
 class RateLaw:
-    """How a coercivity grows with the rate: by a power, or logarithmically as thermally activated domain walls do.
+    """Rate dependence of a coercivity: a power law, or a logarithmic law as for thermally activated domain walls.
 
     Parameters
     ----------
     strength : float
-        Growth at the reference rate, in the unit of what grows.
+        Growth at the reference rate, in the unit of the growing quantity.
     reference_rate : float, V/s
-        At this rate the growth is `strength`.
+        Rate at which the growth is `strength`.
     exponent : float
-        Of the power law; 0 for the logarithmic one.
+        Exponent of the power law; 0 selects the logarithmic law.
     onset : float, V/s
-        Below this rate the logarithmic law is linear.
+        Rate below which the logarithmic law is linear.
     settling : float, seconds
-        Time constant with which walls get used to another rate.
+        Time constant of the rate filter.
     """
 
     strength: float
@@ -382,7 +382,7 @@ class RateLaw:
     settling: float = 0.005
 
     def growth(self, t: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the growth along a path, shape (N,), of voltages (V) at times (s)."""
+        """Return the growth, shape (N,), along voltages `v` (V) at times `t` (s), shape (N,) each."""
         rate = _settled(t, np.abs(np.gradient(v, t)), self.settling)
         if self.exponent:
             return np.asarray(self.strength * (rate / self.reference_rate) ** self.exponent, dtype=np.float64)
@@ -393,18 +393,18 @@ class RateLaw:
 
 @dataclass(frozen=True)
 class Viscosity:
-    """Domain walls that switch later the faster the voltage moves.
+    """Rate-dependent switching of domain walls.
 
     Parameters
     ----------
     law : RateLaw
-        In volts for ``coercivity``, in metres for ``friction``.
+        Rate law, in volts for ``coercivity``, in metres for ``friction``.
     form : {"coercivity", "friction"}
-        ``coercivity``: every relay's thresholds move apart, each by the growth, so that relays see the voltage through
-        a play of that half-width. ``friction``: walls drag the stage behind by a force whose direction follows the
-        voltage over `transition`, and whose size is the growth.
+        ``coercivity``: the thresholds of every relay move apart by the growth, so that the relays receive the voltage
+        through a play operator of that half-width. ``friction``: a drag whose magnitude is the growth and whose
+        direction follows that of the voltage over `transition`.
     transition : float, volts
-        Constant of the exponential with which the friction turns round.
+        Decay constant of the friction direction after a reversal.
     """
 
     law: RateLaw
@@ -412,7 +412,7 @@ class Viscosity:
     transition: float = 6.0
 
     def relay_voltage(self, t: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the voltage that the relays see, shape (N,), V."""
+        """Return the voltage at the relays, shape (N,), volts."""
         if self.form != "coercivity":
             return v
         half_width = self.law.growth(t, v)
@@ -424,7 +424,7 @@ class Viscosity:
         return seen
 
     def drag(self, t: FloatArray, v: FloatArray) -> FloatArray:
-        """Return by how much the stage is pulled back, shape (N,), metres."""
+        """Return the displacement lost to friction, shape (N,), metres."""
         if self.form != "friction":
             return np.zeros_like(v)
         direction, now = np.empty_like(v), 0.0
@@ -436,7 +436,7 @@ class Viscosity:
 
 
 def _settled(t: FloatArray, x: FloatArray, time_constant: float) -> FloatArray:
-    """Return `x` as an element follows it that takes each sample as held since the last."""
+    """Return `x` after a first-order low-pass filter, with each sample held over the preceding interval."""
     settled, now = np.empty_like(x), float(x[0]) if x.size else 0.0
     left = np.exp(-np.diff(t, prepend=t[:1]) / time_constant).tolist()
     for index, (share, value) in enumerate(zip(left, x.tolist(), strict=True)):

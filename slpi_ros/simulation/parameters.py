@@ -1,4 +1,4 @@
-"""What a simulated stage is made of, as numbers."""
+"""Parameters of a simulated stage."""
 
 import math
 from dataclasses import dataclass, fields
@@ -10,7 +10,7 @@ from slpi_ros.errors import UsageError
 
 @dataclass(frozen=True)
 class StageParameters:
-    """One axis of a simulated stage.
+    """Parameters of one axis of a simulated stage.
 
     Parameters
     ----------
@@ -25,37 +25,37 @@ class StageParameters:
     levels : int
         Levels of the relay grid.
     width_scale : float, volts
-        Distance between the two thresholds of a relay at which the density has fallen to 1/e.
+        Distance between the two thresholds of a relay at which the density has decreased to 1/e.
     width_growth : float
         Relative change of `width_scale` from the middle to the upper end of the threshold range.
     bias_slope, bias_bow : float
-        Logarithm of the density at the upper end of the threshold range, relative to its middle: the part odd
-        in the bias and the part even in it.
+        Logarithm of the density at the upper end of the threshold range relative to its middle: the part odd in the
+        bias, and the part even in the bias.
     curvature : float
-        Cubic share of the reversible part; negative saturates towards the ends of the threshold range.
+        Cubic share of the reversible part; negative values saturate towards the ends of the threshold range.
     stiffening : float
-        Bow of the displacement over what relays and reversible part add up to, as a share of the stroke: the flexure
-        is stiffer (positive) or softer towards the upper end. With it, loops between the same two voltages differ.
+        Curvature of the displacement as a function of the summed relay and reversible parts, as a share of the stroke:
+        positive if the flexure stiffens towards the upper end. With curvature, loops between the same voltages differ.
     noise_rms : float, metres
-        Gaussian sensor noise.
+        Standard deviation of the Gaussian sensor noise.
     quantisation : float, metres
-        Step of the sensor's digits; 0 for none.
+        Resolution of the sensor; 0 for none.
     offset : float, metres
-        What the sensor reads at rest.
+        Sensor reading at rest.
     exponent : float
-        Of the power-law material (see PowerLawMaterial), whose loops of every amplitude look alike: peaks grow as
-        voltage to this power. 0 for the exponential material, which `width_scale`, `width_growth`, `bias_slope`,
-        `bias_bow` and `curvature` describe; they mean nothing to the other one.
+        Exponent of the power-law material (see PowerLawMaterial), whose loops are similar at all amplitudes: peaks grow
+        as voltage to this power. 0 selects the exponential material, to which alone `width_scale`, `width_growth`,
+        `bias_slope`, `bias_bow` and `curvature` apply.
     origin : float, volts
-        From where the power law counts voltages.
+        Voltage origin of the power law.
     width_exponent : float
-        How much rarer wide relays are than narrow ones in the power law.
+        Exponent by which the density of the power law decreases with relay width.
     creep_gain : float
-        Creep in one decade of time, as a share of the displacement; 0 for none.
+        Creep per decade of time, as a share of the displacement; 0 for none.
     creep_shortest, creep_longest : float, seconds
         Shortest and longest time constant of creep.
     resonance_frequency : float, hertz
-        Of the flexure mode; 0 for none.
+        Undamped frequency of the flexure mode; 0 for none.
     resonance_damping : float
         Damping ratio of the flexure mode.
     amplifier_lag : float, seconds
@@ -64,7 +64,7 @@ class StageParameters:
     Raises
     ------
     UsageError
-        If a value is not finite or describes no stage.
+        If a value is not finite or out of range.
     """
 
     stroke: float = 22e-6
@@ -93,7 +93,7 @@ class StageParameters:
     amplifier_lag: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no stage."""
+        """Validate the parameters."""
         for item in fields(self):
             value = getattr(self, item.name)
             if not math.isfinite(value):
@@ -107,7 +107,7 @@ class StageParameters:
             ("levels", self.levels >= 2, "at least 2"),
             ("width_scale", self.width_scale > 0, "more than 0 V"),
             ("width_growth", abs(self.width_growth) < 1, "between -1 and 1"),
-            ("curvature", self.curvature > -1 / 3, "more than -1/3, or the stage would turn back"),
+            ("curvature", self.curvature > -1 / 3, "more than -1/3, else the displacement would decrease"),
             ("stiffening", abs(self.stiffening) <= 0.1, "from -0.1 to 0.1"),
             ("noise_rms", self.noise_rms >= 0, "0 m or more"),
             ("quantisation", self.quantisation >= 0, "0 m or more"),
@@ -126,12 +126,12 @@ class StageParameters:
 
     @property
     def has_dynamics(self) -> bool:
-        """Whether the displacement depends on time and not only on the order of the voltages."""
+        """Whether the displacement depends on time in addition to the sequence of voltages."""
         return bool(self.creep_gain or self.resonance_frequency or self.amplifier_lag)
 
     @classmethod
     def random(cls, seed: int) -> "StageParameters":
-        """Draw a plausible stage: 20 to 25 µm, 12 to 17 % hysteresis, a density that differs with bias.
+        """Return a random plausible stage: 20 to 25 µm, 12 to 17 % hysteresis, a density that varies with bias.
 
         Parameters
         ----------
@@ -141,7 +141,7 @@ class StageParameters:
         Returns
         -------
         StageParameters
-            Sensor noise and quantisation keep their defaults.
+            Parameters; sensor noise and quantisation have their default values.
         """
         rng = np.random.default_rng(seed)
 

@@ -1,4 +1,4 @@
-"""Desired displacements to judge a stage by."""
+"""Reference paths and loop figures for the evaluation of a stage."""
 
 import math
 from collections.abc import Callable
@@ -18,15 +18,15 @@ _SMOOTHING_S = 0.05
 def scan_path(
     y_min: float, y_max: float, *, duration: float = 30.0, rate: float = 200.0, seed: int = 0
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw a smooth path of desired displacements that no calibration has seen.
+    """Return a smooth random path of desired displacements that differs from calibration drives.
 
     Parameters
     ----------
     y_min, y_max : float, metres
-        Never left; the path rises from `y_min`.
+        Limits of the path, which rises from `y_min`.
     duration : float, seconds
-        Time of the last sample, at least 4 s: equal parts of several tones, of ramps as of a raster scan, and
-        of turns at random places.
+        Time of the last sample, at least 4 s, divided equally into several tones, ramps as in a raster scan, and random
+        reversals.
     rate : float, hertz
         Samples per second.
     seed : int
@@ -37,7 +37,7 @@ def scan_path(
     t : ndarray, shape (N,), seconds
         Times from 0 to `duration`.
     y : ndarray, shape (N,), metres
-        The path.
+        Desired displacements.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def scan_path(
 
 
 def _tones(t: FloatArray, within: NDArray[np.bool_], rng: np.random.Generator) -> FloatArray:
-    """Several sines filling 0 to 1 while `within`, faded in from 0."""
+    """Return a sum of sines, faded in from 0 and scaled to 0..1, for the samples selected by `within`."""
     phases = rng.uniform(0, 2 * np.pi, len(_TONES_HZ))
     wave = sum(np.sin(2 * np.pi * f * t + phase) / f for f, phase in zip(_TONES_HZ, phases, strict=True))
     low, high = np.min(wave[within]), np.max(wave[within])
@@ -72,7 +72,7 @@ def _tones(t: FloatArray, within: NDArray[np.bool_], rng: np.random.Generator) -
 def _corners(
     ramps: float, turns: float, end: float, level: float, rng: np.random.Generator
 ) -> tuple[list[float], list[float]]:
-    """Return times and levels of corners: a raster from `ramps` on, random turns from `turns` to `end`."""
+    """Return times and levels of corners: a raster from `ramps` on, random reversals from `turns` to `end`."""
     times, levels = [ramps], [level]
     window = rng.uniform(0.02, 0.35), rng.uniform(0.65, 0.98)
     while times[-1] < end:
@@ -89,7 +89,7 @@ def _smooth(path: FloatArray, half_width: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class LoopFigure:
-    """A closed major loop in five numbers.
+    """Characteristic values of a closed major loop.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class LoopFigure:
     bottom, top : float, metres
         Displacement at the lower and the upper voltage of the closed loop.
     rising_middle, falling_middle : float, metres
-        Displacement halfway between the two voltages, on the way up and on the way down.
+        Displacement at the middle voltage on the rising and on the falling branch.
     """
 
     start: float
@@ -119,24 +119,24 @@ class LoopFigure:
 
     @property
     def remanence(self) -> float:
-        """What remains of the first rise after the return to the lower voltage, metres."""
+        """Displacement that remains at the lower voltage after the first rise and fall, metres."""
         return self.bottom - self.start
 
 
 def measure_loop(respond: Callable[[float], float], low: float, high: float) -> LoopFigure:
-    """Drive two major loops and note where they pass.
+    """Drive two major loops and return the characteristic values of the second.
 
     Parameters
     ----------
     respond : callable
-        Takes a voltage (V) and returns the displacement (m) it leads to; starts at rest at `low` or below.
+        Maps a voltage (V) to the displacement (m), starting at rest at `low` or below.
     low, high : float, volts
-        The voltages between which the loop is driven.
+        Ends of the loop.
 
     Returns
     -------
     LoopFigure
-        The figures of the second loop, which is closed.
+        Values of the second loop, which is closed.
     """
     middle = (low + high) / 2
     start, _, bottom = respond(low), respond(high), respond(low)

@@ -1,4 +1,4 @@
-"""One axis of a simulated piezo stage: amplifier, Preisach relays, a reversible curve, creep, a flexure, a sensor."""
+"""One axis of a simulated piezo stage: amplifier, Preisach relays, reversible curve, creep, flexure mode and sensor."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -16,23 +16,22 @@ FloatArray = NDArray[np.float64]
 
 
 class Material(Protocol):
-    """What a stage needs to know of its piezo."""
+    """Relay density and reversible curve of a piezo material."""
 
     def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
-        """Return weights of relays by bias and width (V), any unit, for RelayTriangle."""
+        """Return relay weights by bias and width (V), arbitrary unit, for RelayTriangle."""
 
     def reversible(self, voltage: float) -> float:
-        """Return the part of the displacement without memory, any unit, at a voltage (V)."""
+        """Return the displacement without memory, arbitrary unit, at a voltage (V)."""
 
 
 class ExponentialMaterial:
-    """Relays whose number falls exponentially with their width and changes with bias; a cubic reversible curve.
+    """A relay density that decreases exponentially with width and varies with bias, and a cubic reversible curve.
 
     Parameters
     ----------
     parameters : StageParameters
-        Of which the threshold range, `width_scale` and `width_growth`, `bias_slope`, `bias_bow` and `curvature` are
-        used.
+        Only the threshold range, `width_scale`, `width_growth`, `bias_slope`, `bias_bow` and `curvature` are used.
     """
 
     def __init__(self, parameters: StageParameters) -> None:
@@ -41,7 +40,7 @@ class ExponentialMaterial:
         self._centre, self._half_range = (low + high) / 2, (high - low) / 2
 
     def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
-        """Return weights of relays.
+        """Return relay weights.
 
         Parameters
         ----------
@@ -51,9 +50,9 @@ class ExponentialMaterial:
         Returns
         -------
         ndarray, same shape
-            In arbitrary units.
+            Weights in arbitrary units.
         """
-        # The fall with width changes with bias too: a mere product of the two would be too easy a stage.
+        # The decay with width varies with bias, because a product of the two would be unrealistically simple.
         b = (bias - self._centre) / self._half_range
         scale = self._parameters.width_scale * (1 + self._parameters.width_growth * b)
         density = np.exp(self._parameters.bias_slope * b + self._parameters.bias_bow * b**2 - width / scale)
@@ -66,24 +65,23 @@ class ExponentialMaterial:
 
 
 class PowerLawMaterial:
-    """Relays without a scale of their own: loops of every amplitude look alike.
+    """A scale-free relay density: loops of all amplitudes are similar.
 
-    With thresholds counted from `origin`, the density of relays that switch up at ``a`` and down at ``b <= a`` is
-    ``mu(a, b) = a^(p-2) (b/a)^m``, ``p`` the `exponent` and ``m`` the `width_exponent`: a relay's width counts relative
-    to its voltage, and the wider ones are rarer. Below the origin the density is its mirror image, and no relay has
-    one threshold on either side: a preloaded stack comes back to where it started. The sum over a triangle of relays
-    is the Everett function
+    With thresholds relative to `origin`, the density of relays that switch up at ``a`` and down at ``b <= a`` is
+    ``mu(a, b) = a^(p-2) (b/a)^m``, with ``p`` the `exponent` and ``m`` the `width_exponent`. Below the origin the
+    density is its mirror image, and no relay has thresholds on both sides: a preloaded stack returns to its start. The
+    sum over a triangle of relays is the Everett function
 
     ``E(a, b) = a^p [(1 - r^p) / p - (1 - r^(m+1)) / (m+1)] / (m+1-p)``, ``r = b/a``,
 
-    homogeneous of degree ``p``. The rise from the origin is ``V^p``, nearly straight where ``p`` is nearly 1; the fall
-    has the slope ``r^(p-1) - r^m``, little after the turn and more and more later: for ``p = m = 1`` the parabola of
-    Rayleigh's law, whose opening here grows with the amplitude and not with its square.
+    homogeneous of degree ``p``. The rise from the origin is ``V^p``, nearly straight for ``p`` near 1; the slope of the
+    fall, ``r^(p-1) - r^m``, is small after the reversal and then increases: for ``p = m = 1`` the parabola of
+    Rayleigh's law, with a width that grows with the amplitude instead of its square.
 
     Parameters
     ----------
     parameters : StageParameters
-        Of which the threshold range, `levels`, `exponent`, `origin` and `width_exponent` are used.
+        Only the threshold range, `levels`, `exponent`, `origin` and `width_exponent` are used.
 
     References
     ----------
@@ -96,19 +94,19 @@ class PowerLawMaterial:
         self._half_cell = (parameters.threshold_max - parameters.threshold_min) / parameters.levels / 2
 
     def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
-        """Return weights of relays, integrated over the cells of the grid.
+        """Return relay weights, integrated over the cells of the grid.
 
-        The middle of a cell does not stand for the cell close to the origin, where the loops of small amplitude live.
+        The density at the centre of a cell is inaccurate close to the origin, which determines small loops.
 
         Parameters
         ----------
         bias, width : ndarray, one shape, volts
-            Mean of the two thresholds and their distance, in the middle of each cell.
+            Mean and distance of the two thresholds at the centre of each cell.
 
         Returns
         -------
         ndarray, same shape
-            In arbitrary units.
+            Weights in arbitrary units.
         """
         up, down = bias + width / 2, bias - width / 2
         up_low, up_high = up - self._half_cell, up + self._half_cell
@@ -117,17 +115,17 @@ class PowerLawMaterial:
         return np.maximum(outer - self.everett(up_low, down_low) - self.everett(up_high, down_high), 0.0)
 
     def everett(self, up: FloatArray, down: FloatArray) -> FloatArray:
-        """Return the sum of the relays that a fall from one voltage to another switches.
+        """Return the sum of the relays that switch during a fall from one voltage to another.
 
         Parameters
         ----------
         up, down : ndarray, one shape, volts
-            Where the fall begins and ends; where it would rise, the sum is 0.
+            Start and end of the fall; the sum is 0 if `down` exceeds `up`.
 
         Returns
         -------
         ndarray, same shape
-            In arbitrary units.
+            Sum in arbitrary units.
         """
         a, b = up - self._origin, down - self._origin
         return self._above_origin(a, b) + self._above_origin(-b, -a)
@@ -151,12 +149,12 @@ def material(parameters: StageParameters) -> Material:
     Parameters
     ----------
     parameters : StageParameters
-        With an `exponent` relays spread by a power law, without one exponentially.
+        Parameters; with an `exponent` other than 0 the power law applies, else the exponential density.
 
     Returns
     -------
     Material
-        Its density and its reversible curve.
+        Relay density and reversible curve.
     """
     return PowerLawMaterial(parameters) if parameters.exponent else ExponentialMaterial(parameters)
 
@@ -165,29 +163,28 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 class RelayTriangle:
-    """Relays that switch up at one threshold and down at a lower one, summed with weights.
+    """A weighted sum of relays that switch up at one threshold and down at a lower one.
 
-    Row ``i`` and column ``j <= i`` of the state matrix hold a bundle of relays whose up-thresholds are spread
-    evenly from ``low + i h`` to ``low + (i + 1) h`` and whose down-thresholds lie ``(i - j) h`` below them;
-    the state is the share of the bundle that is up. Without the spread, the level spacing ``h`` would show as
-    steps of tens of nanometres.
+    Row ``i`` and column ``j <= i`` of the state matrix hold a group of relays with up-thresholds uniformly distributed
+    from ``low + i h`` to ``low + (i + 1) h`` and down-thresholds ``(i - j) h`` below; the state is the share of the
+    group that is up. With discrete thresholds, the level spacing ``h`` would produce steps of tens of nanometres.
 
     Parameters
     ----------
     low, high : float, volts
-        Range of the thresholds, and of the voltages the relays accept.
+        Range of the thresholds and of the accepted voltages.
     levels : int
-        Number of rows and of columns.
+        Number of rows and columns.
     density : callable
-        ``density(bias, width)`` in arbitrary units: the weight of relays whose thresholds have the mean
-        ``bias`` (V) and the distance ``width`` (V); called once with arrays of shape (levels, levels).
+        ``density(bias, width)``, weight in arbitrary units of relays whose thresholds have the mean ``bias`` (V) and
+        the distance ``width`` (V); called once with arrays of shape (levels, levels).
 
     Attributes
     ----------
     output : float
         Weighted sum of the states, in the unit of `density`.
     voltage : float, volts
-        The voltage of the last step.
+        Voltage of the last step.
 
     References
     ----------
@@ -205,44 +202,44 @@ class RelayTriangle:
         self.all_down()
 
     def all_down(self) -> None:
-        """Switch every relay down, as the lowest voltage does."""
+        """Switch all relays down, as at the lowest voltage."""
         self._state[:] = 0.0
         self._position = 0.0
         self.output = 0.0
         self.voltage = self._low
 
     def scale(self, factor: float) -> None:
-        """Multiply every weight, and so the output, by `factor`."""
+        """Multiply all weights, and the output, by `factor`."""
         self._weight *= factor
         self.output *= factor
 
     @property
     def state(self) -> FloatArray:
-        """Share of relays up in each bundle, shape (levels, levels), 0 where there is none; a copy."""
+        """Share of relays that are up in each group, shape (levels, levels), 0 for unused elements; a copy."""
         return np.tril(self._state)
 
     def check(self, voltage: float) -> None:
-        """Refuse a voltage (V) that is not a number between the lowest and the highest threshold: UsageError."""
+        """Raise UsageError if a voltage (V) is not a number within the threshold range."""
         if not self._low <= voltage <= self._high:
             raise UsageError(f"stage: {voltage} V is not within {self._low} to {self._high} V; clip it")
 
     def step(self, voltage: float) -> float:
-        """Apply a voltage and switch the relays it passes.
+        """Apply a voltage and switch the relays between the previous voltage and this one.
 
         Parameters
         ----------
         voltage : float, volts
-            Any value between the lowest and the highest threshold.
+            Any value within the threshold range.
 
         Returns
         -------
         float
-            The weighted sum of the states, in the unit of the density.
+            Weighted sum of the states, in the unit of the density.
 
         Raises
         ------
         UsageError
-            If the voltage is not a number between the lowest and the highest threshold.
+            If the voltage is not a number within the threshold range.
         """
         self.check(voltage)
         position = (voltage - self._low) / self._spacing
@@ -254,7 +251,7 @@ class RelayTriangle:
         return self.output
 
     def _rise(self, position: float) -> None:
-        # Rows below the old voltage are already up, rows above the new one are not reached.
+        # Rows below the old voltage are already up; rows above the new voltage are not reached.
         first, end = int(self._position), min(int(position) + 1, len(self._index))
         share = np.minimum(position - self._index[first:end, None], 1.0)
         block = (slice(first, end), slice(0, end))
@@ -275,16 +272,16 @@ __all__ = ["PreisachStage", "StageParameters"]
 
 
 class PreisachStage:
-    """A stage whose displacement is a relay sum plus a reversible curve of the voltage, behind a flexure.
+    """A stage whose displacement is a relay sum plus a reversible function of the voltage.
 
-    Where its parameters say so, the voltage passes a slow amplifier first, and the displacement creeps and rings.
+    With the corresponding parameters, it includes the lag of the amplifier, creep, and the resonance of the flexure.
 
     Parameters
     ----------
     parameters : StageParameters, optional
-        What the axis is made of; the defaults of StageParameters without it.
+        Parameters of the axis; by default those of StageParameters.
     seed : int
-        Of the sensor noise.
+        Seed of the sensor noise.
 
     Attributes
     ----------
@@ -294,7 +291,7 @@ class PreisachStage:
     Raises
     ------
     UsageError
-        If so wide a hysteresis needs more than the whole stroke from the relays.
+        If the hysteresis would require a relay part larger than the stroke.
     """
 
     def __init__(self, parameters: StageParameters | None = None, seed: int = 0) -> None:
@@ -311,7 +308,7 @@ class PreisachStage:
         self._zero = self._displacement() - parameters.offset
 
     def rest(self) -> None:
-        """Forget the past and the time: all relays down at the lowest voltage, then 0 V for long."""
+        """Reset to rest: all relays down at the lowest voltage, then 0 V for a long time."""
         self._relays.all_down()
         self._relays.step(0.0)
         if self._dynamics:
@@ -323,20 +320,20 @@ class PreisachStage:
         Parameters
         ----------
         t : float, seconds
-            When. Without dynamics it means nothing. With them, voltage and displacement are taken as linear since
-            the last call; no time passes before the first one after rest.
+            Time of the sample, ignored without dynamics. With dynamics, voltage and displacement are linear since the
+            previous call; the first call after a reset has no duration.
         v : float, volts
-            Within the threshold range.
+            Voltage within the threshold range.
 
         Returns
         -------
         float, metres
-            The displacement, without sensor errors.
+            Displacement without sensor errors.
 
         Raises
         ------
         UsageError
-            If `v` is not a number within the threshold range or, with dynamics, `t` goes back.
+            If `v` is not a number within the threshold range or, with dynamics, `t` decreases.
         """
         if self._dynamics:
             return self._step_in_time(self._dynamics, t, v)
@@ -344,31 +341,31 @@ class PreisachStage:
         return self._displacement()
 
     def measure(self, y_true: float) -> float:
-        """Read the sensor at a displacement (m) and return the reading (m)."""
+        """Return the sensor reading (m) at a displacement (m)."""
         return float(self._sensor.read(np.asarray(y_true)))
 
     def run(self, t: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Apply a record of voltages, continuing from the present state.
+        """Apply a voltage signal, continuing from the current state.
 
         Parameters
         ----------
         t : ndarray, shape (N,), seconds
             Times of the samples.
         v : ndarray, shape (N,), volts
-            Within the threshold range.
+            Voltages within the threshold range.
 
         Returns
         -------
         y_true : ndarray, shape (N,), metres
-            The displacement.
+            Displacement without sensor errors.
         y_measured : ndarray, shape (N,), metres
-            What the sensor reads.
+            Sensor reading.
 
         Raises
         ------
         UsageError
-            If the lengths differ, a voltage is not a number within the threshold range or, with dynamics, a time goes
-            back.
+            If the lengths differ, a voltage is not a number within the threshold range or, with dynamics, a time
+            decreases.
         """
         if t.shape != v.shape:
             raise UsageError(f"stage: {t.shape} times for {v.shape} voltages; give one time for each voltage")
@@ -377,19 +374,19 @@ class PreisachStage:
         return y_true, self._sensor.read(y_true)
 
     def respond(self, v: FloatArray, relay_voltage: FloatArray) -> FloatArray:
-        """Apply a path of which the relays see something else than the reversible part; amplifier and time have no say.
+        """Apply separate voltages to the relays and to the reversible part, without amplifier and dynamics.
 
         Parameters
         ----------
         v : ndarray, shape (N,), volts
-            What the reversible part follows.
+            Voltage of the reversible part.
         relay_voltage : ndarray, shape (N,), volts
-            What switches the relays, within the threshold range.
+            Voltage of the relays, within the threshold range.
 
         Returns
         -------
         ndarray, shape (N,), metres
-            The displacement, without sensor errors.
+            Displacement without sensor errors.
         """
         y = np.empty_like(v)
         for index, (voltage, seen) in enumerate(zip(v.tolist(), relay_voltage.tolist(), strict=True)):
@@ -401,7 +398,7 @@ class PreisachStage:
         self._relays.check(v)
         duration = dynamics.advance(t)
         lagged = dynamics.amplify(duration, v)
-        # Rounding must not carry the lagged voltage over the last threshold.
+        # Rounding must not move the lagged voltage beyond the highest threshold.
         self._relays.step(min(max(lagged, self.parameters.threshold_min), self.parameters.threshold_max))
         offset = self.parameters.offset
         return offset + dynamics.follow(duration, self._displacement() - offset)
@@ -422,7 +419,7 @@ class PreisachStage:
         return self._sum(voltage)
 
     def _share_stroke(self) -> float:
-        """Weight the relays for the wanted hysteresis; return the gain that gives the other part the rest."""
+        """Scale the relays to the specified hysteresis; return the gain of the reversible part for the full stroke."""
         wanted, nominal = self.parameters, self.parameters.nominal_voltage
         relays = measure_loop(self._relays.step, 0.0, nominal)
         share = wanted.hysteresis / relays.hysteresis

@@ -10,14 +10,14 @@ FloatArray = NDArray[np.float64]
 
 
 class Sensor:
-    """A sensor with Gaussian noise and a last digit.
+    """A sensor with Gaussian noise and quantisation.
 
     Parameters
     ----------
     noise_rms : float, metres
         Standard deviation of the noise.
     quantisation : float, metres
-        Step of the readings; 0 for none.
+        Resolution of the readings; 0 for none.
     seed : int
         The same seed gives the same noise.
     """
@@ -28,17 +28,17 @@ class Sensor:
         self._rng = np.random.default_rng(seed)
 
     def read(self, displacement: FloatArray) -> FloatArray:
-        """Read displacements one after the other.
+        """Return the readings for displacements, in order.
 
         Parameters
         ----------
         displacement : ndarray, any shape, metres
-            What the stage does.
+            True displacement.
 
         Returns
         -------
         ndarray, same shape, metres
-            What the sensor says.
+            Sensor reading.
         """
         reading = displacement + self._noise_rms * self._rng.standard_normal(displacement.shape)
         if self._quantisation:
@@ -46,27 +46,26 @@ class Sensor:
         return np.asarray(reading, dtype=np.float64)
 
 
-# Random temperature is smooth over this time: the stage's body is heavy.
+# Smoothing time of random temperature, due to the heat capacity of the stage.
 _INERTIA_S = 6.0
 
 
 @dataclass(frozen=True)
 class Temperature:
-    """Slow motion of the whole stage, whatever its voltage.
+    """Slow displacement of the stage that is independent of the voltage.
 
     Parameters
     ----------
     amplitude : float, metres
-        How far it goes from its start within the record, up to sign.
+        Largest displacement from the start within the record, signed.
     form : {"ramp", "settling", "sine", "wandering"}
-        A straight line; a body that warms up exponentially; a slow sine, as of an air conditioner; a random walk,
-        smooth over some seconds.
+        Linear; exponential warm-up; a slow sine, as of an air conditioner; a random walk, smoothed over some seconds.
     time : float, seconds
         Time constant of ``settling``, period of ``sine``.
     phase : float, radians
-        Of ``sine``.
+        Phase of ``sine``.
     seed : int
-        Of ``wandering``.
+        Seed of ``wandering``.
     """
 
     amplitude: float
@@ -76,7 +75,7 @@ class Temperature:
     seed: int = 0
 
     def path(self, t: FloatArray) -> FloatArray:
-        """Return the drift at times (s) from 0 on, shape (N,), metres; 0 at the start."""
+        """Return the drift, shape (N,), metres, at times `t` from 0 on, shape (N,), seconds; 0 at the start."""
         x = self._form(t - t[0])
         x = x - x[0]
         return np.asarray(self.amplitude * x / np.max(np.abs(x)), dtype=np.float64)
@@ -103,14 +102,14 @@ class Temperature:
 
 @dataclass(frozen=True)
 class Hum:
-    """A disturbance of one frequency.
+    """A sinusoidal disturbance.
 
     Parameters
     ----------
     frequency : float, hertz
     amplitude : float, metres
     phase : float, radians
-        At time 0, of the sine.
+        Phase of the sine at time 0.
     """
 
     frequency: float
@@ -118,25 +117,25 @@ class Hum:
     phase: float = 0.0
 
     def path(self, t: FloatArray) -> FloatArray:
-        """Return the disturbance at times (s), shape (N,), metres."""
+        """Return the disturbance, shape (N,), metres, at times `t`, shape (N,), seconds."""
         return np.asarray(self.amplitude * np.imag(np.exp(1j * (2 * np.pi * self.frequency * t + self.phase))))
 
 
 @dataclass(frozen=True)
 class Interferometer:
-    """A sensor whose two signals, a quarter of a period apart, are not what they should be.
+    """An interferometer with imperfect quadrature signals.
 
     Parameters
     ----------
     period : float, metres
-        Displacement from one fringe to the next: half or a quarter of a wavelength.
+        Displacement per fringe: half or a quarter of the wavelength.
     amplitude : float, metres
-        Of the error's first harmonic, less than ``period / 2 pi``.
+        Amplitude of the error's first harmonic, less than ``period / 2 pi``.
     phase : float, radians
-        Of the error where the displacement is 0: of ``amplitude sin(2 pi y / period + phase)``.
+        Phase of the error at displacement 0, in ``amplitude sin(2 pi y / period + phase)``.
     form : {"offsets", "sine"}
-        ``offsets``: both signals have an offset, and the phase is read from them as it is, which gives the error
-        harmonics; ``sine``: an error without harmonics.
+        ``offsets``: both signals have an uncorrected offset, which gives an error with harmonics; ``sine``: an error
+        without harmonics.
     """
 
     period: float
@@ -145,10 +144,10 @@ class Interferometer:
     form: Literal["offsets", "sine"] = "sine"
 
     def read(self, y: FloatArray) -> FloatArray:
-        """Return the readings of displacements, shape (N,), metres."""
+        """Return the readings, shape (N,), metres, for displacements `y`, shape (N,), metres."""
         wave = 2 * np.pi / self.period
         angle = wave * y + self.phase
         if self.form == "sine":
             return np.asarray(y + self.amplitude * np.sin(angle))
-        # Seen from a centre that is off by so much of its length, the pointer e^(i fringe) has another angle.
+        # Angle of the pointer e^(i fringe) relative to a centre with an offset of this share of its length.
         return np.asarray(y + np.angle(1.0 - wave * self.amplitude * np.exp(-1j * angle)) / wave)

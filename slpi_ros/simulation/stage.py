@@ -10,12 +10,12 @@ from slpi_ros.simulation.preisach import PreisachStage
 
 
 class Stage:
-    """Axes that move independently; each is a hysteresis element with a sensor.
+    """Independent axes, each with hysteresis and a sensor.
 
     Parameters
     ----------
     axes : mapping of axis name to PreisachStage
-        In the order in which voltages are given.
+        Axes, in the order of the voltages.
 
     Attributes
     ----------
@@ -35,21 +35,21 @@ class Stage:
 
     @classmethod
     def random(cls, names: Sequence[str], seed: int, noise_rms: float | None = None) -> "Stage":
-        """Draw a plausible stage.
+        """Return a random plausible stage.
 
         Parameters
         ----------
         names : sequence of str
-            The axes.
+            Names of the axes.
         seed : int
-            The first axis is that of ``StageParameters.random(seed)``; the others differ from it.
+            Seed; the first axis equals ``StageParameters.random(seed)``, the others differ.
         noise_rms : float, metres, optional
-            Sensor noise of every axis in place of the default.
+            Sensor noise of every axis; by default that of StageParameters.
 
         Returns
         -------
         Stage
-            At rest.
+            The stage at rest.
 
         Raises
         ------
@@ -68,7 +68,7 @@ class Stage:
 
     @property
     def voltage_range(self) -> tuple[float, float]:
-        """Lowest and highest voltage that every axis accepts, volts."""
+        """Voltage range accepted by all axes, lowest and highest, volts."""
         parameters = [axis.parameters for axis in self.axes.values()]
         return max(p.threshold_min for p in parameters), min(p.threshold_max for p in parameters)
 
@@ -78,19 +78,19 @@ class Stage:
         Parameters
         ----------
         t : float, seconds
-            When.
+            Time of the sample.
         voltages : sequence of float, length of `axes`, volts
-            In the order of `axes`.
+            Voltages in the order of `axes`.
 
         Returns
         -------
         list of float, length of `axes`, metres
-            The displacements, without sensor errors.
+            Displacements without sensor errors.
         """
         return [axis.step(t, v) for axis, v in zip(self.axes.values(), voltages, strict=True)]
 
     def measure(self, displacements: Sequence[float]) -> list[float]:
-        """Read every sensor: displacements in, readings out, both in metres and in the order of `axes`."""
+        """Return the readings of all sensors (m) for displacements (m), both in the order of `axes`."""
         return [axis.measure(y) for axis, y in zip(self.axes.values(), displacements, strict=True)]
 
 
@@ -99,7 +99,7 @@ _P11_HALF_PERIOD = 0.5
 
 
 def flexure_stage(seed: int = 0) -> PreisachStage:
-    """Return a stage like that of the SLPI paper: 0 to 100 V, quasi-static, loops that differ with bias.
+    """Return a stage similar to that of the SLPI paper: 0 to 100 V, quasi-static, loops that vary with bias.
 
     - 0 to 100 V: the range of its voltage controller (2.2).
     - Stroke 24 µm: chosen. The text states none; the operators of its Table 4 add up to 6.5 in a unit it leaves open.
@@ -114,12 +114,12 @@ def flexure_stage(seed: int = 0) -> PreisachStage:
     Parameters
     ----------
     seed : int
-        Of the sensor noise; the stage is always the same.
+        Seed of the sensor noise; the stage does not depend on it.
 
     Returns
     -------
     PreisachStage
-        At rest at 0 V.
+        The stage at rest at 0 V.
     """
     parameters = StageParameters(
         stroke=24e-6,
@@ -137,7 +137,7 @@ def flexure_stage(seed: int = 0) -> PreisachStage:
 
 
 def p11_stage(seed: int = 0) -> Stage:
-    """Return a stage like the P11.XY100 of the MPI paper: two axes, 0 to 120 V nominal, creeping and ringing.
+    """Return a stage similar to the P11.XY100 of the MPI paper: two axes, 0 to 120 V nominal, with creep and resonance.
 
     - -20 to 150 V: stated (2.1).
     - Peak of 89.189 µm for a triangle of 120 V at 1 Hz: Table 1, where ``a`` is the peak at 1 Hz. The relays' part of
@@ -160,12 +160,12 @@ def p11_stage(seed: int = 0) -> Stage:
     Parameters
     ----------
     seed : int
-        Of the sensor noise, another for each axis; the stage is always the same.
+        Seed of the sensor noise, which differs between the axes; the stage does not depend on it.
 
     Returns
     -------
     Stage
-        Axes ``x`` and ``y``, at rest at 0 V.
+        Stage with axes ``x`` and ``y``, at rest at 0 V.
     """
     x = StageParameters(
         hysteresis=0.11,

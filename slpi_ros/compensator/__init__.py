@@ -1,1 +1,1 @@
-"""The compensator at run time, without ROS: stamps, models that take over, resets, ramps, feedback, trajectories."""
+"""The real-time compensator, independent of ROS: validation, model replacement, ramps, feedback, trajectories."""

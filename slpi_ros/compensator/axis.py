@@ -1,4 +1,4 @@
-"""One axis at run time: its stamps and limits, its model and memory, its feedback, and where it goes by itself."""
+"""Run-time state of one axis: time stamps, limits, model and memory, feedback, ramps."""
 
 from collections.abc import Sequence
 
@@ -14,44 +14,45 @@ from slpi_ros.model.limits import MAX_DT, Limits
 from slpi_ros.model.streaming import StreamingInverse
 
 MAX_DT_NS = int(MAX_DT * SECOND_NS)
-# A first measurement fits a memory within this share of the identified displacements, or this many times the error that
-# the model was identified with: what a sensor's zero, creep and temperature do overnight is less, another history more.
+# A first measurement matches an initial history within this share of the identified displacements, or this many times
+# the held-out error. Overnight changes of sensor zero, creep and temperature are smaller; another history is larger.
 FIT_SHARE, FIT_SIGMAS = 0.005, 4.0
 
 
 class Axis:
-    """One axis. All times are nanoseconds on a clock that never jumps, unless said otherwise.
+    """Inverse hysteresis compensation, with optional feedback, of one axis.
+
+    All times are nanoseconds on a monotonic clock unless stated otherwise.
 
     Parameters
     ----------
     name : str
     place : int
-        Of its voltage among those of all axes.
+        Index of the axis in the voltage command.
     limits : Limits
-        No model widens them.
+        Voltage limits. A loaded model cannot relax these limits.
     loop_settings : LoopSettings
+        Settings of the feedback.
 
     Attributes
     ----------
     model : AxisModel or None
     stream : StreamingInverse
-        Its feedforward; there once a model is. Its memory follows the desired path as if there were no feedback: noise
-        of the sensor must not turn it.
+        Feedforward; available once a model is loaded. Its memory follows the setpoint, not the corrected voltage, so
+        that sensor noise causes no reversals.
     confidence : MemoryConfidence
-        How far the memory is to be trusted.
     driven : bool
-        Whether it has had a model: before, its voltage is not known.
+        Whether a model has ever been loaded; before that, the voltage is unknown.
     ramp : Ramp or Brake or None
-        Where the axis goes by itself; None: where desired displacements lead.
+        Active motion without desired displacements.
     held, slewing : bool
-        Whether the last sample waits at a voltage limit, or is still on its way.
+        Whether the last sample is held at a voltage limit, or slew limited.
     start_memory : str or None
-        Which of the model's memories it was started with, while nothing but the model speaks for it; None once it has
-        been given a voltage, or was restored.
-    given_ns : int
-        When its voltage was given last.
-    point_ns : int or None
-        When its last sample was due, on the clock of trajectories; None: that was no point of one.
+        Assumed initial history; None after the first output voltage or when the memory was restored.
+    given_ns : int, nanoseconds
+        Time of the last output voltage.
+    point_ns : int or None, nanoseconds
+        Deadline of the last sample on the clock of trajectories; None if it was not a trajectory point.
     """
 
     stream: StreamingInverse
@@ -71,7 +72,7 @@ class Axis:
         self._loop_settings = loop_settings
         self._feedback: Feedback | None = None
 
-    # What it is doing
+    # State
 
     @property
     def voltage(self) -> float:
@@ -80,28 +81,28 @@ class Axis:
 
     @property
     def correction(self) -> float:
-        """Part of the present voltage that comes from the feedback, volts."""
+        """Correction by the feedback in the present voltage, volts."""
         return self._feedback.correction if self._feedback else 0.0
 
     @property
     def feedback_state(self) -> str:
-        """What the feedback does: "off", "on", or "holding" where the last sample had no fresh measurement."""
+        """State of the feedback: "off", "on", or "holding" if the last sample had no recent measurement."""
         if not self._loop_settings.enabled:
             return "off"
         return "on" if self._feedback and self._feedback.acting else "holding"
 
     @property
     def drift(self) -> Drift | None:
-        """How far measurements are off the model; None while there are too few."""
+        """Residual (measured - model) statistics; None if there are too few measurements."""
         return self._residuals.drift() if self._feedback else None
 
     @property
     def reversal_voltages(self) -> tuple[float, ...]:
-        """Voltages (V) at which the drive turned, oldest first, and last the present one."""
+        """Voltages (V) of the remembered reversals, oldest first, followed by the present voltage."""
         return whole_way(self._applied if self._feedback else self.stream)
 
     def in_motion(self, now_ns: int) -> bool:
-        """Whether the limit of acceleration forbids to leave it where it is."""
+        """Whether the acceleration limit does not allow the voltage to stop at the next sample."""
         if not self.driven or now_ns - self.given_ns > MAX_DT_NS:
             return False
         return (self._feedback if self._feedback and not self.ramp else self.stream).pace.in_motion
@@ -111,27 +112,27 @@ class Axis:
     def prepare(
         self, model: AxisModel, reversal_voltages: Sequence[float] | None = None, start_memory: StartMemory = "end"
     ) -> StreamingInverse:
-        """Return the stream of a new model, for `use`.
+        """Return the streaming inverse of a new model, for `use`.
 
         Parameters
         ----------
         model : AxisModel
         reversal_voltages : sequence of float, volts
-            As `reversal_voltages` of this axis, which stands for None.
+            Reversals to replay, oldest first, and the voltage; None (default) uses those of this axis.
         start_memory : str
-            Of the model's memories, the one that an axis without a past starts with.
+            Initial history of an axis without known reversals; default "end".
 
         Raises
         ------
         SlpiError
-            If the model cannot serve.
+            If the model cannot be used within the limits, see `take_over`.
         """
         if reversal_voltages is None:
             reversal_voltages = turning_voltages(self.stream.memory) if self.driven else ()
         return take_over(model, self.limits, reversal_voltages, start_memory)
 
     def use(self, model: AxisModel, stream: StreamingInverse) -> None:
-        """Go on with a new model; the voltage stays."""
+        """Replace the model by `model` with its streaming inverse from `prepare`; the voltage is unchanged."""
         if self.driven:
             stream.resume(self.stream)
         self.model, self.stream, self.driven = model, stream, True
@@ -144,12 +145,12 @@ class Axis:
             self._close_loop()
 
     def check_limits(self, limits: Limits) -> Limits:
-        """Return new limits, narrowed to what the model was identified on.
+        """Return new limits, restricted to the identified voltages of the model.
 
         Raises
         ------
         UsageError
-            If the axis is outside of them, or the model has no voltage inside.
+            If the present voltage is outside the limits, or the model was identified entirely outside them.
         """
         if not self.driven:
             return limits
@@ -161,12 +162,12 @@ class Axis:
         return limits.within(self.model.voltage_range) if self.model else limits
 
     def use_limits(self, limits: Limits) -> None:
-        """Go on within other limits; memory and voltage stay.
+        """Replace the limits; hysteresis memory and voltage are unchanged.
 
         Raises
         ------
         UsageError
-            As `check_limits`; the old ones stay then.
+            As `check_limits`; the old limits remain in force.
         """
         allowed = self.check_limits(limits)
         self.limits = limits
@@ -176,7 +177,7 @@ class Axis:
                 self._feedback.limits = allowed
 
     def retune(self, settings: LoopSettings) -> None:
-        """Go on with other settings of the feedback, without a jump."""
+        """Replace the feedback settings without a voltage step."""
         self._loop_settings = settings
         feedback = self._feedback
         if feedback is None:
@@ -186,7 +187,7 @@ class Axis:
         try:
             feedback.retune(settings.gains)
         except SlpiError:
-            # The last measurement was beyond reason, which other gains did not show.
+            # The last measurement gives no finite voltage with the new gains.
             feedback.forget()
             feedback.retune(settings.gains)
         if settings.enabled:
@@ -197,7 +198,7 @@ class Axis:
     # Samples
 
     def check(self, y: float, kind: str = "desired") -> None:
-        """Reject a displacement (m), desired or measured, that is no number or far outside what was identified.
+        """Reject a displacement (m; `kind` "desired" or "measured") that is not finite or far outside the model range.
 
         Raises
         ------
@@ -209,14 +210,14 @@ class Axis:
             raise implausible(y, (low, high), kind)
 
     def update(self, ahead: float, y: float, now_ns: int) -> float:
-        """Return the voltage (V) for the desired displacement `y` (m), `ahead` (s) after the last sample.
+        """Return the voltage (V) for the desired displacement `y`, `ahead` after the last sample.
 
         Parameters
         ----------
         ahead : float, seconds
-            Not more than 0: no time has passed. Of a pause no more than `MAX_DT` counts.
+            Zero or negative counts as no elapsed time. At most `MAX_DT` counts for the slew limit.
         y : float, metres
-        now_ns : int
+        now_ns : int, nanoseconds
         """
         stream = self.stream
         dt = stream.pace.clamp_dt(ahead)
@@ -235,12 +236,12 @@ class Axis:
         return v
 
     def measure(self, displacement: float, now_ns: int) -> bool:
-        """Note a measured displacement (m); return whether it has changed what is taken for the memory.
+        """Store a measured displacement (m); return whether it has changed the assumed hysteresis memory.
 
         Raises
         ------
         RejectedError
-            As `check`; it is not used then.
+            As `check`; the measurement is not used.
         """
         if not self.driven:
             return False
@@ -256,9 +257,9 @@ class Axis:
         return self.confidence is not before
 
     def _choose_memory(self, measured: float) -> None:
-        """Choose among the model's memories the one that fits a displacement (m) measured before any voltage was given.
+        """Choose the initial history that matches a displacement (m) measured before the first output voltage.
 
-        The assumed one stays unless another fits better by more than the noise.
+        The assumed initial history is kept unless another one matches better by more than the noise.
         """
         assert self.model and self.start_memory
         quality, (low, high) = self.model.quality, self.model.displacement_range
@@ -273,17 +274,17 @@ class Axis:
         if errors[best] > max(noise, FIT_SHARE * (high - low)):
             tried = ", ".join(f"{name} {error * 1e6:.4g} um" for name, error in errors.items())
             self.confidence = MemoryConfidence(
-                doubt=f"what is measured fits no memory of the model (off by: {tried}); call ~/reset_memory",
+                doubt=f"the measurement matches no initial history of the model (errors: {tried}); call ~/reset_memory",
                 contradicted=True,
             )
         elif errors[assumed] > errors[best] + noise:
             self.stream = streams[best]
             if self._feedback:
                 self._close_loop()
-            self.confidence = MemoryConfidence(doubt=f"as measured: start_memory '{best}', not '{assumed}'")
+            self.confidence = MemoryConfidence(doubt=f"chosen by measurement: start_memory '{best}', not '{assumed}'")
 
     def _correct(self, ahead: float, dt: float, y: float, v: float, now_ns: int) -> float:
-        """Return the voltage in total (V) where the feedforward is `v` (V)."""
+        """Return the total voltage (V), feedforward `v` (V) and correction, for the desired displacement `y` (m)."""
         feedback, applied = self._feedback, self._applied
         assert feedback
         applied.coupled = self.stream.coupled
@@ -295,13 +296,13 @@ class Axis:
         return v
 
     def _close_loop(self) -> None:
-        """Let measurements count from now on; another stream follows the voltage that is really given."""
+        """Start the feedback; a second streaming inverse follows the total voltage."""
         self._applied = self.stream.copy()
         self._residuals = ResidualWindow(self._applied.uncoupled_displacement)
         self._restart_feedback()
 
     def _restart_feedback(self) -> None:
-        """Begin where the axis is, as fast as it is, without a correction."""
+        """Restart the feedback at the present voltage and rate, without a correction."""
         settings, voltage = self._loop_settings, self._applied.voltage
         self._feedback = feedback = Feedback(settings.gains, self.stream.limits, voltage)
         feedback.hold(0.0, voltage)
@@ -312,7 +313,7 @@ class Axis:
     # Ramps
 
     def start_ramp(self, ramp: Ramp | Brake, now_ns: int) -> None:
-        """Leave the desired path, and go where a ramp leads with every `step_ramp`."""
+        """Start a ramp from the present voltage at `now_ns` (ns); `step_ramp` executes it."""
         moving = self.in_motion(now_ns)
         if not self.ramp and self._feedback:
             self.stream.restore(self._applied.snapshot())
@@ -320,17 +321,17 @@ class Axis:
         if now_ns - self.given_ns > MAX_DT_NS:
             self.rest()
         if not moving:
-            # Its time begins now.
+            # The ramp starts at `now_ns`.
             self.given_ns = now_ns
         self.ramp, self.point_ns, self.start_memory = ramp, None, None
 
     def brake(self, now_ns: int) -> None:
-        """Come to rest with every `step_ramp`, as gently as the limit of acceleration asks for."""
+        """Start to brake within the acceleration limit; `step_ramp` executes it."""
         if not isinstance(self.ramp, Brake):
             self.start_ramp(Brake(), now_ns)
 
     def step_ramp(self, now_ns: int) -> None:
-        """Move on along the ramp, if there is one."""
+        """Execute one step of the active ramp, if any."""
         if self.ramp is None or self.ramp.done:
             return
         dt, stream = (now_ns - self.given_ns) * 1e-9, self.stream
@@ -343,18 +344,18 @@ class Axis:
             stream.pace.rest()
 
     def stop_ramp(self, now_ns: int) -> None:
-        """Take up desired displacements again, from where the axis is and as fast as it is, if there is a ramp."""
+        """End the active ramp, if any; desired displacements continue from the present voltage and rate."""
         if not self.ramp:
             return
         self.ramp = None
         if self._feedback:
             self._restart_feedback()
             self._residuals.forget(self._applied.uncoupled_displacement)
-        # A voltage at rest has time; one in motion goes on.
+        # For a voltage in motion, the time since its last output counts.
         self.stamps.restart((now_ns - self.given_ns) * 1e-9 if self.in_motion(now_ns) else 0.0)
 
     def rest(self) -> None:
-        """Start from a voltage at rest at the next sample."""
+        """Start the next sample from a voltage at rest."""
         if self.driven:
             self.stream.pace.rest()
         if self._feedback:

@@ -1,11 +1,11 @@
-"""The compensator without ROS: desired displacements in, the voltages of all axes out.
+"""Compensation of all axes, independent of ROS: converts desired displacements into voltages.
 
-One sample takes one way: `Controller.update` checks it as a whole, then moves every axis it names. Points of
-trajectories take the same way when they are due. What moves axes without desired displacements (ramps to safe voltages,
-the reset of the memory, braking) does so with every `advance`. What the stage as a whole is doing is its `mode`.
+`Controller.update` validates a sample as a whole and then moves every named axis. Trajectory points are processed in
+the same way when they are due. `Controller.advance` executes motion without desired displacements: ramps to the safe
+voltages, the reset of the hysteresis memory, and braking. `Controller.mode` is the operating mode of the stage.
 
-All times `now_ns` are nanoseconds on a clock that never jumps; `clock_ns` is the clock of trajectories, the same one or
-a simulated one.
+All times `now_ns` are nanoseconds on a monotonic clock. All times `clock_ns` are nanoseconds on the clock of
+trajectories, which is the monotonic clock or a simulated one.
 """
 
 from array import array
@@ -35,56 +35,57 @@ PERIOD_NS, MAX_DT_NS = int(PERIOD * SECOND_NS), int(MAX_DT * SECOND_NS)
 
 
 class Mode(Enum):
-    """What the stage as a whole is doing."""
+    """Operating mode of the whole stage."""
 
     UNCONFIGURED = "unconfigured"
     INACTIVE = "inactive"
-    # Desired displacements are answered.
+    # Desired displacements are converted to voltages.
     STREAMING = "streaming"
-    # Points of a trajectory are to come.
+    # Points of a trajectory are pending.
     TRAJECTORY = "trajectory"
-    # On the way to the safe voltages, which a desired displacement ends.
+    # A ramp to the safe voltages is running; a desired displacement ends it.
     RAMPING = "ramping"
-    # The memory is being reset, which nothing but the end of activity ends.
+    # The memory is being reset; only deactivation interrupts the reset.
     RESETTING = "resetting"
 
 
 class CommandWatchdog:
-    """Tells when no command has come for too long.
+    """Detect that no command has arrived within the command timeout.
 
     Attributes
     ----------
     commanded : bool
-        Whether there has been a command since the activation: before, nothing moves.
+        Whether a command has been executed since the activation. Before the first command, expiry moves no axis.
     expired : bool
-        Whether it has been too long at the last look.
-    safe_voltages : tuple of float, volts, or None
-        Where the axes were sent then; None: they are held.
+        Whether the timeout had elapsed at the last call of `look`.
+    safe_voltages : tuple of float, length of axes, volts, or None
+        Target voltages of the ramp started at expiry; None if the voltages are held.
     """
 
     def __init__(self) -> None:
         self.start(0)
 
     def start(self, now_ns: int) -> None:
-        """Start anew: there has been no command yet."""
+        """Restart the timeout at `now_ns` (ns) and clear all flags."""
         self.commanded = self.expired = False
         self.safe_voltages: tuple[float, ...] | None = None
         self._heard_ns = now_ns
 
     def feed(self, now_ns: int) -> None:
-        """Count from now."""
+        """Restart the timeout at `now_ns` (ns) because a command has arrived."""
         self._heard_ns = now_ns
         self.expired, self.safe_voltages = False, None
 
     def look(self, safety: Safety, now_ns: int, waiting: bool) -> bool:
-        """Look at the clock; return whether it has become too long, or `safety` has changed what happens then.
+        """Update `expired`; return True if the timeout has just elapsed or the reaction in `safety` has changed since.
 
         Parameters
         ----------
         safety : Safety
+            Timeout and reaction to it.
         now_ns : int, nanoseconds
         waiting : bool
-            Whether commands are waited for.
+            Whether commands are expected; if False, the watchdog does not expire.
         """
         before = self.expired, self.safe_voltages
         self.expired = waiting and 0.0 < safety.command_timeout < self.silence(now_ns)
@@ -93,33 +94,35 @@ class CommandWatchdog:
         return self.expired and (self.expired, self.safe_voltages) != before
 
     def silence(self, now_ns: int) -> float:
-        """Return the time without a command, seconds."""
+        """Return the time (s) since the last command at `now_ns` (ns)."""
         return (now_ns - self._heard_ns) * 1e-9
 
 
 class Controller:
-    """All axes of one compensator.
+    """Inverse hysteresis compensation, with optional feedback, for all axes of a stage.
 
     Parameters
     ----------
     axes : sequence of str
-        Names, in the order of the voltages.
+        Axis names, in the order of `voltages`.
     limits : sequence of Limits
-        One for each axis. No model widens them.
+        Voltage limits of each axis, in the order of `axes`. A loaded model cannot relax these limits.
     hardware_id : str
-        The stage; models of another one are refused. "": any will do.
-    time : TimeRules
+        Hardware id of the stage; a model with a different one is refused. An empty string (default) accepts any.
+    time : TimestampRules, optional
+        Rules for message time stamps; default `TimestampRules()`.
     loops : sequence of LoopSettings, optional
-        One for each axis; without them there is no feedback.
+        Feedback settings of each axis; default: feedback is disabled.
 
     Attributes
     ----------
     axes : list of Axis
     voltages : array of float, shape (axes,), volts
-        The present ones, always the same array. An axis that a message does not name keeps its voltage.
+        Present output voltages, updated in place. An axis that a message does not name keeps its voltage.
     mode : Mode
     counts : Counts
     model : StageModel or None
+        Model in use; None before the first one.
     trajectory : TrajectoryExecutor
     watchdog : CommandWatchdog
     """
@@ -149,38 +152,38 @@ class Controller:
         # Lowest and highest voltage (V) of each axis during a reset.
         self._spans: list[tuple[float, float]] = []
         self._next_step_ns = 0
-        # Of the clock of trajectories against the other one, when both were seen last.
+        # Offset of the clock of trajectories from the monotonic clock at the last call, nanoseconds.
         self._clock_ahead_ns = 0
         self.use_time(time or TimestampRules())
 
-    # Life and models
+    # Lifecycle and models
 
     @property
     def active(self) -> bool:
-        """Whether messages are answered."""
+        """Whether the compensator is activated."""
         return self.mode not in (Mode.UNCONFIGURED, Mode.INACTIVE)
 
     @property
     def driven(self) -> bool:
-        """Whether there has been a model: before, the voltages of the axes are not known."""
+        """Whether a model has ever been loaded; before that, the voltages of the axes are unknown."""
         return self.axes[0].driven
 
     def configure(self) -> None:
-        """Wait to be activated."""
+        """Enter the inactive mode."""
         self.mode = Mode.INACTIVE
 
     def cleanup(self) -> None:
-        """Forget the model; the voltages stay."""
+        """Discard the model; the voltages are unchanged."""
         self.mode, self.model = Mode.UNCONFIGURED, None
 
     def activate(self, now_ns: int) -> None:
-        """Answer messages from now on, starting at the present voltages."""
+        """Start to process messages at `now_ns` (ns), from the present voltages at rest."""
         self.mode = Mode.STREAMING
         self.watchdog.start(now_ns)
         self._rest_all(now_ns)
 
     def deactivate(self, now_ns: int) -> None:
-        """Answer no more messages."""
+        """Stop to process messages at `now_ns` (ns); the voltages are held."""
         self.hold(now_ns)
         self._rest_all(now_ns)
         self.mode = Mode.INACTIVE
@@ -188,25 +191,25 @@ class Controller:
     def use_model(
         self, model: StageModel, saved: Mapping[str, SavedAxis] | None = None, start_memory: StartMemory = "end"
     ) -> None:
-        """Take a model over; the voltages stay as they are.
+        """Replace the model in use; the voltages are unchanged.
 
         Parameters
         ----------
         model : StageModel
         saved : mapping of axis name to SavedAxis, optional
-            Where the axes were when the node last ended; for the first model only.
+            Hysteresis state saved at the last shutdown; only used with the first model. Default: no saved state.
         start_memory : str
-            The memory of the model that axes start with which were not saved.
+            Initial history of an axis without saved state, see `AxisModel.initial`; default "end".
 
         Raises
         ------
         SlpiError
-            If the model lacks an axis or cannot serve within the limits; the one before works on.
+            If the model lacks an axis or cannot be used within the limits; the previous model remains in use.
         """
         if self._hardware_id and model.hardware_id and model.hardware_id != self._hardware_id:
             raise UsageError(
-                f"the model is of the stage '{model.hardware_id}', this is '{self._hardware_id}'; "
-                "give a model of this stage, or correct hardware_id"
+                f"the model has hardware id '{model.hardware_id}', this stage has '{self._hardware_id}'; "
+                "use a model of this stage, or correct hardware_id"
             )
         prepared = []
         for axis in self.axes:
@@ -228,29 +231,29 @@ class Controller:
     # Settings
 
     def check_limits(self, limits: Sequence[Limits]) -> None:
-        """Raise what `use_limits` would raise."""
+        """Raise the error that `use_limits` would raise, without a change."""
         for axis, new in zip(self.axes, limits, strict=True):
             axis.check_limits(new)
 
     def use_limits(self, limits: Sequence[Limits]) -> None:
-        """Take new limits over; memory and voltages stay.
+        """Replace the voltage limits of all axes; hysteresis memory and voltages are unchanged.
 
         Raises
         ------
         UsageError
-            If an axis is outside of them, or the model has no voltage inside.
+            If a present voltage is outside the new limits, or the model was identified entirely outside them.
         """
         self.check_limits(limits)
         for axis, new in zip(self.axes, limits, strict=True):
             axis.use_limits(new)
 
     def use_loops(self, loops: Sequence[LoopSettings]) -> None:
-        """Go on with other settings of the feedback, without a jump."""
+        """Replace the feedback settings of all axes without a voltage step."""
         for axis, settings in zip(self.axes, loops, strict=True):
             axis.retune(settings)
 
     def use_time(self, rules: TimestampRules) -> None:
-        """Judge stamps by these rules from now on."""
+        """Replace the rules for message time stamps."""
         self._jump, self._max_age_ns = rules.jump, int(rules.max_age * SECOND_NS)
         for axis in self.axes:
             axis.stamps.jump_ns = int(rules.jump * SECOND_NS)
@@ -259,34 +262,34 @@ class Controller:
 
     @property
     def needs_arrival(self) -> bool:
-        """Whether `update` has to know when a message arrived though it has a stamp."""
+        """Whether `update` needs the arrival time of stamped messages too."""
         return self._max_age_ns > 0
 
     def update(
         self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float], now_ns: int, arrival_ns: int = 0
     ) -> bool:
-        """Move the named axes to their desired displacements; `voltages` holds the answer.
+        """Move the named axes to their desired displacements and update `voltages`.
 
         Parameters
         ----------
         stamp_ns : int, nanoseconds
-            0: the message has none and counts from its arrival.
+            Time stamp of the message; 0 if it has none, then `arrival_ns` is used.
         names : sequence of str
-        displacements : sequence of float, metres
-            One for each name.
+        displacements : sequence of float, length of names, metres
+            Desired displacement of each named axis.
         now_ns : int, nanoseconds
         arrival_ns : int, nanoseconds
-            The arrival, on the clock of the stamps; for messages without stamp and where `needs_arrival`.
+            Arrival time on the clock of the stamps; required without a stamp or if `needs_arrival`. Default 0.
 
         Returns
         -------
         bool
-            Whether an axis could not reach its displacement and waits at a voltage limit.
+            Whether an axis cannot reach its desired displacement and is held at a voltage limit.
 
         Raises
         ------
         RejectedError
-            If the message cannot be answered as a whole; it is counted, and no axis has moved.
+            If the message is rejected as a whole; the rejection is counted and no axis has moved.
         """
         counts = self.counts
         counts.received += 1
@@ -313,17 +316,17 @@ class Controller:
         return held
 
     def measure(self, names: Sequence[str], displacements: Sequence[float], now_ns: int) -> list[Axis]:
-        """Note measured displacements (m) of the axes among the names.
+        """Store measured displacements (m) at `now_ns` (ns); names of other joints are ignored.
 
         Returns
         -------
         list of Axis
-            Those whose memory is taken for another one since, see `Axis.measure`.
+            Axes whose assumed hysteresis memory has changed due to the measurement, see `Axis.measure`.
 
         Raises
         ------
         RejectedError
-            If an axis cannot be there; that is counted and not used, the others are.
+            If a displacement is not plausible; it is counted and not used, the other axes are processed.
         """
         rejected: RejectedError | None = None
         changed = []
@@ -343,7 +346,7 @@ class Controller:
         return changed
 
     def _axes_of(self, names: Sequence[str], count: int, now_ns: int) -> list[Axis]:
-        """Return the named axes; RejectedError unless they take `count` desired displacements now."""
+        """Return the named axes; RejectedError unless they can accept `count` desired displacements now."""
         if self.mode is not Mode.STREAMING or self.model is None:
             self._require_ready()
             if self.mode is Mode.TRAJECTORY:
@@ -354,16 +357,16 @@ class Controller:
 
     def _named(self, names: Sequence[str]) -> list[Axis]:
         """Return the named axes; RejectedError as `require_names`."""
-        # Most senders name the same axes every time.
+        # Most senders use the same names in every message.
         if names != self._last_names:
             require_names(names, self._by_name)
             self._last_axes = [self._by_name[name] for name in names]
-            # What may change is copied.
+            # Copied because the caller may modify the sequence.
             self._last_names = names[:]
         return self._last_axes
 
     def _check(self, axes: Sequence[Axis], stamp_ns: int, displacements: Sequence[float], arrival_ns: int) -> None:
-        """Reject what an axis would refuse: first for what is asked, then for when."""
+        """Reject the sample if a displacement, a time stamp, or its age is not acceptable, in this order."""
         axis = axes[0]
         try:
             for axis, y in zip(axes, displacements, strict=True):
@@ -380,7 +383,7 @@ class Controller:
             )
 
     def _require_ready(self) -> None:
-        """Reject whatever is desired while nothing can be answered."""
+        """Reject a command while the compensator is inactive, without a model, or resetting the memory."""
         if not self.active:
             raise RejectedError(rejection.INACTIVE, "the compensator is not active; activate it")
         if self.model is None:
@@ -396,7 +399,7 @@ class Controller:
         aheads: Sequence[float],
         now_ns: int,
     ) -> tuple[bool, bool]:
-        """Move axes to displacements (m), each so long (s) after its last sample; return whether held, and slewing."""
+        """Move axes to displacements (m), `aheads` (s) after the last sample of each; return (held, slew limited)."""
         if self._stage:
             self._stage.decouple(dict(zip(names, displacements, strict=True)))
         held = slewing = began = False
@@ -424,7 +427,7 @@ class Controller:
         now_ns: int,
         clock_ns: int,
     ) -> None:
-        """Let a trajectory take over: at once, or when its first point is due; one without points cancels.
+        """Start a trajectory at once, or when its first point is due; without points, cancel the current one.
 
         Parameters
         ----------
@@ -432,13 +435,13 @@ class Controller:
         time_from_start_ns : array_like of int, shape (N,), nanoseconds
         positions : array_like, shape (N, K), metres
         start_ns : int, nanoseconds
-            On the clock of trajectories; 0: at once.
+            Start time on the clock of trajectories; 0 starts at once.
         now_ns, clock_ns : int, nanoseconds
 
         Raises
         ------
         RejectedError
-            If it cannot be followed; it is counted, and what was being followed goes on.
+            If the trajectory is not valid; the rejection is counted and the current trajectory continues.
         """
         self.counts.trajectories += 1
         try:
@@ -460,7 +463,7 @@ class Controller:
         self._let_go([axis for axis in self.axes if axis.name in going], now_ns)
 
     def doing(self, now_ns: int) -> str:
-        """Return what is being done, in words."""
+        """Return a text for the present activity."""
         if self.mode is Mode.RESETTING:
             return "resetting the memory"
         deadline_ns = self.trajectory.next_deadline_ns
@@ -472,7 +475,7 @@ class Controller:
         return f"waiting for a trajectory that {'goes on' if self.trajectory.begun else 'begins'} in {wait:.0f} s"
 
     def cancel(self, now_ns: int) -> None:
-        """Forget the trajectory, if there is one; its axes stay or come to rest."""
+        """Cancel the trajectory, if any; its axes stop within their acceleration limit."""
         self.watchdog.feed(now_ns)
         if self.mode is Mode.TRAJECTORY:
             self._end_trajectory()
@@ -486,7 +489,7 @@ class Controller:
             axis.point_ns = None
 
     def _step_trajectory(self, now_ns: int, clock_ns: int) -> bool:
-        """Give the point that is due, if there is one; return whether there was."""
+        """Execute the trajectory point that is due, if any; return whether there was one."""
         tracks = self.trajectory.tracks
         point = self.trajectory.due(clock_ns)
         if point is None:
@@ -506,23 +509,23 @@ class Controller:
             self._end_trajectory()
             self._let_go((), now_ns)
         elif self.trajectory.tracks < tracks:
-            # What comes next may not name the axes that are in motion now.
+            # The next trajectory may not include all axes that are in motion.
             going = self.trajectory.names
             self._let_go([axis for axis in self.axes if axis.name in going], now_ns)
         return True
 
-    # What moves without desired displacements
+    # Motion without desired displacements
 
     @property
     def ramping(self) -> bool:
-        """Whether an axis goes somewhere by itself."""
-        for axis in self.axes:  # noqa: SIM110, quicker than any() by a microsecond in every command
+        """Whether a ramp or braking is active on any axis."""
+        for axis in self.axes:  # noqa: SIM110, 1 us faster than any() for each command
             if axis.ramp is not None:
                 return True
         return False
 
     def next_due_ns(self, now_ns: int, clock_ns: int) -> int | None:
-        """Return when `advance` is to be called next, on the clock of `now_ns`; None: not until something is asked."""
+        """Return the time (ns, monotonic) of the next required call of `advance`; None if no motion is pending."""
         step = self._next_step_ns if self.ramping else None
         point = self.trajectory.next_deadline_ns
         if point is None:
@@ -531,7 +534,7 @@ class Controller:
         return point if step is None else min(point, step)
 
     def advance(self, now_ns: int, clock_ns: int) -> bool:
-        """Do what is due by now: one step of all ramps, one point of a trajectory; return whether voltages are new."""
+        """Execute one step of all ramps and one trajectory point that are due; return whether `voltages` changed."""
         new, self._clock_ahead_ns = False, clock_ns - now_ns
         if self.ramping and now_ns >= self._next_step_ns:
             self._step_ramps(now_ns)
@@ -541,25 +544,25 @@ class Controller:
         return new
 
     def hold(self, now_ns: int) -> None:
-        """End whatever is being done: the axes stay where they are, or come to rest with the next `advance`."""
+        """End all motion: axes hold their voltage, or brake during the next calls of `advance`."""
         self.cancel(now_ns)
         self._let_go((), now_ns)
         if self.active:
             self.mode = Mode.STREAMING
 
     def ramp(self, voltages: Sequence[float], rate: float, now_ns: int) -> None:
-        """Start to go to voltages (V), or as near as limits allow, at a rate (V/s)."""
+        """Start a ramp to `voltages` (V, one per axis, clipped to the limits) at `rate` (V/s)."""
         self._start_ramps([Ramp([voltage], rate) for voltage in voltages], Mode.RAMPING, now_ns)
 
     def reset_memory(self, cycles: int, rate: float, finals: Sequence[float], now_ns: int) -> None:
-        """Start the decaying oscillation that wipes the memory.
+        """Start the decaying voltage oscillation that resets the hysteresis memory of all axes.
 
         Parameters
         ----------
         cycles : int
         rate : float, V/s
-        finals : sequence of float, volts
-            Where the axes end, or as near as their limits allow.
+        finals : sequence of float, length of axes, volts
+            Final voltage of each axis, clipped to its limits.
         now_ns : int, nanoseconds
         """
         ramps = []
@@ -572,9 +575,9 @@ class Controller:
         self._spans = [(axis.stream.voltage,) * 2 for axis in self.axes]
 
     def watch(self, safety: Safety, now_ns: int) -> bool:
-        """Hold the voltages, or go to the safe ones, once no command has come for too long; return whether that is new.
+        """Check the command watchdog: on expiry, hold or ramp to the safe voltages; return whether the state changed.
 
-        A trajectory is a command until its last point; a reset of the memory is none and no silence either.
+        A trajectory counts as a command until its last point. The watchdog is suspended during a reset of the memory.
         """
         waiting = self.mode in (Mode.STREAMING, Mode.RAMPING)
         before = self.watchdog.safe_voltages
@@ -613,12 +616,12 @@ class Controller:
 
     def _end_ramping(self, now_ns: int) -> None:
         if self.mode is Mode.RESETTING:
-            # It was no command, but no silence either.
+            # The watchdog is suspended during a reset.
             self.watchdog.feed(now_ns)
         self.mode = Mode.STREAMING
 
     def _end_reset(self) -> None:
-        """Say what the memory is worth after a reset that ends now, whether it has come to its end or not."""
+        """Set the memory confidence of each axis after a completed or interrupted reset."""
         if self.mode is not Mode.RESETTING:
             return
         for axis, span in zip(self.axes, self._spans, strict=True):
@@ -627,7 +630,7 @@ class Controller:
                 axis.confidence = MemoryConfidence(KNOWN, spanned=span).over(axis.model.voltage_range)
 
     def _let_go(self, but: Collection[Axis], now_ns: int) -> None:
-        """End all ramps: the axes `but` have somewhere to go, the others stay or come to rest as soon as they may."""
+        """End all ramps: the axes in `but` continue with new commands, the others hold their voltage or brake."""
         self._end_reset()
         ramped = self.ramping
         for axis in self.axes:
@@ -649,7 +652,7 @@ class Controller:
             axis.given_ns, axis.point_ns, axis.ramp = now_ns, None, None
 
     def _couple(self) -> None:
-        """Let the streams of the axes know of each other, and show their voltages."""
+        """Build the cross-coupling of the axes and update `voltages`."""
         assert self.model
         coupling = Coupling({axis.name: self.model.axis(axis.name).chain.gains for axis in self.axes})
         streams = {axis.name: axis.stream for axis in self.axes}

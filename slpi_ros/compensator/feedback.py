@@ -1,4 +1,4 @@
-"""Feedback of one axis: feedforward and PID together (second paper, Fig. 12), and how far the model is off."""
+"""Feedback of one axis: feedforward plus PID (second paper, Fig. 12), and residuals measured - model."""
 
 from array import array
 from dataclasses import dataclass, fields
@@ -7,29 +7,29 @@ from math import exp, expm1, inf, isfinite, sqrt
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.model.limits import Limits, RateLimiter
 
-# Measurements that the residuals are kept of.
+# Number of measurements in the residual window.
 WINDOW = 500
-# Fewer than these say nothing.
+# Minimum number of measurements for residual statistics.
 ENOUGH = 50
 
 
 @dataclass(frozen=True)
 class PidGains:
-    """Gains of the feedback, for a stage whose displacement grows with its voltage.
+    """PID gains, for a stage whose displacement increases with its voltage.
 
     Parameters
     ----------
     proportional : float, V/m
     integral : float, V/(m s)
     derivative : float, V s/m
-        Acts on the measured displacement, not on the desired one.
+        Acts on the measured displacement only, not on the setpoint.
     derivative_filter : float, seconds
-        Time constant of the low-pass on the derivative; 0: none.
+        Time constant of the low-pass filter on the derivative; 0 (default) disables it.
 
     Raises
     ------
     UsageError
-        If one is negative or not finite.
+        If a gain is negative or not finite.
     """
 
     proportional: float
@@ -38,45 +38,44 @@ class PidGains:
     derivative_filter: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse gains that make no controller."""
+        """Refuse negative and non-finite gains."""
         for field in fields(self):
             value = getattr(self, field.name)
             if not (isfinite(value) and value >= 0.0):
-                raise UsageError(f"PID gain {field.name} is {value}; give a finite one that is not negative")
+                raise UsageError(f"PID gain {field.name} is {value}; give a finite value that is not negative")
 
 
 class Feedback:
-    """Feedforward + PID of one axis: ``v = correct(t, desired, measured, feedforward)``; it starts disabled.
+    """Feedforward plus PID of one axis: ``v = correct(t, desired, measured, feedforward)``; initially disabled.
 
-    Enabling, disabling and retuning make no jump: what would jump becomes an offset, which fades with `release_time`.
-    So the error at the moment of enabling comes in softly, and at last in full.
+    Enabling, disabling and retuning are bumpless: a step of the correction becomes an offset that decays with the time
+    constant `release_time`, so the error at the moment of enabling takes effect gradually and finally in full.
 
-    The integral grows only as far as the voltage can follow (conditional integration): unlike back-calculation, this
-    forgets nothing it has learnt while the voltage is on its way, slew limited, to a distant feedforward.
+    Windup is avoided by conditional integration: the integral grows only as far as the voltage can follow. Unlike
+    back-calculation, this keeps the integral while the voltage is slew limited on the way to a distant feedforward.
 
-    `step` does what `correct` and `hold` do, with the last measurement that `measure` was told: it acts once, and only
-    while it is fresh. What counts is how far it was from what was desired when it came: what is desired now, nobody can
-    have measured yet.
+    `step` calls `correct` or `hold` with the last measurement stored by `measure`, which acts once, and only within its
+    timeout. The error is taken against the setpoint at the time of the measurement, not against the present one.
 
     Parameters
     ----------
     gains : PidGains
     limits : Limits
-        Of the total voltage. They may be replaced at any time; a voltage outside of them goes inside as `RateLimiter`
-        lets it, here as everywhere: as fast as slew and acceleration allow, and no faster.
+        Limits of the total voltage. They may be replaced at any time; a voltage outside new limits returns within
+        the slew and acceleration limits.
     voltage : float, volts
-        What the axis has at the start.
+        Voltage of the axis at the start; default 0.
     release_time : float, seconds
-        inf: the offset, or the correction of a disabled feedback, stays.
+        Decay time of the offset, or of the correction after disabling; inf keeps both. Default 0.1.
     longest_gap : float, seconds
-        A longer gap between samples counts as this long where time is integrated: integral and fading.
+        Upper limit of the time between samples in the integral and in the decay; default 0.1.
 
     Attributes
     ----------
     pace : RateLimiter
-        Of the total voltage.
+        Rate limiter of the total voltage.
     acting : bool
-        Whether the last `step` had a measurement to act on.
+        Whether the last `step` used a measurement.
 
     Raises
     ------
@@ -94,11 +93,11 @@ class Feedback:
         longest_gap: float = 0.1,
     ) -> None:
         if not isfinite(voltage):
-            raise UsageError(f"voltage at the start is {voltage} V; give the present one")
+            raise UsageError(f"voltage at the start is {voltage} V; give the present voltage")
         if not release_time > 0.0:
-            raise UsageError(f"release_time is {release_time} s; give a positive one")
+            raise UsageError(f"release_time is {release_time} s; give a positive value")
         if not 0.0 < longest_gap < inf:
-            raise UsageError(f"longest_gap is {longest_gap} s; give a positive, finite one")
+            raise UsageError(f"longest_gap is {longest_gap} s; give a positive, finite value")
         self.pace = RateLimiter(limits)
         self.acting = False
         self._gains = gains
@@ -115,7 +114,7 @@ class Feedback:
         self._measured = 0.0
         self._error = 0.0
         self._rate = 0.0
-        # What `measure` was told last, when, and what was desired then.
+        # Last measurement (m), its time (ns), and the setpoint (m) at that time.
         self._latest: tuple[float, int, float | None] | None = None
         self._desired: float | None = None
 
@@ -145,31 +144,31 @@ class Feedback:
 
     @property
     def correction(self) -> float:
-        """What is added to the feedforward voltage, volts, as far as the voltage limits leave room for it."""
+        """Correction added to the feedforward voltage, volts, restricted by the voltage limits."""
         return self._correction
 
     def enable(self) -> None:
-        """Let the next measurement take over from the present correction; without effect when enabled."""
+        """Enable the PID, bumpless, from the next measurement on; without effect if already enabled."""
         if not self._enabled:
             self._enabled = self._taking_over = True
 
     def disable(self) -> None:
-        """Let the correction fade from here on."""
+        """Disable the PID; the correction decays with `release_time`."""
         self._enabled = False
 
     def forget(self) -> None:
-        """Forget the last measurement: the next one takes over from the present correction."""
+        """Discard the last measurement; the PID restarts, bumpless, at the next one."""
         self._error = self._rate = 0.0
         self._measured_at = -inf
         self._taking_over = self._enabled
 
     def retune(self, gains: PidGains) -> None:
-        """Go on with other gains.
+        """Replace the gains without a voltage step.
 
         Raises
         ------
         UsageError
-            If they are beyond reason; the ones before stay.
+            If the gains give no finite voltage; the previous gains remain in use.
         """
         before, after = (self._direct(each, self._error, self._rate) for each in (self._gains, gains))
         offset = self._offset + (before - after)
@@ -183,20 +182,20 @@ class Feedback:
         Parameters
         ----------
         t : float, seconds
-            Not before the last sample.
+            Time of the sample, not before the last one.
         desired, measured : float, metres
         feedforward : float, volts
-            What the inverse model gives for `desired`.
+            Voltage of the inverse model for `desired`.
 
         Returns
         -------
         float, volts
-            Within the limits, and within their slew of the last one.
+            Total voltage, within the voltage, slew and acceleration limits.
 
         Raises
         ------
         UsageError
-            If time runs backwards, or something is not finite. Nothing has moved then: `hold` may serve the sample.
+            If time runs backwards, or a value is not finite; the state is unchanged, and `hold` may be called instead.
         """
         self._check(t, feedforward)
         elapsed = t - self._measured_at
@@ -217,34 +216,34 @@ class Feedback:
         return self._voltage
 
     def hold(self, t: float, feedforward: float) -> float:
-        """Return the voltage (V) for a sample without a measurement: the correction is kept, or fades when disabled.
+        """Return the voltage (V) for a sample without measurement: the correction is kept, or decays if disabled.
 
         Raises
         ------
         UsageError
-            If time (s) runs backwards, or something is not finite; nothing has moved then.
+            If time (s) runs backwards, or a value is not finite; the state is unchanged.
         """
         self._check(t, feedforward)
         self._give(t, feedforward, self._without_measurement(t))
         return self._voltage
 
     def measure(self, displacement: float, now_ns: int) -> None:
-        """Note a measurement (m) that came at `now_ns` (ns, a clock that never jumps), for the next `step`."""
+        """Store a measured displacement (m) received at `now_ns` (ns, monotonic) for the next `step`."""
         self._latest = displacement, now_ns, self._desired
 
     def step(self, dt: float, desired: float, feedforward: float, now_ns: int, timeout: float) -> float:
-        """Return the voltage (V) for a sample, corrected by the last measurement while that is fresh.
+        """Return the voltage (V) for a sample, corrected by the last measurement if it is recent enough.
 
         Parameters
         ----------
         dt : float, seconds
-            Since the last sample.
+            Time since the last sample.
         desired : float, metres
         feedforward : float, volts
         now_ns : int, nanoseconds
-            On the clock of `measure`.
+            Time of the sample on the clock of `measure`.
         timeout : float, seconds
-            An older measurement does not act; the correction stays.
+            Older measurements are ignored and the correction is held.
         """
         t = self._t + dt if self._t > -inf else 0.0
         latest, self._latest = self._latest, None
@@ -255,21 +254,21 @@ class Feedback:
             try:
                 return self.correct(t, aim, latest[0], feedforward)
             except SlpiError:
-                # A measurement beyond reason is none.
+                # A measurement that gives no finite voltage is ignored.
                 self.acting = False
         return self.hold(t, feedforward)
 
     def _check(self, t: float, feedforward: float) -> None:
         if not (isfinite(t) and isfinite(feedforward)):
-            raise UsageError(f"sample t = {t} s, feedforward = {feedforward} V is not finite; leave it out")
+            raise UsageError(f"sample t = {t} s, feedforward = {feedforward} V is not finite; omit the sample")
         if t < self._t:
             raise UsageError(f"time runs backwards: {t:.9g} s after {self._t:.9g} s; send samples in order")
 
     def _next_rate(self, elapsed: float, measured: float) -> float:
-        """Low-pass the slope (m/s) of the line between two measurements: exact for whatever time is between them."""
+        """Return the low-pass filtered slope (m/s) between two measurements, exact for any sample time."""
         if elapsed == 0.0:
             return self._rate
-        # At the first measurement an endless time has elapsed: the slope is 0.
+        # At the first measurement the elapsed time is infinite and the slope is 0.
         slope = (measured - self._measured) / elapsed
         time_constant = self._gains.derivative_filter
         if time_constant == 0.0:
@@ -279,7 +278,7 @@ class Feedback:
     def _next_integral_and_offset(
         self, elapsed: float, error: float, direct: float, feedforward: float, reach: tuple[float, float]
     ) -> tuple[float, float]:
-        """Return both (V); at the moment of taking over they leave the correction as it is."""
+        """Return the next integral and offset (V); at enabling both are chosen to keep the correction."""
         if self._taking_over:
             return self._correction, -direct
         dt = min(elapsed, self._longest_gap)
@@ -293,17 +292,17 @@ class Feedback:
         return gains.proportional * error - gains.derivative * rate
 
     def _without_measurement(self, t: float) -> float:
-        """Return the correction that needs none."""
+        """Return the correction (V) for a sample without measurement at time `t` (s)."""
         if self._enabled:
             return self._correction
         return self._correction * exp(-min(t - self._t, self._longest_gap) / self._release_time)
 
     def _dt(self, t: float) -> float:
-        """Return the time (s) since the last sample; at the first one none has passed, and the voltage stays."""
+        """Return the time (s) since the last sample; 0 for the first sample."""
         return t - self._t if self._t > -inf else 0.0
 
     def _give(self, t: float, feedforward: float, correction: float) -> None:
-        """Move to the voltage nearest to `feedforward` and `correction` together."""
+        """Move to `feedforward` + `correction` (V) as far as limits and rate limiter allow."""
         wanted = feedforward + correction
         if not isfinite(wanted):
             raise UsageError(f"feedforward {feedforward} V, correction {correction} V is not finite; check the gains")
@@ -311,27 +310,27 @@ class Feedback:
         goal = limits.clip(wanted)
         self._voltage = self.pace.step(self._voltage, goal, self._dt(t), self._goal)
         self._t, self._goal = t, goal
-        # Else a correction that no voltage ever showed would have to fade before one that did.
+        # A correction beyond the voltage limits is discarded, so that it does not have to decay later.
         self._correction = part_within(correction, limits.lower - feedforward, limits.upper - feedforward)
 
 
 def part_within(step: float, low: float, high: float) -> float:
-    """Return as much of `step` as leads no farther than `low` or `high`; none of it where it leads away from both."""
+    """Return `step` limited to low..high; 0 where `step` leads away from that interval."""
     return min(max(step, min(low, 0.0)), max(high, 0.0))
 
 
 @dataclass(frozen=True)
 class Drift:
-    """How far measurements are off the model.
+    """Statistics of the residual measured - model.
 
     Parameters
     ----------
     rms : float, metres
-        Of the residual, over the last `WINDOW` measurements.
+        Root mean square of the residual over the last `WINDOW` measurements.
     mean : float, metres
-        Of what was measured minus what was expected.
+        Mean of the residual.
     samples : int
-        Measurements in the window.
+        Number of measurements in the window.
     """
 
     rms: float
@@ -340,10 +339,15 @@ class Drift:
 
 
 class ResidualWindow:
-    """The residuals of the last `WINDOW` measurements.
+    """Residuals measured - model of the last `WINDOW` measurements.
 
-    A stage answers a little later than it is told. So what counts is how far a measurement lies outside of what the
-    model expected at the last two samples, and between them: at rest that is the whole residual.
+    As the stage responds with a delay, the residual is the distance of a measurement from the interval of the model
+    displacements of the last two samples; at rest this is the complete residual.
+
+    Parameters
+    ----------
+    expected : float, metres
+        Model displacement at the start.
     """
 
     __slots__ = ("_before", "_expected", "_next", "_residuals", "_samples")
@@ -354,11 +358,11 @@ class ResidualWindow:
         self._before = self._expected = expected
 
     def expect(self, displacement: float) -> None:
-        """Note what the model gives (m) for the voltage that is applied from now on."""
+        """Store the model displacement (m) for the voltage applied from now on."""
         self._before, self._expected = self._expected, displacement
 
     def measure(self, displacement: float) -> None:
-        """Note what was measured (m)."""
+        """Store the residual of a measured displacement (m)."""
         low, high = self._before, self._expected
         if low > high:
             low, high = high, low
@@ -368,12 +372,12 @@ class ResidualWindow:
         self._samples = min(self._samples + 1, WINDOW)
 
     def forget(self, expected: float) -> None:
-        """Start anew: another model, or another memory."""
+        """Discard all residuals after a change of model or memory; `expected` (m) is the model displacement."""
         self._samples = self._next = 0
         self._before = self._expected = expected
 
     def drift(self) -> Drift | None:
-        """Return what the window says; None when it holds too little."""
+        """Return the statistics of the window; None with fewer than `ENOUGH` measurements."""
         if self._samples < ENOUGH:
             return None
         residuals = self._residuals[: self._samples]
@@ -388,10 +392,10 @@ class LoopSettings:
     Parameters
     ----------
     enabled : bool
-        Whether measurements act on the voltage; if not, they only serve the health.
+        Whether measurements correct the voltage; if False, they only serve the diagnostics.
     gains : PidGains
     timeout : float, seconds
-        An older measurement does not act.
+        Older measurements are ignored.
     """
 
     enabled: bool

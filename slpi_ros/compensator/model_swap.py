@@ -1,4 +1,4 @@
-"""A model takes over: its memory is rebuilt from what the axis went through, and the voltage stays."""
+"""Replacement of the model at run time: the memory is rebuilt from the reversals, the voltage is unchanged."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,29 +14,30 @@ from slpi_ros.model.streaming import TOLERATED_SHARE, StreamingInverse
 def take_over(
     axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = (), start_memory: StartMemory = "end"
 ) -> StreamingInverse:
-    """Return a stream of a new model.
+    """Return the streaming inverse of a new model, with its memory at the present state of the axis.
 
     Parameters
     ----------
     axis : AxisModel
+        The new model.
     limits : Limits
-        Of the node; the stream keeps to what is within them and the identified voltages.
+        Limits of the node; the inverse is further limited to the identified voltages.
     reversal_voltages : sequence of float, volts
-        Where the drive turned, oldest first, and last its present voltage. The new memory goes through them from the
-        model's start. Empty: they are not known, and the memory is the one that `start_memory` names.
+        Reversals of the voltage, oldest first, followed by the present voltage; they are replayed from the model's
+        start. Empty (default): the reversals are unknown, and the initial history is `start_memory`.
     start_memory : str
-        See `AxisModel.initial`.
+        Initial history, see `AxisModel.initial`; default "end".
 
     Raises
     ------
     SlpiError
-        If the model is none that can follow sample by sample, has no voltage within the limits, has been identified
-        far from the present voltage, or its displacements contradict its curves.
+        If the model does not allow streaming, has no voltage within the limits, was identified far from the present
+        voltage, or its displacement range contradicts its curves.
     """
     if not axis.causal:
         raise UsageError(
-            f"kind '{axis.kind}' needs whole paths from its start on, and the compensator follows commands and "
-            "trajectories from anywhere; identify kind 'slpi', or use 'slpi compensate'"
+            f"kind '{axis.kind}' needs the complete path in advance, but the compensator works sample by sample; "
+            "identify kind 'slpi', or use 'slpi compensate'"
         )
     allowed = limits.within(axis.voltage_range)
     try_out(axis, allowed)
@@ -46,14 +47,14 @@ def take_over(
     require_near(present, allowed)
     memory = axis.memory("start")
     replay(memory, reversal_voltages)
-    # No jump: a voltage just outside goes inside with the next samples, as fast as it may.
+    # No step: a voltage just outside the limits returns with the next samples, within slew and acceleration limits.
     stream = axis.stream_from(memory, including(allowed, present))
     stream.limits = allowed
     return stream
 
 
 def go_on(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> StreamingInverse:
-    """Return a stream of a new model where another one has been; its limits are wide enough for its voltage."""
+    """Return the streaming inverse of a new model in the state of `before`; limits are widened to its voltage."""
     memory = axis.memory("start")
     replay(memory, turning_voltages(before.memory))
     stream = axis.stream_from(memory, including(including(allowed, before.voltage), memory.voltage))
@@ -62,26 +63,26 @@ def go_on(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> Streami
 
 
 def turning_voltages(memory: Memory) -> tuple[float, ...]:
-    """Return the voltages (V) at which the drive turned, oldest first, and last the present one."""
+    """Return the voltages (V) of the remembered reversals, oldest first, followed by the present voltage."""
     state = memory.snapshot()
-    # A primed memory remembers a fall from farther than any stage has been.
+    # A primed memory contains a reversal far outside the voltage range of any stage.
     return (*(v for v in state.turn_voltages if abs(v) < FAR / 2), state.voltage)
 
 
 def whole_way(stream: StreamingInverse) -> tuple[float, ...]:
-    """Return the voltages (V) at which the drive turned, oldest first, and last the command that it lags behind."""
+    """Return the reversal voltages (V), oldest first, the present voltage, and the command if that differs."""
     turns = turning_voltages(stream.memory)
     return turns if turns[-1] == stream.voltage else (*turns, stream.voltage)
 
 
 def replay(memory: Memory, voltages: Sequence[float]) -> None:
-    """Move a memory through turning voltages (V), oldest first."""
+    """Apply reversal voltages (V), oldest first, to a memory."""
     for v in voltages:
         memory.forward(v)
 
 
 def try_out(axis: AxisModel, allowed: Limits) -> None:
-    """Ask for both ends of what commands may ask for, at both voltage limits, before a command does.
+    """Check the inverse at both ends of the accepted displacements, starting from both voltage limits.
 
     Raises
     ------
@@ -101,21 +102,21 @@ def try_out(axis: AxisModel, allowed: Limits) -> None:
 
 
 def require_near(present: float, allowed: Limits) -> None:
-    """Refuse a model that was identified far from the present voltage (V), where it only extrapolates.
+    """Refuse a model whose identified voltages are far from the present voltage (V): it would extrapolate.
 
     Raises
     ------
     UsageError
-        If `present` is farther outside than commands may be.
+        If `present` is outside `allowed` by more than `TOLERATED_SHARE` of its span.
     """
     margin = TOLERATED_SHARE * (allowed.upper - allowed.lower)
     if not allowed.lower - margin <= present <= allowed.upper + margin:
         raise UsageError(
-            f"it has {present:g} V, but the model is good for {allowed.lower:g}..{allowed.upper:g} V within the "
-            "limits; move it there first, or identify on a larger range"
+            f"the axis has {present:g} V, but the model is valid for {allowed.lower:g}..{allowed.upper:g} V within "
+            "the limits; move the axis into this range first, or identify on a larger range"
         )
 
 
 def including(limits: Limits, voltage: float) -> Limits:
-    """Return the limits, wide enough for a voltage (V)."""
+    """Return the limits, extended to include `voltage` (V)."""
     return replace(limits, lower=min(limits.lower, voltage), upper=max(limits.upper, voltage))

@@ -1,4 +1,4 @@
-"""The memory of a stage, kept over a restart of the node: JSON, validated."""
+"""Storage of the hysteresis memory of a stage between runs of the node, as a validated JSON document."""
 
 import hashlib
 import json
@@ -17,26 +17,26 @@ from slpi_ros.model.document import format_model
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 
-# As the model says, but not verified; being wiped; wiped since; kept over a restart.
+# Taken from the model, not verified; being reset; reset since; restored after a restart.
 ASSUMED, RESETTING, KNOWN, RESTORED = "assumed", "resetting", "known", "restored"
-# A drive may miss either end of the identified voltages by this share of their span: measured ends are noisy.
+# Tolerance for each end of the identified voltage range, as a share of its span: measured ends are noisy.
 TOLERATED_SHARE = 0.01
 
 
 @dataclass(frozen=True)
 class MemoryConfidence:
-    """How far a memory is to be trusted.
+    """Confidence in the hysteresis memory of an axis.
 
     Parameters
     ----------
     state : str
-        `ASSUMED`, `RESETTING`, `KNOWN` or `RESTORED`.
+        `ASSUMED` (default), `RESETTING`, `KNOWN` or `RESTORED`.
     doubt : str
-        Why it is assumed, where there is more to say than that nothing has verified it.
+        Reason for the state `ASSUMED`; "" (default) if the memory has merely not been verified.
     spanned : (float, float), volts
-        Lowest and highest voltage of the drive that made it known.
+        Lowest and highest voltage of the reset.
     contradicted : bool
-        Whether a measured displacement fits none of the memories that were considered.
+        Whether a measured displacement contradicts every initial history of the model.
     """
 
     state: str = ASSUMED
@@ -45,9 +45,9 @@ class MemoryConfidence:
     contradicted: bool = False
 
     def over(self, identified: tuple[float, float]) -> "MemoryConfidence":
-        """Return what it is worth for a model identified on these voltages (V).
+        """Return the confidence for a model identified on the voltage range `identified` (V).
 
-        Loops wider than the drive are not wiped by it: what the stage did there before still counts.
+        A reset does not erase loops wider than its own voltage span, so the earlier history there remains effective.
         """
         (low, high), (lowest, highest) = self.spanned, identified
         margin = TOLERATED_SHARE * (highest - lowest)
@@ -60,23 +60,23 @@ class MemoryConfidence:
         return replace(self, state=ASSUMED, doubt=doubt)
 
 
-# What a record begins with: a mark of what it belongs to, and its number.
+# Head of an entry: identifier of the saved memory that it belongs to, and sequence number.
 HEAD = struct.Struct("<IQ")
 VOLTAGE_BYTES, CHECKSUM_BYTES = 8, 4
 
 
 class LastVoltages:
-    """Notes every command in two microseconds.
+    """Store the voltages of every command in a file, in about two microseconds.
 
-    Two records are written in turn, each with a checksum: whenever the process dies, one of them is whole. The system
-    keeps what has been written, so nothing waits for the disk; only when the machine itself fails may it be lost.
+    Two entries with checksums are written alternately, so one of them is intact after a crash of the process. The data
+    is not flushed to the disk: it survives the end of the process, but may be lost at a power failure.
 
     Parameters
     ----------
     path : path-like
-        A file of that name is emptied.
+        File to write; an existing one is truncated.
     mark : int
-        Of what the records belong to, 32 bits; it may be changed at any time.
+        Identifier (32 bits) of the saved memory that the entries belong to; may be changed at any time.
 
     Raises
     ------
@@ -89,10 +89,10 @@ class LastVoltages:
         try:
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
         except (OSError, ValueError) as error:
-            raise ModelError(f"{path}: cannot be written: {error}; choose another place") from None
+            raise ModelError(f"{path}: cannot be written: {error}; choose another path") from None
 
     def note(self, voltages: bytes) -> None:
-        """Note the voltages (V) of all axes, each 8 bytes as the machine has them.
+        """Write the voltages (V) of all axes, each as a double in native byte order.
 
         Raises
         ------
@@ -104,17 +104,17 @@ class LastVoltages:
         try:
             os.pwrite(self._file, record + zlib.crc32(record).to_bytes(4, "little"), (number & 1) * (len(record) + 4))
         except OSError as error:
-            raise ModelError(f"{self._path}: cannot be written: {error.strerror}; make room") from None
+            raise ModelError(f"{self._path}: cannot be written: {error.strerror}; free disk space") from None
 
     def discard(self) -> None:
-        """Remove the file: nothing will be given any more."""
+        """Close and delete the file."""
         os.close(self._file)
         with suppress(OSError):
             os.unlink(self._path)
 
 
 def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tuple[float, ...] | None:
-    """Return the voltages (V) noted last for so many axes; None where no whole record bears the mark."""
+    """Return the last voltages (V) stored for `axes` axes; None if no intact entry has the identifier `mark`."""
     size = HEAD.size + VOLTAGE_BYTES * axes + CHECKSUM_BYTES
     try:
         with Path(path).open("rb") as file:
@@ -132,24 +132,24 @@ def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tu
 
 
 SCHEMA = "slpi_ros/saved_memory/1"
-# Characters; a memory of many axes has a few thousand.
+# Maximum length of a document, characters; one of many axes has a few thousand.
 LONGEST = 1_000_000
 INTERRUPTED = "the reset was interrupted"
-CRASHED = "restored from before a crash: the last voltage is right, turns just before may be missing; reset it"
+CRASHED = "restored from before a crash: the last voltage is correct, the latest reversals may be missing; reset it"
 
 
 @dataclass(frozen=True)
 class SavedAxis:
-    """Where one axis was.
+    """Saved hysteresis state of one axis.
 
     Parameters
     ----------
-    reversal_voltages : tuple of float, volts
-        Where the drive turned, oldest first, and last its voltage.
+    reversal_voltages : tuple of float, length >= 1, volts
+        Voltages of the remembered reversals, oldest first, followed by the last voltage.
     certain : bool
-        Whether the memory was known.
+        Whether the memory was known (reset or restored) when it was saved.
     doubt : str
-        Why that may no longer be so; not saved.
+        Reason why the saved state may be incomplete; "" (default) if none. Not saved.
     """
 
     reversal_voltages: tuple[float, ...]
@@ -157,27 +157,27 @@ class SavedAxis:
     doubt: str = ""
 
     def confidence(self, identified: tuple[float, float]) -> MemoryConfidence:
-        """Return how far it is to be trusted with its model, identified on these voltages (V)."""
+        """Return the confidence in the restored memory for a model identified on the voltages `identified` (V)."""
         if self.certain and not self.doubt:
             return MemoryConfidence(RESTORED, spanned=identified)
         return MemoryConfidence(doubt=self.doubt)
 
     def after_crash(self, voltage: float) -> "SavedAxis":
-        """Return what is known of the axis if it was given this voltage (V) last, after it was saved."""
+        """Return the state after a crash in which `voltage` (V) was the last output after saving."""
         moved = () if voltage == self.reversal_voltages[-1] else (voltage,)
         return SavedAxis((*self.reversal_voltages, *moved), self.certain, CRASHED)
 
 
 @dataclass(frozen=True)
 class SavedMemory:
-    """Where a stage was.
+    """Saved hysteresis state of all axes of a stage.
 
     Parameters
     ----------
     model : str
-        `model_id` of the model it belongs to.
+        `model_id` of the model that the state belongs to.
     complete : bool
-        Whether the node ended in order after it was saved; if not, the drive may have turned since.
+        Whether the node was shut down in order after saving; if False, reversals may be missing.
     axes : mapping of axis name to SavedAxis
     """
 
@@ -186,17 +186,17 @@ class SavedMemory:
     axes: Mapping[str, SavedAxis]
 
     def require_fit(self, model: StageModel, names: Sequence[str], limits: Sequence[Limits]) -> None:
-        """Raise ModelError unless it belongs to this model and has a voltage within the limits for every axis."""
+        """Raise ModelError unless the state belongs to `model` and every axis has a voltage within its limits."""
         if self.model != model_id(model):
-            raise ModelError("the saved memory belongs to another model; it is left out")
+            raise ModelError("the saved memory belongs to another model; it is ignored")
         for name, allowed in zip(names, limits, strict=True):
             if name not in self.axes:
-                raise ModelError(f"the saved memory has no axis '{name}'; it is left out")
+                raise ModelError(f"the saved memory has no axis '{name}'; it is ignored")
             voltage = self.axes[name].reversal_voltages[-1]
             if not allowed.lower <= voltage <= allowed.upper:
                 raise ModelError(
                     f"the saved memory has {voltage:g} V for axis '{name}', outside {allowed.lower:g}.."
-                    f"{allowed.upper:g} V; it is left out"
+                    f"{allowed.upper:g} V; it is ignored"
                 )
 
 
@@ -206,7 +206,7 @@ def model_id(model: StageModel) -> str:
 
 
 def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
-    """Write a saved memory, all of it or nothing; return the mark for the voltages to come.
+    """Write a saved memory atomically; return its identifier for `LastVoltages`.
 
     Raises
     ------
@@ -229,23 +229,23 @@ def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
 
 
 def last_voltages(path: str | os.PathLike[str], mark: int) -> LastVoltages:
-    """Return what notes the voltages given after a memory was saved to `path`, in the order of its axes.
+    """Return the writer of the voltages output after a memory was saved to `path`, in the order of its axes.
 
     Raises
     ------
     ModelError
-        If the file beside it cannot be written.
+        If the file `path`.last cannot be written.
     """
     return LastVoltages(_beside(path), mark)
 
 
 def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
-    """Read a saved memory, moved on to the voltages given last; None where there is no such file yet.
+    """Read a saved memory, updated with the last voltages after a crash; None if the file does not exist.
 
     Raises
     ------
     ModelError
-        If the file cannot be read or holds something else.
+        If the file cannot be read or is not a valid document.
     """
     try:
         with Path(path).open(encoding="utf-8") as file:
@@ -255,11 +255,11 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
         return None
     except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise ModelError(f"{path}: no saved memory: {reason}; it is left out") from None
+        raise ModelError(f"{path}: no saved memory: {reason}; it is ignored") from None
     try:
         validate(document, "saved_memory", str(path))
     except RecursionError:
-        raise ModelError(f"{path}: no saved memory: nested too deeply; it is left out") from None
+        raise ModelError(f"{path}: no saved memory: nested too deeply; it is ignored") from None
     axes = {
         name: SavedAxis(tuple(map(float, axis["went_through_V"])), axis["certain"])
         for name, axis in document["axes"].items()
@@ -272,12 +272,12 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
 
 
 class MemoryFile:
-    """Keeps the memory of a stage in a file, and beside it the voltages given since.
+    """Save and restore the hysteresis memory of a stage, including the voltages output since the last save.
 
     Parameters
     ----------
     path : str
-        "": no file; all methods do nothing then.
+        File of the memory; the voltages go to `path`.last. With an empty string all methods do nothing.
     """
 
     def __init__(self, path: str) -> None:
@@ -286,12 +286,12 @@ class MemoryFile:
         self._last: LastVoltages | None = None
 
     def find(self, model: StageModel, names: Sequence[str], limits: Sequence[Limits]) -> Mapping[str, SavedAxis] | None:
-        """Return where the axes were when the node last ended; None where there is no file.
+        """Return the hysteresis state saved at the last shutdown, or None if no file exists.
 
         Raises
         ------
         ModelError
-            If the file cannot be read, or does not belong to this model, these axes and limits.
+            If the file cannot be read, or does not match `model`, the axes `names`, or `limits`.
         """
         saved = load_memory(self._path) if self._path else None
         if saved is None:
@@ -300,7 +300,7 @@ class MemoryFile:
         return saved.axes
 
     def save(self, model: StageModel | None, axes: Mapping[str, SavedAxis], complete: bool) -> None:
-        """Write the memory, if it has changed; `complete`: nothing will move until the node has ended.
+        """Write the state of `axes` if it has changed; `complete`: no further voltage is output before shutdown.
 
         Raises
         ------
@@ -323,7 +323,7 @@ class MemoryFile:
             self._last = last_voltages(self._path, mark)
 
     def note(self, voltages: bytes) -> None:
-        """Note what has just been given, for a life after a crash; called for each command.
+        """Store the voltages just output (V, native doubles), for recovery after a crash; called for each command.
 
         Raises
         ------
@@ -335,7 +335,7 @@ class MemoryFile:
 
 
 def _mark(text: str) -> int:
-    """Return what tells which text of a memory noted voltages belong to."""
+    """Return the identifier that links stored voltages to the text of a saved memory."""
     return zlib.crc32(text.encode())
 
 
@@ -344,4 +344,4 @@ def _beside(path: str | os.PathLike[str]) -> str:
 
 
 def _refuse(constant: str) -> float:
-    raise ValueError(f"{constant} is no voltage")
+    raise ValueError(f"{constant} is not a voltage")

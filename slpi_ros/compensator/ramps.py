@@ -1,4 +1,4 @@
-"""Ways of an axis without desired displacements: to a voltage, through a decaying oscillation, or to rest."""
+"""Motion of an axis without desired displacements: ramps through given voltages, and braking to rest."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -7,26 +7,26 @@ from math import inf
 from slpi_ros.errors import UsageError
 from slpi_ros.model.limits import RateLimiter
 
-# Seconds from one voltage of a ramp to the next.
+# Sample period of a ramp, seconds.
 PERIOD = 0.004
-# So near a voltage counts as reached, volts: rounding, and the slow end of a gentle stop.
+# Distance at which a voltage counts as reached, volts: rounding, and the slow end of an acceleration-limited stop.
 NEAR = 1e-9
 
 
 @dataclass(frozen=True)
 class Safety:
-    """What happens when commands end.
+    """Reaction to a command timeout and to deactivation.
 
     Parameters
     ----------
     command_timeout : float, seconds
-        0: none.
+        Timeout of the watchdog; 0 disables it.
     ramps_on_timeout, ramps_on_deactivate : bool
-        Whether to go to the safe voltages then; if not, voltages are held.
-    voltages : tuple of float, volts
-        The safe ones, one for each axis.
+        Whether to ramp to the safe voltages at that event; if False, the voltages are held.
+    voltages : tuple of float, length of axes, volts
+        Safe voltage of each axis.
     rate : float, V/s
-        How fast to go there.
+        Rate of the ramp to the safe voltages.
     """
 
     command_timeout: float
@@ -37,18 +37,18 @@ class Safety:
 
 
 class Ramp:
-    """A way through voltages, each reached before the next one.
+    """Voltage ramp through a sequence of target voltages, each reached before the next one is approached.
 
     Parameters
     ----------
     goals : iterable of float, volts
     rate : float, V/s
-        Fastest change; the slew limit may be lower.
+        Maximum rate of change, further limited by the slew limit.
 
     Raises
     ------
     UsageError
-        If the rate is not positive, or a goal not finite.
+        If the rate is not positive, or a target voltage is not finite.
     """
 
     def __init__(self, goals: Iterable[float], rate: float) -> None:
@@ -59,16 +59,16 @@ class Ramp:
 
     @property
     def done(self) -> bool:
-        """Whether the last goal is reached."""
+        """Whether the last target voltage has been reached."""
         return not self._goals
 
     def step(self, present: float, dt: float, pace: RateLimiter) -> float:
-        """Return the voltage (V) that follows `present` (V) after `dt` (s), of which at most `MAX_DT` counts."""
+        """Return the next voltage (V) after `present` (V), `dt` (s) later (at most `MAX_DT`), limited by `pace`."""
         if self.done:
             return present
         limits, dt = pace.limits, pace.clamp_dt(dt)
         goal = limits.clip(self._goals[-1])
-        # An axis that is faster than the ramp at first has to brake.
+        # An axis that moves faster than the ramp is decelerated within its acceleration limit.
         fastest = max(self._rate, abs(pace.rate) - limits.acceleration * dt) if dt else inf
         slowed = RateLimiter(replace(limits, slew=min(limits.slew, fastest)))
         slowed.go_on(pace)
@@ -80,19 +80,19 @@ class Ramp:
 
 
 class Brake:
-    """A way to rest, as short as the limit of acceleration allows.
+    """Braking to rest within the acceleration limit.
 
     Attributes
     ----------
     done : bool
-        Whether the voltage may stay.
+        Whether the voltage is at rest.
     """
 
     def __init__(self) -> None:
         self.done = False
 
     def step(self, present: float, dt: float, pace: RateLimiter) -> float:
-        """Return the voltage (V) that follows `present` (V) after `dt` (s)."""
+        """Return the next voltage (V) after `present` (V), `dt` (s) later, limited by `pace`."""
         v = pace.step(present, present, pace.clamp_dt(dt))
         self.done = not pace.in_motion
         return v

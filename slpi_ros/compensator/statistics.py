@@ -1,4 +1,4 @@
-"""Counts of the messages of a compensator, and how long they took."""
+"""Message counters and latency statistics of a compensator."""
 
 from array import array
 from dataclasses import dataclass, field, replace
@@ -10,29 +10,30 @@ from slpi_ros.compensator.validation import CAUSES, MEASURED_CAUSES
 
 @dataclass
 class Counts:
-    """What became of the desired messages.
+    """Message counters of a compensator.
 
     Parameters
     ----------
     received, accepted : int
+        Messages with desired displacements.
     held_at_limit : int
-        Accepted ones of which an axis could not reach its displacement within the voltage limits.
+        Accepted messages for which an axis was held at a voltage limit.
     slew_limited : int
-        Accepted ones of which an axis was still on its way, as fast as slew and acceleration allow.
+        Accepted messages for which the slew or acceleration limit kept an axis from its setpoint.
     excursions : int
-        Times that an axis went out of reach; it stays one until the axis is back.
+        Number of times that an axis began to be held at a voltage limit.
     gaps : int
-        Accepted ones whose stamp came more than `time_jump` after the one before.
+        Accepted messages stamped more than `time_jump` after the previous message.
     time_jumps : int
-        Accepted ones after which time started anew, because the clock had been set back.
+        Accepted messages stamped earlier than the previous message because the clock had been set back.
     by_cause : dict of str to int
-        Rejected ones.
+        Rejected messages by cause.
     measured_by_cause : dict of str to int
-        Measured displacements of axes that were not used.
+        Rejected measured displacements by cause.
     trajectories, trajectories_rejected : int
-        Those that were sent, and those of them that could not be followed.
+        Received and rejected trajectories.
     points_held, points_slewing : int
-        Points of trajectories, as `held_at_limit` and `slew_limited`.
+        Trajectory points that were held at a voltage limit, or slew limited.
     """
 
     received: int = 0
@@ -51,33 +52,33 @@ class Counts:
 
     @property
     def rejected(self) -> int:
-        """All rejected messages."""
+        """Number of rejected messages."""
         return self.received - self.accepted
 
     @property
     def measurements_rejected(self) -> int:
-        """All measured displacements that were not used."""
+        """Number of rejected measured displacements."""
         return sum(self.measured_by_cause.values())
 
     def copy(self) -> "Counts":
-        """Return the present counts, which do not count on."""
+        """Return a copy of the present counts."""
         return replace(self, by_cause=dict(self.by_cause), measured_by_cause=dict(self.measured_by_cause))
 
 
-# Messages looked back on.
+# Number of messages in the statistics.
 WINDOW = 8192
 
 
 @dataclass(frozen=True)
 class TimingReport:
-    """The messages since the last report, the last `WINDOW` of them at most.
+    """Timing of the messages since the last restart, at most of the last `WINDOW` messages.
 
     Parameters
     ----------
     jitter : float, seconds
-        Standard deviation of the time from one to the next.
+        Standard deviation of the time between messages.
     latency : (float, float, float), seconds
-        From the arrival of a message to its published answer: median, 99th percentile, longest.
+        Time from arrival of a message to the published voltages: median, 99th percentile, maximum.
     """
 
     jitter: float
@@ -85,7 +86,7 @@ class TimingReport:
 
 
 class Timing:
-    """Collects arrivals and answers."""
+    """Collect arrival times and latencies of messages."""
 
     def __init__(self) -> None:
         self._arrived = array("q", bytes(8 * WINDOW))
@@ -93,14 +94,14 @@ class Timing:
         self._count = 0
 
     def note(self, arrived_ns: int, answered_ns: int) -> None:
-        """Note one message: when it came and when it was answered, nanoseconds on a clock that never jumps."""
+        """Store the arrival and answer times of one message, nanoseconds on a monotonic clock."""
         at = self._count % WINDOW
         self._arrived[at] = arrived_ns
         self._took[at] = answered_ns - arrived_ns
         self._count += 1
 
     def report(self) -> TimingReport | None:
-        """Return what was collected; None if there were fewer than two messages."""
+        """Return the statistics; None if there were fewer than two messages."""
         count, first = min(self._count, WINDOW), self._count % WINDOW if self._count > WINDOW else 0
         if count < 2:
             return None
@@ -109,5 +110,5 @@ class Timing:
         return TimingReport(float(np.diff(arrived).std()) * 1e-9, (float(p50), float(p99), float(longest)))
 
     def restart(self) -> None:
-        """Forget what was collected."""
+        """Discard the collected times."""
         self._count = 0

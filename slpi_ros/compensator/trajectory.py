@@ -1,11 +1,11 @@
-"""Trajectories: checked as a whole when they arrive, then given point by point, each when it is due.
+"""Trajectories: validated as a whole on arrival, then executed point by point at their deadlines.
 
-Every point is one sample of desired displacements, compensated when its time has come, as a command is. There is no
-interpolation, neither between points nor from the present displacement to the first one (in
-joint_trajectory_controller: interpolation method ``none``): where the path is farther away than the slew limit allows,
-the voltage goes there at the slew limit.
+Every point is one sample of desired displacements, compensated at its deadline in the same way as a command. There is
+no interpolation, neither between points nor from the present displacement to the first one (in
+joint_trajectory_controller: interpolation method ``none``): if a point is farther away than the slew limit allows, the
+voltage approaches it at the slew limit.
 
-A `delay` in the model of an axis shifts when: its points are given so much earlier.
+A `delay` in the model of an axis advances the deadlines of its points by that time.
 """
 
 from bisect import bisect_left
@@ -24,15 +24,15 @@ from slpi_ros.model.streaming import refusal
 FloatArray = NDArray[np.float64]
 TimeArray = NDArray[np.int64]
 
-# No clock shows a later time, and two of them can be added.
+# Upper limit of valid times; the sum of two times does not overflow int64.
 LATEST_NS = 2**62
-# Points made lists of at once.
+# Number of points converted to lists at once.
 BLOCK = 256
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Desired displacements of some axes at given times, as `Trajectory.of` checked them.
+    """Desired displacements of some axes at given times, validated by `Trajectory.of`.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ class Trajectory:
         Strictly increasing, N >= 1.
     positions : ndarray, shape (N, K), metres
     start_ns : int, nanoseconds
-        0: at once. A clock that counts from the machine's start may have been negative then.
+        Start time; 0 starts at once. May be negative on a clock that counts from the start of the machine.
     cut : int
-        Number of earlier points left out: their time had passed.
+        Number of earlier points discarded because their time had passed; default 0.
     """
 
     names: tuple[str, ...]
@@ -62,22 +62,22 @@ class Trajectory:
         *,
         axes: Sequence[str],
     ) -> "Trajectory":
-        """Return a checked trajectory; arrays are not copied.
+        """Return a validated trajectory; arrays are not copied.
 
         Parameters
         ----------
         names : sequence of str, length K
-            Some of `axes`, in any order.
+            A subset of `axes`, in any order.
         time_from_start_ns : array_like of int, shape (N,), nanoseconds
         positions : array_like, shape (N, K), metres
         start_ns : int, nanoseconds
         axes : sequence of str
-            All there are.
+            Names of all axes.
 
         Raises
         ------
         RejectedError
-            If names, shapes, times or positions make no sense; the first bad point is named.
+            If names, shapes, times or positions are not valid; the message names the first invalid point.
         """
         require_names(names, axes)
         times, places = _as_array(time_from_start_ns), _as_array(positions, np.float64)
@@ -91,7 +91,7 @@ class Trajectory:
         if not finite.all():
             point, column = (int(i) for i in np.unravel_index(np.argmin(finite), finite.shape))
             what = f"axis '{names[column]}', point {point}: displacement is {places[point, column]} m"
-            raise RejectedError(rejection.NOT_FINITE, f"{what}; send finite ones only")
+            raise RejectedError(rejection.NOT_FINITE, f"{what}; send finite values only")
         return cls(tuple(names), times.astype(np.int64, copy=False), places, start_ns)
 
     def __len__(self) -> int:
@@ -99,7 +99,7 @@ class Trajectory:
         return self.time_from_start_ns.size
 
     def check_reach(self, accepted: Mapping[str, tuple[float, float]]) -> None:
-        """Reject displacements outside of those accepted (m), by axis name; the first one is named."""
+        """Reject displacements outside the accepted range (m) of each axis; the message names the first one."""
         for column, name in enumerate(self.names):
             y, (low, high) = self.positions[:, column], accepted[name]
             if y.min() < low or y.max() > high:
@@ -108,12 +108,12 @@ class Trajectory:
                 raise RejectedError(rejection.OUT_OF_RANGE, what)
 
     def useful_at(self, now_ns: int) -> "Trajectory":
-        """Return the part whose time has not passed; all of it if it starts at once.
+        """Return the points that are not in the past at `now_ns` (ns); all points if `start_ns` is 0.
 
         Raises
         ------
         RejectedError
-            If nothing is left.
+            If all points are in the past.
         """
         first = int(np.searchsorted(self.time_from_start_ns, now_ns - self.start_ns)) if self.start_ns else 0
         if first == len(self):
@@ -129,17 +129,17 @@ def _as_array(values: ArrayLike, dtype: type | None = None) -> NDArray[Any]:
     try:
         return np.asarray(values, dtype)
     except (TypeError, ValueError, OverflowError) as error:
-        raise RejectedError(rejection.LENGTH, f"the points are no array of numbers: {error}") from None
+        raise RejectedError(rejection.LENGTH, f"the points are not an array of numbers: {error}") from None
 
 
 def _check_times(times: NDArray[Any], start_ns: int) -> None:
-    """Reject times from a start (ns), shape (N,), N >= 1, that are no nanoseconds, or not in strict order."""
+    """Reject times from a start (ns), shape (N,), N >= 1, that are not integers or not strictly increasing."""
     if times.dtype.kind not in "iu":
         raise RejectedError(rejection.NOT_FINITE, f"times are of type {times.dtype}; give whole nanoseconds")
     if abs(start_ns) >= LATEST_NS or times.max() >= LATEST_NS:
         what = f"start {start_ns} ns, last point after {times.max()} ns"
         raise RejectedError(
-            rejection.TIME_BACKWARDS, f"{what}: these are no times of a clock; correct the stamp and the times"
+            rejection.TIME_BACKWARDS, f"{what}: these are not valid times; correct the stamp and the times"
         )
     back = np.concatenate([[times[0] < 0], times[1:] <= times[:-1]])
     if back.any():
@@ -150,14 +150,14 @@ def _check_times(times: NDArray[Any], start_ns: int) -> None:
 
 
 class Point(NamedTuple):
-    """The one point that is to be given now.
+    """The trajectory point to execute now.
 
     Parameters
     ----------
     names : tuple of str, length K
     displacements : list of float, length K, metres
     deadline_ns : int, nanoseconds
-        When it was due.
+        Time at which the point was due.
     """
 
     names: tuple[str, ...]
@@ -166,7 +166,7 @@ class Point(NamedTuple):
 
 
 class _Track:
-    """Points of axes with the same delay, given one after the other.
+    """Points of the axes with the same delay, executed in order.
 
     Parameters
     ----------
@@ -174,39 +174,39 @@ class _Track:
     positions : ndarray, shape (N, K), metres
     deadlines_ns : ndarray of int64, shape (N,), nanoseconds
     first : int
-        The first point that is to be given.
+        Index of the first point to execute.
     counted : bool
-        Whether its points count: where the axes of a trajectory have several delays, they do once.
+        Whether `remaining` counts the points: only one track of each trajectory is counted.
     """
 
     def __init__(
         self, names: tuple[str, ...], positions: FloatArray, deadlines_ns: TimeArray, first: int, counted: bool
     ) -> None:
         self.names, self.counted, self.begun = names, counted, False
-        # The points ``next:stop`` are still to be given.
+        # The points ``next:stop`` are pending.
         self.next, self.stop = first, deadlines_ns.size
         self._positions, self._deadlines_ns = positions, deadlines_ns
         self._load()
 
     def _load(self) -> None:
-        """Make lists of the next points: to take numbers from arrays one by one is several times slower."""
+        """Convert the next block of points to lists: access to single array elements is several times slower."""
         self._from, block = self.next, slice(self.next, self.next + BLOCK)
         self._times, self._rows = self._deadlines_ns[block].tolist(), self._positions[block].tolist()
 
     @property
     def next_ns(self) -> int:
-        """When the next point is due, nanoseconds."""
+        """Deadline of the next point, nanoseconds."""
         return int(self._times[self.next - self._from])
 
     def until(self, time_ns: int) -> int:
-        """Return the first point from `next` on that is due at `time_ns` or later."""
+        """Return the index of the first pending point that is due at `time_ns` or later."""
         at = bisect_left(self._times, time_ns, self.next - self._from)
         if at < len(self._times):
             return min(self._from + at, self.stop)
         return self.next + int(np.searchsorted(self._deadlines_ns[self.next : self.stop], time_ns))
 
     def take(self, now_ns: int) -> tuple[Point, int]:
-        """Return the latest point that is due, and how many due before it are skipped."""
+        """Return the latest point that is due, and the number of earlier pending points, which are skipped."""
         first, self.next = self.next, self.until(now_ns + 1)
         at, self.begun = self.next - 1 - self._from, True
         if at < len(self._rows):
@@ -220,17 +220,17 @@ class _Track:
 
 
 class TrajectoryExecutor:
-    """Tells which point is due, by absolute deadlines: a late call does not delay the points after it.
+    """Return trajectory points at absolute deadlines: a late call does not delay the following points.
 
-    New points replace those before them as in joint_trajectory_controller: at once, or, stamped with a time to come,
-    from their first deadline on. Any number of trajectories may wait for their time.
+    A new trajectory replaces the current points as in joint_trajectory_controller: at once, or, if it starts in the
+    future, from its first deadline on. Any number of trajectories may be pending.
 
-    All times are nanoseconds on one clock, the caller's.
+    All times are nanoseconds on one clock of the caller.
 
     Attributes
     ----------
     skipped : int
-        Points that were due together with a later one, so far.
+        Number of points skipped so far because a later point was already due.
     """
 
     def __init__(self) -> None:
@@ -239,50 +239,50 @@ class TrajectoryExecutor:
 
     @property
     def on(self) -> bool:
-        """Whether points are still to come."""
+        """Whether points are pending."""
         return bool(self._tracks)
 
     @property
     def remaining(self) -> int:
-        """Number of points still to be given."""
+        """Number of pending points."""
         return sum(track.stop - track.next for track in self._tracks if track.counted)
 
     @property
     def names(self) -> set[str]:
-        """Axes that have points to come."""
+        """Names of the axes with pending points."""
         return {name for track in self._tracks for name in track.names}
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """When the next point is due, nanoseconds; None: there is none."""
+        """Deadline of the next point, nanoseconds; None if no point is pending."""
         tracks = self._tracks
         return tracks[0].next_ns if len(tracks) == 1 else min((track.next_ns for track in tracks), default=None)
 
     @property
     def tracks(self) -> int:
-        """Number of trajectories that have points to come, counted again for each delay among their axes."""
+        """Number of pending trajectories, each counted once for every different delay of its axes."""
         return len(self._tracks)
 
     @property
     def begun(self) -> bool:
-        """Whether a trajectory is under way, not only waiting for its time."""
+        """Whether a pending trajectory has already executed a point."""
         return any(track.begun for track in self._tracks)
 
     def start(self, trajectory: Trajectory, now_ns: int, delays: Mapping[str, float] | None = None) -> None:
-        """Let a trajectory take over: at once, or when its first point is due.
+        """Start a trajectory at once, or when its first point is due.
 
         Parameters
         ----------
         trajectory : Trajectory
         now_ns : int, nanoseconds
         delays : mapping of axis name to float, seconds, optional
-            Of the axes: so much before their time points are given. Those that would have had to be given before now
-            are left out, but for the last one.
+            Delay of each axis, by which its deadlines are advanced; default 0. Of the points with deadlines in the past
+            only the last one is executed.
 
         Raises
         ------
         RejectedError
-            If all of it is in the past; what was being followed goes on.
+            If all points are in the past; the current trajectory continues.
         """
         useful = trajectory.useful_at(now_ns)
         due = useful.time_from_start_ns + (trajectory.start_ns or now_ns)
@@ -302,13 +302,13 @@ class TrajectoryExecutor:
         self._tracks = [*(track for track in kept if track.next < track.stop), *tracks]
 
     def cancel(self) -> None:
-        """Forget all points."""
+        """Discard all pending points."""
         self._tracks = []
 
     def due(self, now_ns: int) -> Point | None:
-        """Return the latest point that is due and has not been returned, or None; call it until it returns None.
+        """Return the latest point that is due and not yet returned, or None; to be called until it returns None.
 
-        Points due before it are never given. The last point before a handover is: others may name other axes.
+        Earlier points are skipped, except the last one before another trajectory, which may move other axes.
         """
         if not self._tracks:
             return None

@@ -1,7 +1,7 @@
-"""What is accepted: which axes, displacements and stamps a message may hold, and why it is rejected otherwise.
+"""Validation of axis names, displacements and time stamps in messages.
 
-One rule for all kinds of messages: a message is accepted as a whole, or rejected as a whole with a `RejectedError`
-that says why; nothing has moved then.
+Every message is accepted as a whole, or rejected as a whole with a `RejectedError` that states the cause; a rejected
+message moves no axis.
 """
 
 from collections.abc import Collection, Sequence
@@ -29,12 +29,12 @@ CAUSES = (
     NO_MODEL, INACTIVE, RESETTING, FOLLOWING, EMPTY, LENGTH, DUPLICATE_AXIS, UNKNOWN_AXIS, NOT_FINITE, DUPLICATE,
     TIME_BACKWARDS, STALE, OUT_OF_RANGE,
 )  # fmt: skip
-# Of measured displacements.
+# Causes for measured displacements.
 MEASURED_CAUSES = (NOT_FINITE, OUT_OF_RANGE)
 
 
 class RejectedError(SlpiError):
-    """A message was rejected as a whole, and nothing has moved.
+    """A message was rejected as a whole; no axis has moved.
 
     Attributes
     ----------
@@ -48,15 +48,15 @@ class RejectedError(SlpiError):
 
 
 def require_names(names: Sequence[str], axes: Collection[str]) -> None:
-    """Reject names that are none of the node's axes, or no list of them.
+    """Reject an empty list of axis names, duplicates, and names that are not in `axes`.
 
     Raises
     ------
     RejectedError
-        If there is none, one is named twice, or one is unknown.
+        With the cause `empty`, `duplicate_axis` or `unknown_axis`.
     """
     if not names:
-        raise RejectedError(EMPTY, "no axis is named; name the axes to move")
+        raise RejectedError(EMPTY, "the message names no axis; name the axes to move")
     if len(set(names)) != len(names):
         raise RejectedError(DUPLICATE_AXIS, f"{', '.join(names)}: an axis is named twice; name each once")
     unknown = [name for name in names if name not in axes]
@@ -65,22 +65,22 @@ def require_names(names: Sequence[str], axes: Collection[str]) -> None:
 
 
 def implausible(y: float, accepted: tuple[float, float], kind: str) -> RejectedError:
-    """Return the rejection of a displacement `y` (m) outside of `accepted` (m); `kind`: "desired" or "measured"."""
+    """Return the error for a displacement `y` (m) outside `accepted` (m); `kind` is "desired" or "measured"."""
     if isfinite(y):
         return RejectedError(OUT_OF_RANGE, refusal(y, accepted, kind))
-    return RejectedError(NOT_FINITE, f"{kind} displacement is {y} m; send finite ones only")
+    return RejectedError(NOT_FINITE, f"{kind} displacement is {y} m; send finite values only")
 
 
 @dataclass(frozen=True)
 class TimestampRules:
-    """How stamps are judged.
+    """Rules for message time stamps.
 
     Parameters
     ----------
     jump : float, seconds
-        A stamp older than the last by at most this is late; by more: the clock was set back. Newer by more: a gap.
+        A stamp older than the last by at most this is late; by more, the clock was set back; newer by more is a gap.
     max_age : float, seconds
-        A message stamped longer ago is stale; 0: none is.
+        A message stamped longer ago is rejected as stale; 0 (default) disables the check.
     """
 
     jump: float = 1.0
@@ -88,13 +88,13 @@ class TimestampRules:
 
 
 class Stamps:
-    """The stamps of the samples of one axis, whole nanoseconds.
+    """Check the order of the sample time stamps of one axis and compute elapsed times.
 
     Parameters
     ----------
     jump_ns : int, nanoseconds
-        A stamp that is older than the last one by at most this comes late; by more: the clock was set back, and time
-        starts anew.
+        A stamp that is older than the last one by at most this is late; by more, the clock was set back and the
+        elapsed time restarts. Default 1 s.
     """
 
     __slots__ = ("_last_ns", "_restarted", "jump_ns")
@@ -102,7 +102,7 @@ class Stamps:
     def __init__(self, jump_ns: int = SECOND_NS) -> None:
         self.jump_ns = jump_ns
         self._last_ns: int | None = None
-        # Seconds that have passed since the present voltage was given without a stamp; None: it had one.
+        # Elapsed time (s) set by `restart` for the next stamp; None if the last output had a stamp.
         self._restarted: float | None = None
 
     def check(self, stamp_ns: int) -> None:
@@ -117,14 +117,14 @@ class Stamps:
         if last is None or stamp_ns > last or stamp_ns < last - self.jump_ns:
             return
         if stamp_ns == last:
-            raise RejectedError(DUPLICATE, "the stamp is that of the last accepted message; stamp each sample anew")
+            raise RejectedError(DUPLICATE, "the stamp equals the last accepted one; stamp each sample anew")
         back = f"{(last - stamp_ns) * 1e-9:.9g} s"
-        raise RejectedError(TIME_BACKWARDS, f"time runs {back} backwards; send in order")
+        raise RejectedError(TIME_BACKWARDS, f"time runs {back} backwards; send samples in order")
 
     def accept(self, stamp_ns: int) -> float:
-        """Go on to a stamp (ns) that `check` lets pass; return the seconds since the last one.
+        """Store a stamp (ns) accepted by `check`; return the time (s) since the last stamp.
 
-        They are 0 for the first stamp, what `restart` says after that, and negative where the clock was set back.
+        The time is 0 for the first stamp, as set by `restart` after a restart, negative if the clock was set back.
         """
         last, self._last_ns = self._last_ns, stamp_ns
         elapsed = self._restarted
@@ -135,12 +135,12 @@ class Stamps:
         return min(ahead, 0.0) or elapsed or 0.0
 
     def arrive(self, now_ns: int) -> float:
-        """Go on with a sample that has no stamp but that of its arrival (ns): it is never late."""
+        """Accept a sample without stamp that arrived at `now_ns` (ns); return the time (s) since the last stamp."""
         last = self._last_ns
         if last is not None and last - self.jump_ns <= now_ns < last:
             now_ns = last
         return self.accept(now_ns)
 
     def restart(self, elapsed: float = 0.0) -> None:
-        """Take the next stamp for `elapsed` (s) after the present voltage; stamps older than the last one stay late."""
+        """Count the next stamp as `elapsed` (s) after the present voltage; stamps older than the last remain late."""
         self._restarted = elapsed

@@ -1,30 +1,30 @@
-"""Which voltages an axis may be given, and how far it may go from one sample to the next."""
+"""Voltage limits and the rate limiter of an axis."""
 
 from dataclasses import dataclass, replace
 from math import inf, sqrt
 
 from slpi_ros.errors import UsageError
 
-# A longer pause between two samples frees no longer way than this one, seconds.
+# Longest time between two samples that counts for the rate limiter, seconds.
 MAX_DT = 0.1
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Voltages that an axis may be given, and how fast.
+    """Limits of voltage, slew rate and acceleration of an axis.
 
     Parameters
     ----------
     lower, upper : float, volts
     slew : float, V/s
-        Fastest change; inf: no limit.
+        Maximum rate of change; inf (default): no limit.
     acceleration : float, V/s^2
-        Fastest change of that change; inf: no limit.
+        Maximum change of the rate; inf (default): no limit.
 
     Raises
     ------
     UsageError
-        If they leave no voltage or no motion.
+        If lower exceeds upper, or a rate limit is not positive.
     """
 
     lower: float
@@ -33,15 +33,15 @@ class Limits:
     acceleration: float = inf
 
     def __post_init__(self) -> None:
-        """Refuse limits that leave no voltage."""
+        """Refuse an empty voltage range and non-positive rates."""
         if not self.lower <= self.upper or not self.slew > 0 or not self.acceleration > 0:
             raise UsageError(
                 f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s and acceleration "
-                f"{self.acceleration:g} V/s^2 leave nothing to do; give lower <= upper, and the others positive"
+                f"{self.acceleration:g} V/s^2 are not valid; give lower <= upper, and positive slew and acceleration"
             )
 
     def within(self, voltage_range: tuple[float, float]) -> "Limits":
-        """Return these limits, narrowed to a model's identified voltages."""
+        """Return these limits, restricted to the identified voltages (V) of a model; UsageError if none is left."""
         lower, upper = max(self.lower, voltage_range[0]), min(self.upper, voltage_range[1])
         if lower > upper:
             raise UsageError(
@@ -56,20 +56,20 @@ class Limits:
 
 
 class RateLimiter:
-    """How far a voltage may go from one sample to the next.
+    """Limit the voltage change from one sample to the next by slew rate and acceleration.
 
-    With a limit of acceleration every step leaves room to brake: before the voltage limits always, and before the goal
-    unless the goal itself turns too sharply.
+    With an acceleration limit every step leaves enough distance to brake before the voltage limits, and also before the
+    goal unless the goal itself reverses faster than the acceleration limit allows.
 
     Parameters
     ----------
     limits : Limits
-        They may be replaced at any time; a voltage outside new ones goes inside as fast as slew and acceleration allow.
+        May be replaced at any time; a voltage outside new limits returns within the slew and acceleration limits.
 
     Attributes
     ----------
     rate : float, V/s
-        Of the last step.
+        Rate of the last step.
     """
 
     __slots__ = ("_dt", "limits", "rate")
@@ -80,18 +80,18 @@ class RateLimiter:
 
     @property
     def in_motion(self) -> bool:
-        """Whether the limit of acceleration forbids to stand still at the next sample."""
+        """Whether the acceleration limit does not allow the voltage to stop at the next sample."""
         return abs(self.rate) > self.limits.acceleration * self._dt
 
     def clamp_dt(self, elapsed: float) -> float:
-        """Return how much of the time since the last step (s) counts; after a pause the voltage starts from rest."""
+        """Return the elapsed time (s) limited to 0..`MAX_DT`; after a longer pause the voltage starts from rest."""
         if elapsed > MAX_DT:
             self.rest()
             return MAX_DT
         return max(elapsed, 0.0)
 
     def reach(self, present: float, dt: float) -> tuple[float, float]:
-        """Return the lowest and the highest voltage (V) that may follow `present` (V) after `dt` (s)."""
+        """Return the lowest and highest voltage (V) reachable from `present` (V) within `dt` (s)."""
         limits = self.limits
         lower, upper = limits.lower, limits.upper
         if limits.acceleration < inf:
@@ -101,19 +101,20 @@ class RateLimiter:
             down = -up
         else:
             return lower, upper
-        # A voltage outside its limits goes inside at full pace.
+        # A voltage outside its limits returns at the maximum rate.
         lowest, highest = present + down, present + up
         lowest = max(lowest, min(lower, highest))
         return lowest, min(highest, max(upper, lowest))
 
     def toward(self, present: float, goal: float, goal_before: float, dt: float) -> tuple[float, float]:
-        """Return what `reach` does, narrowed so that the voltage can stop at a goal that moves on as it just did.
+        """Return the interval of `reach`, restricted so that the voltage can stop at a goal of constant velocity.
 
         Parameters
         ----------
         present, goal, goal_before : float, volts
-            The goal now, and at the sample before.
+            Present voltage, goal now, and goal at the previous sample.
         dt : float, seconds
+            Time since the previous sample.
         """
         lowest, highest = self.reach(present, dt)
         if self.limits.acceleration == inf:
@@ -123,27 +124,27 @@ class RateLimiter:
         return min(max(low, lowest), highest), min(max(high, lowest), highest)
 
     def step(self, present: float, goal: float, dt: float, goal_before: float | None = None) -> float:
-        """Return the voltage (V) that follows `present` (V) on the way to a `goal` (V) after `dt` (s)."""
+        """Return the next voltage (V) from `present` (V) towards `goal` (V) after `dt` (s)."""
         lowest, highest = self.toward(present, goal, goal if goal_before is None else goal_before, dt)
         v = min(max(goal, lowest), highest)
         self.moved(v - present, dt)
         return v
 
     def moved(self, way: float, dt: float) -> None:
-        """Remember how fast the last step went: `way` (V) in `dt` (s)."""
+        """Store the rate of the last step: `way` (V) in `dt` (s)."""
         if dt > 0.0:
             self.rate, self._dt = way / dt, dt
 
     def rest(self) -> None:
-        """Start anew from a voltage at rest."""
+        """Reset the rate to zero."""
         self.rate = 0.0
 
     def go_on(self, before: "RateLimiter") -> None:
-        """Go on as fast as another pace has been going."""
+        """Take over the rate of another rate limiter."""
         self.rate, self._dt = before.rate, before._dt
 
     def _ways(self, present: float, dt: float) -> tuple[float, float]:
-        """Return how far (V) down and up slew, acceleration and room to brake allow."""
+        """Return the largest steps (V) down and up that slew, acceleration and braking distance allow."""
         limits = self.limits
         change, fastest = limits.acceleration * dt, limits.slew
         down = max(self.rate - change, -fastest) * dt
@@ -164,23 +165,23 @@ class RateLimiter:
 
 
 def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:
-    """Return the voltages (V) at which a decaying oscillation turns, the final one last.
+    """Return the reversal voltages (V) of a decaying oscillation, followed by the final voltage.
 
-    The first cycle reaches both limits and closes every loop between them. The amplitude then falls by the same
-    amount each cycle, on either side of the final voltage by as much as there is room.
+    The first cycle reaches both limits and so erases every loop between the limits. The amplitude then decreases
+    linearly over the cycles, on each side of the final voltage in proportion to the distance from the limit.
 
     Parameters
     ----------
     limits : Limits
     final : float, volts
-        Within the limits.
+        Final voltage, within the limits.
     cycles : int
-        At least 1.
+        Number of cycles, at least 1.
 
     Raises
     ------
     UsageError
-        If there is no cycle, or the final voltage is outside.
+        If `cycles` is below 1, or `final` is outside the limits.
     """
     if cycles < 1 or not limits.lower <= final <= limits.upper:
         raise UsageError(
@@ -188,7 +189,7 @@ def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:
             "give at least one cycle and a final voltage within the limits"
         )
     above, below = limits.upper - final, limits.lower - final
-    # Which limit came first must not matter: the upper one is visited once more.
+    # The upper limit is visited once more, so that the result does not depend on the limit reached first.
     turns = [limits.upper, limits.lower]
     for left in range(cycles, 0, -1):
         share = left / cycles

@@ -1,8 +1,8 @@
-"""Node ``compensator``: desired displacements in, voltages out.
+"""Node ``compensator``: converts desired displacements into voltages.
 
-The node only adapts: it decodes messages, asks the `Controller`, and publishes its voltages, what it rejects and its
-health. What moves without a message (points of trajectories, ramps, the reset of the memory) does so from one timer,
-which is set to when the controller says that it is due.
+The node is an adapter: it decodes messages, calls the `Controller`, and publishes voltages and diagnostics. Motion
+without messages (trajectory points, ramps, the reset of the memory) is executed by one timer, which is set to the next
+deadline of the controller.
 """
 
 import sys
@@ -48,20 +48,20 @@ from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSetti
 from slpi_ros.nodes.jobs import Read, Reading
 from slpi_ros.nodes.parameters import Parameters
 
-# Seconds between two messages of a kind in the log.
+# Minimum time between two log messages of the same kind, seconds.
 LOG_PERIOD, FILE_LOG_PERIOD = 5.0, 60.0
-# How often the node looks whether commands have stopped, seconds.
+# Period of the watchdog check, seconds.
 WATCH_PERIOD = 0.05
-# How often a simulated clock is looked at, nanoseconds; the shortest time that a timer is set to.
+# Polling period of a simulated clock, and shortest period of a timer, nanoseconds.
 SIMULATED_PERIOD_NS, SHORTEST_WAIT_NS = 1_000_000, 1_000
 # History, depth and reliability, by parameters qos_overrides./TOPIC.{publisher,subscription}.POLICY.
 OVERRIDABLE = QoSOverridingOptions.with_default_policies()
-# How long an end waits until the last voltages have arrived.
+# Time to wait at shutdown for the delivery of the last voltages.
 PATIENCE = Duration(seconds=1.0)
 
 
 class Compensator(LifecycleNode):
-    """A lifecycle node that answers every desired message with the voltages of all its axes.
+    """Lifecycle node that publishes the voltages of all axes for every message with desired displacements.
 
     Subscribes ``desired_displacement``, ``desired_trajectory``, ``measured_displacement`` and ``stage_model``,
     publishes ``voltage_command`` and ``/diagnostics``, serves ``~/reset_memory``; types, units and quality of service
@@ -70,9 +70,9 @@ class Compensator(LifecycleNode):
     Raises
     ------
     UsageError
-        If the parameters make no sense.
+        If the parameters are not valid.
     ModelError
-        If ``model_file`` holds no model for these axes and limits.
+        If ``model_file`` is not a valid model for these axes and limits.
     """
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class Compensator(LifecycleNode):
         self._model_topic = self.resolve_topic_name("stage_model")
         self._model_reader = ThreadPoolExecutor(1, "stage_model")
         self._reading: Reading | None = None
-        # A simulated clock may stand still; the amplifier's slew is real.
+        # The steady clock, as a simulated one may stop while the amplifier moves in real time.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(PERIOD, self._on_timer, clock=steady)
         self._timer.cancel()
@@ -114,7 +114,7 @@ class Compensator(LifecycleNode):
 
     @property
     def executor_kind(self) -> str:
-        """Which executor is to spin this node."""
+        """Executor for this node, "events" or "default"."""
         return str(self._settings.values["executor"])
 
     @property
@@ -132,7 +132,7 @@ class Compensator(LifecycleNode):
     # Lifecycle
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Load the model file, if there is one, and take part in the topics."""
+        """Load the model file, if any, and create publisher and subscriptions."""
         path = self._settings.values["model_file"]
         try:
             if path:
@@ -140,7 +140,7 @@ class Compensator(LifecycleNode):
                 self._use_model(model, model_id(model), path)
         except SlpiError as error:
             self._failure = error
-            # Where the refusal ends the process, its message is printed anyway.
+            # During autostart the error ends the process and is printed there.
             self._refuse_model(error, logged=not self._starting)
             return TransitionCallbackReturn.FAILURE
         self._publisher = self.create_lifecycle_publisher(
@@ -166,7 +166,7 @@ class Compensator(LifecycleNode):
         return self.create_subscription(kind, topic, callback, qos, qos_overriding_options=OVERRIDABLE, raw=raw)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Answer from now on, starting at the present voltages."""
+        """Start to process messages, from the present voltages."""
         self._save_memory(complete=False)
         self._controller.activate(time.monotonic_ns())
         result = super().on_activate(state)
@@ -175,13 +175,13 @@ class Compensator(LifecycleNode):
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Hold the present voltages, or go to the safe ones first."""
+        """Hold the present voltages, or first ramp to the safe voltages."""
         self._end_activity()
         self._report()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the model and leave the topics."""
+        """Discard the model and destroy publisher and subscriptions."""
         result = super().on_cleanup(state)
         self._controller.cleanup()
         self._leave_topics()
@@ -189,7 +189,7 @@ class Compensator(LifecycleNode):
         return result
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Hold the present voltages for good, or go to the safe ones first."""
+        """Hold the present voltages, or first ramp to the safe voltages, and finalize."""
         self._end_activity()
         result = super().on_shutdown(state)
         if self._controller.mode is not Mode.UNCONFIGURED:
@@ -199,7 +199,7 @@ class Compensator(LifecycleNode):
         return result
 
     def destroy_node(self) -> None:
-        """End the activity in order, and the node."""
+        """Deactivate in order, then destroy the node."""
         self._stop_reading()
         self._end_activity()
         super().destroy_node()
@@ -221,7 +221,7 @@ class Compensator(LifecycleNode):
             now_ns = time.monotonic_ns()
             if controller.advance(now_ns, now_ns):
                 self._publish()
-        # The process may end next, and with it what has not arrived.
+        # Voltages that have not been delivered are lost when the process ends.
         self._publisher.wait_for_all_acked(PATIENCE)
         controller.deactivate(time.monotonic_ns())
         self._save_memory(complete=True)
@@ -243,9 +243,9 @@ class Compensator(LifecycleNode):
         self._answer(0, self._controller.names, (message.data,))
 
     def _answer(self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float]) -> None:
-        """Publish the voltages for one message, or say why not."""
+        """Publish the voltages for one message, or report its rejection."""
         controller, now_ns = self._controller, time.monotonic_ns()
-        # Asking for the time takes as long as compensating an axis.
+        # Reading the clock takes as long as compensating an axis.
         arrival_ns = 0 if stamp_ns and not controller.needs_arrival else self.get_clock().now().nanoseconds
         try:
             held = controller.update(stamp_ns, names, displacements, now_ns, arrival_ns)
@@ -285,13 +285,13 @@ class Compensator(LifecycleNode):
         self._report()
 
     def _reject(self, what: str, error: RejectedError) -> None:
-        """Say why a message was rejected; the controller has counted it."""
+        """Log and report the rejection of a message, already counted by the controller."""
         self._reporter.last_rejection = str(error)
         self.get_logger().warning(f"{what}rejected: {error}", throttle_duration_sec=LOG_PERIOD)
         self._report_at_least(WARN)
 
     def _publish(self) -> None:
-        # As bytes: to make a message of them takes longer than to compensate an axis.
+        # Published as bytes: creating a message object takes longer than compensating an axis.
         voltages = self._controller.voltages.tobytes()
         self._publisher.publish(self._voltage_header + voltages)
         if self._keeps_memory:
@@ -301,7 +301,7 @@ class Compensator(LifecycleNode):
                 self.get_logger().error(str(error), throttle_duration_sec=FILE_LOG_PERIOD)
 
     def _warn_held(self) -> None:
-        """Warn, once for each excursion."""
+        """Warn once for each excursion beyond the reachable displacements."""
         self._report_at_least(WARN)
         if self._controller.counts.excursions > self._excursions:
             self._excursions = self._controller.counts.excursions
@@ -311,10 +311,10 @@ class Compensator(LifecycleNode):
                 "send displacements within the identified range"
             )
 
-    # What moves without messages
+    # Motion without messages
 
     def _clocks(self) -> tuple[int, int]:
-        """Return the time on a clock that never jumps, and that of trajectories, nanoseconds."""
+        """Return the times on the monotonic clock and on the clock of trajectories, nanoseconds."""
         now_ns = time.monotonic_ns()
         return now_ns, self.get_clock().now().nanoseconds if self._simulated else now_ns
 
@@ -327,8 +327,8 @@ class Compensator(LifecycleNode):
         now_ns, clock_ns = self._clocks()
         if before is Mode.TRAJECTORY and self._on_simulated != self._simulated:
             controller.cancel(now_ns)
-            self.get_logger().error("use_sim_time was changed: the trajectory's times mean nothing now, stopped")
-        # One point at a time: others have their turn even where points come faster than they can be given.
+            self.get_logger().error("use_sim_time was changed: trajectory canceled, as its times are no longer valid")
+        # One point per call, so that other callbacks run even if points are due faster than they can be processed.
         deadline_ns = controller.trajectory.next_deadline_ns
         held = controller.counts.points_held
         if controller.advance(now_ns, clock_ns):
@@ -344,7 +344,7 @@ class Compensator(LifecycleNode):
         self._schedule()
 
     def _schedule(self) -> None:
-        """Set the timer to when the controller has something to do."""
+        """Set the timer to the next deadline of the controller."""
         now_ns, clock_ns = self._clocks()
         due_ns = self._controller.next_due_ns(now_ns, clock_ns)
         if due_ns is None:
@@ -369,17 +369,17 @@ class Compensator(LifecycleNode):
         self._reporter.report(self._settings)
 
     def _report_at_least(self, level: bytes) -> None:
-        """Report now if the last report was better than this."""
+        """Report now if the level of the last report was lower than `level`."""
         if self._reporter.level < level:
             self._report()
 
     # Models
 
     def _on_model(self, message: String) -> None:
-        """Use the model of a message soon, or say why not: the one before works on.
+        """Load the model of a message in the background; the previous model is used until then.
 
-        To check a document takes as long as many commands, so this is done in the background. Those that have not been
-        read when a newer one comes are left.
+        The validation of a document takes as long as many commands, so it runs in another thread. It is canceled when a
+        newer document arrives.
         """
         self._stop_reading()
         try:
@@ -395,7 +395,7 @@ class Compensator(LifecycleNode):
             self._reading = None
 
     def _on_model_read(self, coming: Future[Read | None]) -> None:
-        """Go on in the thread that the node lives in."""
+        """Continue in the thread of the executor."""
         if self.executor:
             self.executor.create_task(self._take_model, coming)
 
@@ -417,7 +417,7 @@ class Compensator(LifecycleNode):
         self._report()
 
     def _use_model(self, model: StageModel, fingerprint: str, source: str) -> None:
-        """Take a model over, unless it is the one in use: a latched document may come more than once."""
+        """Replace the model unless it is already in use: a latched document may arrive repeatedly."""
         controller, settings, reporter = self._controller, self._settings, self._reporter
         if controller.model is None or fingerprint != reporter.model_id:
             try:
@@ -441,7 +441,7 @@ class Compensator(LifecycleNode):
     # The memory
 
     def _begin_memory(self) -> None:
-        """Say once what is only assumed of the memory, or reset it if that is wanted, when active and with a model."""
+        """Warn once about an assumed memory, or reset the memory if `reset_on_start`; only when active with a model."""
         controller = self._controller
         unsure = [axis for axis in controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
         if controller.model is None or controller.mode is not Mode.STREAMING or not unsure:
@@ -454,17 +454,17 @@ class Compensator(LifecycleNode):
             self._assumption = said
             self.get_logger().warning(
                 f"the memory is assumed: {said}; call {self.get_fully_qualified_name()}/reset_memory (~/reset_memory) "
-                "to wipe it, or set reset_on_start"
+                "to reset it, or set reset_on_start"
             )
 
     def _assumed(self, axis: Axis) -> str:
-        """Say what is assumed of the memory of an axis."""
+        """Return a text for the assumed memory of an axis."""
         if axis.confidence.doubt or not axis.start_memory:
-            return axis.confidence.doubt or "as it was left"
-        where = {"end": "where its record ended", "start": "where its record began", "wiped": "wiped"}
+            return axis.confidence.doubt or "as before activation"
+        where = {"end": "at the end of the record", "start": "at the start of the record", "wiped": "as after a reset"}
         text = f"starts {where[axis.start_memory]}, at {axis.stream.voltage:.6g} V (start_memory {axis.start_memory})"
         if axis.start_memory == "end" and axis.model and axis.model.end is None:
-            text += ", which the model does not tell: where it began is taken"
+            text += "; the model holds no end, its start is used"
         return text
 
     def _start_reset(self) -> None:
@@ -475,10 +475,10 @@ class Compensator(LifecycleNode):
         self._report()
 
     def _on_reset(self) -> str:
-        """Start a reset, unless one is under way; return why that cannot be, or ""."""
+        """Start a reset unless one is running; return the reason if this is not possible, else ""."""
         controller = self._controller
         if not controller.active or controller.model is None:
-            return "not reset: there must be a model, and the node must be active"
+            return "not reset: a model is required, and the node must be active"
         if controller.mode is Mode.TRAJECTORY:
             return f"not reset: {controller.doing(time.monotonic_ns())}; wait, or cancel it with an empty one"
         if controller.mode is not Mode.RESETTING:
@@ -486,7 +486,7 @@ class Compensator(LifecycleNode):
         return ""
 
     def _answer_reset(self) -> None:
-        """Say how a reset has ended."""
+        """Answer the service with the result of the reset."""
         axes, voltages = self._controller.axes, ", ".join(f"{v:.6g}" for v in self._controller.voltages)
         doubts = [f"axis '{axis.name}': {axis.confidence.doubt}" for axis in axes if axis.confidence.state != KNOWN]
         if any(axis.confidence.doubt == INTERRUPTED for axis in axes):
@@ -502,7 +502,7 @@ class Compensator(LifecycleNode):
         self._reset_service.answer(not doubts, said)
 
     def _save_memory(self, complete: bool) -> None:
-        """Write the memory, or say why not; `complete`: nothing will move until the node has ended."""
+        """Save the memory, or log the error; `complete`: no further voltage is output before shutdown."""
         controller = self._controller
         if not self._keeps_memory or controller.model is None:
             return
@@ -519,7 +519,7 @@ class Compensator(LifecycleNode):
 def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayLike]:
     """Return stamp (ns), names, times (ns) and positions of a serialized JointTrajectory.
 
-    What cannot be read names nothing, and positions of different lengths stay as they are: the controller rejects both.
+    An unreadable message yields no names, positions of different lengths are kept: the controller rejects both.
     """
     if arrays := decode_trajectory(data):
         return arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.positions

@@ -1,4 +1,4 @@
-"""The compensator's health on ``/diagnostics``."""
+"""Diagnostics of the compensator on ``/diagnostics``."""
 
 import time
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ Problem = tuple[bool, bytes, str]
 
 
 class Reporter:
-    """Makes and publishes the compensator's health.
+    """Collect and publish the diagnostics of the compensator.
 
     Parameters
     ----------
@@ -29,11 +29,11 @@ class Reporter:
     finalized : bool
         Whether the node has been shut down.
     timing : Timing
-        Of the messages.
+        Latency of messages.
     lateness : Timing
-        Of the points of trajectories.
+        Deadline error of trajectory points.
     last_rejection, model_error : str
-        Why a message, and a model, was rejected last; "" where the model in use is newer.
+        Reason for the last rejected message and model; `model_error` is "" after a newer model was accepted.
     models_refused : int
     model_id : str
         Fingerprint of the model in use.
@@ -50,11 +50,11 @@ class Reporter:
 
     @property
     def level(self) -> bytes:
-        """Of the last report."""
+        """Diagnostic level of the last report."""
         return self._diagnostics.level
 
     def report(self, settings: CompensatorSettings) -> None:
-        """Publish the health."""
+        """Publish the diagnostics."""
         model = self._controller.model
         values = self._counters() | self._pace() | self._model_values(model)
         if model:
@@ -65,14 +65,14 @@ class Reporter:
         self._diagnostics.report(Health(problems, self._summary(), values, hardware_id))
 
     def start_window(self) -> None:
-        """Count what comes from now on as news."""
+        """Start a new reporting period."""
         self._window, self._window_start = self._controller.counts.copy(), time.perf_counter()
         self.timing.restart()
         self.lateness.restart()
 
     @property
     def _state(self) -> str:
-        """The state of the lifecycle."""
+        """Lifecycle state."""
         mode = self._controller.mode
         if self.finalized:
             return "finalized"
@@ -93,7 +93,7 @@ class Reporter:
         return ", ".join(dict.fromkeys(axis.confidence.state for axis in self._controller.axes))
 
     def _silence(self) -> str:
-        """Say what is done about commands that have stopped; "" while they come."""
+        """Return the watchdog message; "" while commands arrive."""
         controller, watchdog = self._controller, self._controller.watchdog
         if not watchdog.expired or controller.mode not in (Mode.STREAMING, Mode.RAMPING):
             return ""
@@ -157,7 +157,7 @@ class Reporter:
         }
 
     def _problems(self, settings: CompensatorSettings) -> Iterator[Problem]:
-        """Say what is wrong, or was since the last periodic report."""
+        """Yield the problems present or counted since the last periodic report."""
         counts, window = self._controller.counts, self._window
         ready, active = self._controller.model is not None, self._controller.active
         yield self.model_error != "", WARN if ready else ERROR, f"model refused: {self.model_error}"
@@ -182,7 +182,7 @@ class Reporter:
 
 
 def _microseconds(report: TimingReport | None) -> tuple[str, str, str]:
-    """Write median, 99th percentile and longest."""
+    """Format median, 99th percentile and maximum in microseconds."""
     p50, p99, longest = (f"{each * 1e6:.0f}" for each in report.latency) if report else ("", "", "")
     return p50, p99, longest
 
@@ -204,20 +204,20 @@ def _axis_values(axis: Axis) -> dict[str, object]:
 
 
 def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]:
-    yield moving and axis.feedback_state == "holding", WARN, f"axis '{axis.name}': feedback holds, no fresh measurement"
+    yield moving and axis.feedback_state == "holding", WARN, f"axis '{axis.name}': feedback holds, measurement too old"
     yield axis.confidence.contradicted, WARN, f"axis '{axis.name}': {axis.confidence.doubt}"
     drift, quality = axis.drift, axis.model.quality if axis.model else None
     if drift and quality:
         usual = max(quality.held_out_rms, quality.floor_rms)
         text = (
             f"axis '{axis.name}' is off its model by {drift.rms * 1e9:.1f} nm rms, mean {drift.mean * 1e9:.1f} nm, in "
-            f"{drift.samples} measurements; identified with {usual * 1e9:.1f} nm: reset the memory, or identify again"
+            f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: reset the memory, or identify again"
         )
         yield 0.0 < factor * usual < drift.rms, WARN, text
 
 
 def _hours_since(created: str) -> str:
-    """Return how long ago an ISO 8601 time was; "" if it is none."""
+    """Return the hours since an ISO 8601 time; "" if it is not valid."""
     try:
         then = datetime.fromisoformat(created)
     except ValueError:

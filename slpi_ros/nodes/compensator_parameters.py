@@ -1,4 +1,4 @@
-"""The compensator's parameters: one table, from which declaration, validation and the README's table follow."""
+"""Parameters of the compensator: one table for declaration, validation and the table in the README."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ HOLD_OR_SAFE = ("hold", "safe")
 
 
 def each_axis(name: str, default: float, description: str, between: tuple[float, float]) -> Declaration:
-    """Declare a number that each axis may have its own of."""
+    """Declare a number that may be given for each axis."""
     text = f"{description} One value, or one for each axis."
     return Declaration(name, default, text, between=between, number=True, each_axis=True)
 
@@ -36,7 +36,7 @@ def scalar(
 
 
 def text(name: str, default: str, description: str, *choices: str, read_only: bool = False) -> Declaration:
-    """Declare a string, one of the choices if there are any."""
+    """Declare a string, limited to `choices` if any are given."""
     return Declaration(name, default, description, read_only, choices=choices)
 
 
@@ -46,18 +46,18 @@ DECLARATIONS = (
     ),
     text(
         "model_file", "",
-        "Model document to start with; empty: wait for one on stage_model. A change counts when configured next.",
+        "Model document to load; empty: wait for stage_model. A change takes effect at the next configure.",
     ),
     text(
-        "hardware_id", "", "The stage; models of another one are refused. Empty: any model, named as it says.",
+        "hardware_id", "", "Hardware id of the stage; other models are refused. Empty: any model is accepted.",
         read_only=True,
     ),
     # Limits
-    each_axis("voltage_min", 0.0, "Lowest voltage ever given, volts.", VOLTAGE),
-    each_axis("voltage_max", 100.0, "Highest voltage ever given, volts.", VOLTAGE),
-    each_axis("slew_limit", 0.0, "Fastest change of a voltage, V/s; 0: as fast as asked.", RATE),
+    each_axis("voltage_min", 0.0, "Lower voltage limit, volts.", VOLTAGE),
+    each_axis("voltage_max", 100.0, "Upper voltage limit, volts.", VOLTAGE),
+    each_axis("slew_limit", 0.0, "Maximum rate of a voltage, V/s; 0: no limit.", RATE),
     each_axis(
-        "acceleration_limit", 0.0, "Fastest change of the slew, V/s^2; 0: none. The voltage then stops gently.",
+        "acceleration_limit", 0.0, "Maximum change of the rate, V/s^2; 0: no limit.",
         ACCELERATION,
     ),
     # Commands
@@ -69,73 +69,73 @@ DECLARATIONS = (
     ),
     scalar(
         "time_jump", 1.0,
-        "Seconds. A stamp older than the last one by at most this is late and rejected, by more: the clock was set "
-        "back and time starts anew. Newer by more: a gap, counted.",
+        "Seconds. A stamp older than the last one by at most this is rejected as late; by more, the clock was set back "
+        "and time restarts. Newer by more is counted as a gap.",
         (1e-3, 86_400.0),
     ),
-    scalar("max_age", 0.0, "Seconds; a message stamped longer ago is rejected as stale. 0: none is.", TIMEOUT),
+    scalar("max_age", 0.0, "Seconds; a message stamped longer ago is rejected as stale. 0: no check.", TIMEOUT),
     scalar(
         "command_timeout", 0.0,
-        "Seconds without an accepted command until on_timeout happens and /diagnostics warns. 0: never.",
+        "Watchdog, seconds without an accepted command until on_timeout applies and /diagnostics warns. 0: disabled.",
         TIMEOUT,
     ),
     # Safe ends
     text(
-        "on_timeout", "hold", "When commands stop: hold the voltage, or go to the safe one (hold or safe).",
+        "on_timeout", "hold", "At command_timeout: hold the voltage, or ramp to safe_voltage (hold or safe).",
         *HOLD_OR_SAFE,
     ),
     text(
         "on_deactivate", "hold",
-        "When deactivated or shut down: hold the voltage, or first go to the safe one (hold or safe).",
+        "At deactivation or shutdown: hold the voltage, or first ramp to safe_voltage (hold or safe).",
         *HOLD_OR_SAFE,
     ),
-    each_axis("safe_voltage", 0.0, "The safe voltage, volts.", VOLTAGE),
-    scalar("ramp_rate", 50.0, "How fast to go to the safe voltage, V/s; slew_limit may be lower.", POSITIVE_RATE),
+    each_axis("safe_voltage", 0.0, "Safe voltage, volts.", VOLTAGE),
+    scalar("ramp_rate", 50.0, "Rate of the ramp to safe_voltage, V/s, at most slew_limit.", POSITIVE_RATE),
     # Memory
     text(
         "start_memory", "end",
-        "Memory to start with, of those that the model knows: that at the end of its record, at the start of it, or "
-        "wiped, as after reset_memory (end, start or wiped). A memory_file has precedence.",
+        "Initial history: that at the end of the model's record, at the start of the record, or after a reset (end, "
+        "start or wiped). A memory_file takes precedence.",
         *START_MEMORIES,
     ),
     Declaration(
-        "reset_on_start", False, "Whether to reset the memory after activation, before commands are answered.",
+        "reset_on_start", False, "Whether to reset the memory after activation, before commands are accepted.",
     ),
     Declaration(
         "reset_cycles", 10, "Cycles of the decaying oscillation of reset_memory, from full range to none.",
         between=(1, 1000),
     ),
     scalar(
-        "reset_rate", 200.0, "How fast reset_memory drives, V/s; slew_limit may be lower.", POSITIVE_RATE
+        "reset_rate", 200.0, "Voltage rate of reset_memory, V/s, at most slew_limit.", POSITIVE_RATE
     ),
     text(
-        "reset_to", "present", "Where reset_memory ends: present (where it began) or safe (the safe voltage).",
+        "reset_to", "present", "Final voltage of reset_memory: present (before the reset) or safe (safe_voltage).",
         "present", "safe",
     ),
-    text("memory_file", "", "File that keeps the memory over a restart; empty: none.", read_only=True),
+    text("memory_file", "", "File that stores the memory for the next start; empty: none.", read_only=True),
     # Feedback
-    Declaration("feedback", False, "Whether measured_displacement corrects the voltage."),
+    Declaration("feedback", False, "Whether PID feedback of measured_displacement corrects the voltage."),
     each_axis("kp", 0.0, "Proportional gain of the feedback, V/m.", GAIN),
     each_axis("ki", 0.0, "Integral gain of the feedback, V/(m s).", GAIN),
     each_axis("kd", 0.0, "Derivative gain of the feedback, V s/m, on the measured displacement.", GAIN),
     each_axis(
-        "derivative_filter", 0.0, "Time constant of the low-pass on the derivative, seconds; 0: none.", (0.0, 1e3)
+        "derivative_filter", 0.0, "Time constant of the derivative low-pass, seconds; 0: none.", (0.0, 1e3)
     ),
-    scalar("measurement_timeout", 0.1, "Seconds; an older measurement does not act: the correction is held.", TIMEOUT),
+    scalar("measurement_timeout", 0.1, "Seconds; older measurements are ignored and the correction is held.", TIMEOUT),
     scalar(
         "drift_alarm", 3.0,
-        "/diagnostics warns when measurements are off the model by this many times its held-out error, rms; 0: never.",
+        "/diagnostics warns if the rms of measured - model exceeds this many times the held-out error; 0: never.",
         (0.0, 1e6),
     ),
     # The node
     Declaration("autostart", True, "Whether the node configures and activates itself.", read_only=True),
     text(
-        "executor", "events", "Executor that spins the node: events (fast) or default (in every rclpy).",
+        "executor", "events", "Executor of the node: events (fast) or default (available in every rclpy).",
         "events", "default", read_only=True,
     ),
-    scalar("diagnostic_period", 1.0, "Seconds between two reports on /diagnostics.", (0.05, 3600.0), read_only=True),
+    scalar("diagnostic_period", 1.0, "Period of /diagnostics, seconds.", (0.05, 3600.0), read_only=True),
     Declaration(
-        "realtime_priority", 0, "Priority under SCHED_FIFO, 1 to 99, where the system allows it; 0: as any process.",
+        "realtime_priority", 0, "SCHED_FIFO priority, 1 to 99, if the system permits; 0: normal scheduling.",
         read_only=True, between=(0, 99),
     ),
 )  # fmt: skip
@@ -143,16 +143,16 @@ DECLARATIONS = (
 
 @dataclass(frozen=True)
 class ResetSettings:
-    """How the memory is reset.
+    """Settings of the reset of the hysteresis memory.
 
     Parameters
     ----------
     cycles : int
     rate : float, V/s
     to_safe : bool
-        Whether it ends at the safe voltages, not at the present ones.
+        Whether the reset ends at the safe voltages; if False, at the voltages before the reset.
     on_start : bool
-        Whether it is reset after activation.
+        Whether the memory is reset after each activation.
     """
 
     cycles: int
@@ -163,15 +163,15 @@ class ResetSettings:
 
 @dataclass(frozen=True)
 class CompensatorSettings:
-    """What the parameters say together.
+    """Validated settings of the compensator.
 
     Parameters
     ----------
     values : mapping of str to object
-        All parameters by name, each checked by itself; tuples where each axis may have its own.
+        All parameters by name, each validated; tuples with one value per axis where each axis may have its own.
     limits : tuple of Limits
         One for each axis.
-    time : TimeRules
+    time : TimestampRules
     safety : Safety
     reset : ResetSettings
     loops : tuple of LoopSettings
@@ -187,12 +187,12 @@ class CompensatorSettings:
 
     @classmethod
     def of(cls, given: Values) -> "CompensatorSettings":
-        """Make the settings of all parameters by name.
+        """Return the settings for all parameters by name.
 
         Raises
         ------
         UsageError
-            If a value, or what they say together, makes no sense.
+            If a value, or a combination of values, is not valid.
         """
         axes = given["axes"]
         if not axes or not all(axes) or len(set(axes)) != len(axes):
@@ -237,12 +237,11 @@ class CompensatorSettings:
 
 
 def _limits(values: Mapping[str, Any]) -> tuple[Limits, ...]:
-    """Return the limits of each axis; UsageError where they leave no voltage."""
+    """Return the limits of each axis; UsageError if voltage_min is not below voltage_max."""
     for name, low, high in zip(values["axes"], values["voltage_min"], values["voltage_max"], strict=True):
         if not low < high:
             raise UsageError(
-                f"axis '{name}': voltage_min {low:g} V is not below voltage_max {high:g} V; "
-                "leave some voltage between them"
+                f"axis '{name}': voltage_min {low:g} V is not below voltage_max {high:g} V; correct one of the two"
             )
     each = (values[name] for name in ("voltage_min", "voltage_max", "slew_limit", "acceleration_limit"))
     return tuple(

@@ -1,4 +1,4 @@
-"""Node ``exciter``: drives a stage so that it can be identified."""
+"""Node ``exciter``: excites a stage for identification."""
 
 import math
 import sys
@@ -23,7 +23,7 @@ from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes.common import COMMANDS, LATCHED, request_stop, run
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, choice, number, numbers, whole
 
-# A driver may read back a voltage this share of the range outside the limits; it is taken to be at the limit.
+# A read-back voltage outside the limits by at most this share of the range counts as at the limit.
 READ_BACK = 0.01
 
 VOLTAGE = (-10_000.0, 10_000.0)
@@ -37,47 +37,47 @@ LIVE, TRAJECTORY = OUTPUTS = ("live", "trajectory")
 DECLARATIONS = (
     Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
     Declaration(
-        "voltage_min", math.nan, "Lowest voltage ever given, volts; must be given. One value, or one for each axis.",
+        "voltage_min", math.nan, "Lower voltage limit, volts; required. One value, or one for each axis.",
         number=True,
     ),
     Declaration(
-        "voltage_max", math.nan, "Highest voltage ever given, volts; must be given. One value, or one for each axis.",
+        "voltage_max", math.nan, "Upper voltage limit, volts; required. One value, or one for each axis.",
         number=True,
     ),
     Declaration(
-        "slew_limit", 0.0, "Fastest change of a voltage, V/s; 0: none. One value, or one for each axis.",
+        "slew_limit", 0.0, "Maximum rate of a voltage, V/s; 0: no limit. One value, or one for each axis.",
         between=SLEW, number=True,
     ),
     Declaration(
         "start_voltage", math.nan,
-        "Where the axes rest before and after the drive, volts; NaN: where stage_state says that they are, and without "
-        "it at voltage_min. One value, or one for each axis.",
+        "Voltage before and after the excitation, volts; NaN: as reported by stage_state, or voltage_min without a "
+        "report. One value, or one for each axis.",
         number=True,
     ),
-    Declaration("duration", 30.0, "Seconds, shared by the axes.", between=DURATION, number=True),
-    Declaration("rate", 200.0, "Voltages per second.", between=RATE, number=True),
+    Declaration("duration", 30.0, "Total excitation time of all axes, seconds.", between=DURATION, number=True),
+    Declaration("rate", 200.0, "Sample rate, hertz.", between=RATE, number=True),
     Declaration(
-        "settle", 3.0, "Seconds to wait for others to connect, once the voltages have a subscriber.",
+        "settle", 3.0, "Seconds to wait for further subscribers after the first one.",
         between=SETTLE, number=True,
     ),
-    Declaration("drive", DRIVES[0], f"What to drive: {', '.join(DRIVES)}."),
-    Declaration("seed", 0, "The same seed gives the same drive.", between=SEED),
-    Declaration("repeat", False, "Whether to begin again at the end, until stopped."),
+    Declaration("drive", DRIVES[0], f"Excitation drive: {', '.join(DRIVES)}."),
+    Declaration("seed", 0, "Seed of the random parts of the excitation drive.", between=SEED),
+    Declaration("repeat", False, "Whether to repeat the excitation until stopped."),
     Declaration(
         "output", LIVE,
-        "live: one voltage_command after the other. trajectory: all at once on voltage_trajectory, for whoever keeps "
-        "time itself.",
+        "live: samples on voltage_command at the sample rate. trajectory: all samples in one message on "
+        "voltage_trajectory, for a device with its own timing.",
         read_only=True,
     ),
     Declaration(
-        "autostart", True, "Whether to start at once, and end with the drive; else ~/start starts it.", read_only=True
+        "autostart", True, "Whether to start at once and exit at the end; if false, ~/start starts.", read_only=True
     ),
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class ExciterSettings:
-    """What the node is told by its parameters; voltages in volts, in the order of `axes`.
+    """Validated settings of the exciter; voltages in volts, in the order of `axes`.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class ExciterSettings:
         Lowest and highest voltages.
     slew_limit : list of float, V/s
     start : list of float or None
-        None: as ``stage_state`` says.
+        Voltage before and after the excitation; None: as reported by ``stage_state``.
     duration : float, seconds
     rate : float, hertz
     settle : float, seconds
@@ -112,12 +112,12 @@ class ExciterSettings:
 
     @classmethod
     def of(cls, values: Values) -> "ExciterSettings":
-        """Make the settings of all parameters by name.
+        """Return the settings for all parameters by name.
 
         Raises
         ------
         UsageError
-            If a value makes no sense, or no drive can be made of them.
+            If a value is not valid, or no excitation drive exists for the values.
         """
         axes = tuple(values["axes"])
         start = values["start_voltage"]
@@ -141,14 +141,14 @@ class ExciterSettings:
         return settings
 
     def drawn(self, heard: Sequence[float] | None) -> Drive:
-        """Return the drive of a stage that was heard to be at some voltages (V), or not heard of.
+        """Return the excitation drive from the reported voltages `heard` (V, one per axis), or None if unknown.
 
         Raises
         ------
         UsageError
-            If there is no such drive.
+            If no excitation drive exists for the settings.
         SlpiError
-            If the stage is outside its limits.
+            If a reported voltage is outside the limits.
         """
         start = self._within_limits(heard) if self.start is None and heard else self.start
         return excite(
@@ -168,32 +168,32 @@ class ExciterSettings:
             slack = READ_BACK * (high - low)
             if not low - slack <= v <= high + slack:
                 raise SlpiError(
-                    f"exciter: axis '{axis}' is at {v:g} V, outside {low:g} to {high:g} V; bring it there first"
+                    f"exciter: axis '{axis}' is at {v:g} V, outside {low:g} to {high:g} V; move it inside first"
                 )
         return [min(max(v, low), high) for v, low, high in zip(heard, *self.limits, strict=True)]
 
 
 POLL_PERIOD = 0.1
 LOG_PERIOD = 5.0
-# The last voltage must have arrived before the node goes.
+# Time to wait at shutdown for the delivery of the last voltage.
 PATIENCE = Duration(seconds=1.0)
-# A drive that takes so much longer than it should is reported.
+# A warning is logged if the excitation takes longer than planned by this factor.
 SLUGGISH = 1.02
 
 
 class Exciter(Node):
-    """Drives a stage within its limits, and brings it back to where it was, whatever ends the drive.
+    """Excite a stage within its limits, and return it to its initial voltage when the excitation ends or is stopped.
 
-    Publishes ``voltage_command``, one sample a period by a clock that never jumps: after a stall the drive goes on
-    where it was, later, and never leaps. Or, with the parameter ``output`` "trajectory", all samples at once on
-    ``voltage_trajectory``: volts in ``effort``, as in ``stage_state``, and no positions. Subscribes ``stage_state`` to
-    learn where the axes are. It waits for a subscriber before it starts.
-    Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `exciter_settings`.
+    Publishes ``voltage_command`` with one sample per period of a monotonic clock: after a stall excitation continues
+    later with the next sample, without a step. With the parameter ``output`` "trajectory" all samples are published in
+    one message on ``voltage_trajectory``: volts in ``effort``, as in ``stage_state``, without positions. Subscribes
+    ``stage_state`` for the initial voltages. The node waits for a subscriber before it starts.
+    Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
 
     Raises
     ------
     UsageError
-        If the parameters make no drive.
+        If the parameters are not valid.
     """
 
     def __init__(self) -> None:
@@ -211,7 +211,7 @@ class Exciter(Node):
         self.create_subscription(JointState, "stage_state", self._on_state, qos_profile_sensor_data)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        # A simulated clock may stand still.
+        # A simulated clock may stop.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._polls_left = self._listeners = 0
         self._waiting = self.create_timer(POLL_PERIOD, self._look, clock=self._steady, autostart=False)
@@ -219,7 +219,7 @@ class Exciter(Node):
             self._wait()
 
     def destroy_node(self) -> None:
-        """Bring the axes back, then destroy the node."""
+        """Return the axes to their initial voltage, then destroy the node."""
         if self.context.ok():
             if self._playback:
                 self._turn_back(self._playback)
@@ -233,11 +233,11 @@ class Exciter(Node):
     def _settings(self) -> ExciterSettings:
         return self._parameter_set.settings
 
-    # Before the drive
+    # Before the excitation
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._playback or self._polls_left:
-            response.message = "started already; call ~/stop first"
+            response.message = "already started; call ~/stop first"
         else:
             self._wait()
             response.success = True
@@ -250,7 +250,7 @@ class Exciter(Node):
         self._waiting.reset()
 
     def _look(self) -> None:
-        """Begin when nobody has joined for a while: who connects late would miss the beginning."""
+        """Start once no subscriber has joined for the settling time, so that no subscriber misses the first samples."""
         listeners = self._publisher.get_subscription_count()
         if not listeners:
             self.get_logger().info(
@@ -271,7 +271,7 @@ class Exciter(Node):
         if all(map(math.isfinite, heard)):
             self._heard = heard
 
-    # The drive
+    # Excitation
 
     def _begin(self) -> None:
         settings = self._settings
@@ -286,8 +286,8 @@ class Exciter(Node):
         self._timer = self.create_timer(1.0 / drive.rate, self._step, clock=self._steady)
         self._hand_over(self._playback)
         if self.count_publishers(self._publisher.topic_name) > 1:
-            self.get_logger().warning(f"others publish {self._publisher.topic_name} too; stop them and drive again")
-        self.get_logger().info(f"driving {', '.join(drive.axes)} for {settings.duration:g} s. {drive.why}")
+            self.get_logger().warning(f"{self._publisher.topic_name} has other publishers; stop them and repeat")
+        self.get_logger().info(f"exciting {', '.join(drive.axes)} for {settings.duration:g} s. {drive.why}")
 
     def _step(self) -> None:
         if self._playback:
@@ -312,12 +312,12 @@ class Exciter(Node):
         if not playback.stopping:
             if took > SLUGGISH * planned:
                 self.get_logger().warning(
-                    f"the drive took {took:.1f} s in place of {planned:.1f} s; for this machine lower the rate"
+                    f"the excitation took {took:.1f} s instead of {planned:.1f} s; use a lower rate on this machine"
                 )
             if self._settings.autostart:
                 request_stop()
 
-    # Its end
+    # Stop
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = True
@@ -327,14 +327,14 @@ class Exciter(Node):
         return response
 
     def _turn_back(self, playback: Playback) -> float:
-        """Return to where the axes rest; return how long that takes, seconds."""
+        """Start the return to the initial voltages; return its duration, seconds."""
         if playback.stop():
             self._hand_over(playback)
         return playback.seconds_left
 
 
 def trajectory_of(playback: Playback) -> JointTrajectory:
-    """Return what is left of a drive: volts in ``effort``, no positions, times from now."""
+    """Return the remaining samples as a trajectory: volts in ``effort``, no positions, times from now."""
     rate = playback.drive.rate
     points = [
         JointTrajectoryPoint(effort=array("d", voltages), time_from_start=_duration(number / rate))
@@ -349,7 +349,7 @@ def _duration(seconds: float) -> DurationMsg:
 
 
 def main() -> int:
-    """Run the node; return the exit code of the process: 0 when the drive is done or was stopped."""
+    """Run the node; return the exit code of the process: 0 when the excitation is complete or was stopped."""
     return run(Exciter)
 
 

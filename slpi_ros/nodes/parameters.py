@@ -1,4 +1,4 @@
-"""Parameters of a node, declared in one table and validated together."""
+"""Node parameters, declared in one table and validated together."""
 
 import json
 import math
@@ -18,25 +18,25 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Declaration:
-    """One parameter.
+    """Declaration of one node parameter.
 
     Parameters
     ----------
     name : str
     default : object
-        Its type is the parameter's type.
+        Default value; its type is the parameter's type.
     description : str
-        What ``ros2 param describe`` shows.
+        Text shown by ``ros2 param describe``.
     read_only : bool
-        Whether only the start of the node may set it.
+        Whether the value can only be set at the start of the node; default False.
     between : (float, float), optional
-        Smallest and largest value of a number; without it any.
+        Smallest and largest value of a number; default: any value.
     number : bool
-        Whether integers, and one value for each axis, may stand for the default's one double. Not for whole numbers.
+        Whether a double may also be given as an integer or as one value for each axis. Not for integer parameters.
     each_axis : bool
-        Whether each axis may have a value of its own.
+        Whether each axis may have its own value.
     choices : tuple of str
-        What a string may be; empty: anything.
+        Allowed values of a string; empty (default): any.
     """
 
     name: str
@@ -49,12 +49,12 @@ class Declaration:
     choices: tuple[str, ...] = ()
 
     def read(self, values: Values, axes: Sequence[str]) -> Any:
-        """Return the checked value among all of them by name: a tuple with one for each axis where each may have one.
+        """Return the validated value from `values`: a tuple with one value per axis if `each_axis`.
 
         Raises
         ------
         UsageError
-            It names the parameter and what it may be.
+            If the value is not valid; the message names the parameter and the allowed values.
         """
         if self.each_axis and self.between:
             return tuple(numbers(values, self.name, axes, *self.between))
@@ -65,14 +65,14 @@ class Declaration:
         return choice(values, self.name, self.choices) if self.choices else values[self.name]
 
     def row(self) -> str:
-        """Return its row of a README's table: name, default, description."""
+        """Return the row for the README table: name, default, description."""
         default = self.default if isinstance(self.default, str | list) else f"{self.default}".lower()
         text = json.dumps(default) if isinstance(default, list) or not default else default
         fixed = " Read-only." if self.read_only else ""
         return f"| `{self.name}` | `{text}` | {self.description}{fixed} |"
 
     def descriptor(self) -> ParameterDescriptor:
-        """Return what rclpy shows, and checks where it can."""
+        """Return the ROS descriptor, including the range that rclpy checks."""
         described = ParameterDescriptor(
             description=self.description, read_only=self.read_only, dynamic_typing=self.number
         )
@@ -86,19 +86,19 @@ class Declaration:
 
 
 class Parameters(Generic[Settings]):
-    """The parameters of a node and the settings made of them, which change together or not at all.
+    """Node parameters and the settings derived from them, changed atomically.
 
     Parameters
     ----------
     node : Node
     declarations : sequence of Declaration
     make : callable
-        Makes the settings of all values by name; its SlpiError refuses them.
+        Returns the settings for all values by name; raises SlpiError if they are not valid.
 
     Raises
     ------
     UsageError
-        If the values given at the start make no settings.
+        If the values given at the start are not valid.
     """
 
     def __init__(self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]) -> None:
@@ -110,7 +110,7 @@ class Parameters(Generic[Settings]):
         self.settings = make(self._values)
 
     def follow(self, apply: Callable[[Settings], None], check: Callable[[Settings], None] | None = None) -> None:
-        """From now on allow changes that `check` lets pass (it raises SlpiError if not), and `apply` them."""
+        """Allow parameter changes that `check` accepts (else it raises SlpiError); call `apply` with new settings."""
         self._applied, self._checked = apply, check
         self._node.add_on_set_parameters_callback(self._check)
         self._node.add_post_set_parameters_callback(self._apply)
@@ -131,7 +131,7 @@ class Parameters(Generic[Settings]):
             self._applied(self.settings)
 
     def _ours(self, changes: Sequence[Parameter]) -> dict[str, Any]:
-        """Leave out rclpy's own, such as use_sim_time."""
+        """Return the changes without parameters of rclpy, such as use_sim_time."""
         return {change.name: change.value for change in changes if change.name in self._values}
 
 
@@ -147,7 +147,7 @@ def number(values: Values, name: str, low: float, high: float) -> float:
 
 
 def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: float) -> list[float]:
-    """Return the parameter `name` as floats, one for each axis; a single value stands for all of them.
+    """Return the parameter `name` as floats, one for each axis; a single value applies to all axes.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: fl
     """
     given = values[name]
     if isinstance(given, Sequence) and not isinstance(given, str):
-        # Arrays are shown as the lists that they were given as.
+        # Arrays are converted to lists for messages.
         given = several = list(given)
     else:
         several = [given] * len(axes)

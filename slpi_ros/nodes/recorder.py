@@ -1,4 +1,4 @@
-"""Node ``recorder``: topics into a bag, where rosbag2 is not installed."""
+"""Node ``recorder``: records topics into a bag without rosbag2."""
 
 import importlib
 import math
@@ -17,49 +17,49 @@ from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.messages import JOINT_STATE
 from slpi_ros.nodes.common import request_stop, run
 
-# a burst must fit while the disk is slow
+# Queue length for bursts during slow disk writes.
 DEPTH = 10_000
 DISCOVERY_PERIOD = 0.1
-# publishers and subscribers may take seconds to find each other
+# Discovery of publishers may take several seconds.
 PATIENCE = 5.0
 STAGE_STATE = "stage_state"
 _READ_ONLY = ParameterDescriptor(read_only=True, dynamic_typing=True)
 
 
 class Recorder(Node):
-    """Writes topics to a bag until it is stopped.
+    """Record topics into a bag until stopped.
 
-    Subscribes whatever the parameter ``topics`` names, with the reliability and durability that the
-    publishers offer; messages stay serialised. Until the recording is complete the bag is in
-    ``.NAME.partial`` beside its place.
-    Parameters, all read-only: ``output`` (the rosbag2 folder to make), ``topics`` (default
-    ``[stage_state]``), ``storage`` (``mcap`` or ``sqlite3``), ``duration`` (s from the first message; it
-    ends too when none has come 5 s after that time; 0: until a signal).
+    Subscribes the topics named by the parameter ``topics``, with the reliability and durability that the
+    publishers offer; messages are not deserialized. An incomplete bag is kept in ``.NAME.partial`` in
+    the folder of the output.
+    Parameters, all read-only: ``output`` (rosbag2 folder to create), ``topics`` (default ``[stage_state]``),
+    ``storage`` (``mcap`` or ``sqlite3``), ``duration`` (s from the first message; without any message the
+    node stops 5 s after this time; 0: record until a signal).
 
     Raises
     ------
     UsageError
-        If a parameter has a value that makes no recording.
+        If a parameter is not valid.
     RecordError
-        If the bag cannot be made.
+        If the bag cannot be created.
     """
 
     def __init__(self) -> None:
         super().__init__("recorder")
         output = str(self._parameter("output", ""))
         if not output:
-            raise UsageError("recorder: no output; name the bag to make with --ros-args -p output:=FOLDER")
-        # names as other nodes see them, after namespace and remapping
+            raise UsageError("recorder: no output; name the bag with --ros-args -p output:=FOLDER")
+        # Topic names after namespace and remapping.
         self._awaited = {self.resolve_topic_name(topic): topic for topic in self._topics()}
         self._duration = self._seconds()
         storage = str(self._parameter("storage", "mcap"))
         self._bag: BagWriter | None = BagWriter(output, storage=storage, topic=None)
         self._listening: dict[str, Any] = {}
         for name, topic in self._awaited.items():
-            # its type is known, so nothing is lost between the first message and the next look at the graph
+            # Subscribed before discovery, as the type is known, so that no message is lost.
             if topic.rpartition("/")[2] == STAGE_STATE:
                 self._subscribe(name, JOINT_STATE, ())
-        # the clock of a simulation may stand still
+        # A simulated clock may stop.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._discovery = self.create_timer(DISCOVERY_PERIOD, self._discover, clock=self._steady)
         if self._duration:
@@ -80,7 +80,7 @@ class Recorder(Node):
             super().destroy_node()
 
     def _discover(self) -> None:
-        """Subscribe topics whose publishers have appeared, as these publish."""
+        """Subscribe the topics for which publishers have been discovered."""
         for name in list(self._awaited):
             if publishers := self.get_publishers_info_by_topic(name):
                 del self._awaited[name]
@@ -99,7 +99,7 @@ class Recorder(Node):
         return str(types.pop())
 
     def _subscribe(self, name: str, msgtype: str, publishers: Sequence[Any]) -> None:
-        """Subscribe a topic in the way that all its publishers can serve; again if that has changed."""
+        """Subscribe a topic with a QoS that all its publishers offer; resubscribe if that QoS has changed."""
         offers = [publisher.qos_profile for publisher in publishers]
         reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
         latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers) and offers
@@ -135,10 +135,10 @@ class Recorder(Node):
             self._bag = None
 
     def _drain(self) -> None:
-        """Record what came before the end: the executor has stopped, but the middleware still holds it."""
+        """Record the messages still queued in the middleware after the executor has stopped."""
         for name, subscription in self._listening.items():
             with subscription.handle:
-                # a publisher that never rests must not keep us here
+                # Limited, so that continuous publishing cannot delay the end.
                 for _ in range(DEPTH):
                     taken = subscription.handle.take_message(subscription.msg_type, True)
                     if taken is None:
@@ -146,7 +146,7 @@ class Recorder(Node):
                     self._record(name, taken[0])
 
     def _finish(self) -> None:
-        """Put the bag in its place, unless nothing is in it."""
+        """Close the bag and move it to its path; RecordError if it is empty."""
         if self.context.ok():
             self._drain()
         bag, self._bag = self._bag, None
@@ -173,7 +173,7 @@ class Recorder(Node):
     def _seconds(self) -> float:
         duration = self._parameter("duration", 0.0)
         if isinstance(duration, bool) or not isinstance(duration, int | float):
-            raise UsageError(f"recorder: duration is {duration!r}; give seconds, or 0 for no end")
+            raise UsageError(f"recorder: duration is {duration!r}; give seconds, or 0 to record until stopped")
         if not (math.isfinite(duration) and duration >= 0):
             raise UsageError(f"recorder: duration is {duration} s; give 0 or more")
         return float(duration)
@@ -185,7 +185,7 @@ def _message_class(topic: str, msgtype: str) -> Any:
         return getattr(importlib.import_module(f"{package}.{kind}"), name)
     except (ImportError, AttributeError) as error:
         raise RecordError(
-            f"recorder: {topic} is {msgtype}, which is not installed; source its workspace or leave it out"
+            f"recorder: {topic} is {msgtype}, which is not installed; source its workspace or omit the topic"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Node ``stage_simulator``: a stage that exists only as relays, answering voltages with displacements."""
+"""Node ``stage_simulator``: a simulated stage that publishes displacements for voltage commands."""
 
 import math
 import sys
@@ -16,38 +16,38 @@ from slpi_ros.simulation.stage import Stage, p11_stage
 
 LOG_PERIOD = 5.0
 RATE_MAX = 10e3
-# Seconds; after that creep is over.
+# Seconds; creep has decayed after this time.
 DAY = 86_400.0
 _READ_ONLY = ParameterDescriptor(read_only=True)
-# Otherwise ROS refuses 100 where 100.0 is meant.
+# Dynamic typing, so that ROS accepts 100 for 100.0.
 _NUMBER = ParameterDescriptor(read_only=True, dynamic_typing=True)
 
 
 class StageSimulator(Node):
-    """A simulated stage behind the topics of a real one.
+    """Simulate a stage with the topics of a real one.
 
     Subscribes ``voltage_command`` (std_msgs/Float64MultiArray, volts in the order of the axes) and publishes
     ``stage_state`` (sensor_msgs/JointState: ``position`` in metres as measured, ``effort`` in volts as
     applied).
     Parameters, all read-only: ``axes``, ``seed``, ``preset``, ``noise_rms`` (m), ``rate`` (Hz), ``voltage_min`` and
     ``voltage_max`` (V; commands beyond them are clipped, as the amplifier saturates), ``hardware_id`` (by default
-    ``simulated-`` with the preset, or the seed where there is none), ``initial_history`` (V; all axes went through
-    these voltages a day before and rested at 0 V since, so that a restart may find the stage as it was left), and
-    ``answer_commands``: publish one state for each accepted command, or, when false, `rate` states a second.
+    ``simulated-`` with the preset, or the seed without a preset), ``initial_history`` (V; voltages applied to all axes
+    one day before the start, followed by 0 V, to reproduce the state of an earlier run), and
+    ``answer_commands``: publish one state for each accepted command, or, if false, `rate` states per second.
 
-    Without preset the stage is drawn from the seed, and only its hysteresis counts. Preset "p11" is the creeping and
-    ringing stage of the MPI paper, axes x and y, with noise of its own, of which the seed is; it lives on the node's
-    clock, so that a simulated one may drive it.
+    Without preset the stage has random hysteresis for the given seed and no other effects. Preset "p11" is the stage of
+    the MPI paper with creep and resonance, axes x and y, and its own sensor noise, drawn from the seed; it uses the
+    node's clock, which may be a simulated one.
 
     Attributes
     ----------
     ignored : int
-        Commands that were ignored because of their length or because they held a value that is not finite.
+        Number of commands ignored because of a wrong length or a value that is not finite.
 
     Raises
     ------
     UsageError
-        If a parameter has a value of which no stage can be made.
+        If a parameter is not valid.
     """
 
     def __init__(self) -> None:
@@ -85,7 +85,7 @@ class StageSimulator(Node):
             self._publish()
 
     def _apply(self, voltages: Sequence[float]) -> None:
-        # Whatever the clock does, a stage has no way back.
+        # The time of the stage never decreases, even if the clock is set back.
         self._latest = max(self._latest, self.get_clock().now().nanoseconds * 1e-9)
         self._displacement = self._stage.step(self._latest, voltages)
         self._state.effort = array("d", voltages)
@@ -114,16 +114,16 @@ class StageSimulator(Node):
         stage = p11_stage(seed)
         if axes != list(stage.axes):
             raise UsageError(
-                f"stage_simulator: axes are {', '.join(axes)}, those of preset p11 {', '.join(stage.axes)}; name these"
+                f"stage_simulator: axes are {', '.join(axes)}, preset p11 has {', '.join(stage.axes)}; use these"
             )
         return stage
 
     def _hardware_id(self) -> str:
-        """Return a name for each stage that is another one; the seed of a preset is only that of its noise."""
+        """Return an id for the simulated stage; the seed of a preset only affects noise and is not included."""
         return f"simulated-{self.get_parameter('preset').value or self.get_parameter('seed').value}"
 
     def _initial_history(self) -> list[float]:
-        # A stage that has stayed at 0 V has never been driven.
+        # Default: a stage that has always been at 0 V.
         given = self.declare_parameter("initial_history", [0.0], _NUMBER).value
         history = list(given) if isinstance(given, Sequence | array) and not isinstance(given, str) else [math.nan]
         if not all(self._low <= v <= self._high for v in history):
@@ -162,7 +162,7 @@ class StageSimulator(Node):
 
 
 def main() -> int:
-    """Run the node until it is told to stop.
+    """Run the node until it is stopped.
 
     Returns
     -------

@@ -54,7 +54,7 @@ def test_the_next_life_starts_from_the_voltages_given_last(kept):
         client.connect()
         status, values = client.report(memory="assumed")
         assert "restored from before a crash" in status.message
-        assert "turns just before may be missing" in values["x.memory_doubt"]
+        assert "reversals may be missing" in values["x.memory_doubt"]
         # What has just been given may not be noted yet. No time has passed at the first sample: nothing moves.
         found = [float(values[f"{axis}.voltage_V"]) for axis in AXES]
         assert any(found == pytest.approx(each, abs=1e-4) for each in given)

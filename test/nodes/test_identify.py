@@ -29,13 +29,14 @@ from nodes.ros_helpers import (  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from slpi_ros.errors import RecordError  # noqa: E402
 from slpi_ros.identification.fit import identify  # noqa: E402
 from slpi_ros.io.bag_reader import read_bag  # noqa: E402
 from slpi_ros.io.bag_writer import write_bag  # noqa: E402
 from slpi_ros.io.record import Record  # noqa: E402
 from slpi_ros.io.schemas import validate  # noqa: E402
-from slpi_ros.model.document import load_model, parse_model  # noqa: E402
-from slpi_ros.nodes.jobs import FitProcess, FitRequest  # noqa: E402
+from slpi_ros.model.document import format_model, load_model, parse_model  # noqa: E402
+from slpi_ros.nodes.jobs import DiagnosisRequest, FitProcess, FitRequest, judge  # noqa: E402
 
 NAME = "/identify: identify"
 # Quick to fit, and needs no better.
@@ -68,12 +69,6 @@ def bag(tmp_path_factory) -> str:
 def humming_bag(tmp_path_factory) -> str:
     """Return a bag long enough to be diagnosed."""
     return write_calibration(tmp_path_factory.mktemp("bags") / "humming", samples=1500, hum=100e-9)
-
-
-@pytest.fixture(scope="module")
-def second_humming_bag(tmp_path_factory) -> str:
-    """Return another bag of that stage, driven otherwise."""
-    return write_calibration(tmp_path_factory.mktemp("bags") / "second", seed=2, samples=1500, hum=100e-9)
 
 
 @dataclass
@@ -307,9 +302,8 @@ def test_trigger_without_anything_to_do():
         assert not answer.success and "no bag" in answer.message
 
 
-def test_a_diagnosis_of_the_model_in_use_over_all_its_bags(humming_bag, second_humming_bag, tmp_path):
-    bags = [humming_bag, second_humming_bag]
-    with identifying(bags=bags, kind="slpi", output=str(tmp_path / "stage.json")) as client:
+def test_a_diagnosis_of_the_model_in_use(humming_bag, tmp_path):
+    with identifying(bags=[humming_bag], kind="slpi", output=str(tmp_path / "stage.json")) as client:
         client.identified()
         assert client.diagnosis("none")["diagnosis.folder"] == ""
         answer = client.diagnose()
@@ -317,21 +311,30 @@ def test_a_diagnosis_of_the_model_in_use_over_all_its_bags(humming_bag, second_h
         assert answer.success and "x: named: Found: hum" in answer.message and "\n" not in answer.message
         assert str(folder / "report.html") in answer.message and str(folder / "extended_model.json") in answer.message
         # Reports went on meanwhile.
-        assert client.diagnosis("diagnosing")["diagnosis.bag"] == ", ".join(bags)
+        assert client.diagnosis("diagnosing")["diagnosis.bag"] == humming_bag
         done = client.diagnosis("done")
         assert done["x.verdict"] == "named" and done["diagnosis.folder"] == str(folder)
         document = json.loads((folder / "diagnosis.json").read_text())
         validate(document, "diagnosis", "test")
-        found = document["axes"]["x"]
-        assert [effect["name"] for effect in found["effects"]] == ["hum"]
-        assert [record["source"] for record in found["records"]] == bags
-        assert all(record["left_out_rms_m"] > 0.0 for record in found["records"])
-        # The phase of a hum is each record's own.
-        assert not load_model(folder / "extended_model.json").axes["x"].effects
+        assert [effect["name"] for effect in document["axes"]["x"]["effects"]] == ["hum"]
+        assert load_model(folder / "extended_model.json").axes["x"].effects
         assert (folder / "report.html").read_text().startswith("<!doctype html>")
         # What is running stays as it is.
         assert len(client.models) == 1 and not parse_model(client.models[0].data, "test").axes["x"].effects
         assert "Traceback" not in client.node.stderr
+
+
+def test_a_diagnosis_reads_all_bags_of_the_fit(bag, humming_bag, tmp_path, monkeypatch):
+    seen = []
+
+    def diagnosed(records, model):
+        seen.extend(record.source for record in records)
+        raise RecordError("enough")
+
+    monkeypatch.setattr("slpi_ros.nodes.jobs.diagnose", diagnosed)
+    document = format_model(identify(read_bag(bag), "pi"))
+    outcome = judge(DiagnosisRequest((bag, humming_bag), "stage_state", document, str(tmp_path)))
+    assert outcome.error == "enough" and seen == [bag, humming_bag]
 
 
 def test_a_diagnosis_that_cannot_be_is_told(bag, tmp_path):
@@ -396,15 +399,15 @@ def test_an_endless_identification_blocks_nothing_and_leaves_nothing(bag, number
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds processes in /proc")
-def test_an_endless_diagnosis_blocks_nothing_and_leaves_nothing(bag, tmp_path):
-    with identifying(bags=[bag], diagnosis_directory=str(tmp_path)) as client:
+def test_an_endless_diagnosis_blocks_nothing_and_leaves_nothing(bag, humming_bag, tmp_path):
+    with identifying(bags=[bag, humming_bag], diagnosis_directory=str(tmp_path)) as client:
         client.identified()
         asked = client.graph.node.create_client(Trigger, "/identify/diagnose")
         client.graph.spin_until(asked.service_is_ready, "the service")
         answers = [asked.call_async(Trigger.Request())]
         (worker,) = client.graph.spin_until(lambda: children(client.node.process.pid), "the worker")
         os.kill(worker, signal.SIGSTOP)
-        client.diagnosis("diagnosing")
+        assert client.diagnosis("diagnosing")["diagnosis.bag"] == f"{bag}, {humming_bag}"
         # Who asks meanwhile waits for the same one; bags are identified as ever.
         answers.append(asked.call_async(Trigger.Request()))
         assert client.graph.call(Trigger, "/identify/identify", Trigger.Request()).success

@@ -241,8 +241,7 @@ def _limits(values: Mapping[str, Any]) -> tuple[Limits, ...]:
     for name, low, high in zip(values["axes"], values["voltage_min"], values["voltage_max"], strict=True):
         if not low < high:
             raise UsageError(
-                f"axis '{name}': voltage_min {low:g} V is not below voltage_max {high:g} V; "
-                "correct one of the two"
+                f"axis '{name}': voltage_min {low:g} V is not below voltage_max {high:g} V; correct one of the two"
             )
     each = (values[name] for name in ("voltage_min", "voltage_max", "slew_limit", "acceleration_limit"))
     return tuple(

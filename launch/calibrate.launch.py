@@ -1,4 +1,4 @@
-"""A calibration record: the exciter drives the stage, the recorder keeps what it does, and both end together.
+"""Record a calibration bag: the exciter excites the stage, the recorder stores it, and both end together.
 
 ros2 launch slpi_ros calibrate.launch.py params_file:=exciter.yaml bag:=calibration
 """
@@ -32,19 +32,19 @@ def generate_launch_description() -> LaunchDescription:
             ("voltage_command", LaunchConfiguration("voltage_topic")),
             ("stage_state", LaunchConfiguration("state_topic")),
         ],
-        # The way back to rest may take longer than launch is used to wait.
+        # The return to the initial voltage may exceed the default timeout of launch.
         sigterm_timeout="60",
         sigkill_timeout="60",
         output="screen",
     )
     return LaunchDescription([
         DeclareLaunchArgument("params_file", description="parameters of the exciter: see config/exciter.yaml"),
-        DeclareLaunchArgument("bag", description="folder of the bag to be made"),
-        DeclareLaunchArgument("namespace", default_value="", description="of the nodes and their topics"),
+        DeclareLaunchArgument("bag", description="folder of the bag to create"),
+        DeclareLaunchArgument("namespace", default_value="", description="namespace of the nodes and their topics"),
         DeclareLaunchArgument(
-            "voltage_topic", default_value="voltage_command", description="where voltages go: a controller's commands"
+            "voltage_topic", default_value="voltage_command", description="topic of the voltage commands"
         ),
-        DeclareLaunchArgument("state_topic", default_value="stage_state", description="of the stage's driver"),
+        DeclareLaunchArgument("state_topic", default_value="stage_state", description="topic of the stage state"),
         recorder,
         exciter,
         RegisterEventHandler(OnProcessExit(target_action=exciter, on_exit=[EmitEvent(event=Shutdown())])),

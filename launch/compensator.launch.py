@@ -1,4 +1,4 @@
-"""One compensator: ros2 launch slpi_ros compensator.launch.py params_file:=... model_file:=..."""
+"""Start one compensator: ros2 launch slpi_ros compensator.launch.py params_file:=... model_file:=..."""
 
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition, UnlessCondition
@@ -20,9 +20,9 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription([
         DeclareLaunchArgument("params_file", default_value=ONE_AXIS, description="parameters of the compensator"),
         DeclareLaunchArgument("model_file", default_value="", description="model document, if not in params_file"),
-        DeclareLaunchArgument("namespace", default_value="", description="of the node and its topics"),
+        DeclareLaunchArgument("namespace", default_value="", description="namespace of the node and its topics"),
         DeclareLaunchArgument(
-            "voltage_topic", default_value="voltage_command", description="where voltages go: a controller's commands"
+            "voltage_topic", default_value="voltage_command", description="topic of the voltage commands"
         ),
         compensator(as_in_params_file, IfCondition(no_model_file)),
         compensator(with_model_file, UnlessCondition(no_model_file)),

@@ -1,8 +1,8 @@
-"""A simulated stage, its compensator, and the identification of a bag.
+"""Start a simulated stage, a compensator, and the identification of a bag.
 
-ros2 launch slpi_ros demo.launch.py                                  stage and compensator, which waits for a model
-ros2 bag record /stage_state -o calibration                          while voltages go to /voltage_command
-ros2 param set /identify bags "['calibration']"                      the compensator has its model
+ros2 launch slpi_ros demo.launch.py                                  start stage and compensator without a model
+ros2 bag record /stage_state -o calibration                          record while /voltage_command is published
+ros2 param set /identify bags "['calibration']"                      identify and load the model
 """
 
 from launch.actions import DeclareLaunchArgument
@@ -17,11 +17,11 @@ ONE_AXIS = PathJoinSubstitution([FindPackageShare("slpi_ros"), "config", "one_ax
 
 
 def generate_launch_description() -> LaunchDescription:
-    # Written as YAML: a bare list would be taken for the pieces of one string.
+    # Written as YAML: launch would concatenate a plain list to one string.
     bags = ParameterValue(["['", LaunchConfiguration("bag"), "']"], value_type=list[str])
     return LaunchDescription([
         DeclareLaunchArgument("bag", default_value="", description="recorded calibration to identify at once"),
-        DeclareLaunchArgument("namespace", default_value="", description="of all nodes and their topics"),
+        DeclareLaunchArgument("namespace", default_value="", description="namespace of all nodes and their topics"),
         Node(
             package="slpi_ros",
             executable="stage_simulator",

@@ -1,4 +1,4 @@
-"""The model of one axis: a hysteresis model, the effects around it, where its memory starts, what it comes from."""
+"""Model of one axis: hysteresis model, effects, initial history, and fit quality."""
 
 import warnings
 from collections.abc import Mapping
@@ -27,25 +27,25 @@ Mask = NDArray[np.bool_]
 StartMemory = Literal["end", "start", "wiped"]
 START_MEMORIES: tuple[StartMemory, ...] = ("end", "start", "wiped")
 
-# Turning voltages kept in a document.
+# Maximum number of reversal voltages in a document.
 MOST_TURNS = 1000
-# Cycles of the decaying drive after which the memory is taken for wiped.
+# Cycles of the decaying oscillation of a reset.
 WIPING_CYCLES = 10
 
 
 @dataclass(frozen=True)
 class Start:
-    """A state of the memory: at `voltage` (V) and `displacement` (m), after `history`.
+    """Initial state of the hysteresis memory: `voltage` and `displacement` after `history`.
 
     Parameters
     ----------
     voltage : float, volts
     displacement : float, metres
     history : tuple of float, volts
-        Voltages at which the drive turned before, oldest first. Empty: the stage has never been moved.
+        Earlier reversal voltages, oldest first. Empty (default): the stage has never been moved.
     from_rest : bool
-        True: the stage had never been moved before it left the first voltage of `history`. False: a long fall to that
-        voltage wiped the memory.
+        True: the stage was never moved before it left the first voltage of `history`. False (default): a long descent
+        to that voltage erased the memory.
     """
 
     voltage: float
@@ -56,20 +56,20 @@ class Start:
 
 @dataclass(frozen=True)
 class FitQuality:
-    """How well the model describes the record it comes from, free-run, metres.
+    """Free-run error of the model on the record of its identification.
 
     Parameters
     ----------
     rms, maximum : float, metres
-        Error over the samples fitted.
+        Error of the fitted samples.
     held_out_rms : float, metres
-        Error over blocks left out of the fit, from cross-validation.
+        Held-out error, from cross-validation.
     floor_rms : float, metres
-        Noise of the sensor, estimated from the record.
+        Repeatability floor, estimated from the record.
     samples : int
-        Samples fitted.
+        Number of fitted samples.
     covered : float
-        Share of the surface's cells that the record visited, 0..1.
+        Share of the cells of the Everett function that the record visited, 0..1.
     source : str
         The record.
     """
@@ -85,7 +85,7 @@ class FitQuality:
 
 @dataclass(frozen=True)
 class AxisModel:
-    """One axis.
+    """Model of one axis: hysteresis and effects, simulated, inverted or streamed.
 
     Parameters
     ----------
@@ -93,21 +93,21 @@ class AxisModel:
         Name of the hysteresis model.
     hysteresis : Hysteresis
     start : Start
-        The memory where the record began.
+        Initial history of the record.
     voltage_range : (float, float), volts
     displacement_range : (float, float), metres
-        What the record covered. `compensate` keeps to these voltages.
+        Ranges covered by the record. `compensate` gives no voltage outside.
     quality : FitQuality
     effects : tuple of Effect
-        What the stage does beside its hysteresis, in the order in which it acts.
+        Effects besides the hysteresis, in the order in which the effects act; default: none.
     end : Start, optional
-        The memory where the record ended, the last one of several. None: not known, as in older documents, and for
-        kinds that are not causal.
+        Memory at the end of the (last) record. None (default): unknown, as in older documents and for kinds that are
+        not causal.
 
     Raises
     ------
     ModelError
-        If an effect comes twice.
+        If an effect occurs twice.
     """
 
     kind: str
@@ -125,17 +125,17 @@ class AxisModel:
 
     @property
     def causal(self) -> bool:
-        """Whether the model can follow a path that is not known in advance."""
+        """Whether the model allows streaming, without future samples."""
         return not isinstance(self.hysteresis, PathModel)
 
     def initial(self, start_memory: StartMemory) -> Start:
-        """Return the state of the memory that a drive starts from.
+        """Return the initial history named by `start_memory`.
 
         Parameters
         ----------
         start_memory : str
             ``end`` of the record (its start where the end is not known), ``start`` of it, or ``wiped``: after a
-            decaying drive over the identified voltages to 0 V, or the identified voltage nearest to that.
+            decaying oscillation over the identified voltages to 0 V, or to the nearest identified voltage.
 
         Raises
         ------
@@ -153,7 +153,7 @@ class AxisModel:
         raise UsageError(f"start_memory is '{start_memory}'; give one of {', '.join(START_MEMORIES)}")
 
     def memory(self, start_memory: StartMemory = "end") -> Memory:
-        """Return a fresh memory in the state that `start_memory` names, see `initial`.
+        """Return a new memory in the initial history `start_memory`, see `initial`.
 
         Raises
         ------
@@ -162,14 +162,14 @@ class AxisModel:
         """
         if isinstance(self.hysteresis, PathModel):
             raise UsageError(
-                f"kind '{self.kind}' needs the whole path in advance and cannot follow it sample by sample; "
-                "give it a whole path, or identify kind 'slpi'"
+                f"kind '{self.kind}' needs the complete path in advance and does not allow streaming; "
+                "pass the complete path, or identify kind 'slpi'"
             )
         start = self.initial(start_memory)
         if not start.history:
             return Memory(self.hysteresis, start.voltage, start.displacement)
         first, *turns = (*start.history, start.voltage)
-        # Displacement is known at the end of the history: walk it once to learn how far it leads.
+        # The displacement is known at the end of the history: simulate it once for that at its start.
         primed = not start.from_rest
         way = Memory(self.hysteresis, first, 0.0, primed=primed).forward_array(np.array([first, *turns]))[-1]
         memory = Memory(self.hysteresis, first, start.displacement - float(way), primed=primed)
@@ -178,19 +178,19 @@ class AxisModel:
         return memory
 
     def after(self, u: FloatArray, start_memory: StartMemory = "start") -> Start:
-        """Return the state of the memory after a drive, reduced to the turns that are still remembered.
+        """Return the state of the memory after a voltage signal, reduced to the remembered reversals.
 
         Parameters
         ----------
         u : ndarray, shape (N,), volts
             Voltages that reach the hysteresis.
         start_memory : str
-            Where the drive starts; see `initial`.
+            Initial history, see `initial`; default "start".
 
         Returns
         -------
         Start
-            Of at most `MOST_TURNS` turns; some of the nested loops are left out where there are more.
+            With at most `MOST_TURNS` reversals; beyond that some of the nested loops are omitted.
 
         Raises
         ------
@@ -203,34 +203,34 @@ class AxisModel:
         if not state.direction:
             return Start(state.voltage, state.displacement)
         from_rest = start.from_rest or not start.history
-        # A primed memory remembers a fall from farther than any stage has been.
+        # A primed memory contains a reversal far outside the voltage range of any stage.
         turns = tuple(v for v in state.turn_voltages if abs(v) < FAR / 2)
         if from_rest:
             turns = ((*start.history, start.voltage)[0], *turns)
         if len(turns) > MOST_TURNS:
-            # Loops are left out whole, evenly over the nested ones, so that every turn still changes the direction.
+            # Complete loops are omitted, evenly over the nested ones, so that the directions still alternate.
             loops = np.unique(np.linspace(0, len(turns) // 2 - 1, MOST_TURNS // 2 - 1).astype(np.int64)) * 2
             turns = tuple(turns[i] for first in loops for i in (first, first + 1)) + turns[len(turns) // 2 * 2 :]
         return Start(state.voltage, state.displacement, turns or (state.voltage,), from_rest)
 
     def stream(self, limits: Limits | None = None, start_memory: StartMemory = "end") -> StreamingInverse:
-        """Return a fresh stream within `limits` and the identified voltages; it starts as `initial` says."""
+        """Return a streaming inverse within `limits` and the identified voltages, from `initial(start_memory)`."""
         return self.stream_from(self.memory(start_memory), self._allowed(limits))
 
     def stream_from(self, memory: Memory, allowed: Limits) -> StreamingInverse:
-        """Return a stream that goes on from a memory of this axis; its effects are at rest there."""
+        """Return a streaming inverse that continues from a memory of this axis; the effects start at rest."""
         middle = self._middle if self.chain.rate_dependence else None
         return StreamingInverse(memory, self.displacement_range, allowed, self.effects, middle)
 
     def simulate(self, t: FloatArray, v: FloatArray) -> FloatArray:
         """Return the displacement, shape (N,), metres, for the voltage `v`, shape (N,), volts, at times `t` (s).
 
-        Other axes rest. Time does not matter to a model without effects.
+        Other axes are at rest. Without effects the time is ignored.
         """
         return self.seen(t, self.uncoupled_displacement(t, v), {})
 
     def uncoupled_displacement(self, t: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the displacement, shape (N,), metres, that the voltage alone gives: before other axes come in."""
+        """Return the displacement, shape (N,), metres, for `v`, shape (N,), volts, without cross-coupling."""
         if not self.effects:
             return self._forward_array(v)
         around = EffectContext(t - t[:1])
@@ -243,25 +243,25 @@ class AxisModel:
         )
 
     def seen(self, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
-        """Return the displacement that a sensor sees, shape (N,), metres.
+        """Return the displacement as measured by the sensor, shape (N,), metres.
 
         Parameters
         ----------
         t : ndarray, shape (N,), seconds
         own : ndarray, shape (N,), metres
-            What `uncoupled_displacement` gives.
+            Result of `uncoupled_displacement`.
         others : mapping of axis name to ndarray, shape (N,), metres
-            Own motions of the other axes from their start.
+            Motion of each other axis from its start, without cross-coupling.
         """
         return forward(self.chain.shared, own, EffectContext(t - t[:1], others=others)) if self.effects else own
 
     def compensate(
         self, t: FloatArray, y: FloatArray, limits: Limits | None = None, start_memory: StartMemory = "end"
     ) -> tuple[FloatArray, Mask]:
-        """Return the voltage for a desired displacement `y`, shape (N,), metres, and where it waits at a limit.
+        """Return the voltage for a desired displacement `y`, shape (N,), metres, and where it is held at a limit.
 
-        Other axes rest. Time `t`, shape (N,), seconds, does not matter to a model without effects. The memory starts as
-        `initial` says.
+        Other axes are at rest. Time `t`, shape (N,), seconds, is ignored without effects. The initial history is
+        `initial(start_memory)`.
 
         Raises
         ------
@@ -273,7 +273,7 @@ class AxisModel:
         return self.command(t, self.remove_sensor_effects(t, y), limits, start_memory)
 
     def remove_sensor_effects(self, t: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the own displacement, shape (N,), metres, for a desired one, shape (N,), metres; other axes rest.
+        """Return the own displacement, shape (N,), metres, for a desired one, shape (N,), metres; other axes at rest.
 
         Raises
         ------
@@ -291,7 +291,7 @@ class AxisModel:
     def command(
         self, t: FloatArray, own: FloatArray, limits: Limits | None = None, start_memory: StartMemory = "end"
     ) -> tuple[FloatArray, Mask]:
-        """Return the voltage for an own displacement, shape (N,), metres, and where it waits at a limit."""
+        """Return the voltage for an own displacement, shape (N,), metres, and where it is held at a limit."""
         if start_memory != "start":
             return replace(self, start=self.initial(start_memory)).command(t, own, limits, "start")
         allowed = self._allowed(limits)
@@ -309,7 +309,7 @@ class AxisModel:
     def _through_play(
         self, around: EffectContext, own: FloatArray, allowed: Limits, between: Limits
     ) -> tuple[FloatArray, Mask]:
-        """Return what `command` does where the hysteresis sees the voltage through a play: one sample after another."""
+        """Return the result of `command` for a play before the hysteresis, computed sample by sample."""
         chain = self.chain
         h = backward(chain.own, own, around)
         stream = StreamingInverse(self.memory("start"), self.displacement_range, between, chain.before[-1:])
@@ -327,7 +327,7 @@ class AxisModel:
 
     @cached_property
     def chain(self) -> Chain:
-        """The effects in their places."""
+        """The chain of effects around the hysteresis."""
         return Chain.of(self.effects)
 
     @cached_property
@@ -343,28 +343,28 @@ class AxisModel:
         return (self._known_path() or self.memory("start")).forward_array(v)
 
     def _known_path(self) -> slpi.KnownPath | smpi.KnownPath | None:
-        """Return what moves a model that is not causal along whole paths."""
+        """Return the path operator of a model that is not causal; None for a causal one."""
         if isinstance(self.hysteresis, PathModel):
             return self.hysteresis.along(self.start.voltage, self.start.displacement)
         return None
 
     def _path(self, allowed: Limits) -> slpi.KnownPath | smpi.KnownPath | Memory:
-        """Return what moves the hysteresis from the start on, within voltages that are `allowed`."""
-        # The axis may rest outside its limits; the first voltage it is given is inside.
+        """Return the hysteresis operator at the start, within the `allowed` voltages."""
+        # The axis may start outside its limits; the first output voltage is inside.
         return self._known_path() or StreamingInverse(self.memory("start"), self.displacement_range, allowed).memory
 
     def _invert_hysteresis(self, h: FloatArray, allowed: Limits) -> tuple[FloatArray, Mask]:
-        """Return the voltage for a displacement without effects, shape (N,), metres, and where it waits at a limit."""
+        """Return the voltage for a displacement without effects, (N,), metres, and where it is held at a limit."""
         u = self._path(allowed).inverse_array(h, allowed.lower, allowed.upper)
         return u, self._missed(h, u, allowed)
 
     def _missed(self, h: FloatArray, u: FloatArray, allowed: Limits) -> Mask:
-        """Return where a voltage at a limit does not give the wanted displacement."""
+        """Return where a voltage at a limit does not give the desired displacement."""
         held = (u <= allowed.lower) | (u >= allowed.upper)
         if held.any():
-            # At a limit a desired displacement may just be met.
+            # A desired displacement may be reached exactly at a limit.
             with warnings.catch_warnings():
-                # What stands in for loops that were never identified has been said.
+                # The warning for loops that were not identified has already been issued.
                 warnings.simplefilter("ignore", slpi.UnidentifiedLoopWarning)
                 missed = self._path(allowed).forward_array(u) - h
             low, high = self.displacement_range

@@ -1,4 +1,4 @@
-"""Model documents: JSON in and out, validated; the same text on disk and on the topic ``stage_model``."""
+"""Read and write validated JSON model documents, on disk and for the topic ``stage_model``."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.stage_model import StageModel
 
 SCHEMA = "slpi_ros/model/1"
-# Characters; a model of many axes has a few hundred thousand.
+# Maximum length of a document, characters; a model of many axes has a few hundred thousand.
 LONGEST = 50_000_000
 
 
@@ -40,7 +40,7 @@ def load_model(path: str | os.PathLike[str]) -> StageModel:
         with Path(path).open(encoding="utf-8") as file:
             text = file.read(LONGEST + 1)
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not text, or the name is no file's"
+        reason = error.strerror if isinstance(error, OSError) else "it is not a text file"
         raise ModelError(f"{path}: cannot read a model: {reason}; give a file written by 'slpi identify'") from None
     if len(text) > LONGEST:
         raise ModelError(f"{path}: longer than any model document; give a file written by 'slpi identify'")
@@ -48,7 +48,7 @@ def load_model(path: str | os.PathLike[str]) -> StageModel:
 
 
 def save_model(model: StageModel, path: str | os.PathLike[str]) -> None:
-    """Write a model document to a file, all of it or nothing.
+    """Write a model document to a file atomically.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def parse_model(text: str, source: str) -> StageModel:
         If the text is not a valid model document of this version.
     """
     try:
-        # The engine works with finite numbers only: NaN, Infinity and 1e400 are refused where they are read.
+        # Only finite numbers are valid: NaN, Infinity and 1e400 are refused at parsing.
         document = json.loads(text, parse_float=_finite, parse_int=_whole, parse_constant=_finite)
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{source}: not a model document: {error}; give a file written by 'slpi identify'") from None
@@ -90,7 +90,7 @@ def model_from(document: dict[str, Any], source: str) -> StageModel:
     Raises
     ------
     ModelError
-        If its numbers contradict each other.
+        If the numbers are inconsistent.
     """
     try:
         axes = {name: _axis_from(axis) for name, axis in document["axes"].items()}
@@ -100,7 +100,7 @@ def model_from(document: dict[str, Any], source: str) -> StageModel:
 
 
 def format_model(model: StageModel) -> str:
-    """Return the text of a model's document."""
+    """Return the JSON text of a model document."""
     document = {
         "schema": SCHEMA,
         "hardware_id": model.hardware_id,

@@ -1,4 +1,4 @@
-"""The model of a stage: one for each axis, and how the axes move along with each other."""
+"""Model of a stage: the models of all axes and their cross-coupling."""
 
 import warnings
 from collections.abc import Iterator, Mapping
@@ -21,20 +21,20 @@ Signal = ArrayLike | Mapping[str, ArrayLike]
 
 
 class HeldAtLimitWarning(UserWarning):
-    """Some desired displacements are out of reach and were held at a voltage limit."""
+    """Some desired displacements are not reachable; the voltage was held at a limit."""
 
 
 @dataclass(frozen=True)
 class StageModel:
-    """The model of a stage, as a model document holds it.
+    """Model of all axes of a stage, as stored in a model document.
 
     Parameters
     ----------
     axes : mapping of axis name to AxisModel
     hardware_id : str
-        The stage it was identified on; "" when unknown.
+        Hardware id of the identified stage; "" (default) if unknown.
     created : str
-        ISO 8601 time of identification, UTC.
+        ISO 8601 time of identification, UTC; "" (default) if unknown.
     """
 
     axes: Mapping[str, AxisModel]
@@ -42,20 +42,20 @@ class StageModel:
     created: str = ""
 
     def axis(self, name: str) -> AxisModel:
-        """Return one axis; UsageError when the model does not hold it."""
+        """Return the model of one axis; UsageError if there is no such axis."""
         if name not in self.axes:
             raise UsageError(f"the model has no axis '{name}'; it holds {', '.join(self.axes)}")
         return self.axes[name]
 
     def simulate(self, t: ArrayLike, v: Signal) -> Any:
-        """Return the displacement that a voltage gives, free-run from the model's start.
+        """Return the displacement for a voltage signal, free-run from the initial history of the record.
 
         Parameters
         ----------
         t : array_like, shape (N,), seconds
             Not decreasing.
         v : array_like, shape (N,), or mapping of axis name to array_like, shape (N,), volts
-            A bare array stands for the model's only axis.
+            An array without axis name is allowed for a model with one axis.
 
         Returns
         -------
@@ -65,7 +65,7 @@ class StageModel:
         Raises
         ------
         SlpiError
-            If axes, lengths or values do not fit.
+            If axes, lengths or values are not consistent.
         """
         time, voltage = self._signals(t, v, "voltage")
         own: dict[str, FloatArray] = {}
@@ -77,7 +77,7 @@ class StageModel:
         return seen if isinstance(v, Mapping) else next(iter(seen.values()))
 
     def compensate(self, t: ArrayLike, y: Signal, start_memory: StartMemory = "end") -> Any:
-        """Return the voltage that gives a desired displacement; the inverse of `simulate` where both start alike.
+        """Return the voltage for a desired displacement: the inverse of `simulate` from the same initial history.
 
         Parameters
         ----------
@@ -85,21 +85,21 @@ class StageModel:
             Not decreasing.
         y : array_like, shape (N,), or mapping of axis name to array_like, shape (N,), metres
         start_memory : str
-            The memory that the stage is taken to have: ``end`` of the record (default), ``start`` of it, or ``wiped``;
-            see `AxisModel.initial`.
+            Assumed initial history: ``end`` (default) or ``start`` of the record, or ``wiped``; see
+            `AxisModel.initial`.
 
         Returns
         -------
         ndarray, shape (N,), or dict of axis name to ndarray, shape (N,), volts
-            In the form of `y`, within the identified voltages. Displacements just out of reach wait at the limit,
-            with a `HeldAtLimitWarning`.
+            In the form of `y`, within the identified voltages. For displacements slightly out of reach the voltage is
+            held at the limit, with a `HeldAtLimitWarning`.
 
         Raises
         ------
         UnreachableError
             If a displacement lies far outside the identified ones.
         SlpiError
-            If axes, lengths or values do not fit.
+            If axes, lengths or values are not consistent.
         """
         answers = self.command(t, y, start_memory=start_memory)
         for _, held in answers.values():
@@ -111,14 +111,14 @@ class StageModel:
     def command(
         self, t: ArrayLike, y: Signal, limits: Limits | None = None, start_memory: StartMemory = "end"
     ) -> dict[str, tuple[FloatArray, Mask]]:
-        """Return the voltage that gives a desired displacement, and where it waits at a limit.
+        """Return the voltage for a desired displacement, and where the voltage is held at a limit.
 
         Parameters
         ----------
         t, y, start_memory
             As in `compensate`.
         limits : Limits, optional
-            Of every axis; the identified voltages are never left.
+            Limits of every axis, within the identified voltages; default: the identified voltages.
 
         Returns
         -------
@@ -147,7 +147,7 @@ class StageModel:
     def stream(self, axis: str, start_memory: StartMemory = "end") -> StreamingInverse:
         """Return a causal compensator of one axis: ``step(t, y) -> v``, seconds and metres to volts.
 
-        Other axes are taken to rest; `start_memory` is as in `compensate`.
+        Other axes are assumed at rest; `start_memory` is as in `compensate`.
         """
         return self.axis(axis).stream(start_memory=start_memory)
 
@@ -157,23 +157,23 @@ class StageModel:
         Raises
         ------
         UsageError
-            If a model is not causal.
+            If the model of an axis is not causal.
         """
         streams = {name: axis.stream(start_memory=start_memory) for name, axis in self.axes.items()}
         return StageStream(streams, self.coupling, self.origins)
 
     @cached_property
     def coupling(self) -> Coupling:
-        """How the axes move along with each other."""
+        """Cross-coupling of the axes."""
         return Coupling({name: axis.chain.gains for name, axis in self.axes.items()})
 
     @property
     def origins(self) -> dict[str, float]:
-        """Where each axis starts, metres: from there its motion counts for the others."""
+        """Initial displacement (m) of each axis, from which its motion is counted for cross-coupling."""
         return {name: axis.start.displacement for name, axis in self.axes.items()}
 
     def _signals(self, t: ArrayLike, signal: Signal, what: str) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Return time and the signal of each axis, shape (N,) each, once they fit each other."""
+        """Return validated time and signal of each axis, shape (N,) each."""
         time = check_time(t)
         if not isinstance(signal, Mapping):
             if len(self.axes) != 1:
@@ -195,7 +195,7 @@ class StageModel:
 
 @contextmanager
 def _naming(axis: str, what: str) -> Iterator[None]:
-    """Let errors name the axis and the signal."""
+    """Add axis and signal name to errors."""
     try:
         yield
     except SlpiError as error:
@@ -203,7 +203,7 @@ def _naming(axis: str, what: str) -> Iterator[None]:
 
 
 def check_time(t: ArrayLike) -> FloatArray:
-    """Return `t` as an array, shape (N,), seconds; RecordError unless it is finite and does not decrease."""
+    """Return `t` as an array, shape (N,), seconds; RecordError unless finite and not decreasing."""
     time = _as_array(t, "time")
     if time.ndim != 1 or not np.isfinite(time).all():
         raise RecordError(f"time has shape {time.shape}; give one finite value for each sample")
@@ -220,11 +220,11 @@ def _as_array(values: ArrayLike, what: str) -> FloatArray:
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise UsageError(f"{what} is no array of numbers: {error}") from None
+        raise UsageError(f"{what} is not an array of numbers: {error}") from None
 
 
 def held_message(held: NDArray[np.bool_]) -> str:
-    """Say how many displacements are out of reach, and from where on."""
+    """Return the message for unreachable displacements: number and first sample."""
     return (
         f"{np.count_nonzero(held)} of {held.size} desired displacements need a voltage beyond the limits, "
         f"first sample {int(np.argmax(held))}; held at the limit"

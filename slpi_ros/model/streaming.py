@@ -1,4 +1,4 @@
-"""The causal inverse of one axis, sample by sample, and of several axes that move along with each other."""
+"""Streaming (sample by sample) causal inverse of one axis, and of several cross-coupled axes."""
 
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy, deepcopy
@@ -22,27 +22,27 @@ from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 FloatArray = NDArray[np.float64]
 StreamingEffects = dict[str, StreamingEffect]
 
-# A desired displacement farther outside the identified ones than this share of their span is taken for a mistake (a
-# wrong unit, another stage) and refused; nearer ones are held at the voltage limit.
+# A desired displacement outside the identified range by more than this share of its span is refused as an error (wrong
+# unit, another stage); one closer to the range is held at the voltage limit.
 TOLERATED_SHARE = 0.2
 # Rounding, as a share of the displacement range, or of the voltage.
 ROUNDING = 1e-9
-# A coercivity depends on the voltage that it leads to, but little: so often it is tried again.
+# Fixed-point iterations: the coercivity depends weakly on the resulting voltage.
 TRIALS = 4
 
 
 @dataclass(frozen=True)
 class StreamState:
-    """The whole state of a `StreamingInverse`.
+    """Complete state of a `StreamingInverse`.
 
     Parameters
     ----------
     memory : MemoryState
     voltage, goal : float, volts
-        Present command, and what the last desired displacement asked for.
+        Present command, and the voltage required by the last desired displacement.
     rate : float, V/s
     desired, displacement : float, metres
-        What the hysteresis was asked for last, and the displacement of the axis before other axes come in.
+        Last setpoint of the hysteresis, and displacement of the axis without cross-coupling.
     effects : mapping of effect name to its state
     """
 
@@ -58,33 +58,33 @@ class StreamState:
 class StreamingInverse:
     """Causal compensation of one axis: ``v = step(t, y)``.
 
-    A desired displacement goes back through the effects behind the hysteresis, the hysteresis, and the effects before
-    it. The voltage it asks for is kept within the limits, and what comes of it goes forward again: the memory follows
-    the voltage that reaches the hysteresis, and the effects what is really done. So limits do the memory no harm.
+    A desired displacement is inverted through the effects after the hysteresis, the hysteresis, and the effects before
+    it. The resulting voltage is limited and then propagated forward, so that the hysteresis memory and the effects
+    follow the voltage that is really applied.
 
     Parameters
     ----------
     memory : Memory
-        The model's memory, in its state at the start; owned by the stream from here on. Effects are at rest there.
+        Hysteresis memory in its initial state, modified in place. The effects start at rest.
     displacement_range : (float, float), metres
-        Smallest and largest displacement the model was identified on.
+        Smallest and largest displacement of the identified range.
     limits : Limits
-        Of the command; an amplifier that clips narrows them.
+        Limits of the command; further restricted by a `Saturation` effect.
     effects : tuple of Effect
-        None by default.
+        Effects besides the hysteresis; default: none.
     middle : callable, optional
-        Middle of the largest loop (m) at voltages (V), shape (N,); for rate dependence.
+        Returns the middle of the largest loop (m) for voltages (V), shape (N,); for rate dependence. Default None.
 
     Attributes
     ----------
     memory : Memory
     pace : RateLimiter
     accepted : (float, float), metres
-        Smallest and largest displacement that is not refused.
+        Smallest and largest accepted displacement.
     desired : float, metres
-        What the hysteresis was asked for last.
+        Last setpoint of the hysteresis.
     coupled : float, metres
-        What other axes add to the displacement; set it before a sample that is to reckon with it.
+        Displacement added by other axes; to be set before each sample, default 0.
     """
 
     def __init__(
@@ -101,13 +101,13 @@ class StreamingInverse:
         self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
         self._t = -inf
         self.coupled = 0.0
-        # An amplifier that clips narrows the limits, and needs no follower.
+        # Saturation restricts the limits and needs no streaming effect.
         self._before = _streaming(effect for effect in chain.before if not isinstance(effect, Saturation))
         self._behind, self._shared = _streaming(chain.own), _streaming(chain.shared)
         self._find()
         self.pace = RateLimiter(limits)
         self.limits = limits
-        # The axis may rest outside its limits; the first voltage it is given is inside.
+        # The axis may start outside its limits; the first output voltage is inside.
         memory.forward(self.limits.clip(memory.voltage))
         for streaming in self._before.values():
             streaming.start(memory.voltage)
@@ -118,12 +118,12 @@ class StreamingInverse:
             self._driven.drive(0.0, memory.voltage)
         self._command = self._goal = memory.voltage
         self.desired = memory.displacement
-        # What the last sample asks of the voltage beyond what it gives (m or V), and of the axis as a whole (m).
+        # Shortfall of the last sample: of the hysteresis or the voltage (m or V), and of the axis as a whole (m).
         self._missing = self._short = 0.0
         self._follow(0.0)
 
     def _find(self) -> None:
-        """Note the streaming effects that need more than the displacement."""
+        """Find the streaming effects that need more input than the displacement."""
         self._streaming: StreamingEffects = {**self._before, **self._behind, **self._shared}
         rate = self._streaming.get(RateDependence.name)
         self._play = rate if isinstance(rate, StreamingCoercivity) else None
@@ -131,19 +131,19 @@ class StreamingInverse:
 
     @property
     def limits(self) -> Limits:
-        """Voltage limits; new ones count from the next sample on."""
+        """Voltage limits; new limits apply from the next sample on."""
         return self.pace.limits
 
     @limits.setter
     def limits(self, limits: Limits) -> None:
         lower = min(max(limits.lower, self._clipped[0]), limits.upper)
         self.pace.limits = limits = replace(limits, lower=lower, upper=max(min(limits.upper, self._clipped[1]), lower))
-        # The inverse of the hysteresis is all there is to do.
+        # Only the inverse of the hysteresis is required.
         self._bare = self._without_effects and limits.slew == limits.acceleration == inf
 
     @property
     def timeless(self) -> bool:
-        """Whether it does not matter how long a voltage stays."""
+        """Whether the model does not depend on time."""
         return not self._streaming
 
     @property
@@ -153,34 +153,34 @@ class StreamingInverse:
 
     @property
     def uncoupled_displacement(self) -> float:
-        """Displacement (m) that the model gives the present voltage, before other axes come in."""
+        """Displacement (m) of the model for the present voltage, without cross-coupling."""
         return self._displacement if self._streaming else self.memory.displacement
 
     @property
     def missed(self) -> bool:
-        """Whether the last desired displacement is not met, for whatever limit."""
+        """Whether any limit prevented the last desired displacement."""
         return (self._missing if self._streaming else self._beyond_rounding(self.desired)) != 0.0
 
     @property
     def held(self) -> bool:
-        """Whether the voltage waits at the limit beyond which the last desired displacement lies."""
+        """Whether the voltage is held at the limit beyond which the last desired displacement lies."""
         missing = short = self._beyond_rounding(self.desired)
         if self._streaming:
             missing, short = self._missing, self._short
         limits, v = self.pace.limits, self.voltage
-        # What goes through effects comes to a limit but for rounding; what undoes them may ask for a detour.
+        # Effects reach a limit only within rounding, and their inverse may overshoot.
         if min(missing, short) > 0.0:
             return v >= limits.upper - ROUNDING * (1.0 + abs(limits.upper))
         return max(missing, short) < 0.0 and v <= limits.lower + ROUNDING * (1.0 + abs(limits.lower))
 
     def remove_sensor_effects(self, y: float) -> float:
-        """Return the displacement of the stage (m) at which a sensor reads `y` (m)."""
+        """Return the stage displacement (m) for which the sensor reads `y` (m)."""
         for streaming in self._shared.values():
             y = streaming.inverse(0.0, y)
         return y
 
     def check(self, t: float, y: float) -> None:
-        """Raise what `step` would raise, without moving.
+        """Raise the error that `step` would raise, without a change of state.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class StreamingInverse:
             If `y` lies far outside the identified displacements.
         """
         if not (isfinite(t) and isfinite(y)):
-            raise UsageError(f"sample t = {t} s, displacement = {y} m is not finite; leave it out")
+            raise UsageError(f"sample t = {t} s, displacement = {y} m is not finite; omit the sample")
         if t < self._t:
             raise UsageError(f"time runs backwards: {t:.9g} s after {self._t:.9g} s; send samples in order")
         if not self._lowest <= y <= self._highest:
@@ -202,12 +202,12 @@ class StreamingInverse:
         Raises
         ------
         SlpiError
-            As in `check`; nothing has moved then.
+            As in `check`; the state is unchanged.
         """
         dt = t - self._t
         if not (0.0 <= dt < inf and self._lowest <= y <= self._highest):
             self.check(t, y)
-            # At the first sample no time has passed yet: the voltage stays and catches up from there.
+            # At the first sample no time has passed: a rate limit holds the voltage until the next one.
             dt = 0.0
         if self._bare:
             limits = self.pace.limits
@@ -221,12 +221,12 @@ class StreamingInverse:
     __call__ = step
 
     def move(self, dt: float, y: float) -> float:
-        """Return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last one; neither is checked.
+        """Return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last one, without checks.
 
         Raises
         ------
         UsageError
-            If the model has no voltage for it; without effects nothing has moved then.
+            If the model has no voltage for `y`; without effects the state is unchanged.
         """
         if not self._streaming:
             h = y - self.coupled
@@ -235,7 +235,7 @@ class StreamingInverse:
             return v
         counted = dt
         if dt > MAX_DT:
-            # The voltage has stayed: only the last part of a pause may lead to the new one.
+            # The voltage was held during the pause; only its last part counts for the new voltage.
             counted = MAX_DT
             self.wait(dt - counted)
         h = displacement = self.remove_sensor_effects(y) - self.coupled
@@ -248,7 +248,7 @@ class StreamingInverse:
         return v
 
     def drive(self, voltage: float, dt: float = 0.0) -> float:
-        """Move to a voltage (V), `dt` (s) after the last one, whatever is desired; return the displacement (m)."""
+        """Apply a voltage (V), `dt` (s) after the last one, without a setpoint; return the displacement (m)."""
         self._command = self._goal = voltage
         self.memory.forward(self._reaching(dt, voltage))
         self.desired, self._missing = self.memory.displacement, 0.0
@@ -259,12 +259,12 @@ class StreamingInverse:
         return y
 
     def wait(self, duration: float) -> None:
-        """Let time (s) pass at the present voltage."""
+        """Advance the effects by `duration` (s) at the present voltage."""
         if self._streaming:
             self.drive(self.voltage, duration)
 
     def snapshot(self) -> StreamState:
-        """Return the whole state, to be given back to `restore`."""
+        """Return the complete state for `restore`."""
         return StreamState(
             self.memory.snapshot(),
             self.voltage,
@@ -276,7 +276,7 @@ class StreamingInverse:
         )
 
     def restore(self, state: StreamState) -> None:
-        """Take over a state from `snapshot`."""
+        """Restore a state from `snapshot`."""
         self.memory.restore(state.memory)
         self._command, self._goal, self.pace.rate = state.voltage, state.goal, state.rate
         self.desired, self._displacement = state.desired, state.displacement
@@ -284,12 +284,12 @@ class StreamingInverse:
             streaming.restore(state.effects[name])
 
     def resume(self, before: "StreamingInverse") -> None:
-        """Go on where another model's stream has been; its voltage stays, and what its effects have begun."""
+        """Continue from the inverse of another model: same voltage, rate, coercivity and creep state."""
         self.pace.go_on(before.pace)
         self._command = self._goal = before.voltage
         if self._play and before._play:
             self._play.restore(before._play.snapshot())
-        # The command jumps there, and no time passes.
+        # The command is set without elapsed time.
         self.memory.forward(self._reaching(0.0, before.voltage))
         self.desired = self.memory.displacement
         for name, streaming in self._behind.items():
@@ -299,7 +299,7 @@ class StreamingInverse:
         self._follow(0.0)
 
     def copy(self) -> "StreamingInverse":
-        """Return a stream in the same state, which moves on its own."""
+        """Return an independent copy in the same state."""
         other = copy(self)
         other.memory, other.pace = copy(self.memory), copy(self.pace)
         other.memory.restore(self.memory.snapshot())
@@ -310,7 +310,7 @@ class StreamingInverse:
     def _move(self, dt: float, counted: float, h: float) -> float:
         """Move command and memory towards a displacement of the hysteresis (m); return the command (V).
 
-        `counted` (s) is how much of `dt` (s) the effects are told.
+        `counted` (s) is the part of `dt` (s) that counts for the effects.
         """
         memory, pace = self.memory, self.pace
         if not self._before and pace.limits.acceleration == inf:
@@ -336,7 +336,7 @@ class StreamingInverse:
         return v
 
     def _played(self, h: float) -> tuple[float, float]:
-        """Move the memory to a displacement (m); return the voltage (V) before the play, and what goes round it (m)."""
+        """Move the memory to a displacement (m); return the voltage (V) before the play, and the bypass (m)."""
         memory, limits, play = self.memory, self.pace.limits, self._play
         if not play:
             return memory.inverse(h, limits.lower, limits.upper), 0.0
@@ -355,18 +355,18 @@ class StreamingInverse:
         return v, play.between(v, u)
 
     def _beyond_rounding(self, h: float) -> float:
-        """Return how far (m) the hysteresis is from where it is asked to be; 0 where that is rounding."""
+        """Return setpoint - displacement (m) of the hysteresis; 0 within rounding."""
         missing = h - self.memory.displacement
         return missing if abs(missing) > self._rounding else 0.0
 
     def _reaching(self, dt: float, v: float) -> float:
-        """Let a command (V) go through to the hysteresis; return the voltage (V) that arrives."""
+        """Propagate a command (V) through the effects before the hysteresis; return the resulting voltage (V)."""
         for streaming in self._before.values():
             v = streaming.forward(dt, v)
         return v
 
     def _follow(self, dt: float) -> None:
-        """Let the effects behind the hysteresis follow what it does."""
+        """Propagate the output of the hysteresis through the effects after it."""
         y = self.memory.displacement + (self._play.reversible_bypass if self._play else 0.0)
         if self._driven:
             self._driven.drive(dt, self.memory.voltage)
@@ -376,21 +376,21 @@ class StreamingInverse:
 
 
 def _streaming(effects: Iterable[Effect]) -> StreamingEffects:
-    """Return the streaming effects of effects, of those that have one, by the effect's name."""
+    """Return the streaming effects by name, without effects that have none."""
     return {effect.name: streaming for effect in effects if (streaming := effect.streaming())}
 
 
 def accepted_range(displacement_range: tuple[float, float]) -> tuple[float, float]:
-    """Return the smallest and largest displacement (m) that may be desired, given the identified ones (m)."""
+    """Return the smallest and largest accepted displacement (m) for the identified range (m)."""
     low, high = displacement_range
     margin = TOLERATED_SHARE * (high - low)
     return low - margin, high + margin
 
 
 def refusal(y: float, accepted: tuple[float, float], kind: str = "desired") -> str:
-    """Return the message for a displacement `y` (m), desired or measured, that is refused."""
+    """Return the message for a refused displacement `y` (m); `kind` is "desired" or "measured"."""
     return (
-        f"{kind} displacement {y * 1e6:.6g} um is far outside what the model was identified on "
+        f"{kind} displacement {y * 1e6:.6g} um is far outside the identified range "
         f"(accepted: {accepted[0] * 1e6:.6g} to {accepted[1] * 1e6:.6g} um); "
         "check units and offset, or identify on a larger range"
     )
@@ -402,10 +402,10 @@ class StageStream:
     Parameters
     ----------
     streams : mapping of axis name to StreamingInverse
-        Owned by the stage from here on.
+        Streaming inverse of each axis, modified in place.
     coupling : Coupling
     origins : mapping of axis name to float, metres
-        From there the motion of an axis counts for the others.
+        Displacement of each axis from which its motion is counted for cross-coupling.
 
     Attributes
     ----------
@@ -419,12 +419,12 @@ class StageStream:
         self._coupling, self._origins = coupling, origins
 
     def step(self, t: float, y: Mapping[str, float]) -> dict[str, float]:
-        """Return the voltages (V) for desired displacements `y` (m) at time `t` (s); other axes keep theirs.
+        """Return the voltages (V) for desired displacements `y` (m) at time `t` (s); other axes hold theirs.
 
         Raises
         ------
         SlpiError
-            As `StreamingInverse.check`, or if there is no such axis; nothing has moved then.
+            As `StreamingInverse.check`, or if an axis is unknown; the state is unchanged.
         """
         for name, desired in y.items():
             if name not in self.streams:
@@ -439,7 +439,7 @@ class StageStream:
     __call__ = step
 
     def decouple(self, y: Mapping[str, float]) -> None:
-        """Tell every axis what the others will add once the named ones are at `y` (m)."""
+        """Set `coupled` of every axis for the desired displacements `y` (m) of the named axes."""
         if not self._coupling.on:
             return
         streams, origins = self.streams, self._origins
@@ -453,10 +453,10 @@ class StageStream:
             stream.coupled = float(self._coupling.part(name, motions))
 
     def snapshot(self) -> dict[str, StreamState]:
-        """Return the whole state, to be given back to `restore`."""
+        """Return the complete state for `restore`."""
         return {name: stream.snapshot() for name, stream in self.streams.items()}
 
     def restore(self, state: Mapping[str, StreamState]) -> None:
-        """Take over a state from `snapshot`."""
+        """Restore a state from `snapshot`."""
         for name, stream in self.streams.items():
             stream.restore(state[name])

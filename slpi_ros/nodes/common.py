@@ -1,4 +1,4 @@
-"""Start, spin and end one node: what every executable's ``main`` has in common."""
+"""Start, spin and stop a node: functions shared by all executables."""
 
 import os
 import signal
@@ -29,15 +29,15 @@ from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.io.messages import SECOND_NS
 
 COMMANDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-# Whoever joins late gets the last one.
+# Late subscribers receive the last message.
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# What sensors send: the newest counts.
+# Sensor data: only the newest message is relevant.
 MEASUREMENTS = qos_profile_sensor_data
 DIAGNOSTICS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
-    """Return stamp (ns), names and positions of a serialized JointState; one that makes no sense names nothing."""
+    """Return stamp (ns), names and positions of a serialized JointState; no names if it is not valid."""
     try:
         message = deserialize_message(data, JointState)
     except RuntimeError:
@@ -47,26 +47,26 @@ def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
 
 
 class DeferredService:
-    """A service that answers later, without a thread that waits: neither of the executors may be blocked.
+    """Trigger service with a deferred response that does not block the executor.
 
     Parameters
     ----------
     node : Node
     name : str
     start : callable
-        Starts what is asked for; returns why it cannot, or "".
+        Starts the requested action; returns the reason if this is not possible, else "".
     """
 
     def __init__(self, node: Node, name: str, start: Callable[[], str]) -> None:
         self._start = start
         self._waiting: list[Any] = []
         self._service = node.create_service(Trigger, name, self._on_request)
-        # The executors send what the callback returns; only here is known whom an answer is for.
+        # The executor sends the returned response; the request header is available only here.
         self._send = self._service.send_response
         self._service.send_response = self._send_or_keep
 
     def answer(self, success: bool, message: str) -> None:
-        """Answer everyone who waits."""
+        """Respond to all pending requests."""
         waiting, self._waiting = self._waiting, []
         for header in waiting:
             self._send(Trigger.Response(success=success, message=message), header)
@@ -83,9 +83,9 @@ class DeferredService:
 
 
 def refuse_impossible_transitions(node: LifecycleNode) -> None:
-    """Answer a request for a transition that the present state does not allow with a refusal.
+    """Refuse requests for a lifecycle transition that the present state does not allow.
 
-    Without this, rclpy lets the request end the process: ``ros2 lifecycle set NODE configure`` said twice would do.
+    Otherwise rclpy ends the process, for instance after two calls of ``ros2 lifecycle set NODE configure``.
     """
     for service in node.services:
         if service.srv_type is ChangeState:
@@ -106,12 +106,12 @@ def _refusing(node: LifecycleNode, change_state: Any) -> Any:
 
 
 def ask_for_priority(node: Node, priority: int) -> None:
-    """Run all threads of this process under SCHED_FIFO, those of DDS too; without the right to it say so and go on."""
+    """Run all threads of this process under SCHED_FIFO, including DDS; log a warning if not permitted."""
     try:
         for thread in Path("/proc/self/task").iterdir():
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:
-        node.get_logger().warning(f"no realtime_priority {priority}: {error}; running as any other process")
+        node.get_logger().warning(f"no realtime_priority {priority}: {error}; using normal scheduling")
 
 
 OK: bytes = DiagnosticStatus.OK
@@ -121,18 +121,18 @@ ERROR: bytes = DiagnosticStatus.ERROR
 
 @dataclass(frozen=True)
 class Health:
-    """How a node is.
+    """Diagnostic status of a node.
 
     Parameters
     ----------
     problems : sequence of (level, str)
-        What is wrong, worst or not; empty when all is well.
+        Problems with their levels, in any order; empty if there are none.
     summary : str
-        What the node does when all is well.
+        Message if there are no problems.
     values : mapping of str to object
         Counters and states, shown as text.
     hardware_id : str
-        The stage.
+        Hardware id of the stage; "" (default) if unknown.
     """
 
     problems: tuple[tuple[bytes, str], ...]
@@ -142,7 +142,7 @@ class Health:
 
     @property
     def level(self) -> bytes:
-        """The worst of the problems' levels."""
+        """Highest level of the problems."""
         return max((level for level, _ in self.problems), default=OK)
 
     @property
@@ -153,7 +153,7 @@ class Health:
 
 
 class Diagnostics:
-    """The publisher of one status, named after its node and what the node is."""
+    """Publish one status on ``/diagnostics``, named after the node and its role."""
 
     def __init__(self, node: Node, role: str) -> None:
         self._node = node
@@ -162,7 +162,7 @@ class Diagnostics:
         self.level = OK
 
     def report(self, health: Health) -> None:
-        """Publish the health, and remember its level."""
+        """Publish the status and store its level."""
         self.level = health.level
         status = DiagnosticStatus(
             level=health.level,
@@ -179,7 +179,7 @@ class Diagnostics:
 # A signal is noticed between two calls of spin_once: this bounds the wait on an idle graph.
 SPIN_TIMEOUT = 0.1
 
-# Ctrl-C often arrives twice (terminal and launcher), so only the third one may cut an orderly end short.
+# Ctrl-C often arrives twice (terminal and launcher), so only the third signal interrupts an orderly shutdown.
 PATIENT_SIGNALS = 2
 
 _START_ERRORS = (
@@ -192,14 +192,14 @@ _START_ERRORS = (
 
 @dataclass
 class _Stop:
-    """Who asked the running node to end, and why."""
+    """Stop request for the running node, with its reason."""
 
     requested: bool = False
     signals: int = 0
     failure: SlpiError | None = None
 
     def on_signal(self, *_: object) -> None:
-        """Ask for an orderly end, of a node that is still being made too: it may hold messages already."""
+        """Request an orderly shutdown, also while the node is being created."""
         self.requested = True
         self.signals += 1
         if self.signals > PATIENT_SIGNALS:
@@ -210,14 +210,14 @@ _stop = _Stop()
 
 
 def request_stop(failure: SlpiError | None = None) -> None:
-    """End the node that ``run`` is spinning; for use in its callbacks.
+    """Stop the node that ``run`` is spinning; for use in callbacks.
 
     An exception that leaves a callback makes the events executor print a traceback; this does not.
 
     Parameters
     ----------
     failure : SlpiError, optional
-        Why the node cannot go on: its message is printed and its exit code returned by ``run``.
+        Reason of a failure: ``run`` prints its message and returns its exit code.
     """
     _stop.requested = True
     _stop.failure = _stop.failure or failure
@@ -253,7 +253,7 @@ def make_executor(kind: str) -> Executor:
 
 
 def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
-    """Create a node, spin it until a signal or ``request_stop``, and end it in order.
+    """Create a node, spin it until a signal or ``request_stop``, and shut it down in order.
 
     The ROS context stays valid until the node's ``destroy_node`` has returned, so a node may still publish
     there.
@@ -286,7 +286,7 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
 
 
 def _live(make_node: Callable[[], Node], kind: str) -> None:
-    """Create, spin and destroy the node; raise what made it fail."""
+    """Create, spin and destroy the node; raise the error that stopped it."""
     node = _start(make_node)
     try:
         executor = make_executor(getattr(node, "executor_kind", kind))
@@ -301,14 +301,14 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
         try:
             node.destroy_node()
         except SlpiError as error:
-            # what made the node stop comes first
+            # The first failure takes precedence.
             request_stop(error)
     if _stop.failure is not None:
         raise _stop.failure
 
 
 def _start(make_node: Callable[[], Node]) -> Node:
-    """Create the node; a command line or a parameter that ROS refuses becomes one line."""
+    """Create the node; an argument or parameter refused by ROS becomes a UsageError."""
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         return make_node()
@@ -319,7 +319,7 @@ def _start(make_node: Callable[[], Node]) -> Node:
 @contextmanager
 def _signals_to(handler: Callable[..., None]) -> Iterator[None]:
     """Send SIGINT and SIGTERM to the handler."""
-    # Python lets only the main thread do so; a node that a test runs in another thread goes without
+    # Python allows signal handlers in the main thread only; in other threads none is set.
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     previous = {number: signal.signal(number, handler) for number in numbers}
     try:

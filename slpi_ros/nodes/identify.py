@@ -1,4 +1,4 @@
-"""Node ``identify``: bags in, a latched model out."""
+"""Node ``identify``: identifies a model from bags and publishes it, latched."""
 
 import math
 import os
@@ -37,32 +37,32 @@ REPORT_PERIOD = (0.05, 3600.0)
 DECLARATIONS = (
     Declaration(
         "bags", [""],
-        "Bags to identify in one fit: rosbag2 folders, or lone mcap or db3 files. Setting a parameter later identifies "
-        "anew.",
+        "Bags to identify in one fit: rosbag2 folders, or single mcap or db3 files. A later change of a parameter "
+        "repeats the identification.",
     ),
     Declaration(
         "watch_directory", "",
-        "Folder: every bag completed there is identified too, the newest one there at once, unless it is of another "
-        "stage than the published model; empty: none.",
+        "Watched folder: the newest complete bag and every bag completed later are identified, unless recorded on "
+        "another stage than the published model; empty: none.",
     ),
     Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
     Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}."),
-    Declaration("output", "", "File to write the model to as well; empty: none."),
+    Declaration("output", "", "File for the model document; empty: none."),
     Declaration(
-        "start", math.nan, "Fit from here on, seconds from the bag's first stamp; NaN or negative: from the first.",
+        "start", math.nan, "Start of the fitted part, seconds from the first stamp; NaN or negative: first stamp.",
         number=True,
     ),
     Declaration(
-        "stop", math.nan, "Fit up to here, seconds from the bag's first stamp; NaN or negative: to the last.",
+        "stop", math.nan, "End of the fitted part, seconds from the first stamp; NaN or negative: last stamp.",
         number=True,
     ),
     Declaration(
         "diagnosis_directory", "",
-        "Folder that ~/diagnose writes into; empty: the folder NAME_diagnosis beside the output NAME.json, without an "
-        "output a temporary one, which the answer names.",
+        "Output folder of ~/diagnose; empty: NAME_diagnosis next to the output NAME.json, or, without an output, a "
+        "temporary folder named in the service response.",
     ),
     Declaration(
-        "diagnostic_period", 1.0, "Seconds between two reports on /diagnostics.",
+        "diagnostic_period", 1.0, "Period of /diagnostics, seconds.",
         read_only=True, between=REPORT_PERIOD, number=True,
     ),
 )  # fmt: skip
@@ -70,16 +70,16 @@ DECLARATIONS = (
 
 @dataclass(frozen=True)
 class IdentifySettings:
-    """What the node is told by its parameters.
+    """Validated settings of the node.
 
     Parameters
     ----------
     request : FitRequest
-        What to identify; without bags, what to identify those of the watched folder like.
+        Settings of the identification, also used for bags of the watched folder.
     watch_directory : str
-        "": none.
+        Watched folder; "" if none.
     diagnosis_directory : str
-        "": a temporary one.
+        Output folder of ~/diagnose; "" for a temporary folder.
     diagnostic_period : float, seconds
     """
 
@@ -90,12 +90,12 @@ class IdentifySettings:
 
     @classmethod
     def of(cls, values: Values) -> "IdentifySettings":
-        """Make the settings of all parameters by name.
+        """Return the settings for all parameters by name.
 
         Raises
         ------
         UsageError
-            If a value makes no sense.
+            If a value is not valid.
         """
         bags = tuple(bag for bag in values["bags"] if bag)
         if not values["topic"]:
@@ -113,12 +113,12 @@ class IdentifySettings:
 
 
 def beside(output: str) -> str:
-    """Return the folder beside the file of a model that its diagnosis goes to; "" for no file."""
+    """Return the diagnosis folder next to the model file `output`; "" without a file."""
     return f"{os.path.splitext(output)[0]}_diagnosis" if output else ""
 
 
 def bound(values: Values, name: str) -> float | None:
-    """Return a time of the record, seconds; None where NaN or a negative number says that there is none."""
+    """Return the parameter `name` as a time of the record, seconds; None if NaN or negative."""
     given = values[name]
     if isinstance(given, float) and math.isnan(given):
         return None
@@ -132,7 +132,7 @@ NO_MODEL = "nothing to diagnose: no bag has been identified yet"
 
 @dataclass(frozen=True)
 class Identified:
-    """A model and where it came from.
+    """An identified model document and its source.
 
     Parameters
     ----------
@@ -147,19 +147,19 @@ class Identified:
 
 
 class DiagnosisService:
-    """Says what the model in use gets wrong on the bags it was fitted to, and answers when that is known.
+    """Service ``~/diagnose``: diagnoses the model errors on the bags of the fit, and responds when complete.
 
-    Writes files and publishes nothing: a diagnosis changes no model that is running.
+    The diagnosis writes files only; it does not change the published model.
 
     Parameters
     ----------
     node : Node
     identified : callable
-        Returns the model in use; None where there is none.
+        Returns the model in use, or None.
     folder : callable
-        Returns the folder to write into; "": a temporary one.
+        Returns the output folder; "" for a temporary folder.
     report : callable
-        Is called when a diagnosis begins and when it ends.
+        Called at the start and at the end of a diagnosis.
     """
 
     def __init__(
@@ -181,17 +181,17 @@ class DiagnosisService:
 
     @property
     def error(self) -> str:
-        """Why the last diagnosis failed; "" where it did not."""
+        """Error message of the last diagnosis; "" if none."""
         return self._outcome.error
 
     @property
     def doing(self) -> str:
-        """What is under way, in words; "" when nothing is."""
+        """Text for the running diagnosis; "" if none."""
         return f"diagnosing {self._job.request.source} for {time.monotonic() - self._began:.0f} s" if self._job else ""
 
     @property
     def values(self) -> dict[str, object]:
-        """What ``/diagnostics`` shows."""
+        """Values for ``/diagnostics``."""
         state = "diagnosing" if self._job else "failed" if self.error else "done" if self._last else "none"
         return {
             "diagnosis.state": state,
@@ -202,19 +202,19 @@ class DiagnosisService:
         }
 
     def forget(self) -> None:
-        """Forget what was found: another model is in use."""
+        """Discard the last result because another model is in use."""
         if not self._job:
             self._last, self._outcome = None, DiagnosisOutcome()
 
     def end(self) -> None:
-        """End the diagnosis under way."""
+        """Stop the running diagnosis, if any."""
         self._poll.cancel()
         if self._job:
             self._job.end()
             self._job = None
 
     def _start(self) -> str:
-        """Start a diagnosis, unless one is under way; return why that cannot be, or ""."""
+        """Start a diagnosis unless one is running; return the reason if this is not possible, else ""."""
         if self._job:
             return ""
         identified = self._identified()
@@ -236,7 +236,7 @@ class DiagnosisService:
         return self._temporary
 
     def _look(self) -> None:
-        """Look whether the diagnosis is done."""
+        """Check whether the diagnosis is complete."""
         outcome = self._job.outcome() if self._job else None
         if not self._job or not outcome:
             return
@@ -261,7 +261,7 @@ NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
 
 
 class Identify(Node):
-    """A node that identifies the stage of bags and keeps the model latched on ``stage_model``.
+    """Identify the model of a stage from bags and publish it, latched, on ``stage_model``.
 
     Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`; the service ``~/identify``
     (``std_srvs/Trigger``) starts anew, ``~/diagnose`` says what the published model gets wrong on its bags. A bag that
@@ -271,7 +271,7 @@ class Identify(Node):
     Raises
     ------
     UsageError
-        If the parameters make no sense.
+        If the parameters are not valid.
     """
 
     def __init__(self) -> None:
@@ -290,7 +290,7 @@ class Identify(Node):
         self._identified: Identified | None = None
         self._doubtful: tuple[FitRequest, str] | None = None
         self._error = ""
-        # A simulated clock may stand still.
+        # A simulated clock may stop.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._poll = self.create_timer(POLL_PERIOD, self._look, clock=steady, autostart=False)
         self.create_timer(self._parameter_set.settings.diagnostic_period, self._report, clock=steady)
@@ -307,23 +307,23 @@ class Identify(Node):
         self._begin(self._settings)
 
     def destroy_node(self) -> None:
-        """End the work under way, then destroy the node."""
+        """Stop running jobs, then destroy the node."""
         self._end_job()
         self._diagnosis.end()
         super().destroy_node()
 
     def _on_change(self, settings: IdentifySettings) -> None:
-        """Begin anew, unless only the place of the next diagnosis has changed."""
+        """Repeat the identification, unless only the diagnosis folder has changed."""
         before, self._settings = self._settings, settings
         if settings.watch_directory != before.watch_directory:
-            # Who names another folder may mean another stage.
+            # Another folder may hold bags of another stage.
             self._stage = None
         moved = settings.diagnosis_directory != before.diagnosis_directory
         if not moved or replace(settings, diagnosis_directory=before.diagnosis_directory) != before:
             self._begin(settings)
 
     def _begin(self, settings: IdentifySettings) -> None:
-        """Start to identify what the parameters name, in place of what is under way."""
+        """Stop the running identification and start that of the parameters."""
         self._end_job()
         self._error = ""
         self._doubtful = None
@@ -337,7 +337,7 @@ class Identify(Node):
         self._report()
 
     def _look_for_bags(self) -> None:
-        """Queue the bags that have been completed in the watched folder; tell once of those that will not be."""
+        """Queue newly completed bags of the watched folder; warn once about abandoned ones."""
         for bag in self._watch.look() if self._watch else ():
             self.get_logger().info(f"{bag} is complete")
             self._waiting.append(bag)
@@ -348,7 +348,7 @@ class Identify(Node):
         self._start_next()
 
     def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Publish the model that waits for it; else identify the parameter's bags, or the newest watched one, again."""
+        """Publish a withheld model, if any; else repeat the identification of the bags or of the newest watched one."""
         if self._doubtful:
             (asked, document), self._doubtful = self._doubtful, None
             self._take(asked, FitOutcome(document, self._written(asked, document)))
@@ -367,14 +367,14 @@ class Identify(Node):
         return response
 
     def _start_next(self) -> None:
-        """Start the next identification in the queue, unless one is under way."""
+        """Start the next queued identification, unless one is running."""
         request = None if self._job else self._next_request()
         if request:
             self._job, self._job_start = FitProcess(request), time.monotonic()
             self._poll.reset()
 
     def _next_request(self) -> FitRequest | None:
-        """Return what the parameters ask for, then bag by bag of the watched folder."""
+        """Return the request of the parameters, then one request for each bag of the watched folder."""
         request, self._asked = self._asked, None
         if not request and self._waiting:
             bag = str(self._waiting.popleft())
@@ -390,7 +390,7 @@ class Identify(Node):
             self._job = None
 
     def _look(self) -> None:
-        """Look whether the identification is done."""
+        """Check whether the identification is complete."""
         outcome = self._job.outcome() if self._job else None
         if self._job and outcome:
             request, self._job = self._job.request, None
@@ -399,7 +399,7 @@ class Identify(Node):
             self._start_next()
 
     def _written(self, request: FitRequest, document: str) -> str:
-        """Write a model to the file, if one is named; return why that cannot be, or ""."""
+        """Write a model to the output file, if any; return the error message, or ""."""
         try:
             if request.output:
                 save_model(parse_model(document, request.source), request.output)
@@ -410,7 +410,7 @@ class Identify(Node):
     def _take(self, request: FitRequest, outcome: FitOutcome) -> None:
         if outcome.doubt:
             self._doubtful = request, outcome.document
-            self._error = f"{outcome.doubt}; not published: call ~/identify to publish it all the same"
+            self._error = f"{outcome.doubt}; not published: call ~/identify to publish it nevertheless"
             self.get_logger().warning(self._error)
             self._report()
             return
@@ -469,15 +469,15 @@ class Identify(Node):
 
 
 def abandonment(bags: Sequence[Path]) -> str:
-    """Say in one line which bags seem abandoned, and what to do."""
+    """Return a line that names the abandoned bags and the remedy."""
     return (
         f"{', '.join(map(str, bags))}: not complete, and not grown for {PATIENCE:g} s: the recording seems abandoned; "
-        "if it is, mend it (`ros2 bag reindex` for a folder, `mcap recover` for a file) or delete it"
+        "if it is, repair it (`ros2 bag reindex` for a folder, `mcap recover` for a file) or delete it"
     )
 
 
 def described(model: StageModel) -> str:
-    """Say in one line how good a model is."""
+    """Return a line with the fit quality of a model."""
     axes = []
     for name, axis in model.axes.items():
         quality, (low, high) = axis.quality, axis.displacement_range

@@ -1,4 +1,4 @@
-"""Work in processes of its own: identifications, diagnoses, and the check of large model documents."""
+"""Worker processes for identification, diagnosis, and the validation of large model documents."""
 
 import json
 import multiprocessing
@@ -28,17 +28,17 @@ Outcome = TypeVar("Outcome")
 
 
 class WorkerProcess(Generic[Request, Outcome]):
-    """Work under way.
+    """Run a function in a worker process and return its outcome without blocking.
 
     Parameters
     ----------
     work : callable
-        Makes the outcome of the request; a function of a module.
+        Module-level function that returns the outcome of a request.
     request : object
     outcome : type
-        A dataclass of plain values. Made with `error` alone where the process ends without a result.
+        Dataclass of plain values; created with `error` only if the process ends without a result.
     what : str
-        What is done, for that error.
+        Description of the work for that error.
     """
 
     def __init__(
@@ -46,11 +46,11 @@ class WorkerProcess(Generic[Request, Outcome]):
     ) -> None:
         self.request = request
         self._make, self._what = outcome, what
-        # No fork: the threads of the middleware would not survive it.
+        # Not fork: the middleware threads do not survive a fork.
         context = multiprocessing.get_context("spawn")
         self._receiver, sender = context.Pipe(duplex=False)
         self._process = context.Process(target=_run, args=(sender, work, request), daemon=True)
-        # Ctrl-C reaches the whole group of processes; it is for this one to end the other.
+        # Ctrl-C reaches the whole process group; this process ends the worker itself.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process.start()
@@ -59,7 +59,7 @@ class WorkerProcess(Generic[Request, Outcome]):
         sender.close()
 
     def outcome(self) -> Outcome | None:
-        """Return what came of it, or None while it is under way; never waits for it."""
+        """Return the outcome, or None while the process is running; does not block."""
         if not self._receiver.poll():
             return None
         try:
@@ -67,32 +67,32 @@ class WorkerProcess(Generic[Request, Outcome]):
         except EOFError:
             self._process.join()
             outcome = self._make(
-                error=f"{self._what} ended with exit code {self._process.exitcode} and no result; look for a lack of "
-                "memory, or try a shorter record"
+                error=f"{self._what} ended with exit code {self._process.exitcode} and no result; check the "
+                "available memory, or use a shorter record"
             )
         self.end()
         return outcome
 
     def end(self) -> None:
-        """End it, done or not."""
+        """Terminate the process."""
         self._process.kill()
         self._process.join()
         self._receiver.close()
 
 
 def _run(sender: Connection, work: Callable[[Any], Any], request: Any) -> None:
-    """Send the outcome of a request: what the process does."""
+    """Entry point of the process: send the outcome of a request."""
     sender.send_bytes(json.dumps(asdict(work(request))).encode())
 
 
 @dataclass(frozen=True)
 class StageIdentity:
-    """What tells a stage from others.
+    """Identity of a stage: hardware id and axes.
 
     Parameters
     ----------
     hardware_id : str
-        "": not known.
+        "" if unknown.
     axes : tuple of str
     """
 
@@ -101,11 +101,11 @@ class StageIdentity:
 
     @classmethod
     def of(cls, model: StageModel, before: "StageIdentity | None") -> "StageIdentity":
-        """Return the stage of a model; its hardware id may be known from `before`, where the model does not say."""
+        """Return the stage of a model; a missing hardware id is taken from `before`."""
         return cls(model.hardware_id or (before.hardware_id if before else ""), tuple(model.axes))
 
     def require(self, record: Record) -> None:
-        """Raise RecordError for a record of another stage."""
+        """Raise RecordError if `record` is from another stage."""
         other, lacking = "", [axis for axis in self.axes if axis not in record.axes]
         if lacking:
             other = f"no axis '{lacking[0]}', only {', '.join(record.axes)}"
@@ -121,23 +121,23 @@ class StageIdentity:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """What to identify.
+    """Request of an identification.
 
     Parameters
     ----------
     bags : tuple of str
-        Paths; all in one fit.
+        Paths of the bags, all used in one fit.
     topic : str
     kind : str
         Kind of hysteresis model.
     start, stop : float or None, seconds
-        Part of the record to fit.
+        Fitted part of the record; None: from the first, or to the last stamp.
     output : str
-        File that gets the model too; "": none.
+        File for the model document; "" if none.
     stage : StageIdentity, optional
-        The only stage whose bags are wanted; by default any.
+        Stage that the bags must belong to; default: any.
     published : str
-        The model document that the new one is to take the place of; "": none, and the new one is taken as it is.
+        Model document to be replaced, compared with the new one; "" (default): no comparison.
     """
 
     bags: tuple[str, ...]
@@ -151,15 +151,15 @@ class FitRequest:
 
     @property
     def source(self) -> str:
-        """The bags, in words."""
+        """Text that names the bags."""
         return ", ".join(self.bags)
 
 
 @dataclass(frozen=True)
 class FitOutcome:
-    """What came of it: a model document, or an error, or both when only the file could not be written.
+    """Outcome of an identification: a model document, an error, or both if the file could not be written.
 
-    `doubt` says why the model must not take the place of the published one unasked; it has not been written then.
+    `doubt` is the reason why the model must not replace the published one automatically; it is not written then.
     """
 
     document: str = ""
@@ -168,14 +168,14 @@ class FitOutcome:
 
 
 class FitProcess(WorkerProcess[FitRequest, FitOutcome]):
-    """An identification under way."""
+    """Worker process of an identification."""
 
     def __init__(self, request: FitRequest) -> None:
         super().__init__(fit, request, FitOutcome, f"{request.source}: the identification")
 
 
 def fit(request: FitRequest) -> FitOutcome:
-    """Read the bag, identify the model and write it to the file, if one is named."""
+    """Read the bags, identify the model and write it to the output file, if any."""
     document = ""
     try:
         records = [read_bag(bag, request.topic) for bag in request.bags]
@@ -195,13 +195,13 @@ def fit(request: FitRequest) -> FitOutcome:
     return FitOutcome(document)
 
 
-# A model takes the place of another one unasked only if its held-out error is less than so many times as large, and its
-# largest loop differs by less than this share of its height.
+# A model replaces the published one automatically only if the ratio of the held-out errors is at most this, and the
+# largest loops differ by at most this share of the loop height.
 MUCH_WORSE, FOREIGN = 3.0, 0.1
 
 
 def doubt_about(model: StageModel, published: StageModel) -> str:
-    """Return why a model should not take the place of a published one unasked: it is much worse, or foreign; or ""."""
+    """Return why a model should not replace the published one automatically (worse, or another stage), or ""."""
     for name, old in published.axes.items():
         new = model.axes[name]
         errors = [axis.quality.held_out_rms * 1e9 for axis in (new, old)]
@@ -224,7 +224,7 @@ def doubt_about(model: StageModel, published: StageModel) -> str:
 
 @dataclass(frozen=True)
 class DiagnosisRequest:
-    """What to diagnose.
+    """Request of a diagnosis.
 
     Parameters
     ----------
@@ -232,9 +232,9 @@ class DiagnosisRequest:
         Paths; all in one diagnosis.
     topic : str
     document : str
-        The model's.
+        Model document.
     folder : str
-        Of the files to be written.
+        Output folder.
     """
 
     bags: tuple[str, ...]
@@ -250,7 +250,7 @@ class DiagnosisRequest:
 
 @dataclass(frozen=True)
 class DiagnosisOutcome:
-    """What came of it: of each axis the verdict and a summary, or an error."""
+    """Outcome of a diagnosis: verdict and summary of each axis, or an error."""
 
     verdicts: dict[str, str] = field(default_factory=dict)
     summaries: dict[str, str] = field(default_factory=dict)
@@ -258,7 +258,7 @@ class DiagnosisOutcome:
 
 
 class DiagnosisProcess(WorkerProcess[DiagnosisRequest, DiagnosisOutcome]):
-    """A diagnosis under way."""
+    """Worker process of a diagnosis."""
 
     def __init__(self, request: DiagnosisRequest) -> None:
         super().__init__(judge, request, DiagnosisOutcome, f"{request.source}: the diagnosis")
@@ -283,10 +283,10 @@ def judge(request: DiagnosisRequest) -> DiagnosisOutcome:
     )
 
 
-# Characters. To check more of them, hostile ones, would keep commands waiting for more than some milliseconds, in
-# whatever thread it is done; documents of stages have some ten thousand, at the finest 300,000 for each axis.
+# Characters. The validation of a longer document could delay commands by several milliseconds in any thread of this
+# process; typical documents have ten thousand characters, the finest 300,000 for each axis.
 SMALL, LARGEST = 65_536, 2_000_000
-# How often is looked whether a check is done, seconds.
+# Polling period for the end of a validation, seconds.
 POLL_PERIOD = 0.02
 
 # A model and its fingerprint.
@@ -295,7 +295,7 @@ Read = tuple[StageModel, str]
 
 @dataclass(frozen=True)
 class CheckRequest:
-    """What to check: a model document, and where it came from."""
+    """Request of a validation: a model document and its source."""
 
     document: str
     source: str
@@ -303,14 +303,14 @@ class CheckRequest:
 
 @dataclass(frozen=True)
 class CheckOutcome:
-    """What came of it: the fingerprint of the model, or an error."""
+    """Outcome of a validation: the fingerprint of the model, or an error."""
 
     fingerprint: str = ""
     error: str = ""
 
 
 class CheckProcess(WorkerProcess[CheckRequest, CheckOutcome]):
-    """A check under way."""
+    """Worker process of a validation."""
 
     def __init__(self, request: CheckRequest) -> None:
         with _in_no_hurry():
@@ -318,7 +318,7 @@ class CheckProcess(WorkerProcess[CheckRequest, CheckOutcome]):
 
 
 def check(request: CheckRequest) -> CheckOutcome:
-    """Read a model document."""
+    """Validate a model document."""
     try:
         return CheckOutcome(fingerprint=model_id(parse_model(request.document, request.source)))
     except SlpiError as error:
@@ -326,17 +326,17 @@ def check(request: CheckRequest) -> CheckOutcome:
 
 
 class Reading:
-    """One model document to be read in the background.
+    """Validation of a model document in the background.
 
     Parameters
     ----------
     document, source : str
-        The source names it in messages.
+        Text of the document, and its name in messages.
 
     Raises
     ------
     ModelError
-        If it is too large.
+        If the document is too large.
     """
 
     def __init__(self, document: str, source: str) -> None:
@@ -348,16 +348,16 @@ class Reading:
         self._unwanted = threading.Event()
 
     def cancel(self) -> None:
-        """Come to an end soon: nobody wants the model any more."""
+        """Cancel the validation."""
         self._unwanted.set()
 
     def read(self) -> Read | None:
-        """Return the model and its fingerprint; None once it is unwanted.
+        """Return the model and its fingerprint; None if canceled.
 
         Raises
         ------
         ModelError
-            If it is no valid model document.
+            If the document is not valid.
         """
         if self._unwanted.is_set():
             return None
@@ -381,7 +381,7 @@ class Reading:
 
 @contextmanager
 def _in_no_hurry() -> Iterator[None]:
-    """Start what this thread starts as any other process, even if the thread itself runs in real time."""
+    """Start child processes with normal scheduling, even if this thread has real-time priority."""
     if not hasattr(os, "sched_getscheduler"):
         yield
         return

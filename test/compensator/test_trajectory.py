@@ -154,7 +154,7 @@ def test_points_are_compensated_as_commands_are(limits):
 
 
 CURVES = MODEL.hysteresis
-STEEP = replace(MODEL, hysteresis=replace(CURVES, surface=1.2 * CURVES.everett, rise=1.2 * CURVES.rise))
+STEEP = replace(MODEL, hysteresis=replace(CURVES, everett=1.2 * CURVES.everett, rise=1.2 * CURVES.rise))
 CHANGES = {
     "model": (
         lambda made: made.use_model(StageModel({"x": STEEP, "y": STEEP})),

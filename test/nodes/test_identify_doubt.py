@@ -26,5 +26,5 @@ def test_a_much_worse_model_is_not():
 
 def test_a_foreign_model_is_not():
     shape = X.hysteresis
-    foreign = replace(X, hysteresis=replace(shape, surface=1.3 * shape.surface, rise=1.3 * shape.rise))
+    foreign = replace(X, hysteresis=replace(shape, everett=1.3 * shape.everett, rise=1.3 * shape.rise))
     assert "'x'" in doubt_about(of_error(foreign, 8e-9), of_error(X, 8e-9))

@@ -71,7 +71,7 @@ COMMANDS = ("import", "excite", "identify", "refit", "diagnose", "simulate", "co
 
 def test_excite_identify_refit(tmp_path):
     done = slpi("excite", "-o", tmp_path / "drive.csv", "--voltage-min", 0, "--voltage-max", 100, "--rate", 100)
-    assert done.returncode == 0 and "wipe the memory" in done.stdout
+    assert done.returncode == 0 and "3001 voltages in 30 s" in done.stdout
     t, v = read_table(tmp_path / "drive.csv", "V")
     for name, offset in (("first", 0.0), ("second", 1e-9)):
         y = stage(1).run(t, v["x"])[1] + offset
@@ -138,7 +138,7 @@ def wrong_version(folder, tmp_path):
 
 def binary_model(folder, tmp_path):
     (tmp_path / "binary.json").write_bytes(bytes(range(256)))
-    return ("show", tmp_path / "binary.json"), 1, "not text"
+    return ("show", tmp_path / "binary.json"), 1, "binary.json"
 
 
 def no_model(folder, tmp_path):

@@ -159,9 +159,9 @@ def test_a_new_model_takes_over_where_the_voltage_is(slew):
 def refused_models():
     good = axis_model()
     yield "'x'", {"y": good}
-    yield "outside the voltage +limits", {"x": replace(good, voltage_range=(200.0, 300.0))}
-    yield "none that a stage can take", {"x": replace(good, displacement_range=(0.0, 1e6))}
-    yield "none that a stage can be given", {"x": replace(good, start=Start(5e6, 0.0))}
+    yield r"200\b.*\b300\b", {"x": replace(good, voltage_range=(200.0, 300.0))}
+    yield "displacement", {"x": replace(good, displacement_range=(0.0, 1e6))}
+    yield "voltage", {"x": replace(good, start=Start(5e6, 0.0))}
 
 
 @pytest.mark.parametrize(("why", "axes"), list(refused_models()))

@@ -184,7 +184,7 @@ def test_the_stage_of_the_mpi_paper_creeps_as_time_goes_by():
         ({"rate": 0.0, "answer_commands": False}, "rate is 0.0 Hz"),
         ({"rate": "fast"}, "rate is 'fast'"),
         ({"seed": -1}, "seed is -1"),
-        ({"preset": "p11"}, "those of preset p11 x, y"),
+        ({"preset": "p11"}, "preset p11 has x, y"),
         ({"preset": "best"}, "no preset 'best'"),
         ({"answer_commands": "7"}, "answer_commands"),
     ],

@@ -30,7 +30,7 @@ from slpi_ros.simulation.paths import scan_path  # noqa: E402
 RATE = 250.0
 V_MIN, V_MAX = 0.0, 100.0
 # The graph shows a node a moment before its topics are connected, seconds.
-SETTLE = 1.5
+SETTLE = 3.0
 KINDS = {"pi": "classical PI", "slpi": "SLPI"}
 
 

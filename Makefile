@@ -54,7 +54,7 @@ test: build
 	$(VENV) -m ruff check .
 	$(VENV) -m ruff format --check .
 	$(VENV) -m mypy
-	$(IN_WORKSPACE) $(VENV) -m pytest -n 2 --dist worksteal
+	$(IN_WORKSPACE) $(VENV) -m pytest -n 3 --dist worksteal
 
 demo: build
 	$(IN_WORKSPACE) $(VENV) demo/run_demo.py

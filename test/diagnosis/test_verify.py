@@ -11,6 +11,7 @@ from reports.browser import Browser
 from reports.pages import parsed
 
 import slpi_ros
+import slpi_ros.io.bag_writer
 from slpi_ros.cli import main
 from slpi_ros.diagnosis.verify import CAUSES
 from slpi_ros.errors import RecordError, UsageError
@@ -163,8 +164,8 @@ def folder(tmp_path_factory, model):
     """A model, a bag that passes, one that fails, and one of a path that was compensated from a wrong memory."""
     folder = tmp_path_factory.mktemp("verify")
     slpi_ros.save_model(model, folder / "model.json")
-    slpi_ros.io.bag_reader.write_bag(folder / "good", unseen((100,), offset=-0.93e-6))
-    slpi_ros.io.bag_reader.write_bag(folder / "bad", unseen(gain=1.02))
+    slpi_ros.io.bag_writer.write_bag(folder / "good", unseen((100,), offset=-0.93e-6))
+    slpi_ros.io.bag_writer.write_bag(folder / "bad", unseen(gain=1.02))
     t, desired = path(model)
     v = model.compensate(t, desired, start_memory="start")
     y = after((0, 100, 0)).run(t + 100.0, v)[1]

@@ -23,7 +23,7 @@ from slpi_ros.simulation.paths import scan_path
 from slpi_ros.simulation.preisach import PreisachStage
 
 AXES = ("x", "y")
-RATE, DURATION = 500.0, 8.0
+RATE, DURATION = 500.0, 12.0
 # Of the motion of the other axis; the axes do it to each other.
 COUPLING = {"x": 0.03, "y": -0.02}
 

@@ -74,7 +74,7 @@ def wishes(smooth: bool) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 def achieved(model: StageModel, stages: dict[str, PreisachStage], coupled: bool, smooth: bool) -> dict[str, np.ndarray]:
     """Return the errors of the real displacement, metres, from one second on."""
     t, desired = wishes(smooth)
-    stream, real = model.streams(), {name: np.empty(t.size) for name in AXES}
+    stream, real = model.streams(start_memory="start"), {name: np.empty(t.size) for name in AXES}
     for k, now in enumerate(t.tolist()):
         voltage = stream.step(now, {name: float(path[k]) for name, path in desired.items()})
         for name in AXES:

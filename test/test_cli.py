@@ -138,7 +138,7 @@ def wrong_version(folder, tmp_path):
 
 def binary_model(folder, tmp_path):
     (tmp_path / "binary.json").write_bytes(bytes(range(256)))
-    return ("show", tmp_path / "binary.json"), 1, "binary.json"
+    return ("show", tmp_path / "binary.json"), 1, "not a text file"
 
 
 def no_model(folder, tmp_path):

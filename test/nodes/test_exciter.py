@@ -156,7 +156,7 @@ class TestAnExciterThatWaits:
         np.testing.assert_array_equal(listener.v, wanted)
         stamps = np.array([state.header.stamp.sec + state.header.stamp.nanosec * 1e-9 for state in states])
         # On a busy machine it takes longer, but never less.
-        assert stamps[-1] - stamps[0] > 0.8 * (len(stamps) - 1) / RATE
+        assert stamps[-1] - stamps[0] > 0.95 * (len(stamps) - 1) / RATE
         assert "done after" in node.stderr and "Traceback" not in node.stderr
 
     def test_the_drive_begins_and_ends_where_the_stage_is(self, waiting):

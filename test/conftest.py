@@ -31,6 +31,10 @@ def _reserve_ros_domain() -> int:
     raise RuntimeError("all ROS domains are taken by other test runs; wait for one to end")
 
 
+# The tests run on all cores already: threads of BLAS would only wait for each other. Read when NumPy is imported.
+for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")
+
 # Set before any test module imports rclpy; the nodes that tests start inherit both.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_DOMAIN_ID"] = str(_reserve_ros_domain())

@@ -50,4 +50,4 @@ def test_an_identification_tells_what_it_does(kind):
     heard = []
     with listening(heard.append):
         slpi_ros.identify(calibration(seed=1, duration=8.0)[0], kind)
-    assert heard[0].startswith("axis x") and sum("left out" in what for what in heard) >= 5
+    assert heard[0].startswith("axis x") and sum("fold" in what for what in heard) >= 5

@@ -183,13 +183,13 @@ def test_place_taken_while_recording(tmp_path, node, record):
 @pytest.mark.parametrize(
     ("parameters", "code", "says"),
     [
-        ({}, 2, "recorder: no output; name the bag to make"),
-        ({"output": "bag", "storage": "zip"}, 2, "no bag storage 'zip'; choose mcap or sqlite3"),
-        ({"output": "bag", "duration": "-1.0"}, 2, "recorder: duration is -1.0 s; give 0 or more"),
-        ({"output": "bag", "duration": "soon"}, 2, "recorder: duration is 'soon'; give seconds"),
-        ({"output": "bag", "topics": "one"}, 2, "recorder: topics is 'one'; give a list of names"),
-        ({"output": "bag", "topics": "['a b']"}, 2, "topic name must not contain characters other than"),
-        ({"output": "/proc/no/bag"}, 1, "/proc/no/bag: cannot be made"),
+        ({}, 2, "output"),
+        ({"output": "bag", "storage": "zip"}, 2, "'zip'"),
+        ({"output": "bag", "duration": "-1.0"}, 2, "duration is -1.0"),
+        ({"output": "bag", "duration": "soon"}, 2, "duration is 'soon'"),
+        ({"output": "bag", "topics": "one"}, 2, "topics is 'one'"),
+        ({"output": "bag", "topics": "['a b']"}, 2, "topic name"),
+        ({"output": "/proc/no/bag"}, 1, "/proc/no/bag"),
     ],
 )
 def test_parameters_that_make_no_recording(tmp_path, record, parameters, code, says):

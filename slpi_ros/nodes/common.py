@@ -5,7 +5,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -293,7 +293,9 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
         executor.add_node(node)
         try:
             while ok() and not _stop.requested:
-                executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+                # A subscription may be destroyed while one of its events waits to be taken.
+                with suppress(rclpy_implementation.InvalidHandle):
+                    executor.spin_once(timeout_sec=SPIN_TIMEOUT)
         finally:
             executor.remove_node(node)
             executor.shutdown()

@@ -12,11 +12,10 @@ import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial, reduce
-from typing import TypeVar
+from itertools import pairwise
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
@@ -28,13 +27,13 @@ from slpi_ros.effects.creep import Creep, settling
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import Hysteresis
+from slpi_ros.identification.design_matrix import Rows
 from slpi_ros.identification.least_squares import FOLDS, Problem, blocked_folds
 from slpi_ros.identification.linear_kinds import SMOOTHNESS
 from slpi_ros.identification.samples import Samples
 
 FloatArray = NDArray[np.float64]
 Factor = tuple[FloatArray, bool]
-Summed = TypeVar("Summed", FloatArray, "_Equations")
 
 # What effects add is found in turns with the hysteresis, until a turn changes it by less than this share of the error.
 MOST_TURNS, SETTLED = 15, 0.02
@@ -97,194 +96,224 @@ class Joint:
 
     def __init__(self, evidence: Evidence, u: FloatArray) -> None:
         self.problem, self.evidence = evidence.problem(u), evidence
-        problem, smoothness, design = self.problem, evidence.smoothness, self.problem.design
-        self._groups = _groups(problem, evidence)
-        self._local = [design.local[rows] for rows in self._groups]
-        self._pick = [design.pick[rows] for rows in self._groups]
-        self._at_turns = design.at_turns
-        grams = [self._gram(local, pick) for local, pick in zip(self._local, self._pick, strict=True)]
-        counts = np.array([rows.size for rows in self._groups])
+        self._groups = _groups(self.problem, evidence)
+        self.everything = self.problem.design.rows(np.concatenate(self._groups))
+        self._ends = np.cumsum([0, *(rows.size for rows in self._groups)]).tolist()
+        sample = np.empty(self.problem.y.size, dtype=np.int64)
+        sample[evidence.rows] = np.arange(evidence.rows.size)
+        # Of each row of the equations.
+        self._samples = sample[np.concatenate(self._groups)]
 
-        def factor(chosen: Sequence[int]) -> Factor:
-            matrix = _sum([grams[group] for group in chosen])
-            return _factor(matrix + problem.penalty(smoothness, float(counts[list(chosen)].sum())))
+    @cached_property
+    def factor(self) -> Factor:
+        """Factor of the hysteresis's equations, all samples."""
+        return self._factored(self.everything.gram(), self._ends[-1])
 
-        everything = range(len(grams))
-        self._fold_groups = [list(everything)[fold :: FOLDS + 1] for fold in range(1, FOLDS + 1)]
-        self._record_groups = [
-            list(everything)[k * (FOLDS + 1) : (k + 1) * (FOLDS + 1)] for k in range(len(evidence.parts))
-        ]
-        if len(evidence.parts) == 1:
-            self._record_groups = []
-        # What is left out, and the factor of the rest.
-        self._folds = [(left, _rest(everything, left)) for left in self._fold_groups]
-        self._records = [(left, _rest(everything, left)) for left in self._record_groups]
-        self._fold_factors = [factor(rest) for _, rest in self._folds]
-        self._record_factors = [factor(rest) for _, rest in self._records]
-        self._factor = factor(everything)
+    def _factored(self, gram: FloatArray, count: int) -> Factor:
+        return _factor(gram + self.problem.penalty(self.evidence.smoothness, float(count)))
+
+    @cached_property
+    def rows(self) -> list[Rows]:
+        """Equations of each group."""
+        return [self.problem.design.rows(rows) for rows in self._groups]
+
+    @cached_property
+    def held_out(self) -> tuple[list["_HeldOut"], list["_HeldOut"]]:
+        """The folds, and the records where there are several."""
+        grams = [rows.gram() for rows in self.rows]
+        everything, whole = range(len(grams)), _sum(grams)
+
+        def held_out(left: Sequence[int]) -> _HeldOut:
+            count = self._ends[-1] - sum(self._groups[group].size for group in left)
+            return _HeldOut(left, self._factored(whole - _sum([grams[group] for group in left]), count))
+
+        folds = [held_out(everything[fold :: FOLDS + 1]) for fold in range(1, FOLDS + 1)]
+        if len(self.evidence.parts) == 1:
+            return folds, []
+        return folds, [held_out(everything[k : k + FOLDS + 1]) for k in everything[:: FOLDS + 1]]
 
     @cached_property
     def blocks(self) -> list[NDArray[np.int64]]:
         """Rows of the blocks that are left out, in the order of time."""
-        left_out = [self._groups[group] for left in self._fold_groups for group in left]
+        left_out = [self._groups[group] for fold in self.held_out[0] for group in fold.left]
         return np.array_split(np.sort(np.concatenate(left_out)), BLOCKS)
 
-    def _gram(self, local: sp.csr_array, pick: sp.csr_array) -> FloatArray:
-        at_turns = self._at_turns
-        mixed = (local.T @ pick) @ at_turns
-        gram: FloatArray = (local.T @ local).toarray() + mixed + mixed.T + at_turns.T @ ((pick.T @ pick) @ at_turns)
-        return gram
-
-    def padded(self, signals: FloatArray) -> FloatArray:
-        """Return signals, shape (N, ..), metres, on the rows of the problem, in units of its scale."""
-        whole = np.zeros((self.problem.y.size, *signals.shape[1:]))
-        whole[self.evidence.rows] = signals / self.problem.scale
+    def padded(self, signal: FloatArray) -> FloatArray:
+        """Return a signal, shape (N,), metres, on the rows of the problem, in units of its scale."""
+        whole = np.zeros(self.problem.y.size)
+        whole[self.evidence.rows] = signal / self.problem.scale
         return whole
 
-    def _grouped(self, signals: FloatArray) -> list[FloatArray]:
-        padded = self.padded(signals)
-        return [padded[rows] for rows in self._groups]
+    def sampled(self, signals: FloatArray) -> FloatArray:
+        """Return signals, shape (N, ..), metres, at the rows of the equations, in units of the problem's scale."""
+        chosen: FloatArray = signals[self._samples] / self.problem.scale
+        return chosen
 
-    def _project(self, groups: list[FloatArray]) -> list[FloatArray]:
-        """Return ``A' J`` of each group of rows, shape (p, k)."""
-        parts = zip(groups, self._local, self._pick, strict=True)
-        return [local.T @ part + self._at_turns.T @ (pick.T @ part) for part, local, pick in parts]
+    def grouped(self, signals: FloatArray) -> list[FloatArray]:
+        """Return signals at the rows of the equations as those of each group."""
+        return [signals[first:end] for first, end in pairwise(self._ends)]
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Return what the hysteresis gives for parameters `x`, shape (N,), metres."""
         return self.problem.design.predict(x)[self.evidence.rows] * self.problem.scale
 
-    def score(self, y: FloatArray, columns: FloatArray, *, positive: int = 0, starting: Sequence[int] = ()) -> Score:
+    def columns(self, *signals: FloatArray) -> "Columns":
+        """Return the equations of signals, shape (N,) or (N, k) each, metres, beside the hysteresis."""
+        return Columns(self, self.sampled(np.column_stack(signals)))
+
+    def score(self, signals: Sequence["Columns"], *, positive: int = 0, starting: Sequence[int] = ()) -> Score:
         """Score hysteresis and columns on what is left out.
 
         Parameters
         ----------
-        y : ndarray, shape (N,), metres
-            What they are to explain.
-        columns : ndarray, shape (N, k), metres
+        signals : sequence of Columns
+            The very first column is what the others are to explain, with the hysteresis.
         positive : int
             Number of the last columns whose gains may not be negative.
         starting : sequence of int
-            Columns that tell how a record began: with its constant they are fitted to a record that is left out.
+            Columns, the first one not counted, that tell how a record began: with its constant they are fitted to a
+            record that is left out.
         """
-        sums = _Sums.of(self, y, columns)
-        errors = np.full(self.problem.y.size, np.nan)
-        for (left, rest), factor in zip(self._folds, self._fold_factors, strict=True):
-            x, gains = sums.of_groups(rest).solve(factor, positive=positive)
-            for group in left:
-                errors[self._groups[group]] = self._errors(sums, group, x, gains)
+        at = self.grouped(np.column_stack([one.at for one in signals]))
+        projected = [np.column_stack(parts) for parts in zip(*(one.projected for one in signals), strict=True)]
+        products = [own.T @ own for own in at]
+        whole, inner = _sum(projected), _sum(products)
+        gains = _gains(whole, inner, np.column_stack([one.solved for one in signals]), positive)
+        errors, (folds, records) = np.full(self.problem.y.size, np.nan), self.held_out
+        for k, fold in enumerate(folds):
+            solved = np.column_stack([one.solved_of_folds[k] for one in signals])
+            rest = whole - _sum([projected[group] for group in fold.left])
+            of_rest = _gains(rest, inner - _sum([products[group] for group in fold.left]), solved, positive)
+            x = solved @ _missed(of_rest)
+            for group in fold.left:
+                errors[self._groups[group]] = self.rows[group].predict(x) - at[group] @ _missed(of_rest)
         losses = np.array([float(np.mean(errors[rows] ** 2)) for rows in self.blocks])
-        gains = sums.of_groups(range(len(self._groups))).solve(self._factor, positive=positive)[1]
+        left_out = []
+        for record in records:
+            # The gains of the columns are those of all records: one record at one speed does not tell them.
+            rest = whole - _sum([projected[group] for group in record.left])
+            x = _solved(record.factor, rest @ _missed(gains))
+            missed = [self.rows[group].predict(x) - at[group] @ _missed(gains) for group in record.left]
+            began = [at[group][:, 1:][:, starting] for group in record.left]
+            # Others cannot tell what depends on the initial history alone.
+            judged = _judged(self.problem)[np.concatenate([self._groups[group] for group in record.left])]
+            left_out.append(_without_start(np.concatenate(missed)[judged], np.concatenate(began)[judged]))
         square = self.problem.scale**2
-        left_out = np.array([self._left_out(sums, k, gains, starting) for k in range(len(self._records))])
-        return Score(losses * square, gains, left_out * square)
+        return Score(losses * square, gains, np.array(left_out) * square)
 
-    def _left_out(self, sums: "_Sums", k: int, gains: FloatArray, starting: Sequence[int]) -> float:
-        """Return the mean square of the errors of a record by a hysteresis fitted to the others.
 
-        The gains of the columns are those of all records: one record at one speed does not tell them.
-        """
-        left, rest = self._records[k]
-        equations = sums.of_groups(rest)
-        vector = equations.a_y - equations.a_j @ gains
-        x = scipy.linalg.cho_solve(self._record_factors[k], vector, check_finite=False)
-        missed = np.concatenate([self._errors(sums, group, x, gains) for group in left])
-        began = np.concatenate([sums.columns[group][:, starting] for group in left])
-        # Others cannot tell what depends on the initial history alone.
-        judged = _judged(self.problem)[np.concatenate([self._groups[group] for group in left])]
-        missed, began = missed[judged], began[judged]
-        own = np.column_stack([np.ones(missed.size), began[:, began.any(axis=0)]])
-        return float(np.mean((missed - own @ np.linalg.lstsq(own, missed, rcond=None)[0]) ** 2))
-
-    def _errors(self, sums: "_Sums", group: int, x: FloatArray, gains: FloatArray) -> FloatArray:
-        predicted = self._local[group] @ x + self._pick[group] @ (self._at_turns @ x)
-        errors: FloatArray = predicted + sums.columns[group] @ gains - sums.y[group]
-        return errors
-
-    def fit(self, y: FloatArray, columns: FloatArray | None = None) -> "Fit":
-        """Fit hysteresis and columns, as in `score`, to all samples."""
-        equations = _Sums.of(self, y, columns).of_groups(range(len(self._groups)))
-        x, gains = equations.solve(self._factor, positive=0)
-        return Fit(x, gains, equations.precision(self._factor) * self.problem.scale**2)
+def _without_start(missed: FloatArray, began: FloatArray) -> float:
+    """Return the mean square of errors, shape (n,), without their constant and what columns, shape (n, k), explain."""
+    own = np.column_stack([np.ones(missed.size), began[:, began.any(axis=0)]])
+    return float(np.mean((missed - own @ np.linalg.lstsq(own, missed, rcond=None)[0]) ** 2))
 
 
 @dataclass(frozen=True)
-class Fit:
-    """Hysteresis and columns fitted together.
+class _HeldOut:
+    """Groups that are left out, and the factor of the others' equations."""
+
+    left: Sequence[int]
+    factor: Factor
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns beside the hysteresis.
 
     Parameters
     ----------
-    x : ndarray, shape (p,)
-        Of the hysteresis, in units of the problem's scale; branches may fall a little.
-    gains : ndarray, shape (k,)
-    precision : ndarray, shape (k, k), m^2
-        Inverse covariance of the gains for errors of 1 m, one sample independent of the other.
+    joint : Joint
+    at : ndarray, shape (n, k)
+        The columns at the rows of the equations.
     """
 
-    x: FloatArray
-    gains: FloatArray
-    precision: FloatArray
+    joint: Joint
+    at: FloatArray
 
+    @cached_property
+    def projected(self) -> list[FloatArray]:
+        """``A'J`` of each group, shape (p, k)."""
+        joint = self.joint
+        return [rows.project(own) for rows, own in zip(joint.rows, joint.grouped(self.at), strict=True)]
 
-@dataclass(frozen=True)
-class _Equations:
-    """``A'J``, ``A'y``, ``J'J`` and ``J'y``."""
+    @cached_property
+    def whole(self) -> FloatArray:
+        """``A'J``, shape (p, k)."""
+        return self.joint.everything.project(self.at)
 
-    a_j: FloatArray
-    a_y: FloatArray
-    j_j: FloatArray
-    j_y: FloatArray
+    @cached_property
+    def solved(self) -> FloatArray:
+        """Parameters of the hysteresis that explains each column best, shape (p, k)."""
+        return _solved(self.joint.factor, self.whole)
 
-    def __add__(self, other: "_Equations") -> "_Equations":
-        return _Equations(self.a_j + other.a_j, self.a_y + other.a_y, self.j_j + other.j_j, self.j_y + other.j_y)
-
-    def precision(self, factor: Factor) -> FloatArray:
-        """Return what is left of ``J'J`` beside the hysteresis."""
-        left: FloatArray = self.j_j - self.a_j.T @ scipy.linalg.cho_solve(factor, self.a_j, check_finite=False)
-        return left
-
-    def solve(self, factor: Factor, *, positive: int) -> tuple[FloatArray, FloatArray]:
-        """Return the parameters of the hysteresis, shape (p,), and the gains, shape (k,)."""
-        alone = scipy.linalg.cho_solve(factor, self.a_y, check_finite=False)
-        if not self.j_y.size:
-            return alone, np.empty(0)
-        beside = scipy.linalg.cho_solve(factor, self.a_j, check_finite=False)
-        matrix = self.j_j - self.a_j.T @ beside
-        size = np.sqrt(np.maximum(np.diag(self.j_j), 1e-300))
-        matrix = matrix / np.outer(size, size) + ALIKE * np.eye(size.size)
-        vector = (self.j_y - self.a_j.T @ alone) / size
-        if positive:
-            # With M = R' R the bounded minimum of g' M g / 2 - b' g is that of |R g - R^-T b|.
-            root = scipy.linalg.cholesky(matrix)
-            wanted = scipy.linalg.solve_triangular(root, vector, trans="T")
-            lower = np.repeat([-np.inf, 0.0], [size.size - positive, positive])
-            gains = lsq_linear(root, wanted, (lower, np.full(size.size, np.inf))).x / size
-        else:
-            gains = scipy.linalg.solve(matrix, vector, assume_a="pos") / size
-        return alone - beside @ gains, gains
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """The equations of every group of rows."""
-
-    columns: list[FloatArray]
-    y: list[FloatArray]
-    groups: list[_Equations]
-
-    @classmethod
-    def of(cls, joint: Joint, y: FloatArray, columns: FloatArray | None) -> "_Sums":
-        j = joint._grouped(np.empty((y.size, 0)) if columns is None else columns)
-        own_y = joint._grouped(y[:, None])
-        a_j, a_y = joint._project(j), joint._project(own_y)
-        groups = [
-            _Equations(of_j, of_y[:, 0], part.T @ part, part.T @ part_y[:, 0])
-            for of_j, of_y, part, part_y in zip(a_j, a_y, j, own_y, strict=True)
+    @cached_property
+    def solved_of_folds(self) -> list[FloatArray]:
+        """The same without each fold."""
+        whole = _sum(self.projected)
+        return [
+            _solved(fold.factor, whole - _sum([self.projected[group] for group in fold.left]))
+            for fold in self.joint.held_out[0]
         ]
-        return cls(j, [part[:, 0] for part in own_y], groups)
 
-    def of_groups(self, chosen: Sequence[int]) -> _Equations:
-        return _sum([self.groups[group] for group in chosen])
+    @property
+    def precision(self) -> FloatArray:
+        """Inverse covariance of the gains of the columns, shape (k, k), m^2, for independent errors of 1 m."""
+        left: FloatArray = self.at.T @ self.at - self.whole.T @ self.solved
+        return left * self.joint.problem.scale**2
+
+    def fit(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Fit hysteresis and columns to all samples of `y`, shape (N,), metres.
+
+        Returns
+        -------
+        x : ndarray, shape (p,)
+            Of the hysteresis, in units of the problem's scale; branches may fall a little.
+        gains : ndarray, shape (k,)
+        """
+        own = self.joint.columns(y)
+        solved = np.column_stack([own.solved, self.solved])
+        at = np.column_stack([own.at, self.at])
+        gains = _gains(np.column_stack([own.whole, self.whole]), at.T @ at, solved)
+        return solved @ _missed(gains), gains
+
+
+def _missed(gains: FloatArray) -> FloatArray:
+    """Return the weights, shape (1 + k,), of a signal and the columns that explain it with some gains, shape (k,)."""
+    return np.concatenate([[1.0], -gains])
+
+
+def _gains(projected: FloatArray, products: FloatArray, solved: FloatArray, positive: int = 0) -> FloatArray:
+    """Return the gains, shape (k,), of columns that explain the first one together with the hysteresis.
+
+    Parameters
+    ----------
+    projected, solved : ndarray, shape (p, 1 + k)
+        ``A'J`` and the hysteresis that explains each column.
+    products : ndarray, shape (1 + k, 1 + k)
+        ``J'J``.
+    positive : int
+        Number of the last columns whose gains may not be negative.
+    """
+    if products.shape[0] == 1:
+        return np.empty(0)
+    left = products[1:] - projected[:, 1:].T @ solved
+    size = np.sqrt(np.maximum(np.diag(products)[1:], 1e-300))
+    matrix, vector = left[:, 1:] / np.outer(size, size) + ALIKE * np.eye(size.size), left[:, 0] / size
+    gains: FloatArray
+    if not positive:
+        gains = scipy.linalg.solve(matrix, vector, assume_a="pos")
+    else:
+        # The minimum of g' M g / 2 - b' g with M = R' R is that of |R g - R^-T b|.
+        root = scipy.linalg.cholesky(matrix)
+        wanted = scipy.linalg.solve_triangular(root, vector, trans="T")
+        lower = np.repeat([-np.inf, 0.0], [size.size - positive, positive])
+        gains = lsq_linear(root, wanted, (lower, np.full(size.size, np.inf))).x
+    return gains / size
+
+
+def _solved(factor: Factor, of: FloatArray) -> FloatArray:
+    solution: FloatArray = scipy.linalg.cho_solve(factor, of, check_finite=False)
+    return solution
 
 
 def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
@@ -312,16 +341,12 @@ def _judged(problem: Problem) -> NDArray[np.bool_]:
     return np.asarray((problem.judged & ~walk.first_rise) | (walk.direction == 0))
 
 
-def _rest(everything: Sequence[int], left: Sequence[int]) -> list[int]:
-    return [group for group in everything if group not in left]
-
-
 def _factor(matrix: FloatArray) -> Factor:
     factor: Factor = scipy.linalg.cho_factor(matrix, check_finite=False)
     return factor
 
 
-def _sum(parts: Sequence[Summed]) -> Summed:
+def _sum(parts: Sequence[FloatArray]) -> FloatArray:
     return reduce(operator.add, parts)
 
 
@@ -360,20 +385,20 @@ class Explanation:
         starting = settling(self._relaxations, evidence.around, evidence.used)
         self._before = np.column_stack([starting, evidence.beside])
         self._starting = range(starting.shape[1])
-        self._fit()
+        beside = self.joint.columns(self._before)
+        self._fit(beside)
         if any(effect.side == "displacement" for effect in self.effects):
             for _ in range(MOST_TURNS):
                 h, before = self.joint.predict(self._x), self.added
                 self.added = self._behind(self.effects, h + self._aside, self.u) - h
-                self._fit()
+                self._fit(beside)
                 if np.ptp(self.added - before) < SETTLED * np.std(self.target - h):
                     break
 
-    def _fit(self) -> None:
-        fit = self.joint.fit(self.target, self._before)
-        self._x, self.settling = fit.x, self._before @ fit.gains
-        self.began = fit.gains[: len(self._starting)]
-        self._loops = [cache(partial(self._loop, fit.x, k)) for k in range(len(self.evidence.parts))]
+    def _fit(self, beside: Columns) -> None:
+        self._x, gains = beside.fit(self.target)
+        self.settling, self.began = self._before @ gains, gains[: len(self._starting)]
+        self._loops = [cache(partial(self._loop, self._x, k)) for k in range(len(self.evidence.parts))]
 
     @property
     def _relaxations(self) -> list[float]:
@@ -495,14 +520,18 @@ class Explanation:
         """Score it with a candidate beside it, all effects refitted."""
         first = self._before.shape[1] + self.tangents.shape[1]
         starting = [*self._starting, *range(first, first + candidate.starting)]
-        beside = np.column_stack([self._before, self.tangents, candidate.columns])
-        return self.joint.score(self.target, beside, positive=candidate.positive, starting=starting)
+        signals = self._signals, self.joint.columns(candidate.columns)
+        return self.joint.score(signals, positive=candidate.positive, starting=starting)
+
+    @cached_property
+    def _signals(self) -> Columns:
+        """The target and what stands beside the hysteresis."""
+        return self.joint.columns(self.target, self._before, self.tangents)
 
     @cached_property
     def held_out(self) -> Score:
         """Its own score."""
-        beside = np.column_stack([self._before, self.tangents])
-        return self.joint.score(self.target, beside, starting=self._starting)
+        return self.joint.score([self._signals], starting=self._starting)
 
     @property
     def objective(self) -> float:
@@ -524,8 +553,7 @@ class Explanation:
 
     def _step(self) -> "Explanation":
         """Return it after one step, shortened until it gains; itself where none does."""
-        columns = np.column_stack([self._before, self.tangents])
-        change = self.joint.fit(self.target, columns).gains[self._before.shape[1] :]
+        change = self.joint.columns(self._before, self.tangents).fit(self.target)[1][self._before.shape[1] :]
         for share in SHARES:
             try:
                 effects = self._stepped(share * change)
@@ -562,8 +590,7 @@ class Explanation:
         """
         if not self.effects:
             return []
-        columns = np.column_stack([self.tangents, self._before])
-        precision = self.joint.fit(self.target, columns).precision
+        precision = self.joint.columns(self.tangents, self._before).precision
         errors = self.residual[self.evidence.used]
         size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
         inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
@@ -575,9 +602,8 @@ class Explanation:
 
     def smoothed(self) -> "Explanation":
         """Return it with the hysteresis as smooth as blocks left out say, now that effects no longer disturb it."""
-        problem = self.joint.problem
-        scores = replace(problem, y=self.joint.padded(self.target)).scores(SMOOTHNESS)
-        best = SMOOTHNESS[int(np.argmin(scores))]
+        problem = replace(self.joint.problem, y=self.joint.padded(self.target))
+        best = problem.smoothness_near(self.evidence.smoothness, SMOOTHNESS)
         if best == self.evidence.smoothness:
             return self
         return Explanation(replace(self.evidence, smoothness=best), self.effects).refined(2)

@@ -82,9 +82,9 @@ class Creep:
         grid = Uniform.over(around.t)
         moved = grid.on(signal)
         moved = moved - moved[:1]
-        crept = np.zeros_like(moved)
-        for gain, (now, before, kept) in zip(self.gains, self._holds(grid.dt), strict=True):
-            crept += gain * lfilter([now, before], [1.0, -kept], moved)
+        from slpi_ros.effects.paths import relaxed
+
+        crept = relaxed(moved, np.array(self.gains), np.array(self._holds(grid.dt)))
         if self.initial:
             since = grid.grid - grid.grid[:1]
             for gain, tau in zip(self.gains, self.time_constants, strict=True):

@@ -25,7 +25,6 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.reversals import monotone_runs
 
 CoercivityState = tuple[float, float, float, float]
 
@@ -311,7 +310,7 @@ class RateDependence:
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement of the widened loops, shape (N,), metres, or the voltage at the hysteresis, volts."""
         if self.coercivity:
-            from slpi_ros.effects.coercivity_path import play, settled_rate
+            from slpi_ros.effects.paths import play, settled_rate
 
             return play(signal, self._growth(settled_rate(around.t, signal, self.settling)))
         middle, speed, direction = self._drive(around)
@@ -323,7 +322,7 @@ class RateDependence:
         In the coercivity form return the command, shape (N,), volts, using the rate of the voltage at the hysteresis.
         """
         if self.coercivity:
-            from slpi_ros.effects.coercivity_path import settled_rate
+            from slpi_ros.effects.paths import settled_rate
 
             half_width = self._growth(settled_rate(around.t, signal, self.settling))
             return signal + half_width * np.sign(np.gradient(signal)) if signal.size > 1 else signal.copy()
@@ -415,13 +414,9 @@ class RateDependence:
     def _direction(self, u: FloatArray) -> FloatArray:
         if not self.backlash:
             return np.zeros_like(u)
-        direction, now = np.zeros_like(u), 0.0
-        for start, stop in monotone_runs(u):
-            turn = u[max(start - 1, 0)]
-            way = float(np.sign(u[stop - 1] - turn))
-            direction[start:stop] = way + (now - way) * np.exp(-np.abs(u[start:stop] - turn) / self.transition)
-            now = float(direction[stop - 1])
-        return direction
+        from slpi_ros.effects.paths import direction
+
+        return direction(u, self.transition)
 
     @overload
     def _growth(self, rate: float) -> float: ...

@@ -9,6 +9,7 @@ the product is never formed.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -107,21 +108,33 @@ class Design:
     walk: Walk
 
     @cached_property
-    def pick(self) -> sp.csr_array:
-        """Sparse matrix that selects the reversal at which each sample's branch started, shape (N, turns)."""
-        own = np.flatnonzero(self.walk.origin >= 0)
-        column = np.searchsorted(self.turns, self.walk.origin[own])
-        return sp.csr_array((np.ones(own.size), (own, column)), shape=(self.walk.v.size, self.turns.size))
+    def _branch(self) -> NDArray[np.int64]:
+        """Place in `turns` of the reversal at which each sample's branch started, shape (N,); -1 for none."""
+        origin = self.walk.origin
+        return np.where(origin >= 0, np.searchsorted(self.turns, origin), -1)
 
     @cached_property
-    def at_turns(self) -> FloatArray:
+    def _before(self) -> list[tuple[int, int]]:
+        """Each reversal and the one at which its own branch started, where there is one, in ascending order."""
+        before = self._branch[self.turns]
+        rows = np.flatnonzero(before >= 0)
+        return list(zip(rows.tolist(), before[rows].tolist(), strict=True))
+
+    @cached_property
+    def pick(self) -> sp.csr_array:
+        """Sparse matrix that selects the reversal at which each sample's branch started, shape (N, turns)."""
+        on_branch = self._branch >= 0
+        pointers = np.concatenate([[0], np.cumsum(on_branch)])
+        columns = self._branch[on_branch]
+        return sp.csr_array((np.ones(columns.size), columns, pointers), shape=(self.walk.v.size, self.turns.size))
+
+    @cached_property
+    def at_turns(self) -> sp.csr_array:
         """Rows of the linear prediction at the reversals, accumulated from earlier reversals, shape (turns, p)."""
-        rows: FloatArray = self.local[self.turns].toarray()
-        before = self.walk.origin[self.turns]
-        for row, origin in enumerate(before.tolist()):
-            if origin >= 0:
-                rows[row] += rows[np.searchsorted(self.turns, origin)]
-        return rows
+        rows = self.local[self.turns].toarray()
+        for row, before in self._before:
+            rows[row] += rows[before]
+        return sp.csr_array(rows)
 
     @classmethod
     def of(cls, walk: Walk, branch_part: sp.csr_array) -> "Design":
@@ -134,14 +147,55 @@ class Design:
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Return the displacement of every sample, shape (N,), for parameters `x`, shape (p,), in the unit of `x`."""
-        result: FloatArray = self.local @ x + self.pick @ (self.at_turns @ x)
+        result: FloatArray = self.local @ x
+        at_turns = result[self.turns].tolist()
+        for row, before in self._before:
+            at_turns[row] += at_turns[before]
+        result += np.array([*at_turns, 0.0])[self._branch]
         return result
+
+    def rows(self, chosen: NDArray[np.integer[Any]]) -> "Rows":
+        """Return the rows of some samples."""
+        return Rows(self.local[chosen], self.pick[chosen], self.at_turns)
 
     def normal_equations(self, y: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``A' W A``, shape (p, p), and ``A' W y``, shape (p,), for `y` and `weights` of shape (N,)."""
-        local, pick, at_turns = self.local, self.pick, self.at_turns
-        weigh = sp.diags_array(weights)
-        local_w, pick_w = (local.T @ weigh).tocsr(), (pick.T @ weigh).tocsr()
-        mixed = (local_w @ pick) @ at_turns
-        matrix = (local_w @ local).toarray() + mixed + mixed.T + at_turns.T @ ((pick_w @ pick) @ at_turns)
-        return matrix, local_w @ y + at_turns.T @ (pick_w @ y)
+        chosen = np.flatnonzero(weights)
+        rows = self.rows(chosen)
+        return rows.gram(weights[chosen]), rows.project(weights[chosen] * y[chosen])
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows ``A = local + pick at_turns`` of a design matrix, of n samples.
+
+    Parameters
+    ----------
+    local : sparse array, shape (n, p)
+    pick : sparse array, shape (n, turns)
+    at_turns : sparse array, shape (turns, p)
+    """
+
+    local: sp.csr_array
+    pick: sp.csr_array
+    at_turns: sp.csr_array
+
+    def predict(self, x: FloatArray) -> FloatArray:
+        """Return ``A x``, shape (n,)."""
+        result: FloatArray = self.local @ x + self.pick @ (self.at_turns @ x)
+        return result
+
+    def project(self, signals: FloatArray) -> FloatArray:
+        """Return ``A' J`` for `signals` J, shape (n,) or (n, k)."""
+        result: FloatArray = self.local.T @ signals + self.at_turns.T @ (self.pick.T @ signals)
+        return result
+
+    def gram(self, weights: FloatArray | None = None) -> FloatArray:
+        """Return ``A' W A``, shape (p, p), for `weights`, shape (n,); 1 by default."""
+        local, pick = self.local.T, self.pick.T
+        if weights is not None:
+            local, pick = local @ sp.diags_array(weights), pick @ sp.diags_array(weights)
+        mixed = (local @ self.pick) @ self.at_turns
+        whole = local @ self.local + mixed + mixed.T + self.at_turns.T @ ((pick @ self.pick) @ self.at_turns)
+        result: FloatArray = whole.toarray()
+        return result

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 import osqp
@@ -238,19 +239,40 @@ class Problem:
 
     def scores(self, smoothness: Sequence[float]) -> FloatArray:
         """Return the robust rms held-out error (m) for each smoothness, from fits without monotonicity constraints."""
+        return np.array([self._score(each) for each in smoothness])
+
+    def smoothness_near(self, present: float, among: Sequence[float]) -> float:
+        """Return that of the ascending values `among` from which no neighbour lowers the held-out error.
+
+        The search starts from the `present` one.
+        """
+        score = cache(lambda k: self._score(among[k]))
+        best, k = among.index(present), -1
+        while best != k:
+            k = best
+            best = min(range(max(k - 1, 0), min(k + 2, len(among))), key=score)
+        return among[best]
+
+    @cached_property
+    def _folds(self) -> list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]]:
+        """Number of samples of each fold, normal equations of the others, and its own."""
         matrix, vector = self.design.normal_equations(self.y, self.weights)
-        squares, total = np.zeros(len(smoothness)), 0.0
+        equations = []
         for chosen in self.folds():
             left_out = np.zeros_like(self.weights)
             left_out[chosen] = self.weights[chosen]
-            fold_matrix, fold_vector = self.design.normal_equations(self.y, left_out)
-            energy, total = float(left_out @ self.y**2), total + float(left_out.sum())
-            for k, weight in enumerate(smoothness):
-                rest = self.penalty(weight, self.count - chosen.size)
-                x = solve_free(matrix - fold_matrix + rest, vector - fold_vector)
-                squares[k] += x @ fold_matrix @ x - 2.0 * (x @ fold_vector) + energy
-        rms: FloatArray = np.sqrt(np.maximum(squares, 0.0) / total) * self.scale
-        return rms
+            own_matrix, own_vector = self.design.normal_equations(self.y, left_out)
+            equations.append((chosen.size, matrix - own_matrix, vector - own_vector, own_matrix, own_vector))
+        return equations
+
+    def _score(self, smoothness: float) -> float:
+        """Return the robust rms held-out error (m) of fits without monotonicity constraints."""
+        judged = np.concatenate(self.folds())
+        squares, total = float(self.weights[judged] @ self.y[judged] ** 2), float(self.weights[judged].sum())
+        for count, matrix, vector, own_matrix, own_vector in self._folds:
+            x = solve_free(matrix + self.penalty(smoothness, self.count - count), vector)
+            squares += float(x @ own_matrix @ x - 2.0 * (x @ own_vector))
+        return float(np.sqrt(max(squares, 0.0) / total)) * self.scale
 
 
 def blocked_folds(allowed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:

@@ -147,6 +147,7 @@ def _solutions(problem: Problem, smoothness: float, resamples: int) -> list[Floa
     matrix, _ = design.normal_equations(problem.y, weights)
     matrix += problem.penalty(smoothness, problem.count)
     predicted = design.predict(problem.solve(smoothness))
+    rows = design.rows(np.arange(problem.y.size))
     left_out = problem.held_out_errors(smoothness) / problem.scale
     errors = np.where(np.isfinite(left_out), left_out, predicted - problem.y)
     blocks = np.array_split(np.arange(problem.y.size), BLOCKS)
@@ -155,8 +156,7 @@ def _solutions(problem: Problem, smoothness: float, resamples: int) -> list[Floa
         report_progress(f"fits to other errors, {number + 1} of {resamples}")
         sign = np.repeat(rng.choice((-1.0, 1.0), BLOCKS), [block.size for block in blocks])
         drawn = weights * (predicted + sign * errors)
-        vector = design.local.T @ drawn + design.at_turns.T @ (design.pick.T @ drawn)
-        solutions.append(problem.constrained(matrix, vector))
+        solutions.append(problem.constrained(matrix, rows.project(drawn)))
     return solutions
 
 

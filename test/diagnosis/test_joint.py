@@ -44,10 +44,10 @@ def dense(joint, y, columns, kept):
 def test_fit_is_that_of_everything_stacked(lead, records):
     said, columns = evidence(records, lead)
     joint = Joint(said, said.v)
-    fit = joint.fit(said.y, columns)
+    x_fitted, gains = joint.columns(columns).fit(said.y)
     _, x = dense(joint, said.y, columns, np.ones(said.y.size, dtype=bool))
-    np.testing.assert_allclose(fit.gains, x[-2:], rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(fit.x, x[:-2], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(gains, x[-2:], rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(x_fitted, x[:-2], rtol=0, atol=1e-6)
 
 
 def test_score_is_that_of_fits_without_the_blocks():
@@ -55,14 +55,14 @@ def test_score_is_that_of_fits_without_the_blocks():
     y = said.y + columns @ [0.3, -0.2]
     joint = Joint(said, said.v)
     errors = np.full(y.size, np.nan)
-    for groups in joint._fold_groups:
-        rows = np.concatenate([joint._groups[group] for group in groups])
+    for fold in joint.held_out[0]:
+        rows = np.concatenate([joint._groups[group] for group in fold.left])
         kept = np.ones(y.size, dtype=bool)
         kept[rows] = False
         predicted, _ = dense(joint, y, columns, kept)
         errors[rows] = (predicted - y)[rows]
     losses = [np.mean(errors[rows] ** 2) for rows in joint.blocks]
-    np.testing.assert_allclose(joint.score(y, columns).losses, losses, rtol=1e-4)
+    np.testing.assert_allclose(joint.score([joint.columns(y, columns)]).losses, losses, rtol=1e-4)
     assert np.isfinite(errors).sum() > 0.8 * y.size
 
 
@@ -70,7 +70,7 @@ def test_a_record_left_out_has_nothing_but_its_constant():
     said, columns = evidence(2)
     y = said.y + columns @ [0.3, -0.2]
     joint = Joint(said, said.v)
-    score = joint.score(y, columns)
+    score = joint.score([joint.columns(y, columns)])
     for rows, loss in zip(said.slices, score.records, strict=True):
         kept = np.ones(y.size, dtype=bool)
         kept[rows] = False
@@ -83,13 +83,15 @@ def test_a_record_left_out_has_nothing_but_its_constant():
 
 def test_one_record_cannot_be_left_out():
     said, columns = evidence()
-    assert not Joint(said, said.v).score(said.y, columns).records.size
+    joint = Joint(said, said.v)
+    assert not joint.score([joint.columns(said.y, columns)]).records.size
 
 
 def test_gains_that_may_not_be_negative_are_not():
     said, columns = evidence()
     y = said.y + columns @ [0.3, -0.2]
-    free, bound = (Joint(said, said.v).score(y, columns, positive=count).gains for count in (0, 1))
+    joint = Joint(said, said.v)
+    free, bound = (joint.score([joint.columns(y), joint.columns(columns)], positive=count).gains for count in (0, 1))
     np.testing.assert_allclose(free, [0.3, -0.2], atol=0.03)
     assert bound[1] == pytest.approx(0.0, abs=1e-9)
     assert bound[0] == pytest.approx(0.3, abs=0.05)
@@ -99,6 +101,7 @@ def test_precision_is_what_many_noises_show():
     said, columns = evidence()
     joint, rng = Joint(said, said.v), np.random.default_rng(1)
     noise = 2e-8
-    gains = np.array([joint.fit(said.y + noise * rng.normal(size=said.y.size), columns).gains for _ in range(300)])
-    stated = noise * np.sqrt(np.diag(np.linalg.inv(joint.fit(said.y, columns).precision)))
+    beside = joint.columns(columns)
+    gains = np.array([beside.fit(said.y + noise * rng.normal(size=said.y.size))[1] for _ in range(300)])
+    stated = noise * np.sqrt(np.diag(np.linalg.inv(beside.precision)))
     np.testing.assert_allclose(gains.std(axis=0), stated, rtol=0.15)

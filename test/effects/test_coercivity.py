@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from strategies import FAMILY_CASE, axis_model
 
 from slpi_ros.effects.base import EffectContext
-from slpi_ros.effects.coercivity_path import play, settled_rate
+from slpi_ros.effects.paths import play, settled_rate
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence, StreamingCoercivity
 from slpi_ros.effects.registry import in_order

@@ -1,4 +1,4 @@
-"""Compiled batch evaluation of the coercivity; `rate_dependence` contains the streaming version."""
+"""Compiled batch evaluation of effects with a state that changes from sample to sample."""
 
 from math import exp
 
@@ -32,3 +32,29 @@ def play(v: FloatArray, half_width: FloatArray) -> FloatArray:
         now = min(max(now, v[k] - half_width[k]), v[k] + half_width[k])
         seen[k] = now
     return seen
+
+
+@compiled
+def direction(u: FloatArray, transition: float) -> FloatArray:
+    """Return the direction of a path, shape (N,), volts, from -1 to 1, which changes over a `transition` (V)."""
+    directions, now = np.empty_like(u), 0.0
+    for k in range(u.size):
+        moved = u[k] - u[max(k - 1, 0)]
+        if moved:
+            toward = 1.0 if moved > 0.0 else -1.0
+            now = toward + (now - toward) * exp(-abs(moved) / transition)
+        directions[k] = now
+    return directions
+
+
+@compiled
+def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArray:
+    """Return the sum of relaxations of a motion, shape (N,), metres, for gains, shape (K,), and holds, shape (K, 3)."""
+    crept, before, states = np.empty_like(moved), 0.0, np.zeros(gains.size)
+    for k in range(moved.size):
+        total = 0.0
+        for i in range(gains.size):
+            states[i] = holds[i, 0] * moved[k] + holds[i, 1] * before + holds[i, 2] * states[i]
+            total += gains[i] * states[i]
+        crept[k], before = total, moved[k]
+    return crept

@@ -11,7 +11,7 @@ others, and of that one nothing is estimated but how it began and its constant.
 import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial, reduce
+from functools import cache, cached_property, reduce
 from itertools import pairwise
 
 import numpy as np
@@ -27,7 +27,7 @@ from slpi_ros.effects.creep import Creep, settling
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import Hysteresis
-from slpi_ros.identification.design_matrix import Rows
+from slpi_ros.identification.design_matrix import Design, Rows
 from slpi_ros.identification.least_squares import FOLDS, Problem, blocked_folds
 from slpi_ros.identification.linear_kinds import SMOOTHNESS
 from slpi_ros.identification.samples import Samples
@@ -95,7 +95,7 @@ class Joint:
     """
 
     def __init__(self, evidence: Evidence, u: FloatArray) -> None:
-        self.problem, self.evidence = evidence.problem(u), evidence
+        self.problem, self.evidence, self.u = evidence.problem(u), evidence, u
         self._groups = _groups(self.problem, evidence)
         self.everything = self.problem.design.rows(np.concatenate(self._groups))
         self._ends = np.cumsum([0, *(rows.size for rows in self._groups)]).tolist()
@@ -137,6 +137,16 @@ class Joint:
         """Rows of the blocks that are left out, in the order of time."""
         left_out = [self._groups[group] for fold in self.held_out[0] for group in fold.left]
         return np.array_split(np.sort(np.concatenate(left_out)), BLOCKS)
+
+    @cached_property
+    def largest_loops(self) -> list[tuple[FloatArray, Design]]:
+        """Of each record voltages (V), and the hysteresis from the record's first sample up, down and up over them."""
+        levels, loops = np.linspace(float(self.u.min()), float(self.u.max()), LEVELS), []
+        for part, rows in zip(self.evidence.parts, self.evidence.slices, strict=True):
+            path = np.concatenate([self.u[rows.start : rows.start + 1], levels, levels[::-1], levels])
+            whole = Samples(path, path, np.ones(path.size, dtype=bool)).after(part.history)
+            loops.append((levels, self.evidence.design([whole])))
+        return loops
 
     def padded(self, signal: FloatArray) -> FloatArray:
         """Return a signal, shape (N,), metres, on the rows of the problem, in units of its scale."""
@@ -364,6 +374,8 @@ class Explanation:
     ----------
     u : ndarray, shape (N,), volts
         What drives the hysteresis.
+    h : ndarray, shape (N,), metres
+        What the hysteresis gives.
     added : ndarray, shape (N,), metres
         What the effects add behind the hysteresis, or lead round it.
     settling : ndarray, shape (N,), metres
@@ -389,7 +401,7 @@ class Explanation:
         self._fit(beside)
         if any(effect.side == "displacement" for effect in self.effects):
             for _ in range(MOST_TURNS):
-                h, before = self.joint.predict(self._x), self.added
+                h, before = self.h, self.added
                 self.added = self._behind(self.effects, h + self._aside, self.u) - h
                 self._fit(beside)
                 if np.ptp(self.added - before) < SETTLED * np.std(self.target - h):
@@ -397,8 +409,9 @@ class Explanation:
 
     def _fit(self, beside: Columns) -> None:
         self._x, gains = beside.fit(self.target)
+        self.h = self.joint.predict(self._x)
         self.settling, self.began = self._before @ gains, gains[: len(self._starting)]
-        self._loops = [cache(partial(self._loop, self._x, k)) for k in range(len(self.evidence.parts))]
+        self._middles = [self._middle(k) for k in range(len(self.evidence.parts))]
 
     @property
     def _relaxations(self) -> list[float]:
@@ -429,11 +442,6 @@ class Explanation:
         """What the hysteresis is to explain, shape (N,), metres."""
         return self.evidence.y - self.added
 
-    @cached_property
-    def h(self) -> FloatArray:
-        """What the hysteresis gives, shape (N,), metres."""
-        return self.joint.predict(self._x)
-
     @property
     def predicted(self) -> FloatArray:
         """What hysteresis and effects give, shape (N,), metres."""
@@ -452,10 +460,10 @@ class Explanation:
     def _around(self, u: FloatArray) -> EffectContext:
         around = self.evidence.around
         records = tuple(
-            replace(record, u=u[rows], middle=self._middle(k))
+            replace(record, u=u[rows], middle=self._middles[k])
             for k, (rows, record) in enumerate(zip(self.evidence.slices, around.records, strict=True))
         )
-        return replace(around, u=u, middle=self._middle(0), records=records)
+        return replace(around, u=u, middle=self._middles[0], records=records)
 
     def of_record(self, k: int) -> "RecordLeft":
         """Return what is left of one record."""
@@ -476,21 +484,21 @@ class Explanation:
 
         It is a function of voltages (V).
         """
-        return lambda u: np.asarray(np.interp(u, *self._loops[k]()), dtype=np.float64)
+        x, first = self._x[: self.evidence.basis.size + 1], float(self.h[self.evidence.slices[k].start])
+        levels, whole = self.joint.largest_loops[k]
 
-    def _loop(self, x: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
-        """Return voltages (V) and the middle of the largest loop there (m), for parameters `x`."""
-        evidence, part, first = self.evidence, self.evidence.parts[k], self.evidence.slices[k].start
-        levels = np.linspace(float(self.u.min()), float(self.u.max()), LEVELS)
-        path = np.concatenate([self.u[first : first + 1], levels, levels[::-1], levels])
-        whole = Samples(path, path, np.ones(path.size, dtype=bool)).after(part.history)
-        y = evidence.response([whole], x[: evidence.basis.size + 1])[len(part.history) :] * self.joint.problem.scale
-        falling, rising = y[1 + LEVELS : 1 + 2 * LEVELS][::-1], y[1 + 2 * LEVELS :]
-        return levels, 0.5 * (falling + rising) + float(self.joint.predict(x)[first]) - y[0]
+        @cache
+        def middle() -> FloatArray:
+            y = whole.predict(x)[-1 - 3 * LEVELS :] * self.joint.problem.scale
+            falling, rising = y[1 + LEVELS : 1 + 2 * LEVELS][::-1], y[1 + 2 * LEVELS :]
+            centre: FloatArray = 0.5 * (falling + rising) + first - y[0]
+            return centre
+
+        return lambda u: np.asarray(np.interp(u, levels, middle()), dtype=np.float64)
 
     def respond(self, u: FloatArray) -> FloatArray:
         """Return what the hysteresis gives (m) for another voltage `u`, shape (N,), volts."""
-        response = self.evidence.response(self.evidence.samples(u), self._x)[self.evidence.rows]
+        response = self.evidence.design(self.evidence.samples(u)).predict(self._x)[self.evidence.rows]
         return response * self.joint.problem.scale
 
     @cached_property

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.effects.base import EffectContext
+from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
@@ -162,7 +163,9 @@ class Evidence:
     def around(self) -> EffectContext:
         """Time and the other axes, as effects look at them."""
         return EffectContext(
-            self.t, others=self.others, records=tuple(EffectContext(part.t, others=part.others) for part in self.parts)
+            self.t,
+            others=self.others,
+            records=tuple(EffectContext(part.t, others=part.others, grid=Uniform.over(part.t)) for part in self.parts),
         )
 
     @cached_property
@@ -191,11 +194,11 @@ class Evidence:
         """Pose the problem of the hysteresis driven by `u`, shape (N,), volts."""
         return Problem.pose(self.samples(u), self.basis)
 
-    def response(self, samples: Sequence[Samples], x: FloatArray) -> FloatArray:
-        """Return what the hysteresis of parameters `x` gives for samples, in the unit of `x`."""
+    def design(self, samples: Sequence[Samples]) -> Design:
+        """Return the design matrix of the hysteresis for samples."""
         walks = [Walk.along(own.v, symmetric_rest=self.basis.symmetric_rest, primed=own.primed) for own in samples]
         walk = Walk.joined(walks)
-        return Design.of(walk, self.basis.branch_part(walk)).predict(x)
+        return Design.of(walk, self.basis.branch_part(walk))
 
     def of_record(self, k: int) -> "Evidence":
         """Return what one of the records says by itself."""

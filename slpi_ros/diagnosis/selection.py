@@ -33,6 +33,8 @@ NOT_CLOSING, LEVEL = "loops that do not close", "loops that depend on level"
 FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
 # An effect must lower the held-out error by this share of it.
 LEAST_GAIN = 0.05
+# A fit from another start is taken when it lowers the error by this share of it.
+BETTER = 0.01
 # No more effects than this: a record does not carry more.
 MOST_EFFECTS = 4
 # A gain counts when chance gives as much less often than this; two effects differ when chance does so less often.
@@ -42,6 +44,9 @@ SURROGATES = 1999
 TINY = 1e-30
 # What screening finds less for than this share of the best gain, and of the error, is not tried in full.
 WORTH_TRYING, LEAST_SCREENED = 0.3, 0.01
+# After one step towards its best parameters an effect is given up that explains less than this share of what the best
+# one does.
+WORTH_REFINING = 0.3
 # Another effect that explains less than this share of what the best one does is no alternative to it.
 ALTERNATIVE = 0.7
 # The same at one drive frequency, where a better fit says little.
@@ -98,6 +103,10 @@ class Contender:
         """Number of its parameters that were fitted."""
         return free(self.effect).size
 
+    def refined(self) -> "Contender":
+        """Return it with its parameters at their best."""
+        return Contender(self.name, self.explanation.refined(STEPS))
+
     def counts_beside(self, now: Explanation) -> bool:
         """Return whether it gains enough over what has been found so far."""
         return counts(now.held_out, self.score, own=is_own(self.name))
@@ -123,11 +132,13 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
     error = now.held_out.rms
     most = max((error - score.rms for score, _ in screened.values()), default=0.0)
     least = max(WORTH_TRYING * most, LEAST_SCREENED * error)
-    found = [
-        Contender(name, now.adding(effect).refined(STEPS))
+    tried = [
+        Contender(name, now.adding(effect).refined(1))
         for name, (score, effect) in screened.items()
         if error - score.rms > least
     ]
+    most = max((error**2 - one.score.rms**2 for one in tried), default=0.0)
+    found = [one.refined() if error**2 - one.score.rms**2 >= WORTH_REFINING * most else one for one in tried]
     sound = [one for one in found if plausible(one.effect, one.explanation)]
     several = len(now.evidence.parts) > 1
 
@@ -373,11 +384,18 @@ def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
 
 
 def _without_needless(now: Explanation, names: Collection[str]) -> Explanation:
-    """Return it without those of the named effects that the others make needless."""
+    """Return it without those of the named effects that the others make needless, the rest fitted from new starts.
+
+    An effect that was found while another one was missing may have settled at parameters that make up for that.
+    """
     for name in [effect.name for effect in now.effects if effect.name in names]:
         without = now.without(name)
         if not counts(without.held_out, now.held_out, own=is_own(name)):
             now = without
+        elif without.effects:
+            anew = contenders(without, [name])
+            if anew and gain(now.held_out, anew[0].score) > BETTER:
+                now = anew[0].explanation
     return now
 
 
@@ -417,12 +435,14 @@ def _in_its_place(
     present = {effect.name for effect in now.effects}
     rest = now.without(name)
     tried = []
+    best = Contender(name, now)
+    enough = WORTH_REFINING * (rest.held_out.rms**2 - best.score.rms**2)
     for rival in rivals:
         if rival.name not in present:
-            tried.append(Contender(rival.name, rest.adding(rival).refined(STEPS)))
+            one = Contender(rival.name, rest.adding(rival).refined(1))
+            tried.append(one.refined() if rest.held_out.rms**2 - one.score.rms**2 >= enough else one)
     tried.sort(key=lambda contender: contender.rms)
     alone = one_speed(now.evidence)
-    best = Contender(name, now)
     alternatives = [other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone)]
     inseparable = [other.name for other in tried if {name, other.name} <= DYNAMIC]
     if alone and name in DYNAMIC and not alternatives:

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import ModelError
 
 FloatArray = NDArray[np.float64]
@@ -37,6 +38,8 @@ class EffectContext:
         Displacement of the other axes relative to their start, before coupling.
     records : tuple of EffectContext
         One context per record where the signals are several concatenated records; empty for a single record.
+    grid : Uniform, optional
+        That of `t`, where it is known already.
     """
 
     t: FloatArray
@@ -44,6 +47,12 @@ class EffectContext:
     middle: Callable[[FloatArray], FloatArray] | None = None
     others: Mapping[str, FloatArray] = field(default_factory=dict)
     records: "tuple[EffectContext, ...]" = ()
+    grid: Uniform | None = None
+
+    @property
+    def uniform(self) -> Uniform:
+        """Uniform grid that covers `t`."""
+        return self.grid or Uniform.over(self.t)
 
     def split(self, signal: NDArray[Any]) -> list[NDArray[Any]]:
         """Split a signal, shape (N, ..), into its records and return the list of parts."""

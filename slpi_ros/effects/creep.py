@@ -21,7 +21,7 @@ from slpi_ros.effects.base import (
     require,
     usual_step,
 )
-from slpi_ros.effects.filters import Hold, Uniform, hold
+from slpi_ros.effects.filters import Hold, hold
 
 # Shortest time constant (s) of creep; shorter ones are modelled as lag.
 FASTEST = 0.1
@@ -79,7 +79,7 @@ class Creep:
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with creep, shape (N,), metres."""
-        grid = Uniform.over(around.t)
+        grid = around.uniform
         moved = grid.on(signal)
         moved = moved - moved[:1]
         from slpi_ros.effects.paths import relaxed
@@ -93,7 +93,7 @@ class Creep:
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement before creep, shape (N,), metres."""
-        grid = Uniform.over(around.t)
+        grid = around.uniform
         crept = grid.on(signal)
         moved = crept = crept - crept[:1]
         holds = self._holds(grid.dt)

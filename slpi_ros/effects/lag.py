@@ -19,7 +19,7 @@ from slpi_ros.effects.base import (
     require,
     usual_step,
 )
-from slpi_ros.effects.filters import Hold, Uniform, hold
+from slpi_ros.effects.filters import Hold, hold
 
 # The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
 # of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
@@ -50,13 +50,13 @@ class Lag:
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the lagged voltage, shape (N,), volts; exact if the command is linear between samples."""
-        grid = Uniform.over(around.t)
+        grid = around.uniform
         now, before, kept = hold(grid.dt, self.time_constant)
         return grid.off(_filter(np.array([now, before]), np.array([1.0, -kept]), grid.on(signal)))
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the command, shape (N,), volts: ``u + tau du/dt``."""
-        grid = Uniform.over(around.t)
+        grid = around.uniform
         if not grid.dt:
             return signal.copy()
         real = hold(grid.dt, self.time_constant)

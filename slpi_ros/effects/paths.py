@@ -58,3 +58,20 @@ def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArr
             total += gains[i] * states[i]
         crept[k], before = total, moved[k]
     return crept
+
+
+@compiled
+def smoothed_slope(x: FloatArray) -> FloatArray:
+    """Return the change per sample of a signal, shape (N >= 7,), by quadratic fits over seven samples (Savitzky-Golay).
+
+    At the ends it is that of the first and the last fit.
+    """
+    slope, last = np.empty_like(x), x.size - 4
+    for k in range(x.size):
+        middle = min(max(k, 3), last)
+        linear = quadratic = 0.0
+        for i in range(-3, 4):
+            linear += i * x[middle + i]
+            quadratic += (i * i - 4) * x[middle + i]
+        slope[k] = linear / 28.0 + (k - middle) * quadratic / 42.0
+    return slope

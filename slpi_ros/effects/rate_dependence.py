@@ -11,7 +11,6 @@ from math import copysign, exp
 from typing import ClassVar, overload
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from slpi_ros.effects.base import (
     Candidate,
@@ -235,7 +234,7 @@ COERCIVE_EXPONENT, COERCIVE_ONSET, SETTLING, COERCIVITIES = 0.3, 0.1, 2e-3, (0.0
 # Number of gains of the reversible part.
 POWERS, MOST_POWERS = 3, 6
 
-# Number of samples over which the rate is smoothed in batch evaluation.
+# Least number of samples of which batch evaluation takes a rate.
 WINDOW = 7
 
 
@@ -402,13 +401,14 @@ class RateDependence:
         """Return the mid-line (m), the rate to the power ``e``, and the direction, shape (N,) each."""
         if around.u is None or around.middle is None:
             raise ModelError("effect 'rate_dependence' needs the voltage that drives the hysteresis, and its loop")
-        return around.middle(around.u), self._speed(around.t, around.u), self._direction(around.u)
+        return around.middle(around.u), self._speed(around.uniform, around.u), self._direction(around.u)
 
-    def _speed(self, t: FloatArray, u: FloatArray) -> FloatArray:
-        grid = Uniform.over(t)
+    def _speed(self, grid: Uniform, u: FloatArray) -> FloatArray:
         if not grid.dt or u.size < WINDOW:
             return np.zeros_like(u)
-        rate = savgol_filter(grid.on(u), WINDOW, 2, deriv=1, delta=grid.dt)
+        from slpi_ros.effects.paths import smoothed_slope
+
+        rate = smoothed_slope(grid.on(u)) / grid.dt
         return grid.off((np.abs(rate) / self.reference_rate) ** self.exponent)
 
     def _direction(self, u: FloatArray) -> FloatArray:

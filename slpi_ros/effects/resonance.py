@@ -22,7 +22,7 @@ from slpi_ros.effects.base import (
     rhythms,
     usual_step,
 )
-from slpi_ros.effects.filters import Mode, Uniform
+from slpi_ros.effects.filters import Mode
 
 # Smallest tap spacing, times 1 / w; smaller spacings give larger taps without benefit.
 SPACING = 0.5
@@ -182,7 +182,7 @@ class Resonance:
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with the resonance, shape (N,), metres; exact for an input linear between samples."""
-        grid = Uniform.over(around.t)
+        grid = around.uniform
         if not grid.dt:
             return np.full_like(signal, signal[0]) if signal.size else signal.copy()
         numerator, denominator = self.mode.transfer(grid.dt)
@@ -191,7 +191,7 @@ class Resonance:
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the input of the mode, shape (N,), metres, for the displacement `signal`, shape (N,), metres."""
-        grid = Uniform.over(around.t)
+        grid = around.uniform
         if not grid.dt:
             return signal.copy()
         between = max(1, round(Unringing.shortest(self.mode) / grid.dt))

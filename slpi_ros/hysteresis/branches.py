@@ -18,7 +18,7 @@ class _Straight:
     """A shape without hysteresis, used only to update the stack of reversals."""
 
     _line = Curve.of(np.array([[0.0, END], [0.0, END]]))
-    branches = Branches.constant(_line)
+    branches = Branches.interpolated(np.empty((2, 0)), 2 * [[(_line.knots, 0.0 * _line.knots)]])
 
     def __init__(self, symmetric_rest: bool) -> None:
         self.symmetric_rest = symmetric_rest

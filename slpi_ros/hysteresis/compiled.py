@@ -138,7 +138,7 @@ def through(
     direction : float
     depth : int
     """
-    s, other, traced = direction, 1 - coordinate, walk.shape[1] > 0
+    s, other = direction, 1 - coordinate
     low, high = (lower, upper) if coordinate else (-inf, inf)
     begin, close = np.empty(2), np.empty(2)
     knots = np.empty((2, max(first.shape[1], branches.knots.shape[3], 4 * branches.operators.shape[1] + 2)))
@@ -153,7 +153,7 @@ def through(
         if not still and turn != s:
             if s != 0.0:
                 turns[0, depth], turns[1, depth] = point[0], point[1]
-                if traced:
+                if walk.size:
                     walk[2, depth] = n - 1
                 depth += 1
             s, entered = turn, False
@@ -175,8 +175,7 @@ def through(
                     last = composed(branches.operators, branches.scale[1], s, begin[0] - branches.scale[0], knots)
                 else:
                     last = interpolated(branches, s, begin[0], knots)
-                i = 1
-                entered = True
+                entered, i = True, 1
             if s * (target - close[driven]) >= 0.0:
                 if driven == 1 and s * (limit - close[0]) < 0.0:
                     target, driven, i = limit, 0, 1
@@ -211,7 +210,6 @@ def through(
                 now, out[n] = x[n], answer
                 n += 1
             point[coordinate], point[other] = now, out[n - 1]
-        if traced:
-            for k in range(present, n):
-                walk[0, k], walk[1, k] = walk[2, depth - 1] if depth else -1, int(s)
+        for k in range(present if walk.size else n, n):
+            walk[0, k], walk[1, k] = walk[2, depth - 1] if depth else -1, int(s)
     return n, s, depth

@@ -125,7 +125,7 @@ class MultiSlope:
         object.__setattr__(self, "_w", w)
         object.__setattr__(self, "_bends", np.array([-5.0 * r, half + 1.5 * r, self.amplitude + 8.0 * r]))
         scale = float(self.origin), float(self.amplitude)
-        object.__setattr__(self, "branches", Branches.composed(np.array([r, w]), scale))
+        object.__setattr__(self, "branches", Branches(operators=np.array([r, w]), scale=scale))
 
     def stroke(self, upper: float, lower: float) -> float:
         """Return the Everett function ``E(upper, lower)``, the displacement (m) between two reversals (V)."""

@@ -55,7 +55,8 @@ class PrandtlIshlinskii:
             )
         object.__setattr__(self, "_branch", self._curve(2.0))
         object.__setattr__(self, "_first", self._curve(1.0))
-        object.__setattr__(self, "branches", Branches.constant(self._branch))
+        rows = [[(self._branch.knots, 0.0 * self._branch.knots)]]
+        object.__setattr__(self, "branches", Branches.interpolated(np.empty((2, 0)), 2 * rows))
 
     @property
     def invertible(self) -> bool:

@@ -74,12 +74,12 @@ class Branches(NamedTuple):
         Origin and amplitude of that model.
     """
 
-    vertices: FloatArray
-    knots: FloatArray
-    change: FloatArray
-    last: NDArray[np.int64]
-    operators: FloatArray
-    scale: tuple[float, float]
+    vertices: FloatArray = np.empty((2, 0))
+    knots: FloatArray = np.empty((2, 0, 2, 0))
+    change: FloatArray = np.empty((2, 0, 2, 0))
+    last: NDArray[np.int64] = np.empty((2, 0), dtype=np.int64)
+    operators: FloatArray = np.empty((2, 0))
+    scale: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def interpolated(cls, vertices: FloatArray, rows: Sequence[Sequence[tuple[FloatArray, FloatArray]]]) -> "Branches":
@@ -89,18 +89,7 @@ class Branches(NamedTuple):
         for side, of_side in enumerate(rows):
             for row, pair in enumerate(of_side):
                 packed[:, side, row, :, : last[side, row] + 1] = pair
-        return cls(vertices, packed[0], packed[1], last, np.empty((2, 0)), (0.0, 0.0))
-
-    @classmethod
-    def constant(cls, curve: Curve) -> "Branches":
-        """Return the branches of a shape that is the same from every reversal."""
-        return cls.interpolated(np.empty((2, 0)), 2 * [[(curve.knots, np.zeros_like(curve.knots))]])
-
-    @classmethod
-    def composed(cls, operators: FloatArray, scale: tuple[float, float]) -> "Branches":
-        """Return the branches of a `MultiSlope` model."""
-        none = np.empty((2, 0, 2, 0))
-        return cls(np.empty((2, 0)), none, none, np.empty((2, 0), dtype=np.int64), operators, scale)
+        return cls(vertices, packed[0], packed[1], last)
 
     def curve(self, direction: int, v_turn: float) -> Curve:
         """Return the interpolated branch that starts in `direction` at `v_turn` (V)."""

@@ -239,10 +239,10 @@ class Memory:
             self._curve = known or (shape.branch(s, self._v0) if falls_from_low_end else shape.first_rise(self._v0))
             self._close = (s * inf, s * inf) if s else self._rest
         self._u, self._f, _ = self._curve
-        # Beyond the closing point or the largest voltage the stack must be checked again.
+        # Beyond the closing point, the largest voltage or the last knot the stack must be checked again.
         (v_rest, y_rest), (v_far, y_far) = self._rest, self._far
         self._reach_u = min(s * self._close[0], s * v_rest + v_far) - s * self._v0
-        self._reach_f = min(s * self._close[1], s * y_rest + y_far) - s * self._y0
+        self._reach_f = min(min(s * self._close[1], s * y_rest + y_far) - s * self._y0, self._f[-1])
 
     def _first_closing(self, s: int) -> tuple[float, float]:
         """Return the point where the branch from the first reversal meets the branch that leaves rest."""
@@ -262,7 +262,8 @@ class Memory:
             If `v` is not finite or out of range; the memory is unchanged.
         """
         s = self._direction
-        if not (s * (v - self._v) > 0.0 and s * (v - self._v0) < self._reach_u):
+        u = s * (v - self._v0)
+        if not (s * (v - self._v) > 0.0 and u < self._reach_u):
             if not abs(v - self._rest[0]) < self._far[0]:
                 raise UsageError(f"voltage {v} V is out of range; leave such samples out")
             if v == self._v:
@@ -271,8 +272,8 @@ class Memory:
             self._turn_to(s)
             while s * (v - self._close[0]) >= 0.0:
                 self._close_loop()
+            u = s * (v - self._v0)
         u_knots, f_knots = self._u, self._f
-        u = s * (v - self._v0)
         i = bisect_right(u_knots, u, 1)
         u_a, f_a = u_knots[i - 1], f_knots[i - 1]
         self._v = v
@@ -292,7 +293,8 @@ class Memory:
             If `y` is not finite or out of range; the memory is unchanged.
         """
         s = self._direction
-        if not (s * (y - self._y) > 0.0 and s * (y - self._y0) < self._reach_f):
+        f = s * (y - self._y0)
+        if not (s * (y - self._y) > 0.0 and f < self._reach_f):
             if not abs(y - self._rest[1]) < self._far[1]:
                 raise UsageError(f"displacement {y} m is out of range; leave such samples out")
             if not lower <= self._v <= upper:
@@ -307,11 +309,11 @@ class Memory:
                     self.forward(limit)
                     return limit
                 self._close_loop()
+            f = s * (y - self._y0)
+            if f >= self._f[-1]:
+                raise UsageError(f"displacement {y} m cannot be reached by this model; leave such samples out")
         u_knots, f_knots = self._u, self._f
-        f = s * (y - self._y0)
         i = bisect_right(f_knots, f, 1)
-        if i == len(f_knots):
-            raise UsageError(f"displacement {y} m cannot be reached by this model; leave such samples out")
         u_a, f_a = u_knots[i - 1], f_knots[i - 1]
         v = self._v0 + s * (u_a + (f - f_a) * ((u_knots[i] - u_a) / (f_knots[i] - f_a)))
         if not lower <= v <= upper:

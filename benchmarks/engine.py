@@ -1,4 +1,7 @@
-"""Speed of the engine: per sample while streaming, and as a share of ``numpy.interp`` in batch; how it grows."""
+"""Speed of the engine: per sample while streaming, and as a share of ``numpy.interp`` in batch; how it grows.
+
+Times are of the processor, as other programs may run on the machine.
+"""
 
 import statistics
 import time
@@ -7,9 +10,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.hysteresis.branches import trace
 from slpi_ros.hysteresis.loop_family import LoopFamily
+from slpi_ros.hysteresis.multi_slope import MultiSlope, thresholds_for
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.turning_points import Memory, Shape
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 
 FloatArray = NDArray[np.float64]
 SPAN = 100.0
@@ -54,12 +60,12 @@ def per_sample(step: Callable[[float], float], values: list[float]) -> tuple[flo
 
 
 def median_time(work: Callable[[], object], repeats: int = 9) -> float:
-    """Return the median time of some work, seconds."""
+    """Return the median processor time of some work, seconds."""
     times = []
     for _ in range(repeats):
-        before = time.perf_counter()
+        before = time.process_time()
         work()
-        times.append(time.perf_counter() - before)
+        times.append(time.process_time() - before)
     return statistics.median(times)
 
 
@@ -76,35 +82,52 @@ def streaming() -> None:
             path = wishes(shape, zigzag(200_000, every)).tolist()
             numbers = per_sample(Memory(shape).inverse, path)
             print(f"  {name:<20} a turn every {every:>3} samples {numbers[0]:8.2f} {numbers[1]:7.1f} {numbers[2]:7.0f}")
+    y = wishes(loop_family(), zigzag(200_000, 2000)).tolist()
+    quality = FitQuality(0.0, 0.0, 0.0, 0.0, len(y), 1.0, "")
+    model = AxisModel("slpi", loop_family(), Start(0.0, 0.0), (0.0, SPAN), (min(y), max(y)), quality)
+    stamps = [1e-3 * sample for sample in range(len(y))]
+    bare = median_time(lambda: [inverse(value) for inverse in [Memory(model.hysteresis).inverse] for value in y])
+    public = median_time(
+        lambda: [step(t, value) for step in [model.stream().step] for t, value in zip(stamps, y, strict=True)]
+    )
+    print(f"  mean, few turns: Memory.inverse {1e6 * bare / len(y):.2f}, model.stream {1e6 * public / len(y):.2f}")
+
+
+def oscillation(turns: int, low: float = 0.0, high: float = SPAN) -> FloatArray:
+    """Return 1,000,000 voltages that oscillate with a slowly decreasing amplitude, of at most `low` to `high`."""
+    share = np.cos(np.linspace(0.0, np.pi * turns, 1_000_000)) * np.linspace(0.98, 0.88, 1_000_000)
+    return low + (high - low) / 2 * (1 - share)
 
 
 def batch() -> None:
-    """Print times of the batch paths beside numpy.interp."""
-    family = loop_family()
-    print("batch, 1,000,000 samples, ms            forward  inverse  numpy.interp   share of its speed")
-    knots, values = family.grid, family.everett[:, 0]
-    for turns in (20, 200, 2000, 20000):
-        v = (
-            SPAN
-            / 2
-            * (1 - 0.98 * np.cos(np.linspace(0.0, np.pi * turns, 1_000_000)) * np.linspace(1.0, 0.9, 1_000_000))
-        )
-        y = wishes(family, v)
-        forward = median_time(lambda v=v: Memory(family).forward_array(v))
-        inverse = median_time(lambda y=y: Memory(family).inverse_array(y))
-        bare = median_time(lambda v=v: np.interp(v, knots, values))
-        print(
-            f"  {turns:>6} turns {1e3 * forward:30.1f} {1e3 * inverse:8.1f} {1e3 * bare:13.1f}"
-            f" {bare / forward:12.0%} {bare / inverse:6.0%}"
-        )
+    """Print times of the batch paths as shares of the speed of numpy.interp."""
+    print("batch, 1,000,000 samples: numpy.interp, ms, and share of its speed")
+    print("                                interp  forward  inverse  partly out of reach   branches of the samples")
+    multi_slope = MultiSlope(0.0, SPAN, thresholds_for(SPAN), np.linspace(0.1, 1.0, 11) * 1e-8)
+    plays = PrandtlIshlinskii(np.linspace(0.0, SPAN / 2, 30), np.full(30, 1e-8))
+    for name, shape in (("slpi", loop_family()), ("mpi", multi_slope), ("pi", plays)):
+        u, f = shape.branch(1, 0.0).knots
+        for turns in (20, 200, 2000, 20000):
+            v = oscillation(turns)
+            y = wishes(shape, v)
+            works = (
+                lambda v=v, u=u, f=f: np.interp(v, u, f),
+                lambda v=v, shape=shape: Memory(shape).forward_array(v),
+                lambda y=y, shape=shape: Memory(shape).inverse_array(y),
+                lambda y=y, shape=shape: Memory(shape).inverse_array(y, 0.2 * SPAN, 0.8 * SPAN),
+                lambda v=v: trace(v, symmetric_rest=False),
+            )
+            bare, *spent = (median_time(work) for work in works)
+            shares = "".join(f"{bare / each:11.0%}" for each in spent)
+            print(f"  {name:<5} {turns:>6} turns {1e3 * bare:15.1f} {shares}")
 
 
 def growth() -> None:
     """Print how the inverse's time grows."""
     print("growth of the inverse, batch, ms")
     family = loop_family()
-    for samples in (10_000, 100_000, 1_000_000, 10_000_000):
-        y = wishes(family, decaying(samples, samples // 5000))
+    for samples in (300, 1000, 10_000, 100_000, 1_000_000, 10_000_000):
+        y = wishes(family, decaying(samples, max(samples // 5000, 2)))
         print(f"  {samples:>10,} samples {1e3 * median_time(lambda y=y: Memory(family).inverse_array(y), 3):10.2f}")
     for operators in (10, 100, 1000):
         thresholds = np.linspace(0.0, SPAN / 2, operators)
@@ -121,6 +144,9 @@ def growth() -> None:
 
 def main() -> None:
     """Print all."""
+    before = time.process_time()
+    wishes(loop_family(), np.linspace(0.0, SPAN, 1_000_000))
+    print(f"first long path of this process, s (more if it had to be compiled): {time.process_time() - before:.2f}")
     streaming()
     batch()
     growth()

@@ -1,48 +1,39 @@
 """Assign each sample of a voltage to its branch, using the stack of reversals, which is the same for all models."""
 
-from typing import NamedTuple
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.reversals import monotone_runs
-from slpi_ros.hysteresis.turning_points import END, Curve, Memory
+from slpi_ros.hysteresis.turning_points import END, Branches, Curve, Memory, worth_compiling
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
-# Values of `Piece.origin` for branches that started before the first sample.
+# Origins of branches that started before the first sample.
 AT_REST, LONG_FALL = -1, -2
-
-
-class Piece(NamedTuple):
-    """Samples ``start:stop`` on one branch, which started at sample `origin`, or is `AT_REST` or the `LONG_FALL`."""
-
-    start: int
-    stop: int
-    direction: int
-    origin: int
-
-
-_IDENTITY = Curve.of(np.array([[0.0, END], [0.0, END]]))
 
 
 class _Straight:
     """A shape without hysteresis, used only to update the stack of reversals."""
+
+    _line = Curve.of(np.array([[0.0, END], [0.0, END]]))
+    branches = Branches.interpolated(np.empty((2, 0)), 2 * [[(_line.knots, 0.0 * _line.knots)]])
 
     def __init__(self, symmetric_rest: bool) -> None:
         self.symmetric_rest = symmetric_rest
 
     def branch(self, direction: int, v_turn: float) -> Curve:
         """Return the identity curve."""
-        return _IDENTITY
+        return self._line
 
     def first_rise(self, v_rest: float) -> Curve:
         """Return the identity curve."""
-        return self.branch(1, v_rest)
+        return self._line
 
 
-def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> list[Piece]:
-    """Divide a voltage signal into pieces that each lie on one branch.
+def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> tuple[IntArray, IntArray]:
+    """Return the branch of each sample of a voltage signal.
 
     Parameters
     ----------
@@ -55,21 +46,24 @@ def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> list[
 
     Returns
     -------
-    list of Piece
-        Pieces in order; together they cover all samples except the initial ones at rest.
+    origin : ndarray of int, shape (N,)
+        Sample at which the branch started, or `AT_REST` or `LONG_FALL`.
+    direction : ndarray of int, shape (N,)
+        +1 rising, -1 falling; 0 at rest, or -1 if `primed`.
     """
-    if not v.size:
-        return []
-    memory = Memory(_Straight(symmetric_rest), float(v[0]), float(v[0]), primed=primed)
-    origins = [LONG_FALL] if primed else []
-    pieces: list[Piece] = []
-    for start, stop in monotone_runs(v):
-        if not start:
-            continue
-        for begin, end in memory.split_at_closures(v, start, stop, 0):
-            if memory.depth > len(origins):
-                origins.append(start - 1)
-            del origins[memory.depth :]
-            pieces.append(Piece(begin, end, memory.direction, origins[-1] if origins else AT_REST))
-            memory.advance_to(float(v[end - 1]), float(v[end - 1]))
-    return pieces
+    v = np.require(v, np.float64, ("C", "W"))
+    # Row 2 is the stack: the sample of each reversal.
+    walk = np.full((3, v.size + primed), LONG_FALL)
+    if v.size:
+        memory = Memory(_Straight(symmetric_rest), float(v[0]), float(v[0]), primed=primed)
+        if worth_compiling(v.size):
+            memory.run_compiled(v, 0, -inf, inf, walk)
+        else:
+            depth = memory.depth
+            for n, voltage in enumerate(v.tolist()):
+                memory.forward(voltage)
+                if memory.depth > depth:
+                    walk[2, depth] = n - 1
+                depth = memory.depth
+                walk[:2, n] = walk[2, depth - 1] if depth else AT_REST, memory.direction
+    return walk[0, : v.size], walk[1, : v.size]

@@ -6,20 +6,19 @@ is ``y_a + E(v, beta)``, so every loop closes. At a grid vertex the branch is a 
 the grid's spacing; between vertices it is interpolated.
 """
 
-from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.turning_points import END, FAR, Curve
+from slpi_ros.hysteresis.turning_points import END, FAR, Branches, Curve
 
 FloatArray = NDArray[np.float64]
-# A vertex (V, with the sign of the branch direction), the knots of its branch, and their derivative with respect to the
-# start voltage of a branch up to the previous vertex.
-Gap = tuple[float, FloatArray, FloatArray]
+# Knots and change of a row of `Branches`.
+Row = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -49,9 +48,7 @@ class LoopFamily:
     rise: FloatArray
     edge_gain: float
     symmetric_rest: bool = field(default=False, init=False)
-    _vertices: list[float] = field(init=False, repr=False)
-    _edges: dict[int, FloatArray] = field(init=False, repr=False)
-    _gaps: dict[int, list[Gap]] = field(init=False, repr=False)
+    branches: Branches = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Validate the arrays and compute the knots of the branches from all vertices."""
@@ -75,13 +72,17 @@ class LoopFamily:
                 "finite and rise strictly"
             )
         object.__setattr__(self, "everett", triangle)
-        object.__setattr__(self, "_vertices", self.grid.tolist())
         rows, columns = [triangle[i, i::-1] for i in range(n)], [triangle[j:, j] for j in range(n)]
         top = self._edge(self.grid[-1] - self.grid[::-1], rows[-1])
-        edges = {1: top, -1: self._edge(self.grid - self.grid[0], columns[0])}
-        object.__setattr__(self, "_edges", edges)
-        rising = list(_gaps(self.grid, columns, edges[1]))
-        object.__setattr__(self, "_gaps", {1: rising, -1: list(_gaps(-self.grid[::-1], rows[::-1], edges[-1]))})
+        bottom = self._edge(self.grid - self.grid[0], columns[0])
+        # A fall from far above, which wipes the memory, follows the first rise's slope down to the grid.
+        fall = np.column_stack([np.zeros(2), top + FAR / 2 * np.array([[1.0], [self.edge_gain]])])
+        far = fall, np.sign(fall) * [[1.0], [self.edge_gain]]
+        at_top, at_bottom = ((edge, np.zeros_like(edge)) for edge in (top, bottom))
+        rising = [at_bottom, at_bottom, *_rows(self.grid, columns, top), at_top]
+        falling = [far, at_top, *_rows(-self.grid[::-1], rows[::-1], bottom), at_bottom]
+        vertices = np.array([[-inf, *self.grid], [-self.grid[-1] - FAR / 2, *-self.grid[::-1]]])
+        object.__setattr__(self, "branches", Branches.interpolated(vertices, [rising, falling]))
 
     def _edge(self, u: FloatArray, f: FloatArray) -> FloatArray:
         """Return the knots, shape (2, n + 1), of branches that start at the end of the grid or beyond."""
@@ -94,30 +95,7 @@ class LoopFamily:
         model, with the loops of the grid's end. A fall from far above, which wipes the memory, follows the last of
         these.
         """
-        n = self.grid.size
-        if direction < 0 and v_turn - self.grid[-1] > FAR / 2:
-            return self._long_fall(v_turn)
-        ahead = self._first_vertex_ahead(v_turn, direction)
-        if ahead in (0, n):
-            return Curve.of(self._edges[direction if ahead == n else -direction])
-        vertex, knots, change = self._gaps[direction][ahead - 1]
-        knots = knots + change * (vertex - direction * v_turn)
-        curve = Curve.of(knots if knots[0, 1] > 0.0 else knots[:, 1:])
-        # For a reversal next to a vertex, rounding may merge the grid's end and the following knot.
-        at = len(curve.u) - ahead - 2
-        if curve.u[at] < curve.u[at + 1] and curve.f[at] < curve.f[at + 1]:
-            return curve
-        return Curve.of(np.delete(curve.knots, at + 1, axis=1))
-
-    def _long_fall(self, v_turn: float) -> Curve:
-        above, (u, f) = v_turn - self.grid[-1], self._edges[1]
-        return Curve.of(np.array([np.append(0.0, above + u), np.append(0.0, self.edge_gain * above + f)]))
-
-    def _first_vertex_ahead(self, v_turn: float, direction: int) -> int:
-        """Return the index, counted in `direction`, of the first vertex at or beyond `v_turn`."""
-        if direction > 0:
-            return bisect_left(self._vertices, v_turn)
-        return len(self._vertices) - bisect_right(self._vertices, v_turn)
+        return self.branches.curve(direction, v_turn)
 
     def first_rise(self, v_rest: float) -> Curve:
         """Return the curve of the first rise from `v_rest` (V)."""
@@ -132,12 +110,12 @@ class LoopFamily:
         return v - np.clip(v, self.grid[0], self.grid[-1])
 
 
-def _gaps(vertices: FloatArray, lines: Sequence[FloatArray], edge: FloatArray) -> Iterator[Gap]:
-    """Yield the intervals between vertices, whose branches are `lines` on the grid and `edge` beyond."""
+def _rows(vertices: FloatArray, lines: Sequence[FloatArray], edge: FloatArray) -> Iterator[Row]:
+    """Yield the rows for the intervals between vertices, whose branches are `lines` on the grid and `edge` beyond."""
     for k in range(1, vertices.size):
         own, before = vertices[k:] - vertices[k], vertices[k:] - vertices[k - 1]
         # The first column is the reversal itself.
         knots = np.column_stack([np.zeros(2), [own, lines[k]], edge[:, -k - 1 :]])
         change = np.zeros_like(knots)
         change[:, 1 : before.size + 1] = ([before, lines[k - 1][1:]] - knots[:, 1 : before.size + 1]) / before[0]
-        yield float(vertices[k]), knots, change
+        yield knots, change

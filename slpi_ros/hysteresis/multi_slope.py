@@ -19,11 +19,10 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.hysteresis.turning_points import END, FAR, Curve, Memory
+from slpi_ros.hysteresis.turning_points import END, FAR, Branches, Curve, Memory
 
 FloatArray = NDArray[np.float64]
 
@@ -100,6 +99,7 @@ class MultiSlope:
     thresholds: FloatArray
     weights: FloatArray
     symmetric_rest: bool = field(default=False, init=False)
+    branches: Branches = field(init=False, repr=False)
     _r: FloatArray = field(init=False, repr=False)
     _w: FloatArray = field(init=False, repr=False)
     _bends: FloatArray = field(init=False, repr=False)
@@ -123,7 +123,9 @@ class MultiSlope:
         r, w, half = r[moving], w[moving], 0.5 * self.amplitude
         object.__setattr__(self, "_r", r)
         object.__setattr__(self, "_w", w)
-        object.__setattr__(self, "_bends", np.concatenate([-5.0 * r, half + 1.5 * r, self.amplitude + 8.0 * r]))
+        object.__setattr__(self, "_bends", np.array([-5.0 * r, half + 1.5 * r, self.amplitude + 8.0 * r]))
+        scale = float(self.origin), float(self.amplitude)
+        object.__setattr__(self, "branches", Branches(operators=np.array([r, w]), scale=scale))
 
     def stroke(self, upper: float, lower: float) -> float:
         """Return the Everett function ``E(upper, lower)``, the displacement (m) between two reversals (V)."""
@@ -143,24 +145,30 @@ class MultiSlope:
     def _rise_from(self, turn: float) -> Curve:
         """Return a rising branch: each operator is constant until its rising envelope reaches it."""
         starts = np.maximum(turn, falling_envelope(turn, self._r, self.amplitude) + self._r)
-        u = np.unique(np.append(starts, turn))
-        return self._curve(u - turn, self._w @ np.maximum(0.0, u - starts[:, None]))
+        return _curve(starts - turn, self._w)
 
     def _fall_from(self, turn: float) -> Curve:
         """Return a falling branch: each operator is constant until it meets its falling envelope, then follows that."""
-        r, top = self._r, rising_envelope(turn, self._r)
+        r, w, (low, middle, high) = self._r, self._w, self._bends
+        top = rising_envelope(turn, r)
         gentle = (top - AMPLITUDE_SHARE * self.amplitude - THRESHOLD_SHARE * r) / GENTLE
         starts = np.minimum(turn, np.maximum(top / STEEP, gentle))
-        u = np.unique(np.concatenate([[turn], starts, self._bends[self._bends < turn]]))[::-1]
-        left = falling_envelope(starts, r, self.amplitude)[:, None]
-        fallen = np.maximum(0.0, left - falling_envelope(u, r[:, None], self.amplitude))
-        return self._curve(turn - u, self._w @ fallen)
+        slopes = np.where(starts > middle, GENTLE, STEEP)
+        slopes[(starts <= low) | (starts > high)] = 1.0
+        later = self._bends < starts
+        changes = np.array([[1.0 - STEEP], [STEEP - GENTLE], [GENTLE - 1.0]]) * w
+        return _curve(turn - np.append(starts, self._bends[later]), np.append(slopes * w, changes[later]))
 
-    def _curve(self, u: FloatArray, f: FloatArray) -> Curve:
-        """Return the curve through the knots, extended with slope 1 per operator."""
-        # Prevent decreasing branches due to rounding.
-        f = np.maximum.accumulate(f)
-        return Curve.of(np.array([np.append(u, u[-1] + END), np.append(f, f[-1] + END * self._w.sum())]))
+
+def _curve(u: FloatArray, changes: FloatArray) -> Curve:
+    """Return the curve whose slope changes at the distances `u`, shape (n,), volts, by `changes`, shape (n,), m/V.
+
+    `slpi_ros.hysteresis.compiled.composed` computes the same, with the same rounding.
+    """
+    order = np.argsort(u, kind="stable")
+    u, slopes = np.append(0.0, u[order]), np.append(0.0, np.cumsum(changes[order]))
+    u = np.append(u, u[-1] + END)
+    return Curve.of(np.array([u, np.append(0.0, np.cumsum(slopes * np.diff(u)))]))
 
 
 def cycles(x: FloatArray, back: float) -> list[tuple[int, int]]:
@@ -296,6 +304,8 @@ class KnownPath:
 
     def _amplitude_for(self, peak: float, v_start: float, y_start: float) -> float:
         """Return the amplitude (V) of the cycle from a start (V, m) with the peak displacement `peak` (m)."""
+        # Only this kind needs it, and importing it takes longer than all the rest of the package's hysteresis.
+        from scipy.optimize import brentq
 
         def missing(amplitude: float) -> float:
             return peak - y_start - _Cycle(self.model, amplitude, v_start, y_start).stroke(v_start)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.turning_points import END, Curve
+from slpi_ros.hysteresis.turning_points import END, Branches, Curve
 
 FloatArray = NDArray[np.float64]
 
@@ -36,6 +36,7 @@ class PrandtlIshlinskii:
     thresholds: FloatArray
     weights: FloatArray
     symmetric_rest: bool = field(default=True, init=False)
+    branches: Branches = field(init=False, repr=False)
     _branch: Curve = field(init=False, repr=False)
     _first: Curve = field(init=False, repr=False)
 
@@ -54,6 +55,8 @@ class PrandtlIshlinskii:
             )
         object.__setattr__(self, "_branch", self._curve(2.0))
         object.__setattr__(self, "_first", self._curve(1.0))
+        rows = [[(self._branch.knots, 0.0 * self._branch.knots)]]
+        object.__setattr__(self, "branches", Branches.interpolated(np.empty((2, 0)), 2 * rows))
 
     @property
     def invertible(self) -> bool:

@@ -11,8 +11,9 @@ Models differ only in the *shape* of a branch, ``y = y_a + s F(s (v - v_a))`` wi
 both directions, exactly and causally.
 """
 
+import sys
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import NamedTuple, Protocol
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import UsageError
-from slpi_ros.hysteresis.reversals import count_before, monotone_runs, require_finite
+from slpi_ros.hysteresis.reversals import require_finite
 
 FloatArray = NDArray[np.float64]
 
@@ -30,12 +31,13 @@ FAR = 1e5
 END = 4 * FAR
 # Number of cached branch curves; reversals can be numerous and curves are large.
 KEPT_CURVES = 64
-# Monotone runs with fewer samples are evaluated in a loop, which is faster than numpy.interp for these.
-SHORT_RUN = 64
+# Fewest samples of a path for which loading the compiled engine, and calling it once loaded, takes less time than the
+# loop over samples.
+LOADED_FROM, COMPILED_FROM = 20_000, 200
 
 
 class Curve(NamedTuple):
-    """A branch shape ``F`` as knots (V, m), strictly increasing from ``u[0] = f[0] = 0``, the last at distance `END`.
+    """A branch shape ``F`` as knots (V, m), increasing from ``u[0] = f[0] = 0``, the last at distance `END`.
 
     The knots are stored as lists for a fast scalar search and as an array, shape (2, k).
     """
@@ -51,6 +53,54 @@ class Curve(NamedTuple):
         return cls(u, f, knots)
 
 
+class Branches(NamedTuple):
+    """All branches of a shape as arrays, for the compiled engine; index 0 rising, 1 falling.
+
+    Voltages of the falling branches are negated. A branch is interpolated between vertices or composed of operators.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (2, n), volts
+        Ascending. Row k of the other arrays is for branches that start above vertex k - 1, up to vertex k.
+    knots : ndarray, shape (2, n + 1, 2, m), volts and metres
+        Branch from vertex k.
+    change : ndarray, shape (2, n + 1, 2, m)
+        Derivative of the knots with respect to the distance (V) of the start below vertex k.
+    last : ndarray of int, shape (2, n + 1)
+        Index of the last knot.
+    operators : ndarray, shape (2, k)
+        Thresholds (V) and weights (m/V) of a `MultiSlope` model.
+    scale : (float, float), volts
+        Origin and amplitude of that model.
+    """
+
+    vertices: FloatArray = np.empty((2, 0))
+    knots: FloatArray = np.empty((2, 0, 2, 0))
+    change: FloatArray = np.empty((2, 0, 2, 0))
+    last: NDArray[np.int64] = np.empty((2, 0), dtype=np.int64)
+    operators: FloatArray = np.empty((2, 0))
+    scale: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def interpolated(cls, vertices: FloatArray, rows: Sequence[Sequence[tuple[FloatArray, FloatArray]]]) -> "Branches":
+        """Return the branches whose knots and change, shape (2, k) each, are `rows`, n + 1 for each direction."""
+        last = np.array([[knots.shape[1] - 1 for knots, _ in side] for side in rows], dtype=np.int64)
+        packed = np.zeros((2, *last.shape, 2, int(last.max()) + 1))
+        for side, of_side in enumerate(rows):
+            for row, pair in enumerate(of_side):
+                packed[:, side, row, :, : last[side, row] + 1] = pair
+        return cls(vertices, packed[0], packed[1], last)
+
+    def curve(self, direction: int, v_turn: float) -> Curve:
+        """Return the interpolated branch that starts in `direction` at `v_turn` (V)."""
+        side, u_turn = int(direction < 0), direction * v_turn
+        vertices = self.vertices[side]
+        row = int(vertices.searchsorted(u_turn))
+        distance = vertices[row] - u_turn if row < vertices.size else 0.0
+        count = self.last[side, row] + 1
+        return Curve.of(self.knots[side, row, :, :count] + self.change[side, row, :, :count] * distance)
+
+
 class Shape(Protocol):
     """Branch shapes of a hysteresis model, as required by the engine."""
 
@@ -60,6 +110,10 @@ class Shape(Protocol):
 
         If not, rest is the low end of the memory: a fall from rest is an ordinary branch that returns to rest.
         """
+
+    @property
+    def branches(self) -> Branches:
+        """All branches as arrays."""
 
     def branch(self, direction: int, v_turn: float) -> Curve:
         """Return the shape of the branch that starts in `direction` at the reversal `v_turn` (V)."""
@@ -185,10 +239,10 @@ class Memory:
             self._curve = known or (shape.branch(s, self._v0) if falls_from_low_end else shape.first_rise(self._v0))
             self._close = (s * inf, s * inf) if s else self._rest
         self._u, self._f, _ = self._curve
-        # Beyond the closing point or the largest voltage the stack must be checked again.
+        # Beyond the closing point, the largest voltage or the last knot the stack must be checked again.
         (v_rest, y_rest), (v_far, y_far) = self._rest, self._far
         self._reach_u = min(s * self._close[0], s * v_rest + v_far) - s * self._v0
-        self._reach_f = min(s * self._close[1], s * y_rest + y_far) - s * self._y0
+        self._reach_f = min(min(s * self._close[1], s * y_rest + y_far) - s * self._y0, self._f[-1])
 
     def _first_closing(self, s: int) -> tuple[float, float]:
         """Return the point where the branch from the first reversal meets the branch that leaves rest."""
@@ -208,31 +262,23 @@ class Memory:
             If `v` is not finite or out of range; the memory is unchanged.
         """
         s = self._direction
-        if s * (v - self._v) > 0.0 and s * (v - self._v0) < self._reach_u:
-            return self._follow_to_voltage(v)
-        return self._turn_or_close_at_voltage(v)
-
-    def _follow_to_voltage(self, v: float) -> float:
-        """Advance along the current branch."""
-        s, u_knots, f_knots = self._direction, self._u, self._f
         u = s * (v - self._v0)
+        if not (s * (v - self._v) > 0.0 and u < self._reach_u):
+            if not abs(v - self._rest[0]) < self._far[0]:
+                raise UsageError(f"voltage {v} V is out of range; leave such samples out")
+            if v == self._v:
+                return self._y
+            s = 1 if v > self._v else -1
+            self._turn_to(s)
+            while s * (v - self._close[0]) >= 0.0:
+                self._close_loop()
+            u = s * (v - self._v0)
+        u_knots, f_knots = self._u, self._f
         i = bisect_right(u_knots, u, 1)
         u_a, f_a = u_knots[i - 1], f_knots[i - 1]
         self._v = v
         self._y = y = self._y0 + s * (f_a + (u - u_a) * ((f_knots[i] - f_a) / (u_knots[i] - u_a)))
         return y
-
-    def _turn_or_close_at_voltage(self, v: float) -> float:
-        """Push a reversal or remove closed loops as required, and move to `v`."""
-        if not abs(v - self._rest[0]) < self._far[0]:
-            raise UsageError(f"voltage {v} V is out of range; leave such samples out")
-        if v == self._v:
-            return self._y
-        s = 1 if v > self._v else -1
-        self._turn_to(s)
-        while s * (v - self._close[0]) >= 0.0:
-            self._close_loop()
-        return self._follow_to_voltage(v)
 
     # Inverse: displacement to voltage
 
@@ -247,96 +293,51 @@ class Memory:
             If `y` is not finite or out of range; the memory is unchanged.
         """
         s = self._direction
-        if s * (y - self._y) > 0.0 and s * (y - self._y0) < self._reach_f:
-            return self._follow_to_displacement(y, lower, upper)
-        return self._turn_or_close_at_displacement(y, lower, upper)
-
-    def _follow_to_displacement(self, y: float, lower: float, upper: float) -> float:
-        """Advance along the current branch, at most to a voltage limit."""
-        s, u_knots, f_knots = self._direction, self._u, self._f
         f = s * (y - self._y0)
+        if not (s * (y - self._y) > 0.0 and f < self._reach_f):
+            if not abs(y - self._rest[1]) < self._far[1]:
+                raise UsageError(f"displacement {y} m is out of range; leave such samples out")
+            if not lower <= self._v <= upper:
+                self.forward(min(max(self._v, lower), upper))
+            s = 1 if y > self._y else -1
+            limit = upper if s > 0 else lower
+            if y == self._y or s * (limit - self._v) <= 0.0:
+                return self._v
+            self._turn_to(s)
+            while s * (y - self._close[1]) >= 0.0:
+                if s * (limit - self._close[0]) < 0.0:
+                    self.forward(limit)
+                    return limit
+                self._close_loop()
+            f = s * (y - self._y0)
+            if f >= self._f[-1]:
+                raise UsageError(f"displacement {y} m cannot be reached by this model; leave such samples out")
+        u_knots, f_knots = self._u, self._f
         i = bisect_right(f_knots, f, 1)
-        if i == len(f_knots):
-            raise UsageError(f"displacement {y} m cannot be reached by this model; leave such samples out")
         u_a, f_a = u_knots[i - 1], f_knots[i - 1]
         v = self._v0 + s * (u_a + (f - f_a) * ((u_knots[i] - u_a) / (f_knots[i] - f_a)))
-        if lower <= v <= upper:
-            self._v, self._y = v, y
-            return v
-        self._turn_or_close_at_voltage(min(max(v, lower), upper))
-        return self._v
-
-    def _turn_or_close_at_displacement(self, y: float, lower: float, upper: float) -> float:
-        """Push a reversal or remove closed loops as required, and move to `y` within the limits."""
-        if not abs(y - self._rest[1]) < self._far[1]:
-            raise UsageError(f"displacement {y} m is out of range; leave such samples out")
-        if not lower <= self._v <= upper:
-            self._turn_or_close_at_voltage(min(max(self._v, lower), upper))
-        if y == self._y:
+        if not lower <= v <= upper:
+            self.forward(min(max(v, lower), upper))
             return self._v
-        s = 1 if y > self._y else -1
-        limit = upper if s > 0 else lower
-        if s * (limit - self._v) <= 0.0:
-            return self._v
-        self._turn_to(s)
-        while s * (y - self._close[1]) >= 0.0:
-            if s * (limit - self._close[0]) < 0.0:
-                self._turn_or_close_at_voltage(limit)
-                return limit
-            self._close_loop()
-        return self._follow_to_displacement(y, lower, upper)
+        self._v, self._y = v, y
+        return v
 
-    # Batch evaluation: between two reversals the model is one monotone piecewise linear function
+    # Whole paths
 
     def forward_array(self, v: FloatArray) -> FloatArray:
         """Move through the voltages `v`, shape (N,), volts; return the displacements, shape (N,), metres."""
-        return self._through(v, 0, -inf, inf, None)
+        return self._through(v, 0, -inf, inf)
 
-    def inverse_array(
-        self, y: FloatArray, lower: float = -inf, upper: float = inf, reached: FloatArray | None = None
-    ) -> FloatArray:
+    def inverse_array(self, y: FloatArray, lower: float = -inf, upper: float = inf) -> FloatArray:
         """Move through the displacements `y`, shape (N,), metres; return the voltages, shape (N,), volts.
 
-        `lower` and `upper` (V) limit the voltage as in `inverse`. The displacements reached within these limits, shape
-        (N,), metres, are written to `reached`, if given.
+        `lower` and `upper` (V) limit the voltage as in `inverse`.
         """
-        if reached is not None:
-            reached[:] = y
-        return self._through(y, 1, lower, upper, reached)
+        return self._through(y, 1, lower, upper)
 
-    def split_at_closures(
-        self, x: FloatArray, start: int, stop: int, coordinate: int, lower: float = -inf, upper: float = inf
-    ) -> Iterator[tuple[int, int]]:
-        """Divide the monotone run ``start:stop`` of `x` at loop closures, and update the stack.
-
-        `coordinate` is the unit of `x`, shape (N,): 0 voltage (V), 1 displacement (m). Each piece lies on one branch
-        and ends before a loop that closes beyond a voltage limit (V). The caller must `advance_to` the last sample of a
-        piece before requesting the next piece.
-        """
-        s = 1 if x[stop - 1] > x[start - 1] else -1
-        limit = upper if s > 0 else lower
-        if not lower <= self._v <= upper or self._v == limit:
-            return
-        self._turn_to(s)
-        while start < stop:
-            cut = start + count_before(x[start:stop], s, self._close[coordinate])
-            if cut > start:
-                yield start, cut
-            if cut < stop:
-                if s * (limit - self._close[0]) < 0.0:
-                    return
-                self._close_loop()
-            start = cut
-
-    def advance_to(self, v: float, y: float) -> None:
-        """Set the current point (V, m), which must lie ahead on the current branch."""
-        self._v, self._y = v, y
-
-    def _through(
-        self, x: FloatArray, coordinate: int, lower: float, upper: float, reached: FloatArray | None
-    ) -> FloatArray:
-        """Evaluate the model along one coordinate `x` (0 voltage, 1 displacement), writing to `reached`."""
-        x = np.ascontiguousarray(x, dtype=np.float64)
+    def _through(self, x: FloatArray, coordinate: int, lower: float, upper: float) -> FloatArray:
+        """Evaluate the model along one coordinate `x` (0 voltage, 1 displacement)."""
+        x = np.require(x, np.float64, ("C", "W"))
         if not x.size:
             return np.empty_like(x)
         rest, far = self._rest[coordinate], self._far[coordinate]
@@ -345,82 +346,40 @@ class Memory:
             require_finite(x)
             at = int(np.argmax(np.abs(x - rest)))
             raise UsageError(f"sample {at} is {x[at]} {'Vm'[coordinate]}, out of range; remove such samples")
-        out = np.empty_like(x)
-        for start, stop in monotone_runs(x):
-            # Otherwise the axis is held at a voltage limit and has not reached the desired displacement.
-            on_path = start and x[start - 1] == (self._y if coordinate else self._v)
-            if stop - start >= SHORT_RUN and on_path:
-                start = self._along_branches(x, out, start, stop, coordinate, lower, upper)
-            noted = None if reached is None else reached[start:stop]
-            out[start:stop] = self._sample_by_sample(x[start:stop].tolist(), coordinate, lower, upper, noted)
+        if worth_compiling(x.size):
+            return self.run_compiled(x, coordinate, lower, upper)
+        if coordinate:
+            return np.array([self.inverse(y, lower, upper) for y in x.tolist()])
+        return np.array([self.forward(v) for v in x.tolist()])
+
+    def run_compiled(
+        self, x: FloatArray, coordinate: int, lower: float, upper: float, walk: NDArray[np.int64] | None = None
+    ) -> FloatArray:
+        """Return the other coordinate along `x`; `slpi_ros.hysteresis.compiled.through` describes the arguments."""
+        from slpi_ros.hysteresis.compiled import through
+
+        if coordinate and not lower <= self._v <= upper:
+            self.forward(min(max(self._v, lower), upper))
+        out, turns = np.empty_like(x), np.empty((2, self.depth + x.size))
+        turns[:, : self.depth] = self._turns
+        point, rest = np.array([self._v, self._y]), np.array(self._rest, dtype=np.float64)
+        first = np.ascontiguousarray(self._shape.first_rise(self._rest[0]).knots)
+        done, direction, depth = through(
+            *(x, coordinate, float(lower), float(upper), out),
+            *(float(self._direction), point, turns, self.depth, rest),
+            *(self._shape.symmetric_rest, first, self._shape.branches),
+            np.empty((3, 0), dtype=np.int64) if walk is None else walk,
+        )
+        v_turns, y_turns = turns[:, :depth].tolist()
+        v, y = point.tolist()
+        self.restore(MemoryState(int(direction), v, y, tuple(v_turns), tuple(y_turns)))
+        if done < x.size:
+            # Beyond the last knot: raises the error of the sample.
+            (self.inverse if coordinate else self.forward)(float(x[done]))
         return out
 
-    def _along_branches(
-        self, x: FloatArray, out: FloatArray, start: int, stop: int, coordinate: int, lower: float, upper: float
-    ) -> int:
-        """Evaluate the run ``start:stop`` branch by branch; return its end, which is earlier at a voltage limit."""
-        done = start
-        for begin, end in self.split_at_closures(x, start, stop, coordinate, lower, upper):
-            drive, response = self._knots(coordinate, float(x[end - 1]))
-            result = np.interp(x[begin:end], drive, response)
-            if coordinate:
-                end = begin + int(np.count_nonzero((result >= lower) & (result <= upper)))
-            out[begin:end] = result[: end - begin]
-            if end > begin:
-                point = float(x[end - 1]), float(out[end - 1])
-                self.advance_to(*(point[::-1] if coordinate else point))
-                done = end
-            if end - begin < len(result):
-                break
-        return done
 
-    def _knots(self, coordinate: int, farthest: float) -> tuple[FloatArray, FloatArray]:
-        """Return the branch up to `farthest` as ascending knots of input and output coordinate."""
-        s = self._direction
-        origin = (self._v0, self._y0)
-        reach = s * (farthest - origin[coordinate])
-        drive, response = self._curve.knots[:, :-1][:: 1 - 2 * coordinate]
-        if reach > drive[-1]:
-            # The last knot is too distant for exact arithmetic.
-            (*_, d0, d1), (*_, r0, r1) = self._curve[1::-1] if coordinate else self._curve[:2]
-            drive, response = np.append(drive, reach), np.append(response, r0 + (reach - d0) * ((r1 - r0) / (d1 - d0)))
-        return (origin[coordinate] + s * drive)[::s], (origin[1 - coordinate] + s * response)[::s]
-
-    def _sample_by_sample(
-        self, run: list[float], coordinate: int, lower: float, upper: float, reached: FloatArray | None
-    ) -> list[float]:
-        """Evaluate a monotone run sample by sample; fast while samples stay on one branch."""
-        responses: list[float] = []
-        while len(responses) < len(run):
-            x = run[len(responses)]
-            responses.append(self.inverse(x, lower, upper) if coordinate else self.forward(x))
-            if x == (self._y if coordinate else self._v):
-                self._follow_run(run, responses, coordinate, lower, upper)
-            elif reached is not None:
-                reached[len(responses) - 1] = self._y
-        return responses
-
-    def _follow_run(
-        self, run: list[float], responses: list[float], coordinate: int, lower: float, upper: float
-    ) -> None:
-        """Append the outputs of the samples on the current branch within the voltage limits."""
-        s, origin = self._direction, (self._v0, self._y0)
-        reach = self._reach_f if coordinate else self._reach_u
-        drive, response = (self._f, self._u) if coordinate else (self._u, self._f)
-        d_origin, r_origin = origin[coordinate], origin[1 - coordinate]
-        last = present = self._y if coordinate else self._v
-        i = bisect_right(drive, s * (present - d_origin), 1)
-        for x in run[len(responses) :]:
-            d = s * (x - d_origin)
-            if not (s * (x - present) > 0.0 and d < reach and d < drive[-1]):
-                break
-            while drive[i] <= d:
-                i += 1
-            d_a, r_a = drive[i - 1], response[i - 1]
-            answer = r_origin + s * (r_a + (d - d_a) * ((response[i] - r_a) / (drive[i] - d_a)))
-            if coordinate and not lower <= answer <= upper:
-                break
-            responses.append(answer)
-            present = x
-        if present != last:
-            self.advance_to(*((responses[-1], present) if coordinate else (present, responses[-1])))
+def worth_compiling(samples: int) -> bool:
+    """Return whether the compiled engine is faster than the loop over that many samples."""
+    loaded = "slpi_ros.hysteresis.compiled" in sys.modules
+    return samples >= (COMPILED_FROM if loaded else LOADED_FROM)

@@ -44,12 +44,7 @@ class Walk:
     @classmethod
     def along(cls, v: FloatArray, *, symmetric_rest: bool, primed: bool) -> "Walk":
         """Find the branches of a voltage `v`, shape (N,), that starts at rest or, if `primed`, after a long fall."""
-        origin = np.full(v.size, LONG_FALL if primed else AT_REST)
-        direction = np.full(v.size, -1 if primed else 0)
-        for piece in trace(v, symmetric_rest=symmetric_rest, primed=primed):
-            origin[piece.start : piece.stop] = piece.origin
-            direction[piece.start : piece.stop] = piece.direction
-        return cls(v, origin, direction, np.zeros(v.size, dtype=np.int64))
+        return cls(v, *trace(v, symmetric_rest=symmetric_rest, primed=primed), np.zeros(v.size, dtype=np.int64))
 
     @classmethod
     def joined(cls, walks: Sequence["Walk"]) -> "Walk":

@@ -138,6 +138,7 @@ class StreamingInverse:
     def limits(self, limits: Limits) -> None:
         lower = min(max(limits.lower, self._clipped[0]), limits.upper)
         self.pace.limits = limits = replace(limits, lower=lower, upper=max(min(limits.upper, self._clipped[1]), lower))
+        self._v_min, self._v_max = limits.lower, limits.upper
         # Only the inverse of the hysteresis is required.
         self._bare = self._without_effects and limits.slew == limits.acceleration == inf
 
@@ -204,17 +205,14 @@ class StreamingInverse:
         SlpiError
             As in `check`; the state is unchanged.
         """
-        dt = t - self._t
-        if not (0.0 <= dt < inf and self._lowest <= y <= self._highest):
+        if not (self._t <= t < inf and self._lowest <= y <= self._highest):
             self.check(t, y)
-            # At the first sample no time has passed: a rate limit holds the voltage until the next one.
-            dt = 0.0
         if self._bare:
-            limits = self.pace.limits
-            v = self.memory.inverse(y, limits.lower, limits.upper)
+            v = self.memory.inverse(y, self._v_min, self._v_max)
             self.desired = y
         else:
-            v = self.move(dt, y)
+            # At the first sample no time has passed: a rate limit holds the voltage until the next one.
+            v = self.move(t - self._t if self._t > -inf else 0.0, y)
         self._t = t
         return v
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from strategies import cases_and_paths, repeated
 
-from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, Piece, trace
+from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, trace
 
 FloatArray = NDArray[np.float64]
 
@@ -61,13 +61,11 @@ STARTS = [(True, False), (True, True), (False, False), (False, True)]
 def test_every_moved_sample_lies_on_one_branch_and_the_right_one(symmetric_rest, primed, drawn, at_rest):
     case, path = drawn
     v = np.concatenate([[case.rest[0]] * at_rest, path])
-    answers: list[tuple[int, int] | None] = [None] * v.size
-    before = 0
-    for piece in trace(v, symmetric_rest=symmetric_rest, primed=primed):
-        assert before <= piece.start < piece.stop
-        before = piece.stop
-        for i in range(piece.start, piece.stop):
-            answers[i] = piece.direction, piece.origin
+    origin, direction = trace(v, symmetric_rest=symmetric_rest, primed=primed)
+    moved = np.maximum.accumulate(v != v[0])
+    assert (origin[~moved] == (LONG_FALL if primed else AT_REST)).all()
+    assert (direction[~moved] == (-1 if primed else 0)).all()
+    answers = [pair if on else None for pair, on in zip(zip(direction, origin, strict=True), moved, strict=True)]
     expected = branches(v, symmetric_rest=symmetric_rest, primed=primed)
     turned = [None if answer is None else (answer[0], turn(v, answer[1])) for answer in answers]
     assert turned == [None if answer is None else (answer[0], turn(v, answer[1])) for answer in expected]
@@ -82,26 +80,19 @@ def turn(v: FloatArray, origin: int) -> tuple[float, str]:
     return (float(v[0]), "rest") if origin <= 0 else (float(v[origin]), f"sample {origin}")
 
 
-def test_pieces_by_name():
+def test_branches_by_name():
     v = np.array([0.0, 0.0, 2.0, 5.0, 3.0, 4.0, 4.0, 6.0, -7.0, 1.0])
-    assert trace(v, symmetric_rest=True) == [
-        Piece(2, 4, 1, AT_REST),
-        Piece(4, 5, -1, 3),
-        Piece(5, 7, 1, 4),
-        Piece(7, 8, 1, AT_REST),
-        Piece(8, 9, -1, AT_REST),
-        Piece(9, 10, 1, 8),
-    ]
-    assert trace(v, symmetric_rest=False)[-2:] == [Piece(8, 9, -1, 7), Piece(9, 10, 1, 8)]
-    assert trace(v, symmetric_rest=False, primed=True)[0] == Piece(2, 4, 1, 1)
-    assert trace(v, symmetric_rest=False, primed=True)[-2:] == [Piece(8, 9, -1, LONG_FALL), Piece(9, 10, 1, 8)]
-
-
-@pytest.mark.parametrize("last", [4.0, 6.0])
-def test_samples_still_at_rest_lie_on_no_piece(last):
-    assert trace(np.array([5.0, 5.0, 5.0, last]), symmetric_rest=False)[0][:2] == (3, 4)
+    origin, direction = trace(v, symmetric_rest=True)
+    assert direction.tolist() == [0, 0, 1, 1, -1, 1, 1, 1, -1, 1]
+    assert origin.tolist() == [AT_REST] * 4 + [3, 4, 4, AT_REST, AT_REST, 8]
+    assert trace(v, symmetric_rest=False)[0].tolist() == [AT_REST] * 4 + [3, 4, 4, AT_REST, 7, 8]
+    origin, direction = trace(v, symmetric_rest=False, primed=True)
+    assert direction.tolist() == [-1, -1, 1, 1, -1, 1, 1, 1, -1, 1]
+    assert origin.tolist() == [LONG_FALL] * 2 + [1, 1, 3, 4, 4, 1, LONG_FALL, 8]
 
 
 @pytest.mark.parametrize("v", [[], [3.0], [3.0, 3.0, 3.0]])
-def test_what_never_moves_has_no_pieces(v):
-    assert trace(np.array(v), symmetric_rest=True) == []
+def test_what_never_moves_is_at_rest(v):
+    origin, direction = trace(np.array(v), symmetric_rest=True)
+    assert origin.tolist() == [AT_REST] * len(v)
+    assert direction.tolist() == [0] * len(v)

@@ -83,9 +83,7 @@ def test_batch_with_limits_equals_stream_with_limits(drawn):
 def test_a_batch_with_limits_leaves_the_memory_where_its_voltages_lead(drawn):
     case, before, lower, upper, wishes = drawn
     memory, twin = after(case, before), after(case, before)
-    reached = np.empty_like(wishes)
-    led_to = stream_forward(twin, memory.inverse_array(wishes, lower, upper, reached))
-    np.testing.assert_allclose(reached, led_to, rtol=0, atol=1e-9 * case.height)
+    stream_forward(twin, memory.inverse_array(wishes, lower, upper))
     np.testing.assert_allclose(memory.displacement, twin.displacement, rtol=0, atol=1e-9 * case.height)
     back = np.linspace(memory.voltage, memory.voltage - 0.5 * case.width, 50)
     np.testing.assert_allclose(memory.forward_array(back), twin.forward_array(back), rtol=0, atol=1e-9 * case.height)

@@ -169,7 +169,9 @@ def test_held_is_what_would_stay_however_fast_it_might_go(drawn):
     for t, y in samples:
         v = stream.step(t, y)
         if stream.missed:
-            assert stream.held == (stream.copy().memory.inverse(y, limits.lower, limits.upper) == v)
+            fastest = stream.copy().memory.inverse(y, limits.lower, limits.upper)
+            # The slew limit reaches a voltage limit within rounding.
+            assert stream.held == (fastest == pytest.approx(v, rel=1e-13, abs=1e-13))
         else:
             assert not stream.held
 

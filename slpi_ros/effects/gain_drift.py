@@ -9,8 +9,11 @@ import numpy as np
 
 from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 
-# Knots of the candidates, as shares of the record: uniform, and concentrated at the start after a rest.
-KNOTS = (*(tuple(np.linspace(0.0, 1.0, count + 1)[1:].tolist()) for count in (1, 2, 4, 8)), (0.05, 0.15, 0.4, 1.0))
+# Numbers of uniform knots of the candidates. Others are at equal factors of time, so many to a decade, as piezo ageing
+# goes with the logarithm of time: from the end of the first loop on, as that one has nothing to be compared with.
+UNIFORM, PER_DECADE = (1, 2, 4, 8), 2.0
+# Weight of what the gains and shifts of all knots have in common.
+COMMON = 0.01
 
 
 @dataclass(frozen=True)
@@ -70,15 +73,18 @@ class GainDrift:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield curves with one knot and with several.
+        """Yield curves with one knot and with several, uniform and at equal factors of time.
 
         Each candidate has a column for the sensitivity and one for a shift, which determine the origin. The origin is
         limited to the record's displacements, because otherwise any thermal drift could be fitted as a gain drift.
         """
         t, low, high = left.t - left.t[0], float(left.h.min()), float(left.h.max())
         moved = left.h - 0.5 * (low + high)
-        for shares in KNOTS:
-            times = t[-1] * np.array(shares)
+        end, first = float(t[-1]), float(np.interp(2.0 * np.ptp(left.u), _travel(left), t))
+        curves = [np.linspace(0.0, end, count + 1)[1:] for count in UNIFORM]
+        if 0.0 < first < end:
+            curves.append(np.geomspace(first, end, 2 + int(PER_DECADE * np.log10(end / first))))
+        for times in curves:
             hats = np.column_stack([np.interp(t, (0.0, *times), (0.0, *row)) for row in np.eye(times.size)])
             yield Candidate(np.column_stack([hats * moved[:, None], hats]), partial(cls._through, times, low, high))
 
@@ -86,7 +92,10 @@ class GainDrift:
     def _through(cls, times: FloatArray, low: float, high: float, found: FloatArray) -> "GainDrift":
         """Return the curve for gains ``a`` and shifts ``b``, shape (2 K,), that best satisfies ``b = -origin a``."""
         gains, shifts = found.reshape(2, -1)
-        origin = 0.5 * (low + high) - float(gains @ shifts) / max(float(gains @ gains), 1e-300)
+        # A knot tells as much as it has samples. What all have in common comes from the first piece alone.
+        weights = np.gradient(np.append(0.0, times))[1:]
+        inner = np.diag(weights) - np.outer(weights, weights) / (1.0 + COMMON) / weights.sum()
+        origin = 0.5 * (low + high) - float(gains @ inner @ shifts) / max(float(gains @ inner @ gains), 1e-300)
         return cls(tuple(times.tolist()), tuple(gains.tolist()), min(max(origin, low), high))
 
     def describe(self) -> str:
@@ -104,6 +113,11 @@ class GainDrift:
     def streaming(self) -> "StreamingGainDrift":
         """Return the sensitivity at the end of the record as a streaming effect."""
         return StreamingGainDrift(self.origin, 1.0 + self.gains[-1])
+
+
+def _travel(left: ResidualView) -> FloatArray:
+    """Return the travel of the voltage up to each sample, shape (N,), volts, counting only what is used."""
+    return np.cumsum(np.abs(np.diff(left.u, prepend=left.u[0])) * left.used)
 
 
 class StreamingGainDrift:

@@ -9,10 +9,10 @@ import numpy as np
 
 from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 
-# Numbers of uniform knots of the candidates. Others are at equal factors of time, so many to a decade, as piezo ageing
-# goes with the logarithm of time: from the end of the first loop on, as that one has nothing to be compared with.
+# Numbers of uniform knots of the candidates. Within the first piece there are others at equal factors of time, so many
+# to a decade, as piezo ageing goes with the logarithm of time; the first one ends the first loop.
 UNIFORM, PER_DECADE = (1, 2, 4, 8), 2.0
-# Weight of what the gains and shifts of all knots have in common.
+# Weight of what the gains and shifts of all knots have in common: the first piece of the record alone tells it.
 COMMON = 0.01
 
 
@@ -73,30 +73,27 @@ class GainDrift:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield curves with one knot and with several, uniform and at equal factors of time.
+        """Yield a line, and curves with uniform knots and more of them at the beginning.
 
-        Each candidate has a column for the sensitivity and one for a shift, which determine the origin. The origin is
-        limited to the record's displacements, because otherwise any thermal drift could be fitted as a gain drift.
+        The origin is that of the residual. It is limited to the record's displacements, because otherwise any thermal
+        drift could be fitted as a gain drift.
         """
-        t, low, high = left.t - left.t[0], float(left.h.min()), float(left.h.max())
-        moved = left.h - 0.5 * (low + high)
-        end, first = float(t[-1]), float(np.interp(2.0 * np.ptp(left.u), _travel(left), t))
-        curves = [np.linspace(0.0, end, count + 1)[1:] for count in UNIFORM]
-        if 0.0 < first < end:
-            curves.append(np.geomspace(first, end, 2 + int(PER_DECADE * np.log10(end / first))))
+        t, end = left.t - left.t[0], float(left.t[-1] - left.t[0])
+        travel = np.cumsum(np.abs(np.diff(left.u, prepend=left.u[0])) * left.used)
+        first = float(np.interp(2.0 * np.ptp(left.u), travel, t))
+        curves = [np.array([end])]
+        for count in UNIFORM:
+            knots = np.linspace(0.0, end, count + 1)[1:]
+            early = int(np.ceil(PER_DECADE * np.log10(knots[0] / first))) if 0.0 < first < knots[0] else 0
+            curves.append(np.append(np.geomspace(first, knots[0], early, endpoint=False), knots))
         for times in curves:
             hats = np.column_stack([np.interp(t, (0.0, *times), (0.0, *row)) for row in np.eye(times.size)])
-            yield Candidate(np.column_stack([hats * moved[:, None], hats]), partial(cls._through, times, low, high))
+            origin = _origin(left, times, hats)
+            yield Candidate(hats * (left.h - origin)[:, None], partial(cls._through, times, origin))
 
     @classmethod
-    def _through(cls, times: FloatArray, low: float, high: float, found: FloatArray) -> "GainDrift":
-        """Return the curve for gains ``a`` and shifts ``b``, shape (2 K,), that best satisfies ``b = -origin a``."""
-        gains, shifts = found.reshape(2, -1)
-        # A knot tells as much as it has samples. What all have in common comes from the first piece alone.
-        weights = np.gradient(np.append(0.0, times))[1:]
-        inner = np.diag(weights) - np.outer(weights, weights) / (1.0 + COMMON) / weights.sum()
-        origin = 0.5 * (low + high) - float(gains @ inner @ shifts) / max(float(gains @ inner @ gains), 1e-300)
-        return cls(tuple(times.tolist()), tuple(gains.tolist()), min(max(origin, low), high))
+    def _through(cls, times: FloatArray, origin: float, gains: FloatArray) -> "GainDrift":
+        return cls(tuple(times.tolist()), tuple(gains.tolist()), origin)
 
     def describe(self) -> str:
         """Describe the magnitude, the duration and the half time."""
@@ -115,9 +112,23 @@ class GainDrift:
         return StreamingGainDrift(self.origin, 1.0 + self.gains[-1])
 
 
-def _travel(left: ResidualView) -> FloatArray:
-    """Return the travel of the voltage up to each sample, shape (N,), volts, counting only what is used."""
-    return np.cumsum(np.abs(np.diff(left.u, prepend=left.u[0])) * left.used)
+def _origin(left: ResidualView, times: FloatArray, hats: FloatArray) -> float:
+    """Return the displacement (m) that a change of sensitivity, `hats` of shape (N, K), leaves where it is.
+
+    Gains ``a`` and shifts ``b`` of the residual are found beside a constant gain and shift, which the hysteresis has
+    taken; the origin satisfies ``b = -origin a`` best.
+    """
+    low, high = float(left.h.min()), float(left.h.max())
+    half = 0.5 * (high - low) or 1.0
+    moved = (left.h - 0.5 * (low + high)) / half
+    columns = np.column_stack([hats * moved[:, None], hats, moved, np.ones_like(moved)])
+    found = np.linalg.lstsq(columns[left.used], left.residual[left.used], rcond=None)[0]
+    gains, shifts = found[: 2 * times.size].reshape(2, -1)
+    # A knot tells as much as it has samples.
+    weights = np.gradient(np.append(0.0, times))[1:]
+    inner = np.diag(weights) - np.outer(weights, weights) / (1.0 + COMMON) / weights.sum()
+    share = -float(gains @ inner @ shifts) / max(float(gains @ inner @ gains), 1e-300)
+    return 0.5 * (low + high) + half * min(max(share, -1.0), 1.0)
 
 
 class StreamingGainDrift:

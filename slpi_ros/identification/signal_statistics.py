@@ -334,8 +334,9 @@ _BESIDE = 3
 # Readings are found to be mixed with the next or the one before where more than this share of them lie off by more than
 # half of the way to it, so many times as many as on the other side; judged by those whose way noise leaves to be seen.
 _MIXED_SHARE, _MIXED_TIMES, _MIXED_NOISE = 0.02, 5.0, 0.12
-# One of them lies off by this share of that way at least, and of so many robust standard deviations.
-_MIXED_LEAST, _MIXED_DEVIATIONS = 0.2, 4.0
+# One of them lies off by this share of that way at least, by a line through others and by a model, and by so many robust
+# standard deviations.
+_MIXED_BY_LINE, _MIXED_BY_MODEL, _MIXED_DEVIATIONS = 0.2, 0.05, 4.0
 # Hardly any lies farther off than the next reading.
 _MIXED_MOST = 1.3
 
@@ -381,8 +382,9 @@ def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
     found, judged = [], 0
     for start in range(0, y.size, _ENOUGH):
         first = max(start - _RINGING, 0)
-        off, way = (x[start - first :][:_ENOUGH] for x in _beside_lines(y[first:][: _ENOUGH + 2 * _RINGING], v[first:]))
-        found.append(start + _mixed(side * off, way))
+        here = slice(first, start + _ENOUGH + _RINGING)
+        off, way = (x[start - first :][:_ENOUGH] for x in _beside_lines(y[here], v[here]))
+        found.append(start + _mixed(side * off, way, _MIXED_BY_LINE))
         judged += int(np.count_nonzero(way))
     return Mixed(np.concatenate(found), judged, side)
 
@@ -403,14 +405,14 @@ def mixed_beside(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> ND
     # What the model gets wrong is alike in neighbouring readings.
     off = off - median_filter(off, 4 * _BESIDE + 3)
     way = np.diff(path, append=path[-1]) if side > 0 else np.diff(path, prepend=path[0])
-    return at[_mixed(side * off, way[at])]
+    return at[_mixed(side * off, way[at], _MIXED_BY_MODEL)]
 
 
-def _mixed(off: FloatArray, way: FloatArray) -> NDArray[np.int64]:
-    """Return which readings, `off` by so much (m) on their way to the next one, `way` (m), are mixed with that."""
+def _mixed(off: FloatArray, way: FloatArray, least: float) -> NDArray[np.int64]:
+    """Return which readings, `off` by so much (m) and a share of their way to the next one, `way` (m), are mixed."""
     known, ahead = way != 0.0, np.sign(way) * off
     noise_off = _MIXED_DEVIATIONS * _rms(off[known]) if known.any() else 0.0
-    found = ahead > np.maximum(_MIXED_LEAST * np.abs(way), noise_off)
+    found = ahead > np.maximum(least * np.abs(way), noise_off)
     # What lies beyond the next reading is something else.
     return np.flatnonzero(known & found & (ahead < _MIXED_MOST * np.abs(way) + noise_off))
 

@@ -334,8 +334,8 @@ _BESIDE = 3
 # Readings are found to be mixed with the next or the one before where more than this share of them lie off by more than
 # half of the way to it, so many times as many as on the other side; judged by those whose way noise leaves to be seen.
 _MIXED_SHARE, _MIXED_TIMES, _MIXED_NOISE = 0.02, 5.0, 0.12
-# One of them lies off by this share of that way at least, by a line through others and by a model, and by so many robust
-# standard deviations.
+# One of them lies off by this share of that way at least, by a line through others and by a model, and by so many
+# robust standard deviations.
 _MIXED_BY_LINE, _MIXED_BY_MODEL, _MIXED_DEVIATIONS = 0.2, 0.05, 4.0
 # Hardly any lies farther off than the next reading.
 _MIXED_MOST = 1.3

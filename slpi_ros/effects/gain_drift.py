@@ -10,8 +10,8 @@ import numpy as np
 from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 
 # Numbers of uniform knots of the candidates. Within the first piece there are others at equal factors of time, so many
-# to a decade, as piezo ageing goes with the logarithm of time; the first one ends the first loop.
-UNIFORM, PER_DECADE = (1, 2, 4, 8), 2.0
+# to a decade, as piezo ageing goes with the logarithm of time; the first one comes after a loop and so many readings.
+UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
 # Weight of what the gains and shifts of all knots have in common: the first piece of the record alone tells it.
 COMMON = 0.01
 
@@ -80,7 +80,7 @@ class GainDrift:
         """
         t, end = left.t - left.t[0], float(left.t[-1] - left.t[0])
         travel = np.cumsum(np.abs(np.diff(left.u, prepend=left.u[0])) * left.used)
-        first = float(np.interp(2.0 * np.ptp(left.u), travel, t))
+        first = float(max(np.interp(2.0 * np.ptp(left.u), travel, t), t[left.used][:FEWEST][-1]))
         curves = [np.array([end])]
         for count in UNIFORM:
             knots = np.linspace(0.0, end, count + 1)[1:]

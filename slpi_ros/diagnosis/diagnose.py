@@ -251,14 +251,17 @@ def _given(model: AxisModel, selection: Selection) -> Given:
 def _compared(bare: AxisModel, one: Explanation) -> Given:
     """Compare the hysteresis of the given model with what effects leave for one to explain."""
     errors, refitted, gains, deviations = [], [], [], []
-    for part, rows in zip(one.evidence.parts, one.evidence.slices, strict=True):
+    # Like the given one, the other hysteresis has branches that rise.
+    hysteresis, begins = one.hysteresis()
+    for part, rows, begin in zip(one.evidence.parts, one.evidence.slices, begins, strict=True):
         chosen = _known(part)
         target = (one.target - one.settling)[rows][chosen]
         starts = _starts(bare, part)
         tried = [replace(bare, start=start).simulate(part.t, one.u[rows])[chosen] for start in starts]
         h = min(tried, key=lambda h: float(np.std(target - h)))
         errors.append(np.var(target - h))
-        refitted.append(np.var(one.residual[rows][chosen]))
+        own = replace(bare, hysteresis=hysteresis, start=Start(float(one.u[rows][0]), begin, part.history))
+        refitted.append(np.var(target - own.simulate(part.t, one.u[rows])[chosen]))
         gain, deviation = _gain(h, target)
         gains.append(gain)
         deviations.append(deviation)

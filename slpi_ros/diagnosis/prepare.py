@@ -77,6 +77,8 @@ class Part:
         How far the other axes of the record have moved since its start.
     digit : float, metres
         Step between two readings of the sensor; 0 where they are continuous.
+    mixed : float
+        Share of the readings that are early, late or a mixture of two neighbouring values; they are not used.
     """
 
     source: str
@@ -89,6 +91,7 @@ class Part:
     history: tuple[float, ...]
     others: Mapping[str, FloatArray]
     digit: float
+    mixed: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -247,11 +250,11 @@ def evidence_of(
     )
     evidence = Evidence(parts, basis, _smoothness(started, basis))
     residual = _residual(evidence)
-    used = [
-        _trusted(part, residual[rows], only_wiped=beginning.only_wiped)
-        for part, rows, beginning in zip(parts, evidence.slices, beginnings, strict=True)
+    trusted = [
+        _trusted(part, residual[rows], samples, only_wiped=beginning.only_wiped)
+        for part, rows, (_, samples, _), beginning in zip(parts, evidence.slices, read, beginnings, strict=True)
     ]
-    return replace(evidence, parts=tuple(replace(part, used=own) for part, own in zip(parts, used, strict=True)))
+    return replace(evidence, parts=tuple(trusted))
 
 
 def _readings(
@@ -268,21 +271,25 @@ def _readings(
         )
     # Of readings with one stamp the first counts: what depends on time cannot say anything of the others.
     chosen = np.flatnonzero(kept)[:MOST_SAMPLES]
-    samples = Samples(samples.v[chosen], samples.y[chosen], samples.fitted[chosen])
+    v, y, fitted, mixed = samples.v[chosen], samples.y[chosen], samples.fitted[chosen], samples.mixed * chosen.size
+    samples = replace(samples, v=v, y=y, fitted=fitted, mixed=mixed // samples.v.size)
     return t[chosen], samples, {name: y[chosen] for name, y in others.items()}
 
 
-def _trusted(part: Part, residual: FloatArray, *, only_wiped: bool) -> NDArray[np.bool_]:
-    """Return which samples are explained, shape (N,), by what a hysteresis alone leaves of them."""
-    used = part.used & ~_outliers(residual, part.used)
+def _trusted(part: Part, residual: FloatArray, samples: Samples, *, only_wiped: bool) -> Part:
+    """Return a record without the samples that what a hysteresis alone leaves of them, shape (N,), shows to be bad."""
+    samples = samples.without_mixed(part.y - residual)
+    used = part.used & samples.fitted
+    used = used & ~_outliers(residual, used)
     if only_wiped or _beginning_disagrees(residual, used, part.wiped):
         used = used & part.wiped
-    return used
+    known = samples.mixed + np.count_nonzero(samples.fitted)
+    return replace(part, used=used, seen=samples.fitted, mixed=samples.mixed / known)
 
 
 def _residual(evidence: Evidence) -> FloatArray:
     """Return what a hysteresis alone leaves, shape (N,), metres."""
-    problem = evidence.problem(evidence.v)
+    problem = evidence.problem(evidence.v).reweighted()
     matrix, vector = problem.design.normal_equations(problem.y, problem.weights)
     x = solve_free(matrix + problem.penalty(evidence.smoothness, problem.count), vector)
     return (problem.y - problem.design.predict(x))[evidence.rows] * problem.scale

@@ -322,6 +322,7 @@ def judged(
         summary=_of_given(given, selection, before_rms)
         + _summary(verdict, selection, effects, floor, before_rms)
         + _not_in_model(left_out_of_model, selection.dropped)
+        + _mixed(now.evidence)
         + _cannot_tell(driven_alike),
         floor_rms=floor.rms,
         floor_source=floor.source,
@@ -418,6 +419,11 @@ def _not_in_model(left_out: Sequence[str], dropped: Sequence[str]) -> str:
     if dropped:
         said += f" Dropped, as other records get worse with what one record shows of it: {', '.join(dropped)}."
     return said
+
+
+def _mixed(evidence: Evidence) -> str:
+    share = 100.0 * max(part.mixed for part in evidence.parts)
+    return f" {share:.2g} % of the readings are late or mixed with the one beside them and left out." if share else ""
 
 
 def _summary(

@@ -9,8 +9,11 @@ import numpy as np
 
 from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 
-# Knots of the candidates, as shares of the record: uniform, and concentrated at the start after a rest.
-KNOTS = (*(tuple(np.linspace(0.0, 1.0, count + 1)[1:].tolist()) for count in (1, 2, 4, 8)), (0.05, 0.15, 0.4, 1.0))
+# Numbers of uniform knots of the candidates. Within the first piece there are others at equal factors of time, so many
+# to a decade, as piezo ageing goes with the logarithm of time; the first one comes after a loop and so many readings.
+UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
+# Weight of what the gains and shifts of all knots have in common: the first piece of the record alone tells it.
+COMMON = 0.01
 
 
 @dataclass(frozen=True)
@@ -70,24 +73,27 @@ class GainDrift:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield curves with one knot and with several.
+        """Yield a line, and curves with uniform knots and more of them at the beginning.
 
-        Each candidate has a column for the sensitivity and one for a shift, which determine the origin. The origin is
-        limited to the record's displacements, because otherwise any thermal drift could be fitted as a gain drift.
+        The origin is that of the residual. It is limited to the record's displacements, because otherwise any thermal
+        drift could be fitted as a gain drift.
         """
-        t, low, high = left.t - left.t[0], float(left.h.min()), float(left.h.max())
-        moved = left.h - 0.5 * (low + high)
-        for shares in KNOTS:
-            times = t[-1] * np.array(shares)
+        t, end = left.t - left.t[0], float(left.t[-1] - left.t[0])
+        travel = np.cumsum(np.abs(np.diff(left.u, prepend=left.u[0])) * left.used)
+        first = float(max(np.interp(2.0 * np.ptp(left.u), travel, t), t[left.used][:FEWEST][-1]))
+        curves = [np.array([end])]
+        for count in UNIFORM:
+            knots = np.linspace(0.0, end, count + 1)[1:]
+            early = int(np.ceil(PER_DECADE * np.log10(knots[0] / first))) if 0.0 < first < knots[0] else 0
+            curves.append(np.append(np.geomspace(first, knots[0], early, endpoint=False), knots))
+        for times in curves:
             hats = np.column_stack([np.interp(t, (0.0, *times), (0.0, *row)) for row in np.eye(times.size)])
-            yield Candidate(np.column_stack([hats * moved[:, None], hats]), partial(cls._through, times, low, high))
+            origin = _origin(left, times, hats)
+            yield Candidate(hats * (left.h - origin)[:, None], partial(cls._through, times, origin))
 
     @classmethod
-    def _through(cls, times: FloatArray, low: float, high: float, found: FloatArray) -> "GainDrift":
-        """Return the curve for gains ``a`` and shifts ``b``, shape (2 K,), that best satisfies ``b = -origin a``."""
-        gains, shifts = found.reshape(2, -1)
-        origin = 0.5 * (low + high) - float(gains @ shifts) / max(float(gains @ gains), 1e-300)
-        return cls(tuple(times.tolist()), tuple(gains.tolist()), min(max(origin, low), high))
+    def _through(cls, times: FloatArray, origin: float, gains: FloatArray) -> "GainDrift":
+        return cls(tuple(times.tolist()), tuple(gains.tolist()), origin)
 
     def describe(self) -> str:
         """Describe the magnitude, the duration and the half time."""
@@ -104,6 +110,25 @@ class GainDrift:
     def streaming(self) -> "StreamingGainDrift":
         """Return the sensitivity at the end of the record as a streaming effect."""
         return StreamingGainDrift(self.origin, 1.0 + self.gains[-1])
+
+
+def _origin(left: ResidualView, times: FloatArray, hats: FloatArray) -> float:
+    """Return the displacement (m) that a change of sensitivity, `hats` of shape (N, K), leaves where it is.
+
+    Gains ``a`` and shifts ``b`` of the residual are found beside a constant gain and shift, which the hysteresis has
+    taken; the origin satisfies ``b = -origin a`` best.
+    """
+    low, high = float(left.h.min()), float(left.h.max())
+    half = 0.5 * (high - low) or 1.0
+    moved = (left.h - 0.5 * (low + high)) / half
+    columns = np.column_stack([hats * moved[:, None], hats, moved, np.ones_like(moved)])
+    found = np.linalg.lstsq(columns[left.used], left.residual[left.used], rcond=None)[0]
+    gains, shifts = found[: 2 * times.size].reshape(2, -1)
+    # A knot tells as much as it has samples.
+    weights = np.gradient(np.append(0.0, times))[1:]
+    inner = np.diag(weights) - np.outer(weights, weights) / (1.0 + COMMON) / weights.sum()
+    share = -float(gains @ inner @ shifts) / max(float(gains @ inner @ gains), 1e-300)
+    return 0.5 * (low + high) + half * min(max(share, -1.0), 1.0)
 
 
 class StreamingGainDrift:

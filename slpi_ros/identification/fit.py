@@ -87,6 +87,12 @@ def identify(
             with threadpool_limits(1):
                 fitted = fit(samples)
                 model = _axis_model(kind, fitted, source)
+                if model.causal and any(part.side for part in samples):
+                    starts = zip(fitted.starts, samples, strict=True)
+                    paths = [replace(model, start=own).memory("start").forward_array(part.v) for own, part in starts]
+                    samples = [part.without_mixed(path) for part, path in zip(samples, paths, strict=True)]
+                    fitted = fit(samples)
+                    model = _axis_model(kind, fitted, source)
                 if model.causal:
                     # The final state includes the voltage after `stop`.
                     whole = samples[last] if stop is None else select_samples(records[last], axis, None, None)

@@ -83,8 +83,9 @@ class SignalQuality:
         Number of single readings that repeat an earlier one, while the other signal moves.
     spikes : int
         Number of other single outliers.
-    mixed : int
-        Number of readings that are early, late or a mixture of two neighbouring values.
+    mixed, mixed_share : int, float
+        Number of readings that are early, late or a mixture of two neighbouring values, and their share of those that
+        can be judged.
     mixed_size : float
         Typical error of these readings.
     """
@@ -100,6 +101,7 @@ class SignalQuality:
     stale: int
     spikes: int
     mixed: int = 0
+    mixed_share: float = 0.0
     mixed_size: float = 0.0
 
     @property
@@ -257,12 +259,13 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     off_y = signal_statistics.lone_outliers(y, v, gain, max(noise_y, digit_y), noise_v)
     # Simultaneous outliers of both signals are attributed to the voltage, which the displacement follows.
     off_y = np.setdiff1d(off_y, off_v)
-    mixed = signal_statistics.mixed_readings(y, v)
+    mixed, judged, _ = signal_statistics.mixed_readings(y, v)
     displacement = _signal(y, missing[1], noise_y, digit_y, frozen, off_y, mixed)
     if mixed.size:
         # Half of the displacement between the neighbouring readings.
         ways = np.abs(y[np.minimum(mixed + 1, y.size - 1)] - y[np.maximum(mixed - 1, 0)]) / 2.0
-        displacement = replace(displacement, mixed=int(mixed.size), mixed_size=float(np.median(ways)))
+        size, share = float(np.median(ways)), mixed.size / judged
+        displacement = replace(displacement, mixed=int(mixed.size), mixed_share=share, mixed_size=size)
     return _signal(v, missing[0], noise_v, digit_v, stopped, off_v), displacement
 
 
@@ -431,8 +434,9 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
         yield Finding("warn", f"{text}{slow}; where noise should tell them apart they are not fitted")
     if signal.mixed:
         text = f"{name} early, late or mixed with the reading beside it in {_of(signal.mixed, samples)}"
+        share = f"{100.0 * signal.mixed_share:.2g} % of those not beside a turn"
         size = f"off by up to {signal.mixed_size * 1e6:.3g} um"
-        yield Finding("warn", f"{text}, {size}: the link delivers old or mixed values; they are not fitted")
+        yield Finding("warn", f"{text}, {share}, {size}: the link delivers old or mixed values; they are not fitted")
     if signal.stale:
         text = f"{name} stale, a reading of before, in {_of(signal.stale, samples)}"
         yield Finding("warn" if signal.stale > _OUTLIERS * samples else "ok", text)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.reversals import monotone_runs
-from slpi_ros.identification.signal_statistics import mixed_readings, stuck, without_noise
+from slpi_ros.identification.signal_statistics import mixed_beside, mixed_readings, stuck, without_noise
 from slpi_ros.io.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -39,12 +39,17 @@ class Samples:
     history : int
         Number of leading samples that form the initial history, which begins with a long fall to the first sample.
         Default 0: the axis starts at rest.
+    mixed, side : int
+        Number of samples that are not fitted because their displacement is late or mixed with that of a neighbour, and
+        which one, as in `slpi_ros.identification.signal_statistics.Mixed`. Default 0: none.
     """
 
     v: FloatArray
     y: FloatArray
     fitted: NDArray[np.bool_]
     history: int = 0
+    mixed: int = 0
+    side: int = 0
 
     @property
     def primed(self) -> bool:
@@ -54,16 +59,28 @@ class Samples:
     def after(self, history: tuple[float, ...]) -> "Samples":
         """Return the samples preceded by the voltages (V) of an initial history."""
         before = np.array(history)
-        return Samples(
-            np.concatenate([before, self.v]),
-            np.concatenate([np.zeros(before.size), self.y]),
-            np.concatenate([np.zeros(before.size, dtype=bool), self.fitted]),
+        return replace(
+            self,
+            v=np.concatenate([before, self.v]),
+            y=np.concatenate([np.zeros(before.size), self.y]),
+            fitted=np.concatenate([np.zeros(before.size, dtype=bool), self.fitted]),
             history=before.size + self.history,
         )
 
     def only(self, chosen: NDArray[np.bool_]) -> "Samples":
         """Return the samples, fitting only those that are `chosen`, a mask of shape (N,)."""
         return replace(self, fitted=self.fitted & chosen)
+
+    def without_mixed(self, path: FloatArray) -> "Samples":
+        """Return the samples without those that are mixed by the displacement of a model, `path`, shape (N,), metres.
+
+        Without a model, `select_samples` cannot judge the readings beside a turn.
+        """
+        if not self.side:
+            return self
+        fitted, mixed = self.fitted.copy(), mixed_beside(path, self.y, self.fitted, self.side)
+        fitted[mixed] = False
+        return replace(self, fitted=fitted, mixed=self.mixed + mixed.size)
 
     def thinned(self, most: int) -> "Samples":
         """Return about `most` evenly spaced samples plus all reversals, which preserves the hysteresis state."""
@@ -83,7 +100,8 @@ class Samples:
 
     def at(self, kept: NDArray[np.bool_]) -> "Samples":
         """Return the samples that are `kept`, a mask of shape (N,)."""
-        return Samples(self.v[kept], self.y[kept], self.fitted[kept], int(np.count_nonzero(kept[: self.history])))
+        history = int(np.count_nonzero(kept[: self.history]))
+        return replace(self, v=self.v[kept], y=self.y[kept], fitted=self.fitted[kept], history=history)
 
     @property
     def voltage_range(self) -> tuple[float, float]:
@@ -161,13 +179,13 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
         y = np.where(fitted, y, 0.0)
     _require_motion(v, y, fitted, where)
     # Stuck and mixed readings are not fitted.
-    for bad in (stuck, mixed_readings):
-        if fitted.all():
-            fitted[bad(y, v)] = False
-        else:
-            known = np.flatnonzero(fitted)
-            fitted[known[bad(y[known], v[known])]] = False
-    return Samples(without_noise(t if driven.all() else t[driven], v), y, fitted)
+    known = np.flatnonzero(fitted)
+    fitted[known[stuck(y[known], v[known])]] = False
+    known = np.flatnonzero(fitted)
+    mixed = mixed_readings(y[known], v[known])
+    fitted[known[mixed.readings]] = False
+    smooth = without_noise(t if driven.all() else t[driven], v)
+    return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side)
 
 
 def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int, int]:

@@ -332,16 +332,35 @@ def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArr
 # A reading is compared with so many on either side.
 _BESIDE = 3
 # Readings are found to be mixed with the next or the one before where more than this share of them lie off by more than
-# half of the way to it, so many times as many as on the other side, and where noise leaves that to be seen.
+# half of the way to it, so many times as many as on the other side; judged by those whose way noise leaves to be seen.
 _MIXED_SHARE, _MIXED_TIMES, _MIXED_NOISE = 0.02, 5.0, 0.12
-# One of them lies off by this share of that way at least, and of so many robust standard deviations.
-_MIXED_LEAST, _MIXED_DEVIATIONS = 0.2, 4.0
+# One of them lies off by this share of that way at least, by a line through others and by a model, and by so many
+# robust standard deviations.
+_MIXED_BY_LINE, _MIXED_BY_MODEL, _MIXED_DEVIATIONS = 0.2, 0.05, 4.0
 # Hardly any lies farther off than the next reading.
 _MIXED_MOST = 1.3
 
 
-def mixed_readings(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the readings of a displacement that are early, late or a mixture of two neighbouring values.
+class Mixed(NamedTuple):
+    """Readings of a displacement that are early, late or a mixture of two neighbouring values.
+
+    Parameters
+    ----------
+    readings : ndarray of int, shape (M,)
+        Those readings.
+    judged : int
+        Number of readings among which they were found; those beside a turn are not.
+    side : int
+        1 where they are mixed with the next one, -1 with the one before, 0 where there are none but by chance.
+    """
+
+    readings: NDArray[np.int64]
+    judged: int
+    side: int
+
+
+def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
+    """Find the readings of a displacement that are early, late or a mixture of two neighbouring values.
 
     Such a reading lies between its true value and that of a neighbour, as from a link that delivers an old value or
     parts of two. All deviate to the same side, unlike noise and outliers.
@@ -350,38 +369,63 @@ def mixed_readings(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
     ----------
     y, v : ndarray, shape (N,), metres and volts
         Displacement and voltage.
-
-    Returns
-    -------
-    ndarray of int, shape (M,)
-        Empty where readings do not differ so by more than chance.
     """
-    off, known = _off_in_readings(y[:_ENOUGH], v[:_ENOUGH])
-    count = np.count_nonzero(known)
-    if count < FEWEST:
-        return np.empty(0, np.int64)
-    deviation = 1.4826 * float(np.median(np.abs(off[known])))
-    early, late, far = (np.count_nonzero(at) for at in (off > 0.5, off < -0.5, np.abs(off) > _MIXED_MOST))
+    off, way = _beside_lines(y[:_ENOUGH], v[:_ENOUGH])
+    clear = np.abs(way) * _MIXED_NOISE > _rms(off[way != 0.0]) if way.any() else way != 0.0
+    count = int(np.count_nonzero(clear))
+    ways = off[clear] / way[clear]
+    early, late, far = (np.count_nonzero(at) for at in (ways > 0.5, ways < -0.5, np.abs(ways) > _MIXED_MOST))
     many, few = max(early, late), min(early, late)
-    if deviation > _MIXED_NOISE or many < max(_MIXED_SHARE * count, _MIXED_TIMES * few) or far > 0.1 * many:
-        return np.empty(0, np.int64)
-    side = 1.0 if early > late else -1.0
-    least = max(_MIXED_LEAST, _MIXED_DEVIATIONS * deviation)
-    found = []
+    if count < FEWEST or many < max(_MIXED_SHARE * count, _MIXED_TIMES * few) or far > 0.1 * many:
+        return Mixed(np.empty(0, np.int64), count, 0)
+    side = 1 if early > late else -1
+    found, judged = [], 0
     for start in range(0, y.size, _ENOUGH):
         first = max(start - _RINGING, 0)
         here = slice(first, start + _ENOUGH + _RINGING)
-        at = first + np.flatnonzero(side * _off_in_readings(y[here], v[here])[0] > least)
-        found.append(at[(at >= start) & (at < start + _ENOUGH)])
-    return np.concatenate(found)
+        off, way = (x[start - first :][:_ENOUGH] for x in _beside_lines(y[here], v[here]))
+        found.append(start + _mixed(side * off, way, _MIXED_BY_LINE))
+        judged += int(np.count_nonzero(way))
+    return Mixed(np.concatenate(found), judged, side)
 
 
-def _off_in_readings(y: FloatArray, v: FloatArray) -> tuple[FloatArray, Mask]:
-    """Return how far each reading, shape (N,), is ahead on its way, in steps from one to the next, and where known."""
+def mixed_beside(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> NDArray[np.int64]:
+    """Return the `fitted` readings, of a displacement with mixed ones, that are mixed by a model; those at turns too.
+
+    Parameters
+    ----------
+    path, y : ndarray, shape (N,), metres
+        Displacement by the model, and as it was read.
+    fitted : ndarray of bool, shape (N,)
+    side : int
+        As in `Mixed`.
+    """
+    at = np.flatnonzero(fitted)
+    off = (y - path)[at]
+    # What the model gets wrong is alike in neighbouring readings.
+    off = off - median_filter(off, 4 * _BESIDE + 3)
+    way = np.diff(path, append=path[-1]) if side > 0 else np.diff(path, prepend=path[0])
+    return at[_mixed(side * off, way[at], _MIXED_BY_MODEL)]
+
+
+def _mixed(off: FloatArray, way: FloatArray, least: float) -> NDArray[np.int64]:
+    """Return which readings, `off` by so much (m) and a share of their way to the next one, `way` (m), are mixed."""
+    known, ahead = way != 0.0, np.sign(way) * off
+    noise_off = _MIXED_DEVIATIONS * _rms(off[known]) if known.any() else 0.0
+    found = ahead > np.maximum(least * np.abs(way), noise_off)
+    # What lies beyond the next reading is something else.
+    return np.flatnonzero(known & found & (ahead < _MIXED_MOST * np.abs(way) + noise_off))
+
+
+def _beside_lines(y: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far each reading, shape (N,), metres, lies from a line through others, and the way between two.
+
+    Both are 0 for readings that are not in the middle of a move.
+    """
     width = 2 * _BESIDE + 1
-    off, known = np.zeros(y.size), np.zeros(y.size, dtype=bool)
+    off, way = np.zeros(y.size), np.zeros(y.size)
     if y.size < 2 * width:
-        return off, known
+        return off, way
     y_beside, v_beside = sliding_window_view(y, width), sliding_window_view(v, width)
     steps = np.diff(v_beside, axis=1)
     one_way = (steps > 0.0).all(axis=1) | (steps < 0.0).all(axis=1)
@@ -389,13 +433,13 @@ def _off_in_readings(y: FloatArray, v: FloatArray) -> tuple[FloatArray, Mask]:
     y_beside, steps = y_beside[at], steps[at]
     gain = np.median(np.diff(y_beside, axis=1) / steps, axis=1)
     line = np.median(y_beside - gain[:, None] * (v_beside[at] - v[at + _BESIDE][:, None]), axis=1)
-    way = gain * np.median(steps, axis=1)
-    moves = way != 0.0
-    off[at[moves] + _BESIDE] = ((y[at + _BESIDE] - line) / np.where(moves, way, 1.0))[moves]
-    known[at[moves] + _BESIDE] = True
-    # A branch bends, so that all readings of a part of it lie beside the line.
-    off[known] -= median_filter(off, 2 * width + 1)[known]
-    return off, known
+    off[at + _BESIDE] = y[at + _BESIDE] - line
+    way[at + _BESIDE] = gain * np.median(steps, axis=1)
+    known = way != 0.0
+    # A branch bends, so that all readings of a part of it lie beside the line: as many steps, whichever way it goes.
+    steps_off = np.divide(off, way, out=np.zeros_like(off), where=known)
+    off[known] -= (median_filter(steps_off, 2 * width + 1) * way)[known]
+    return np.where(known, off, 0.0), way
 
 
 _FEWEST_READINGS = 5

@@ -71,7 +71,7 @@ def test_readings_mixed_with_the_one_beside_them_are_found(side):
     beside = np.clip(bad + side, 0, v.size - 1)
     mixed = y.copy()
     mixed[bad] += share * (y[beside] - y[bad])
-    found = mixed_readings(mixed, v)
+    found = mixed_readings(mixed, v).readings
     # Near turns, and where hardly anything is mixed in, they are not to be told.
     assert 0.6 * bad.size < found.size < 1.1 * bad.size
     assert np.isin(found, bad).mean() > 0.97
@@ -82,9 +82,9 @@ def test_clean_and_noisy_readings_are_not_mixed():
         record, _ = calibration(seed=seed)
         for every in (1, 4, 8):
             v, y = record.voltage["x"][::every], record.displacement["x"][::every]
-            assert not mixed_readings(y, v).size
+            assert not mixed_readings(y, v).side
             outliers = y + 1e-7 * (np.random.default_rng(seed).random(y.size) < 0.05)
-            assert not mixed_readings(outliers, v).size
+            assert not mixed_readings(outliers, v).side
 
 
 def test_share_of_mixed_readings_of_a_measured_record(measured_data):

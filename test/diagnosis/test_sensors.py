@@ -1,0 +1,56 @@
+"""What a diagnosis makes of what the sensor does: short forms of benchmarks/sensors.py."""
+
+import numpy as np
+import pytest
+from identification.records import calibration, record_of, stage
+
+import slpi_ros
+from slpi_ros.io.tables import import_table
+
+SAMPLES, RATE, DRIFT = 3000, 100.0, -0.024
+
+
+def mixed_record(share, move, drift, side=1):
+    """Return triangles of `move` readings, some mixed with the next one, and the mask of those."""
+    random, k = np.random.default_rng(3), np.arange(SAMPLES)
+    v = 100.0 * (1.0 - np.abs((k / move) % 2.0 - 1.0))
+    _, y = stage(3).run(k / RATE, v)
+    y = y + drift * np.minimum(k / (0.6 * SAMPLES), 1.0) * (y - np.median(y))
+    much = np.where(random.random(k.size) < share, random.uniform(0.3, 1.0, k.size), 0.0)
+    return record_of(k / RATE, v, y + much * (np.roll(y, -side) - y)), much > 0.0
+
+
+def test_late_and_mixed_readings_are_left_out_and_the_drift_is_found():
+    record, bad = mixed_record(0.11, 40, DRIFT)
+    diagnosis = slpi_ros.diagnose(record, slpi_ros.identify(record))
+    found = diagnosis.axes["x"]
+    assert [named.name for named in found.effects] == ["gain_drift"]
+    assert found.effects[0].effect.gains[-1] == pytest.approx(DRIFT, rel=0.25)
+    assert found.after_rms < 2.0 * 8e-9
+    assert f"{100.0 * bad.mean():.2g} %".split(".")[0].split(" ")[0] in found.summary
+
+
+def test_clean_readings_are_not_mixed_and_nothing_is_found():
+    record, _ = mixed_record(0.0, 40, 0.0, -1)
+    found = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"]
+    assert found.verdict == "nothing_found" and "mixed" not in found.summary
+
+
+@pytest.mark.parametrize("kind", ["coarse", "clipped"])
+def test_a_sensor_is_no_cause(kind):
+    record, _ = calibration(seed=2)
+    y = record.displacement["x"]
+    span = np.ptp(y)
+    y = np.round(y / (span / 120.0)) * (span / 120.0) if kind == "coarse" else np.minimum(y, y.max() - 0.05 * span)
+    record = record_of(record.t, record.voltage["x"], y)
+    found = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"]
+    assert not found.effects and not found.given.changed
+
+
+def test_the_measured_record_with_late_readings(measured_data):
+    record = import_table(measured_data / "afm_cycles.csv")
+    found = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"]
+    assert [named.name for named in found.effects] == ["gain_drift"]
+    assert found.effects[0].effect.gains[-1] == pytest.approx(-0.024, rel=0.25)
+    assert found.after_rms <= 25e-9 and not found.given.changed
+    assert "11 %" in found.summary

@@ -70,7 +70,8 @@ class Case:
 class Outcome:
     """What became of a case; `failure` is an error's message, or why there is nothing to judge.
 
-    `first` is what the first record alone was said to hold, `told` and `measured` are gains in %.
+    `first` is what the first record alone was said to hold, `told` and `measured` are gains in %, `kept` is in the
+    extended model, and `changed` that the stage is said to have changed, which it never has.
     """
 
     case: Case
@@ -83,6 +84,8 @@ class Outcome:
     told: float = np.nan
     measured: float = np.nan
     kept: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+    changed: bool = False
     samples: int = 0
     seconds: float = 0.0
     failure: str = ""
@@ -111,6 +114,7 @@ class Outcome:
             return f"{start} {self.failure}"
         told = f"{self.verdict}: {', '.join(self.named) or 'none'}"
         told += f" (or {', '.join(self.alternatives)})" if self.alternatives else ""
+        told += f", dropped {', '.join(self.dropped)}" if self.dropped else ""
         if self.case.kind == "advised":
             told = f"first {self.first}; advised {self.advice}; together {told}"
         else:
@@ -118,6 +122,7 @@ class Outcome:
             told += f"on a third record {self.measured:.0f} %" + ("" if self.close or np.isnan(self.told) else "  FAR")
         wrong = "" if self.right else "  MISSED"
         wrong += f"  INVENTED {', '.join(self.invented)}" if self.invented else ""
+        wrong += "  CHANGED" if self.changed else ""
         return f"{start} {self.samples:6d} {self.seconds:5.0f} s  {told}{wrong}"
 
 
@@ -148,7 +153,7 @@ def advised(case: Case) -> Outcome:
         if alone.verdict == "ambiguous":
             break
     else:
-        return Outcome(case, (name,), failure=f"not drawn: {TRIES} first records, none shows the effect and is ambiguous")
+        return Outcome(case, (name,), failure=f"not drawn: none of {TRIES} first records is ambiguous")
     told = ", ".join("/".join((each.name, *each.alternatives)) for each in alone.effects)
     advice, voltage = advised_drive(alone.next_experiment or "", case)
     if voltage is None:
@@ -250,6 +255,8 @@ def _diagnosed(
         named=tuple(each.name for each in found.effects),
         alternatives=tuple(sorted({other for each in found.effects for other in each.alternatives})),
         kept=tuple(effect.name for effect in diagnosis.extended.axes[axis].effects),
+        dropped=found.dropped,
+        changed=bool(found.given and found.given.changed),
         samples=sum(len(record) for record in records),
         seconds=time.perf_counter() - began,
     )
@@ -280,6 +287,7 @@ def table(outcomes: Sequence[Outcome]) -> None:
         print(f"all that is hidden is named: {len(right)} of {len(drawn)} (wanted: {wanted})")
         print(f"verdict `named`, and nothing beside: {len(exact)} of {len(drawn)}")
         print(f"something is named that is not there: {sum(bool(each.invented) for each in drawn)} of {len(drawn)}")
+        print(f"said to have changed since: {sum(each.changed for each in drawn)} of {len(drawn)}")
         print(f"failed: {sum(bool(each.failure) for each in drawn)} of {len(drawn)}")
         judged = [each for each in drawn if np.isfinite(each.told)]
         if judged:

@@ -118,8 +118,10 @@ class Outcome:
         if self.case.kind == "advised":
             told = f"first {self.first}; advised {self.advice}; together {told}"
         else:
-            told += f"; in the model: {', '.join(self.kept) or 'none'}; gain told {self.told:.0f} %, "
-            told += f"on a third record {self.measured:.0f} %" + ("" if self.close or np.isnan(self.told) else "  FAR")
+            told += f"; in the model: {', '.join(self.kept) or 'none'}"
+            if np.isfinite(self.told):
+                told += f"; gain told {self.told:.0f} %, on a third record {self.measured:.0f} %"
+                told += "" if self.close else "  FAR"
         wrong = "" if self.right else "  MISSED"
         wrong += f"  INVENTED {', '.join(self.invented)}" if self.invented else ""
         wrong += "  CHANGED" if self.changed else ""
@@ -204,7 +206,8 @@ def pair(case: Case) -> Outcome:
     outcome, diagnosis = _diagnosed(Outcome(case, names), records, plain, axis)
     effects = diagnosis.axes[axis].effects
     shared = [each for each in effects if each.name not in OWN]
-    if not shared:
+    # Where the gain drifts, a hysteresis without effects holds the mean gain of its records, which a third one has not.
+    if not shared or "gain_drift" in names:
         return outcome
     told = 100.0 * (1.0 - np.prod([1.0 - each.gain_percent / 100.0 for each in shared]))
     # What is the record's own, and was named before, is not in the error that the gain is a share of.

@@ -20,7 +20,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-records bench-latency bench-soak bench-trajectory bench-xy bench-readme clean distclean FORCE
+.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-soak bench-trajectory bench-xy bench-readme clean distclean FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -30,6 +30,8 @@ help:
 	@echo 'make bench-robustness  spoiled records beside clean ones, 8 seeds, 2 minutes'
 	@echo 'make bench-diagnosis   hidden effects: named, missed, invented; about an hour'
 	@echo 'make bench-records     what is found on some measured records, judged on others; half an hour'
+	@echo 'make bench-next-record   an advised second record, and pairs judged on a third; an hour or two'
+	@echo 'make bench-start-memory  100 memories at the start of a record: is a change told where there is one only'
 	@echo 'make bench-latency  round trip through the compensator beside a bare echo node, 4 minutes'
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'
 	@echo 'make bench-trajectory  a trajectory of a million points: acceptance and deadlines'
@@ -70,6 +72,12 @@ bench-diagnosis: build
 
 bench-records: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/records.py
+
+bench-next-record: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/next_record.py
+
+bench-start-memory: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/start_memory.py
 
 bench-latency: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/latency.py

@@ -5,6 +5,8 @@ gain, and with another zero.
 """
 
 import argparse
+import warnings
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +21,8 @@ from slpi_ros.simulation.preisach import PreisachStage
 
 FloatArray = NDArray[np.float64]
 RATE, NOISE, GAIN, ZERO = 200.0, 8e-9, 0.01, 0.3e-6
+# Relative gain and zero (m) of the stage when it is recorded again.
+CASES = {"unchanged": (1.0, 0.0), "gain": (1.0 + GAIN, 0.0), "zero": (1.0, ZERO)}
 # What a figure that is told may be off by, as a share of it.
 WITHIN = 0.2
 
@@ -32,52 +36,72 @@ def record(seed: int, t: FloatArray, v: FloatArray, before: FloatArray, gain: fl
     return slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": measured + zero}, "again")
 
 
+def drives(number: int, seconds: float, random: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return times (s) and voltages (V) of a record, and voltages (V) that went before it."""
+    turns = random.uniform(0.0, 100.0, 12)
+    before = np.interp(np.arange(2400), np.linspace(0, 2399, turns.size), turns)
+    t, v = calibration_drive(0.0, 100.0, duration=seconds, rate=RATE, seed=100 + number)
+    if number % 2:
+        # A sine that grows about where the stage is, to a share of the range that differs.
+        reach = random.uniform(0.2, 0.5)
+        v = 50.0 + 100.0 * reach * np.minimum(1.0, t / t[-1]) * np.sin(2.0 * np.pi * 0.5 * t)
+    return t, v, np.append(before, v[0])
+
+
+def judged(case: str, model: slpi_ros.StageModel, again: slpi_ros.Record, whole: bool) -> dict[str, str]:
+    """Return what each says of a record of the `whole` range or of a part of it, where that is wrong, else ""."""
+    found = match(model.axes["x"], select_samples(again, "x", None, None))
+    matched = (
+        f"gain {found.gain_change:+.3%} +- {found.gain_uncertainty:.3%}, width {found.width_change:+.2%} +- "
+        f"{found.width_uncertainty:.2%}, zero {found.offset * 1e9:+.0f} +- {found.offset_uncertainty * 1e9:.0f} nm, "
+        f"error {found.rms * 1e9:.1f} nm"
+    )
+    if case == "zero":
+        # A record of a part of the range cannot tell a moved zero from another history.
+        off = abs(found.offset - ZERO)
+        right = found.zero_moved and off <= WITHIN * ZERO if whole else off <= found.offset_uncertainty
+        return {"match": "" if right else matched}
+    drifted = slpi_ros.refit(model, again)[1]["x"].drifted
+    if case == "gain":
+        right = found.gain_changed and abs(found.gain_change / GAIN - 1.0) <= WITHIN
+        return {"match": "" if right else matched, "refit": "" if drifted else "no change"}
+    verified = slpi_ros.verify(again, model).axes["x"].records[0]
+    diagnosed = slpi_ros.diagnose(again, model).axes["x"]
+    accused = diagnosed.given.changed or diagnosed.given.zero_moved or diagnosed.effects
+    return {
+        "match": matched if found.gain_changed or found.width_changed or found.zero_moved else "",
+        "refit": "changed" if drifted else "",
+        "verify": "" if verified.passed and not verified.zero_moved else f"{verified.to_document()}",
+        "diagnose": diagnosed.summary if accused else "",
+    }
+
+
 def main() -> None:
     """Print how often a change is told."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--memories", type=int, default=10)
+    parser.add_argument("--seeds", type=int, default=10, help="stages")
+    parser.add_argument("--seed", type=int, default=0, help="of the first stage")
+    parser.add_argument("--memories", type=int, default=10, help="of each stage")
     parser.add_argument("--seconds", type=float, default=12.0)
     options = parser.parse_args()
-    none = np.zeros(0)
-    for seed in range(options.seeds):
+    warnings.simplefilter("ignore")
+    counts: Counter[tuple[str, str]] = Counter()
+    for seed in range(options.seed, options.seed + options.seeds):
         random = np.random.default_rng(seed)
         t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=RATE, seed=seed)
-        model = slpi_ros.identify(record(seed, t, v, none, 1.0, 0.0))
-        cases = {"unchanged": (1.0, 0.0), "gain": (1.0 + GAIN, 0.0), "zero": (1.0, ZERO)}
-        told = dict.fromkeys(cases, 0)
+        model = slpi_ros.identify(record(seed, t, v, np.zeros(0), 1.0, 0.0))
         for number in range(options.memories):
-            turns = random.uniform(0.0, 100.0, 12)
-            before = np.interp(np.arange(2400), np.linspace(0, 2399, turns.size), turns)
-            t, v = calibration_drive(0.0, 100.0, duration=options.seconds, rate=RATE, seed=100 + number)
-            if number % 2:
-                # A sine that grows about where the stage is, to a share of the range that differs.
-                reach = random.uniform(0.2, 0.5)
-                v = 50.0 + 100.0 * reach * np.minimum(1.0, t / t[-1]) * np.sin(2.0 * np.pi * 0.5 * t)
-            before = np.append(before, v[0])
-            for case, (gain, zero) in cases.items():
+            t, v, before = drives(number, options.seconds, random)
+            for case, (gain, zero) in CASES.items():
                 again = record(seed, t, v, before, gain, zero)
-                found = match(model.axes["x"], select_samples(again, "x", None, None))
-                change = slpi_ros.refit(model, again)[1]["x"] if case != "zero" else None
-                if case == "unchanged":
-                    right = not (found.gain_changed or found.width_changed or found.zero_moved or change.drifted)
-                elif case == "gain":
-                    right = found.gain_changed and abs(found.gain_change / GAIN - 1.0) <= WITHIN and change.drifted
-                else:
-                    # A record of a part of the range cannot tell a moved zero from another history.
-                    off = abs(found.offset - ZERO)
-                    right = off <= found.offset_uncertainty if number % 2 else found.zero_moved and off <= WITHIN * ZERO
-                told[case] += right
-                if not right:
-                    print(
-                        f"  seed {seed}, memory {number}, {case}: gain {found.gain_change:+.3%} +- "
-                        f"{found.gain_uncertainty:.3%}, width {found.width_change:+.2%} +- "
-                        f"{found.width_uncertainty:.2%}, zero {found.offset * 1e9:+.0f} +- "
-                        f"{found.offset_uncertainty * 1e9:.0f} nm, error {found.rms * 1e9:.1f} nm, explained to "
-                        f"{found.rms_explained * 1e9:.1f}, known {np.mean(found.known):.0%}, from {found.known_from}, "
-                        f"drifted {change and change.drifted}"
-                    )
-        print(f"seed {seed}: right of {options.memories}: " + ", ".join(f"{k} {n}" for k, n in told.items()))
+                for who, wrong in judged(case, model, again, whole=not number % 2).items():
+                    counts[case, who] += not wrong
+                    if wrong:
+                        print(f"seed {seed}, memory {number}, {case}, {who}: {wrong}", flush=True)
+        print(f"seed {seed} done", flush=True)
+    print(f"\nright of {options.seeds * options.memories}")
+    for (case, who), count in sorted(counts.items()):
+        print(f"  {case:<12}{who:<10}{count:4d}")
 
 
 if __name__ == "__main__":

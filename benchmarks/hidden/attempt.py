@@ -25,8 +25,52 @@ NOISE = (3e-9, 15e-9)
 CLOSE = 0.15
 # Effects that take their time.
 SLOW = {"creep", "gain_drift", "thermal_drift"}
+# Samples per second of what goes before a record.
+RATE_BEFORE = 100.0
 # Seconds. Where the samples allow, records take no less.
 SHORTEST = 20.0
+
+
+class Drives:
+    """Voltages of one record of a stage, and those before its first sample, from rest.
+
+    Parameters
+    ----------
+    stage : dict of axis name to StageParameters or BoucWen
+    t : ndarray, shape (N,), seconds
+    v : dict of axis name to ndarray, shape (N,), volts
+    before : dict of axis name to ndarray, shape (M,), volts, optional
+        Unrecorded voltages, `RATE_BEFORE` samples per second, the last one just before the first sample.
+    """
+
+    def __init__(
+        self,
+        stage: dict[str, Base],
+        t: FloatArray,
+        v: dict[str, FloatArray],
+        before: dict[str, FloatArray] | None = None,
+    ) -> None:
+        self.stage, self.t, self.v = stage, t, v
+        self._before = before or {axis: np.empty(0) for axis in v}
+        self._own: dict[tuple[object, ...], FloatArray] = {}
+
+    def reading(self, axis: str, physics: Physics) -> FloatArray:
+        """Return what the sensor of an axis shows without noise; the other axes have no effects."""
+        motion = {name: self._motion(name, physics if name == axis else Physics()) for name in self.v}
+        return sensed(physics, self.t, motion, axis)
+
+    def _motion(self, axis: str, physics: Physics) -> FloatArray:
+        key = (axis, physics.amplifier, physics.viscosity, physics.creep, physics.flexure, physics.ageing)
+        if key not in self._own:
+            stage, before = self.stage[axis], self._before[axis]
+            t = np.concatenate([self.t[0] + np.arange(-before.size, 0) / RATE_BEFORE, self.t])
+            v = np.concatenate([before, self.v[axis]])
+            y = own_motion(stage, replace(physics, ageing=None), t, v)[before.size :]
+            if physics.ageing:
+                # The course of the sensitivity is relative to the start of the record.
+                y = stage.offset + physics.ageing.scaled(self.t, self.v[axis], y - stage.offset)
+            self._own[key] = y
+        return self._own[key]
 
 
 class Draw:
@@ -48,22 +92,11 @@ class Draw:
         other = next((axis for axis in self.axes if axis != self.victim), "")
         setting = Setting(self.t, self.v[self.victim], rate, room.low, room.high, other)
         self.natures = {effect: DRAWS[effect](rng, setting) for effect in effects}
-        self._own: dict[tuple[object, ...], FloatArray] = {}
-
-    def reading(self, axis: str, physics: Physics) -> FloatArray:
-        """Return what the sensor of an axis shows without noise; the other axes have no effects."""
-        motion = {name: self._motion(name, physics if name == axis else Physics()) for name in self.axes}
-        return sensed(physics, self.t, motion, axis)
-
-    def _motion(self, axis: str, physics: Physics) -> FloatArray:
-        key = (axis, physics.amplifier, physics.viscosity, physics.creep, physics.flexure, physics.ageing)
-        if key not in self._own:
-            self._own[key] = own_motion(self.stage[axis], physics, self.t, self.v[axis])
-        return self._own[key]
+        self.drives = Drives(self.stage, self.t, self.v)
 
     def rms(self, physics: Physics) -> float:
         """Return what a refit of the hysteresis leaves of an effect, metres."""
-        with_it, without = self.reading(self.victim, physics), self.reading(self.victim, Physics())
+        with_it, without = (self.drives.reading(self.victim, part) for part in (physics, Physics()))
         if physics.amplifier and physics.amplifier.clips:
             return beyond_identified(self.time_ns, self.v[self.victim], with_it)
         return beyond_hysteresis(self.v[self.victim], with_it - without)

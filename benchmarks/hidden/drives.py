@@ -13,6 +13,8 @@ Section = Callable[[Path, np.random.Generator, float], None]
 
 # Ranges of travel per second.
 SLOWEST, FASTEST = 0.15, 4.0
+# Share of the range, of records with one frequency.
+SMALLEST_MOVE = 0.1
 # So often the package's own drives take the place of the sections.
 OWN_DRIVES = 0.25
 
@@ -144,6 +146,31 @@ def drive(room: Room, effects: tuple[str, ...], rng: np.random.Generator) -> Flo
         sections[index](path, rng, float(shares[index]))
     path.to(0.0, 1.0)
     path.hold(0.2)
+    return path.voltages(room)
+
+
+def one_frequency(room: Room, frequency: float, rng: np.random.Generator) -> FloatArray:
+    """Draw the voltages of one axis, shape (room.steps + 1,), whose moves all take as long: a full loop, then others.
+
+    Parameters
+    ----------
+    room : Room
+    frequency : float, hertz
+        Two moves take one over it, as nearly as the duration allows.
+    """
+    path, half = Path(), 0.5 / frequency
+    for _ in range(max(round(room.duration * frequency), 3)):
+        path.to(float(rng.uniform(path.at + SMALLEST_MOVE, 1.0)) if path.legs else 1.0, half)
+        path.to(float(rng.uniform(0.0, path.at - SMALLEST_MOVE)) if len(path.legs) > 1 else 0.0, half)
+    return path.voltages(room)
+
+
+def wandering(room: Room, to: float, rng: np.random.Generator) -> FloatArray:
+    """Draw the voltages of one axis, shape (room.steps + 1,), from rest by random turns to a share of the range."""
+    path = Path()
+    varied(path, rng, 0.8 * room.duration)
+    path.to(to, 0.1 * room.duration)
+    path.hold(float(rng.uniform(0.0, 0.2)) * room.duration)
     return path.voltages(room)
 
 

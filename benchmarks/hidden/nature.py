@@ -1,7 +1,7 @@
 """Draws of the eleven effects: the physics of each and the parameters by which it is known."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ Parameters = Mapping[str, float | tuple[float, ...] | Mapping[str, float]]
 
 # Pairs of which nobody could tell that they are two.
 CONFUSABLE = ({"delay", "lag"},)
+# What another record of the same stage has in its own way.
+OWN = ("gain_drift", "thermal_drift", "hum")
 
 
 @dataclass(frozen=True)
@@ -214,3 +216,17 @@ DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "gain_drift": _gain_drift,
 }
 NAMES = tuple(DRAWS)
+
+
+def another_time(
+    name: str, physics: Physics, parameters: Parameters, strength: float, setting: Setting, rng: np.random.Generator
+) -> tuple[Physics, Parameters]:
+    """Return an effect as another record of the same stage has it: physics and parameters."""
+    if name not in OWN:
+        return physics, parameters
+    if physics.hum:
+        # The mains are the same.
+        phase = float(rng.uniform(-np.pi, np.pi))
+        return Physics(hum=replace(physics.hum, phase=phase)), {**parameters, "phase": phase}
+    nature = DRAWS[name](rng, setting)
+    return nature.physics(strength), nature.parameters(strength)

@@ -1,19 +1,20 @@
 """Draw a stage, hide effects in it, and record it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.excitation.drives import calibration_drive
+from slpi_ros.excitation.legs import Room
 from slpi_ros.io.record import Record
 from slpi_ros.simulation.chain import Physics, own_motion
 from slpi_ros.simulation.sensor import Sensor
 
-from .attempt import BASES, CLOSE, NOISE, Base, Draw, together
-from .drives import log_uniform
-from .nature import NAMES, Parameters
+from .attempt import BASES, CLOSE, NOISE, RATE_BEFORE, Base, Draw, Drives, together
+from .drives import log_uniform, wandering
+from .nature import NAMES, Parameters, Setting, another_time
 
 FloatArray = NDArray[np.float64]
 
@@ -25,6 +26,8 @@ ATTEMPTS = 60
 # Metres; the last digit of every sensor.
 _DIGIT = 1e-9
 MOST_SAMPLES = 80_000
+# Of further records: how long a stage is moved before (s), by how much its zero may have moved (m), and nanoseconds.
+SECONDS_BEFORE, LARGEST_ZERO, HOUR = (8.0, 20.0), 1e-6, 3_600_000_000_000
 
 
 @dataclass(frozen=True)
@@ -38,9 +41,12 @@ class Truth:
         Of the package's vocabulary.
     parameters : mapping
         By the package's names, SI; where the physics is another, only those that it shares.
+    strength : float
+    physics : Physics
+        This alone.
     size_over_floor : float
         What a refit of the hysteresis would leave of it were it alone (rms, `size.beyond_hysteresis`; of a saturation
-        `size.beyond_identified`), over the noise.
+        `size.beyond_identified`), over the noise; of further records that of the first.
     contribution : ndarray, shape (N,), metres
         The reading with everything less the reading without this.
     """
@@ -48,6 +54,8 @@ class Truth:
     axis: str
     name: str
     parameters: Parameters
+    strength: float
+    physics: Physics
     size_over_floor: float
     contribution: FloatArray
 
@@ -146,11 +154,70 @@ def calibration_of(hidden: Hidden, duration: float = 40.0, rate: float = 500.0) 
         high = float(hidden.record.voltage[axis].max())
         t, v = calibration_drive(0.0, high, duration=duration, rate=rate, seed=hidden.seed + number)
         y = own_motion(stage, Physics(), t, v)
-        noise = float(np.sqrt(hidden.floor[axis] ** 2 - _DIGIT**2 / 12))
-        records[axis] = v, Sensor(noise, _DIGIT, int(rng.integers(2**31))).read(y)
+        records[axis] = v, Sensor(_noise(hidden, axis), _DIGIT, int(rng.integers(2**31))).read(y)
     time_ns = np.round(t * 1e9).astype(np.int64)
     voltage, displacement = ({axis: pair[index] for axis, pair in records.items()} for index in (0, 1))
     return Record(time_ns, voltage, displacement, "calibration", hidden.record.hardware_id)
+
+
+def again(
+    hidden: Hidden, number: int, voltage: dict[str, FloatArray], rate: float, *, from_rest: bool = False
+) -> Hidden:
+    """Return another record of the same stage: other voltages, another initial history, another zero.
+
+    Drift of zero and sensitivity take another course, and hum another phase; all else is that of `hidden`.
+
+    Parameters
+    ----------
+    hidden : Hidden
+    number : int
+        Of the record; the same one has the same history, zero, noise and drift.
+    voltage : dict of axis name to ndarray, shape (N,), volts
+    rate : float, hertz
+    from_rest : bool
+        Whether the stage was never moved before.
+    """
+    rng = np.random.default_rng([hidden.seed, number, 815])
+    highs = {axis: float(v.max()) for axis, v in hidden.record.voltage.items()}
+    seconds = float(rng.uniform(*SECONDS_BEFORE))
+    before = {
+        axis: wandering(Room(0.0, high, seconds, RATE_BEFORE), float(voltage[axis][0]) / high, rng)
+        for axis, high in highs.items()
+    }
+    t = np.arange(next(iter(voltage.values())).size) / rate
+    drives = Drives(hidden.stage, t, voltage, None if from_rest else before)
+    truth = tuple(_another_time(each, drives, rng, rate, highs) for each in hidden.truth)
+    victim = truth[0].axis if truth else ""
+    parts = {each.name: each.physics for each in truth}
+    zero = {axis: float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)) for axis in voltage}
+    reading, clean = (
+        {axis: zero[axis] + y for axis, y in _readings(drives, victim, some).items()} for some in (parts, {})
+    )
+    measured = {
+        axis: Sensor(_noise(hidden, axis), _DIGIT, int(rng.integers(2**31))).read(y) for axis, y in reading.items()
+    }
+    time_ns = hidden.record.time_ns[0] + number * HOUR + np.round(t * 1e9).astype(np.int64)
+    return replace(
+        hidden,
+        record=Record(time_ns, voltage, measured, f"{hidden.record.source}-{number}", hidden.record.hardware_id),
+        truth=tuple(replace(one, contribution=_contribution(drives, victim, parts, one.name)) for one in truth),
+        reading=reading,
+        clean=clean,
+    )
+
+
+def _another_time(
+    truth: Truth, drives: Drives, rng: np.random.Generator, rate: float, highs: dict[str, float]
+) -> Truth:
+    other = next((axis for axis in drives.v if axis != truth.axis), "")
+    setting = Setting(drives.t, drives.v[truth.axis], rate, 0.0, highs[truth.axis], other)
+    physics, parameters = another_time(truth.name, truth.physics, truth.parameters, truth.strength, setting, rng)
+    return replace(truth, physics=physics, parameters=parameters)
+
+
+def _noise(hidden: Hidden, axis: str) -> float:
+    """Return the noise of a sensor without its last digit, rms, metres."""
+    return float(np.sqrt(hidden.floor[axis] ** 2 - _DIGIT**2 / 12))
 
 
 def _strengths(draw: Draw, size: float | None) -> dict[str, tuple[float, float]] | None:
@@ -172,25 +239,34 @@ def _strengths(draw: Draw, size: float | None) -> dict[str, tuple[float, float]]
 
 
 def _recorded(draw: Draw, strengths: Mapping[str, tuple[float, float]], base: str, seed: int) -> Hidden:
+    floor = {axis: float(np.hypot(noise, _DIGIT / np.sqrt(12))) for axis, noise in draw.noise.items()}
     parts = {name: draw.natures[name].physics(strength) for name, (strength, _) in strengths.items()}
-    physics = {axis: together(parts.values()) if axis == draw.victim else Physics() for axis in draw.axes}
-    reading = {axis: draw.reading(axis, physics[axis]) for axis in draw.axes}
+    reading = _readings(draw.drives, draw.victim, parts)
+    truth = tuple(
+        Truth(
+            draw.victim,
+            name,
+            draw.natures[name].parameters(strength),
+            strength,
+            parts[name],
+            rms / floor[draw.victim],
+            _contribution(draw.drives, draw.victim, parts, name),
+        )
+        for name, (strength, rms) in strengths.items()
+    )
     measured = {
         axis: Sensor(draw.noise[axis], _DIGIT, int(draw.rng.integers(2**31))).read(y) for axis, y in reading.items()
     }
-    floor = {axis: float(np.hypot(noise, _DIGIT / np.sqrt(12))) for axis, noise in draw.noise.items()}
-    truth = []
-    for name, (strength, rms) in strengths.items():
-        without = draw.reading(draw.victim, together(part for other, part in parts.items() if other != name))
-        truth.append(
-            Truth(
-                draw.victim,
-                name,
-                draw.natures[name].parameters(strength),
-                rms / floor[draw.victim],
-                reading[draw.victim] - without,
-            )
-        )
     record = Record(draw.time_ns, draw.v, measured, f"hidden-{seed}", "simulated")
-    clean = {axis: draw.reading(axis, Physics()) for axis in draw.axes}
-    return Hidden(record, tuple(truth), base, reading, clean, floor, draw.stage, seed)
+    return Hidden(record, truth, base, reading, _readings(draw.drives, draw.victim, {}), floor, draw.stage, seed)
+
+
+def _readings(drives: Drives, victim: str, parts: Mapping[str, Physics]) -> dict[str, FloatArray]:
+    physics = together(parts.values())
+    return {axis: drives.reading(axis, physics if axis == victim else Physics()) for axis in drives.v}
+
+
+def _contribution(drives: Drives, victim: str, parts: Mapping[str, Physics], name: str) -> FloatArray:
+    """Return the reading with all parts less the reading without one of them."""
+    without = together(part for other, part in parts.items() if other != name)
+    return drives.reading(victim, together(parts.values())) - drives.reading(victim, without)

@@ -387,25 +387,28 @@ class Explanation:
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
         self.u, self._aside = reaching(self.effects, evidence.v, evidence.around)
-        same = (
-            like is not None
-            and like.evidence.parts is evidence.parts
-            and like.evidence.smoothness == evidence.smoothness
-        )
-        self.joint: Joint = like.joint if like and same and np.array_equal(like.u, self.u) else Joint(evidence, self.u)
-        self.added = self._aside
+        if like and not (like.evidence.parts is evidence.parts and like.evidence.smoothness == evidence.smoothness):
+            like = None
+        self.joint: Joint = like.joint if like and np.array_equal(like.u, self.u) else Joint(evidence, self.u)
         starting = settling(self._relaxations, evidence.around, evidence.used)
         self._before = np.column_stack([starting, evidence.beside])
         self._starting = range(starting.shape[1])
         beside = self.joint.columns(self._before)
-        self._fit(beside)
-        if any(effect.side == "displacement" for effect in self.effects):
-            for _ in range(MOST_TURNS):
-                h, before = self.h, self.added
-                self.added = self._behind(self.effects, h + self._aside, self.u) - h
-                self._fit(beside)
-                if np.ptp(self.added - before) < SETTLED * np.std(self.target - h):
-                    break
+        if like:
+            self.h, self.added, self._middles = like.h, like.added, like._middles
+        else:
+            self.added = self._aside
+            self._fit(beside)
+        if not any(effect.side == "displacement" for effect in self.effects):
+            self.added = self._aside
+            self._fit(beside)
+            return
+        for _ in range(MOST_TURNS):
+            h, before = self.h, self.added
+            self.added = self._behind(self.effects, h + self._aside, self.u) - h
+            self._fit(beside)
+            if np.ptp(self.added - before) < SETTLED * np.std(self.target - h):
+                break
 
     def _fit(self, beside: Columns) -> None:
         self._x, gains = beside.fit(self.target)

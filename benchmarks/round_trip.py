@@ -24,8 +24,9 @@ import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import make_executor
+from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.paths import scan_path
-from slpi_ros.simulation.preisach import PreisachStage, StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
 
 FloatArray = NDArray[np.float64]
 

@@ -7,13 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.excitation.legs import Room
-from slpi_ros.simulation.bouc_wen import BoucWen
-from slpi_ros.simulation.chain import Physics, own_motion, sensed
-from slpi_ros.simulation.dynamics import Amplifier
 from slpi_ros.simulation.parameters import StageParameters
 
 from .drives import drive, log_uniform
 from .nature import DRAWS, NAMES, Nature, Setting
+from .physics import Amplifier, BoucWen, Physics, own_motion, sensed
 from .size import beyond_hysteresis, beyond_identified
 
 FloatArray = NDArray[np.float64]

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.record import Record
-from slpi_ros.simulation.chain import Physics, own_motion
-from slpi_ros.simulation.sensor import Sensor
+from slpi_ros.simulation.preisach import Sensor
 
 from .attempt import BASES, CLOSE, NOISE, Base, Draw, together
 from .drives import log_uniform
 from .nature import NAMES, Parameters
+from .physics import Physics, own_motion
 
 FloatArray = NDArray[np.float64]
 

@@ -10,7 +10,6 @@ from slpi_ros.errors import UsageError
 from slpi_ros.simulation.dynamics import Dynamics
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.paths import measure_loop
-from slpi_ros.simulation.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
 
@@ -268,7 +267,41 @@ class RelayTriangle:
         self._state[block] = after
 
 
-__all__ = ["PreisachStage", "StageParameters"]
+class Sensor:
+    """A sensor with Gaussian noise and quantisation.
+
+    Parameters
+    ----------
+    noise_rms : float, metres
+        Standard deviation of the noise.
+    quantisation : float, metres
+        Resolution of the readings; 0 for none.
+    seed : int
+        The same seed gives the same noise.
+    """
+
+    def __init__(self, noise_rms: float, quantisation: float, seed: int) -> None:
+        self._noise_rms = noise_rms
+        self._quantisation = quantisation
+        self._rng = np.random.default_rng(seed)
+
+    def read(self, displacement: FloatArray) -> FloatArray:
+        """Return the readings for displacements, in order.
+
+        Parameters
+        ----------
+        displacement : ndarray, any shape, metres
+            True displacement.
+
+        Returns
+        -------
+        ndarray, same shape, metres
+            Sensor reading.
+        """
+        reading = displacement + self._noise_rms * self._rng.standard_normal(displacement.shape)
+        if self._quantisation:
+            reading = self._quantisation * np.round(reading / self._quantisation)
+        return np.asarray(reading, dtype=np.float64)
 
 
 class PreisachStage:

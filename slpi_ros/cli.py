@@ -32,6 +32,7 @@ from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.columns import ColumnOptions
 from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.io.schemas import format_document
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.document import load_model, save_model
 from slpi_ros.model.limits import Limits
@@ -321,12 +322,12 @@ def _judged(record: Record, options: argparse.Namespace) -> dict[str, list[Findi
 
 def _diagnose(options: argparse.Namespace) -> None:
     # Imported here: plotting is slow to load, and most commands do not need it.
-    from slpi_ros.reports.diagnosis import PAGE, describe_diagnosis, make_room, write_files
+    from slpi_ros.reports.diagnosis import FILES, PAGE, describe_diagnosis, write_files
 
     topics = _topics(options)
     model = load_model(options.model)
     folder = Path(options.output)
-    make_room(folder)
+    make_folder(folder, *FILES)
     records = [_with_other_axes(bag, options, topics) for bag in options.bags]
     try:
         axes = options.axis or [axis for axis in model.axes if all(axis in record.axes for record in records)]
@@ -357,14 +358,14 @@ def _with_other_axes(bag: str, options: argparse.Namespace, topics: str | Separa
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from slpi_ros.reports.verification import describe_verification, format_verification, make_room, write_files
+    from slpi_ros.reports.verification import FILES, describe_verification, write_files
 
     topics = _topics(options)
     if options.tolerance is not None and not 0.0 < options.tolerance < np.inf:
         raise UsageError(f"--tolerance {options.tolerance:g}: give a positive number of micrometres")
     model = load_model(options.model)
     if options.output:
-        make_room(Path(options.output))
+        make_folder(options.output, *FILES)
     # Read all axes because of cross-coupling; separate topics may not name their axes, so the options name them.
     axes = options.axis if isinstance(topics, SeparateTopics) else None
     records = bags.read_bags(options.bags, topics, axes=axes)
@@ -379,7 +380,8 @@ def _verify(options: argparse.Namespace) -> int:
         raise ModelError(str(error)) from None
     if options.output:
         write_files(Path(options.output), found)
-    print(format_verification(found) if options.json else "\n".join(describe_verification(found)))
+    document = format_document(found.to_document(), "verification")
+    print(document if options.json else "\n".join(describe_verification(found)))
     return 0 if found.passed else 1
 
 

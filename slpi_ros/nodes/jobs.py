@@ -18,6 +18,7 @@ from slpi_ros.compensator.persistence import model_id
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import ModelError, RecordError, SlpiError
 from slpi_ros.identification.fit import identify
+from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.record import Record
 from slpi_ros.model.document import format_model, model_from, parse_model, save_model
@@ -267,11 +268,11 @@ class DiagnosisProcess(WorkerProcess[DiagnosisRequest, DiagnosisOutcome]):
 def judge(request: DiagnosisRequest) -> DiagnosisOutcome:
     """Read the bags, diagnose the model and write the files."""
     # Plotting is slow to load, and a node that only identifies does without.
-    from slpi_ros.reports.diagnosis import make_room, write_files
+    from slpi_ros.reports.diagnosis import FILES, write_files
 
     folder = Path(request.folder)
     try:
-        make_room(folder)
+        make_folder(folder, *FILES)
         records = [read_bag(bag, request.topic) for bag in request.bags]
         diagnosis = diagnose(records, parse_model(request.document, "stage_model"))
         write_files(folder, diagnosis)

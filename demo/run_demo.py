@@ -18,11 +18,11 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("ROS_DOMAIN_ID", str(60 + os.getpid() % 40))
 
 import numpy as np  # noqa: E402
+import plots  # noqa: E402
 from graph import EXECUTABLES, FloatArray, Operator, executable, operator  # noqa: E402
 
 import slpi_ros  # noqa: E402
 from slpi_ros.excitation.drives import calibration_drive  # noqa: E402
-from slpi_ros.reports import plots  # noqa: E402
 from slpi_ros.reports.page import Page, png  # noqa: E402
 from slpi_ros.reports.text import describe_model  # noqa: E402
 from slpi_ros.simulation.paths import scan_path  # noqa: E402

@@ -11,7 +11,7 @@ from slpi_ros.compensator.validation import TimestampRules
 from slpi_ros.errors import UsageError
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.parameters import Declaration, Values
+from slpi_ros.nodes.parameters import Declaration, Values, validated
 
 VOLTAGE = (-10_000.0, 10_000.0)
 RATE = (0.0, 1e9)
@@ -194,10 +194,7 @@ class CompensatorSettings:
         UsageError
             If a value, or a combination of values, is not valid.
         """
-        axes = given["axes"]
-        if not axes or not all(axes) or len(set(axes)) != len(axes):
-            raise UsageError(f"parameter axes is {list(axes)!r}; name at least one axis, and each once")
-        values = {entry.name: entry.read(given, axes) for entry in DECLARATIONS}
+        axes, values = given["axes"], validated(DECLARATIONS, given)
         if values["desired_type"] == "Float64" and len(axes) > 1:
             raise UsageError(
                 f"desired_type Float64 holds one value, but axes are {', '.join(axes)}; "

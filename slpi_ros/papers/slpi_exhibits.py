@@ -108,7 +108,6 @@ def singles(separation: Separation, models: Mapping[str, SeparatedLoops], *, inv
     """Draw each single loop from its vertex and the PI models of it, or their inverses: voltage over displacement."""
     loops = separation.loops
     figure, drawn = panels(1, len(loops), (11, 4.0))
-    names = "from the vertex (V)", "from the vertex (µm)"
     order = slice(None, None, -1 if inverse else 1)
     for number, (panel, loop) in enumerate(zip(drawn, reversed(loops), strict=True)):
         drive, y = _own(separation, loop)
@@ -118,8 +117,8 @@ def singles(separation: Separation, models: Mapping[str, SeparatedLoops], *, inv
             curve = (memory.inverse_array(y), y * 1e6) if inverse else (drive, memory.forward_array(drive) * 1e6)
             panel.plot(*curve[order], color=COLOUR[name], linewidth=1.1, label=name)
         panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
-        x, y_name = names[order]
-        label_axes(panel, x, y_name if panel is drawn[0] else "")
+        x, up = ("µm", "V") if inverse else ("V", "µm")
+        label_axes(panel, f"from the vertex ({x})", f"from the vertex ({up})" if panel is drawn[0] else "")
     drawn[0].legend(frameon=False)
     return figure
 

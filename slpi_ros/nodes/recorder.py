@@ -136,7 +136,7 @@ class Recorder(Node):
             self.destroy_timer(self._end)
             self._end = self._stop_in(self._duration)
         try:
-            self._bag.write_raw(self.get_clock().now().nanoseconds, message, name)
+            self._bag.write(self.get_clock().now().nanoseconds, message, name)
         except RecordError as error:
             request_stop(RecordError(f"{error}; its unfinished files are in {self._bag.partial}"))
             self._bag = None

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.excitation.drives import CALIBRATION, excite
-from slpi_ros.excitation.legs import Path, Room
+from slpi_ros.excitation.legs import DriveSpec, Path
 
 FloatArray = NDArray[np.float64]
 Section = Callable[[Path, np.random.Generator, float], None]
@@ -117,25 +117,25 @@ NEEDED: dict[str, tuple[Section, ...]] = {
 _ANY: tuple[Section, ...] = (varied, nests, tempos, peaks, holds)
 
 
-def drive(room: Room, effects: tuple[str, ...], rng: np.random.Generator) -> FloatArray:
+def drive(spec: DriveSpec, effects: tuple[str, ...], rng: np.random.Generator) -> FloatArray:
     """Draw the voltages of one axis, from rest and back.
 
     Parameters
     ----------
-    room : Room
+    spec : DriveSpec
     effects : tuple of str
         What the record must make visible.
 
     Returns
     -------
-    ndarray, shape (room.steps + 1,), volts
+    ndarray, shape (spec.steps + 1,), volts
     """
     single = [effect for effect in effects if effect != "cross_coupling"]
     if len(single) == 1 and rng.random() < OWN_DRIVES:
-        return _own(room, single[0], int(rng.integers(2**31)))
+        return _own(spec, single[0], int(rng.integers(2**31)))
     sections = list(dict.fromkeys(section for effect in effects for section in NEEDED[effect]))
     sections += [_ANY[index] for index in rng.choice(len(_ANY), 2 if len(sections) < 2 else 1, replace=False)]
-    shares = rng.dirichlet(np.full(len(sections), 8.0)) * 0.9 * room.duration
+    shares = rng.dirichlet(np.full(len(sections), 8.0)) * 0.9 * spec.duration
     path = Path()
     path.hold(float(rng.uniform(0.1, 1.0)))
     for to in (1.0, 0.0, 1.0, 0.0):
@@ -144,13 +144,13 @@ def drive(room: Room, effects: tuple[str, ...], rng: np.random.Generator) -> Flo
         sections[index](path, rng, float(shares[index]))
     path.to(0.0, 1.0)
     path.hold(0.2)
-    return path.voltages(room)
+    return path.voltages(spec)
 
 
-def _own(room: Room, effect: str, seed: int) -> FloatArray:
+def _own(spec: DriveSpec, effect: str, seed: int) -> FloatArray:
     """Return a calibration drive and then the drive that is made for an effect, each half of the time."""
-    first = room.steps // 2
-    limits = {"voltage_min": room.low, "voltage_max": room.high, "rate": room.rate, "seed": seed}
-    calibration = excite(duration=first / room.rate, drive=CALIBRATION, **limits)
-    made = excite(duration=(room.steps - first) / room.rate, drive=effect, **limits)
+    first = spec.steps // 2
+    limits = {"voltage_min": spec.low, "voltage_max": spec.high, "rate": spec.rate, "seed": seed}
+    calibration = excite(duration=first / spec.rate, drive=CALIBRATION, **limits)
+    made = excite(duration=(spec.steps - first) / spec.rate, drive=effect, **limits)
     return np.concatenate([calibration.voltage["x"], made.voltage["x"][1:]])

@@ -181,9 +181,9 @@ class Exciter(Node):
         """Return the axes to their initial voltage, then destroy the node."""
         if self.context.ok():
             if self._playback:
-                self._turn_back(self._playback)
+                self._return(self._playback)
                 while not self._playback.done:
-                    self._give(self._playback.next())
+                    self._publish_sample(self._playback.next())
                     time.sleep(1.0 / self._playback.drive.rate)
             self._publisher.wait_for_all_acked(PATIENCE)
         super().destroy_node()
@@ -243,22 +243,22 @@ class Exciter(Node):
             return
         self._playback, self._begun = Playback(drive, repeat=values["repeat"]), time.monotonic()
         self._timer = self.create_timer(1.0 / drive.rate, self._step, clock=self._steady)
-        self._hand_over(self._playback)
+        self._publish_trajectory(self._playback)
         if self.count_publishers(self._publisher.topic_name) > 1:
             self.get_logger().warning(f"{self._publisher.topic_name} has other publishers; stop them and repeat")
         self.get_logger().info(f"exciting {', '.join(drive.axes)} for {values['duration']:g} s. {drive.why}")
 
     def _step(self) -> None:
         if self._playback:
-            self._give(self._playback.next())
+            self._publish_sample(self._playback.next())
             if self._playback.done:
                 self._end(self._playback)
 
-    def _give(self, voltages: list[float]) -> None:
+    def _publish_sample(self, voltages: list[float]) -> None:
         if self._live:
             self._publisher.publish(Float64MultiArray(data=array("d", voltages)))
 
-    def _hand_over(self, playback: Playback) -> None:
+    def _publish_trajectory(self, playback: Playback) -> None:
         if not self._live:
             self._publisher.publish(trajectory_of(playback))
 
@@ -282,13 +282,13 @@ class Exciter(Node):
         response.success = True
         self._waiting.cancel()
         self._polls_left = 0
-        response.message = f"back in {self._turn_back(self._playback):.1f} s" if self._playback else "at rest"
+        response.message = f"back in {self._return(self._playback):.1f} s" if self._playback else "at rest"
         return response
 
-    def _turn_back(self, playback: Playback) -> float:
+    def _return(self, playback: Playback) -> float:
         """Start the return to the initial voltages; return its duration, seconds."""
         if playback.stop():
-            self._hand_over(playback)
+            self._publish_trajectory(playback)
         return playback.seconds_left
 
 

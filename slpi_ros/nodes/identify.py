@@ -278,7 +278,7 @@ class Identify(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._poll = self.create_timer(POLL_PERIOD, self._poll_job, clock=steady, autostart=False)
         self.create_timer(self._parameter_set.settings.diagnostic_period, self._report, clock=steady)
-        self._watching = self.create_timer(WATCH_PERIOD, self._look_for_bags, clock=steady)
+        self._watching = self.create_timer(WATCH_PERIOD, self._poll_bags, clock=steady)
         self.create_service(Trigger, "~/identify", self._on_trigger)
         self._diagnosis = DiagnosisService(
             self,
@@ -316,13 +316,13 @@ class Identify(Node):
         self._watch = BagWatch(settings.watch_directory) if settings.watch_directory else None
         if not self._asked and not self._watch:
             self.get_logger().warning(NOTHING_TO_DO)
-        self._look_for_bags()
+        self._poll_bags()
         self._start_next()
         self._report()
 
-    def _look_for_bags(self) -> None:
+    def _poll_bags(self) -> None:
         """Queue newly completed bags of the watched folder; warn once about abandoned ones."""
-        for bag in self._watch.look() if self._watch else ():
+        for bag in self._watch.poll() if self._watch else ():
             self.get_logger().info(f"{bag} is complete")
             self._waiting.append(bag)
         abandoned = set(self._watch.abandoned) if self._watch else set()

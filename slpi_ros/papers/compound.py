@@ -74,12 +74,12 @@ class Outcome:
     displacement: FloatArray
 
     @property
-    def read(self) -> ErrorMetrics:
+    def by_sensor(self) -> ErrorMetrics:
         """Errors by the sensor."""
         return error_metrics(self.desired, self.measured)
 
     @property
-    def done(self) -> ErrorMetrics:
+    def by_truth(self) -> ErrorMetrics:
         """Errors of the stage itself."""
         return error_metrics(self.desired, self.displacement)
 
@@ -291,7 +291,7 @@ def present(studies: Mapping[str, AxisStudy]) -> list[Exhibit]:
 def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
     outcomes = {(axis, label): o for axis, study in studies.items() for label, o in study.feedforward.items()}
     rows = [
-        (f"{axis}: {label}", *(um(part) for part in _phases(o)), errors(o.read), um(o.done.mean), um(o.scatter))
+        (f"{axis}: {label}", *map(um, _phases(o)), errors(o.by_sensor), um(o.by_truth.mean), um(o.scatter))
         for (axis, label), o in outcomes.items()
     ]
     first = next(iter(studies))
@@ -300,8 +300,9 @@ def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
         title="Fig. 11: SMPI feedforward, 80 V at 1 Hz",
         paper=f"Errors about 0.3 µm in the rise, 0.5 µm in most of the fall, at most {FEEDFORWARD_BAND:g} µm; a mean "
         f"absolute error of {FEEDFORWARD_MEAN} µm and a “mean square error” of {FEEDFORWARD_ROOT} µm.",
-        ours=f"Axis {first}, {um(smpi.desired.max(), 1)} µm: SMPI {um(smpi.read.mean)} µm in the mean "
-        f"({smpi.read.mean * 1e6 / FEEDFORWARD_MEAN:.0f} times the paper's), loop family {um(family.read.mean)} µm; "
+        ours=f"Axis {first}, {um(smpi.desired.max(), 1)} µm: SMPI {um(smpi.by_sensor.mean)} µm in the mean "
+        f"({smpi.by_sensor.mean * 1e6 / FEEDFORWARD_MEAN:.0f} times the paper's), loop family "
+        f"{um(family.by_sensor.mean)} µm; "
         f"about their own means they scatter by {um(smpi.scatter)} and {um(family.scatter)} µm.",
         remark="The paper's two statements exclude each other: errors of 0.3 and 0.5 µm have a mean of about 0.4 µm. "
         "Ours are larger: the models start at the sensor's zero, the end of a fall, where creep is at work and their "
@@ -323,7 +324,7 @@ def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
 
 def _offsets(outcomes: Iterable[Outcome]) -> str:
     """Return a sentence on the share of a constant offset in errors."""
-    shares = [100.0 * (o.offset / o.read.root_mean_square) ** 2 for o in outcomes]
+    shares = [100.0 * (o.offset / o.by_sensor.root_mean_square) ** 2 for o in outcomes]
     return f"A constant offset is {min(shares):.0f} to {max(shares):.0f} % of the mean square error."
 
 
@@ -358,11 +359,11 @@ def _compound(studies: Mapping[str, AxisStudy]) -> Exhibit:
         for (label, fed_back), o in study.compound.items():
             name = f"{axis}: {_way(label, fed_back)}"
             share = f"{100.0 * o.within(COMPOUND_BAND * 1e-6):.1f}"
-            rows.append((name, errors(o.read), um(o.done.mean), um(o.scatter), share))
+            rows.append((name, errors(o.by_sensor), um(o.by_truth.mean), um(o.scatter), share))
             if label and fed_back:
                 deviations[name] = _farthest(o)
-    worst = {label: max(s.compound[label, True].read.mean for s in studies.values()) * 1e6 for label in KINDS}
-    rested = {label: max(s.rested[label].read.mean for s in studies.values()) * 1e6 for label in KINDS}
+    worst = {label: max(s.compound[label, True].by_sensor.mean for s in studies.values()) * 1e6 for label in KINDS}
+    rested = {label: max(s.rested[label].by_sensor.mean for s in studies.values()) * 1e6 for label in KINDS}
     met = all(np.all(np.abs(d) <= COMPOUND_BAND) for d in deviations.values())
     segments = [
         (str(k + 1), str(peak), str(frequency), *(f"{peak + d[k]:.2f}" for d in deviations.values()))

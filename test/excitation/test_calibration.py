@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import slpi_ros
+from benchmarks.paths import scan_path
 from slpi_ros.errors import UsageError
 from slpi_ros.excitation.drives import calibration_drive, excite
 from slpi_ros.identification.bases import SurfaceBasis
 from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.paths import scan_path
 from slpi_ros.simulation.preisach import PreisachStage
 
 CASES = [(30.0, 100.0, 0), (60.0, 200.0, 1), (80.0, 100.0, 7), (10.0, 200.0, 0)]

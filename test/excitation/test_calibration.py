@@ -150,11 +150,11 @@ def test_thirty_seconds_are_enough(seed):
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"voltage_min": 100.0, "voltage_max": 0.0}, "lower one"),
-        ({"duration": 0.0}, "more than 0"),
-        ({"rate": 2.0}, r"at least .* s at 2 Hz, not 30 s; give more time"),
-        ({"slew_limit": 10.0}, r"at least .* s at 200 Hz and 10 V/s, not 30 s; give more time"),
-        ({"seed": -1}, "seed -1"),
+        ({"voltage_min": 100.0, "voltage_max": 0.0}, r"100\.0 V.*0\.0 V"),
+        ({"duration": 0.0}, r"\b0\.0 s"),
+        ({"rate": 2.0}, r"2 Hz.*30 s"),
+        ({"slew_limit": 10.0}, r"200 Hz.*10 V/s.*30 s"),
+        ({"seed": -1}, "-1"),
     ],
 )
 def test_drives_that_cannot_be_drawn(given, says):

@@ -65,17 +65,17 @@ def test_a_slew_limit_takes_as_long_as_it_must():
 @pytest.mark.parametrize(
     ("spec", "says"),
     [
-        ((100.0, 0.0, 30.0, 100.0), "lower one"),
-        ((0.0, float("inf"), 30.0, 100.0), "lower one"),
-        ((0.0, float("nan"), 30.0, 100.0), "lower one"),
-        ((0.0, 100.0, 0.0, 100.0), "more than 0"),
-        ((0.0, 100.0, 30.0, float("nan")), "more than 0"),
-        ((0.0, 100.0, 30.0, 100.0, -1.0), "slew limit"),
-        ((0.0, 100.0, 30.0, 100.0, float("nan")), "slew limit"),
-        ((0.0, 100.0, 1e6, 1e3), "more than 10000000 samples"),
+        ((100.0, 0.0, 30.0, 100.0), "100.0 V"),
+        ((0.0, float("inf"), 30.0, 100.0), "inf V"),
+        ((0.0, float("nan"), 30.0, 100.0), "nan V"),
+        ((0.0, 100.0, 0.0, 100.0), "0.0 s"),
+        ((0.0, 100.0, 30.0, float("nan")), "nan Hz"),
+        ((0.0, 100.0, 30.0, 100.0, -1.0), "-1.0 V/s"),
+        ((0.0, 100.0, 30.0, 100.0, float("nan")), "nan V/s"),
+        ((0.0, 100.0, 1e6, 1e3), "10000000"),
     ],
 )
-def test_no_room(spec, says):
+def test_specifications_of_no_drive(spec, says):
     with pytest.raises(UsageError, match=says):
         DriveSpec(*spec)
 

@@ -228,11 +228,10 @@ def followed(outcomes: Mapping[str, Outcome], suffix: str, band: float | None) -
     """Draw desired and measured displacement, by model, and the errors below; shade a band (µm)."""
     figure, (upper, lower) = panels(2, 1, (11, 6.4), height_ratios=(1, 1), sharex=True)
     for model, outcome in outcomes.items():
-        desired, measured = outcome.desired * 1e6, outcome.measured * 1e6
-        t = np.arange(desired.size) / RATE
-        upper.plot(t, measured, color=COLOUR[model], linewidth=1.0, label=model + suffix)
-        lower.plot(t, measured - desired, color=COLOUR[model], linewidth=0.8)
-    upper.plot(t, desired, color=DESIRED, linewidth=0.9, linestyle=(0, (4, 3)), label="desired")
+        t, error = np.arange(outcome.desired.size) / RATE, outcome.measured - outcome.desired
+        upper.plot(t, outcome.measured * 1e6, color=COLOUR[model], linewidth=1.0, label=model + suffix)
+        lower.plot(t, error * 1e6, color=COLOUR[model], linewidth=0.8)
+    upper.plot(t, outcome.desired * 1e6, color=DESIRED, linewidth=0.9, linestyle=(0, (4, 3)), label="desired")
     if band is not None:
         lower.axhspan(-band, band, color="#eef2f6", zorder=0)
     label_axes(upper, "", UM)

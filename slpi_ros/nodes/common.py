@@ -296,7 +296,9 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
         executor.add_node(node)
         try:
             while ok() and not _stop.requested:
-                executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+                # A subscription may be destroyed while one of its events waits to be taken.
+                with suppress(rclpy_implementation.InvalidHandle):
+                    executor.spin_once(timeout_sec=SPIN_TIMEOUT)
         finally:
             executor.remove_node(node)
             executor.shutdown()

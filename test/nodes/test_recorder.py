@@ -189,7 +189,7 @@ def test_place_taken_while_recording(tmp_path, node, record):
         ({"output": "bag", "duration": "-1.0"}, 2, "duration"),
         ({"output": "bag", "duration": "soon"}, 2, "'soon'"),
         ({"output": "bag", "topics": "one"}, 2, "topics"),
-        ({"output": "bag", "topics": "['a b']"}, 2, "a b"),
+        ({"output": "bag", "topics": "['a b']"}, 2, "topic name"),
         ({"output": "/proc/no/bag"}, 1, "/proc/no/bag"),
     ],
 )

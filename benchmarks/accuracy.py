@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from paths import scan_path
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.paths import scan_path
 from slpi_ros.simulation.preisach import PreisachStage
 
 FloatArray = NDArray[np.float64]

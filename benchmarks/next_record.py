@@ -35,7 +35,7 @@ from records import free_run
 import slpi_ros
 from slpi_ros.cli import main as slpi
 from slpi_ros.diagnosis.result import Diagnosis
-from slpi_ros.excitation.legs import Room
+from slpi_ros.excitation.legs import DriveSpec
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import read_table
 
@@ -241,7 +241,7 @@ def third_record(draw: Hidden, axis: str, without: set[str]) -> Record:
 
 def _voltages(hidden: Hidden, case: Case, frequency: float, rng: np.random.Generator) -> dict[str, FloatArray]:
     return {
-        axis: one_frequency(Room(0.0, float(v.max()), case.seconds, case.rate), frequency, rng)
+        axis: one_frequency(DriveSpec(0.0, float(v.max()), case.seconds, case.rate), frequency, rng)
         for axis, v in hidden.record.voltage.items()
     }
 

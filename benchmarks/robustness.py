@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from accuracy import NOISE, V_MAX, FloatArray, fresh, record_of
+from paths import scan_path
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.simulation.paths import scan_path
 
 PATH_SECONDS = 40.0
 

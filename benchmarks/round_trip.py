@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from numpy.typing import NDArray
+from paths import scan_path
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
@@ -24,8 +25,8 @@ import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import make_executor
-from slpi_ros.simulation.paths import scan_path
-from slpi_ros.simulation.preisach import PreisachStage, StageParameters
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
 
 FloatArray = NDArray[np.float64]
 

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from accuracy import V_MAX, FloatArray, fresh, record_of
+from paths import scan_path
 from threadpoolctl import threadpool_limits
 
 import slpi_ros
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.simulation.paths import scan_path
 
 RATE, SECONDS, UNSEEN = 100.0, 30.0, 20.0
 # Shares of late or mixed readings, readings from turn to turn, and gain drift.

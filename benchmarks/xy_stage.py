@@ -13,6 +13,7 @@ import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
+from paths import scan_path
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
@@ -27,9 +28,7 @@ from slpi_ros.model.axis_model import Start
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import make_executor
 from slpi_ros.papers.compound import RATE, RECORD, RECORD_SAMPLES, WARM_UP, path, tune
-from slpi_ros.papers.mpi_study import COMPOUND_MEAN, TABLE_6, triangle_record
-from slpi_ros.papers.published import triangles
-from slpi_ros.simulation.paths import scan_path
+from slpi_ros.papers.mpi_study import COMPOUND_MEAN, TABLE_6, triangle_record, triangles
 from slpi_ros.simulation.stage import Stage, p11_stage
 
 FloatArray = NDArray[np.float64]

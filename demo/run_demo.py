@@ -17,15 +17,17 @@ from pathlib import Path
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("ROS_DOMAIN_ID", str(60 + os.getpid() % 40))
 
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+
 import numpy as np  # noqa: E402
+import plots  # noqa: E402
 from graph import EXECUTABLES, FloatArray, Operator, executable, operator  # noqa: E402
 
 import slpi_ros  # noqa: E402
+from benchmarks.paths import scan_path  # noqa: E402
 from slpi_ros.excitation.drives import calibration_drive  # noqa: E402
-from slpi_ros.reports import plots  # noqa: E402
 from slpi_ros.reports.page import Page, png  # noqa: E402
 from slpi_ros.reports.text import describe_model  # noqa: E402
-from slpi_ros.simulation.paths import scan_path  # noqa: E402
 
 RATE = 250.0
 V_MIN, V_MAX = 0.0, 100.0

@@ -32,6 +32,7 @@ from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.columns import ColumnOptions
 from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.io.schemas import format_document
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.document import load_model, save_model
 from slpi_ros.model.limits import Limits
@@ -49,7 +50,7 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
-class _EachOnce(argparse.Action):
+class _UniqueNames(argparse.Action):
     """Store a list of names and reject duplicates."""
 
     def __call__(
@@ -113,7 +114,7 @@ def _identify_options(command: Any) -> None:
     command.add_argument(
         "--loops-at-rest", action="store_true", help="slpi-published: operators start at rest, as published"
     )
-    _where_in_the_bag(command)
+    _topic_options(command)
     _axes(command, help="default: every axis of the bag")
     _span(command)
     command.add_argument("--report", metavar="DIR", help="also write a report with plots of the first bag")
@@ -130,7 +131,7 @@ def _diagnose_options(command: Any) -> None:
         "-o", "--output", metavar="DIR", required=True,
         help="folder of diagnosis.json, extended_model.json and report.html",
     )  # fmt: skip
-    _where_in_the_bag(command)
+    _topic_options(command)
     _axes(command, help="default: every axis that bag and model share")
     _span(command)
 
@@ -149,12 +150,12 @@ def _verify_options(command: Any) -> None:
         "--desired-topic", metavar="TOPIC",
         help=f"also evaluate the tracking error against this topic; default: {bags.DESIRED}, if present in the bag",
     )  # fmt: skip
-    _where_in_the_bag(command)
+    _topic_options(command)
     _axes(command, help="default: every axis that bags and model share")
 
 
-def _axes(command: Any, **told: Any) -> None:
-    command.add_argument("--axis", metavar="NAME", nargs="+", action=_EachOnce, **told)
+def _axes(command: Any, **options: Any) -> None:
+    command.add_argument("--axis", metavar="NAME", nargs="+", action=_UniqueNames, **options)
 
 
 def _span(command: Any) -> None:
@@ -162,7 +163,7 @@ def _span(command: Any) -> None:
     command.add_argument("--stop", metavar="S", type=float, help="end of the fit, seconds from the first stamp")
 
 
-def _where_in_the_bag(command: Any) -> None:
+def _topic_options(command: Any) -> None:
     command.add_argument("--topic", help=f"topic with voltage and displacement; default: {TOPIC}")
     command.add_argument("--voltage-topic", metavar="TOPIC", help="for bags with separate topics: the voltage")
     command.add_argument("--displacement-topic", metavar="TOPIC", help="for separate topics: the displacement")
@@ -254,11 +255,11 @@ def _import(options: argparse.Namespace) -> None:
         displacement_unit=options.displacement_unit,
         axes=tuple(options.axes),
     )
-    record, told = tables.import_with_summary(options.table, columns)
+    record, lines = tables.import_with_summary(options.table, columns)
     record = replace(record, hardware_id=options.hardware_id)
     write_bag(options.output, record, storage=options.storage)
     print(f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s")
-    print("\n".join(told))
+    print("\n".join(lines))
 
 
 def _identify(options: argparse.Namespace) -> None:
@@ -273,10 +274,10 @@ def _identify(options: argparse.Namespace) -> None:
     if options.report:
         make_folder(options.report)
     records = bags.read_bags(options.bags, topics, axes=options.axis)
-    found = [_judged(record, options) for record in records]
+    found = [_assess_record(record, options) for record in records]
     model = identify(records, options.kind, start=options.start, stop=options.stop, loops_at_rest=options.loops_at_rest)
     save_model(model, options.output)
-    told = []
+    lines = []
     part = {"start": options.start, "stop": options.stop}
     if options.report:
         # Imported here: plotting is slow to load, and most commands do not need it.
@@ -287,11 +288,11 @@ def _identify(options: argparse.Namespace) -> None:
             for axis in model.axes
         }
         write_report(Path(options.report), records[0], model, held_out=truth, found=found[0], **part)
-        told += [f"axis {axis}: {line}" for axis, held_out in truth.items() for line in held_out.lines()]
+        lines += [f"axis {axis}: {line}" for axis, held_out in truth.items() for line in held_out.lines()]
     if options.uncertainty:
         for axis in model.axes:
-            told.append(f"axis {axis}: {curve_uncertainty(records, axis, options.kind, **part).line()}")
-    print("\n".join([*told, *describe_model(model)]))
+            lines.append(f"axis {axis}: {curve_uncertainty(records, axis, options.kind, **part).line()}")
+    print("\n".join([*lines, *describe_model(model)]))
 
 
 def _topics(options: argparse.Namespace) -> str | SeparateTopics:
@@ -309,25 +310,25 @@ def _topics(options: argparse.Namespace) -> str | SeparateTopics:
     return TOPIC if options.topic is None else str(options.topic)
 
 
-def _judged(record: Record, options: argparse.Namespace) -> dict[str, list[Finding]]:
+def _assess_record(record: Record, options: argparse.Namespace) -> dict[str, list[Finding]]:
     """Print and return the findings on a record, per axis; IdentificationError if one prevents a fit."""
-    judged = {}
+    assessed = {}
     for axis in record.axes:
-        judged[axis] = found = findings(assess(record, axis, start=options.start, stop=options.stop))
+        assessed[axis] = found = findings(assess(record, axis, start=options.start, stop=options.stop))
         print("\n".join(f"axis {axis}: {finding.level:4} {finding.text}" for finding in found))
         require_usable(found, f"{record.source}: axis '{axis}'")
-    return judged
+    return assessed
 
 
 def _diagnose(options: argparse.Namespace) -> None:
     # Imported here: plotting is slow to load, and most commands do not need it.
-    from slpi_ros.reports.diagnosis import PAGE, describe_diagnosis, make_room, write_files
+    from slpi_ros.reports.diagnosis import FILES, PAGE, describe_diagnosis, write_files
 
     topics = _topics(options)
     model = load_model(options.model)
     folder = Path(options.output)
-    make_room(folder)
-    records = [_with_other_axes(bag, options, topics) for bag in options.bags]
+    make_folder(folder, *FILES)
+    records = [_read_all_axes(bag, options, topics) for bag in options.bags]
     try:
         axes = options.axis or [axis for axis in model.axes if all(axis in record.axes for record in records)]
         for record, axis in ((record, axis) for record in records for axis in axes):
@@ -343,7 +344,7 @@ def _diagnose(options: argparse.Namespace) -> None:
     print(f"{folder / PAGE}: open it in a browser")
 
 
-def _with_other_axes(bag: str, options: argparse.Namespace, topics: str | SeparateTopics) -> Record:
+def _read_all_axes(bag: str, options: argparse.Namespace, topics: str | SeparateTopics) -> Record:
     """Read all axes of the bag, to identify cross-coupling; only the requested axes if the others are unreadable."""
     if options.axis and isinstance(topics, SeparateTopics):
         # Separate topics may not name their axes; the names are then those of the options.
@@ -357,14 +358,14 @@ def _with_other_axes(bag: str, options: argparse.Namespace, topics: str | Separa
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from slpi_ros.reports.verification import describe_verification, format_verification, make_room, write_files
+    from slpi_ros.reports.verification import FILES, describe_verification, write_files
 
     topics = _topics(options)
     if options.tolerance is not None and not 0.0 < options.tolerance < np.inf:
         raise UsageError(f"--tolerance {options.tolerance:g}: give a positive number of micrometres")
     model = load_model(options.model)
     if options.output:
-        make_room(Path(options.output))
+        make_folder(options.output, *FILES)
     # Read all axes because of cross-coupling; separate topics may not name their axes, so the options name them.
     axes = options.axis if isinstance(topics, SeparateTopics) else None
     records = bags.read_bags(options.bags, topics, axes=axes)
@@ -379,7 +380,8 @@ def _verify(options: argparse.Namespace) -> int:
         raise ModelError(str(error)) from None
     if options.output:
         write_files(Path(options.output), found)
-    print(format_verification(found) if options.json else "\n".join(describe_verification(found)))
+    document = format_document(found.to_document(), "verification")
+    print(document if options.json else "\n".join(describe_verification(found)))
     return 0 if found.passed else 1
 
 
@@ -409,7 +411,7 @@ def _simulate(options: argparse.Namespace) -> None:
     _require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
     t, voltage = tables.read_table(options.table, "V")
-    known = _known(voltage, model, options.table)
+    known = _model_columns(voltage, model, options.table)
     tables.write_table(options.output, t, model.simulate(t, known), "m")
     for axis, v in known.items():
         low, high = model.axes[axis].voltage_range
@@ -427,7 +429,7 @@ def _compensate(options: argparse.Namespace) -> None:
     model = load_model(options.model)
     t, desired = tables.read_table(options.table, "m")
     check_time(t)
-    known = _known(desired, model, options.table)
+    known = _model_columns(desired, model, options.table)
     limits = Limits(options.voltage_min, options.voltage_max)
     try:
         answers = model.command(t, known, limits, options.start_memory)
@@ -447,7 +449,7 @@ def _require_another_file(output: str, *inputs: str) -> None:
             raise UsageError(f"{output}: is also read from; give another output file (-o)")
 
 
-def _known(columns: dict[str, FloatArray], model: StageModel, table: str) -> dict[str, FloatArray]:
+def _model_columns(columns: dict[str, FloatArray], model: StageModel, table: str) -> dict[str, FloatArray]:
     """Return the columns of a table; SlpiError if the model lacks one of their axes."""
     for axis in columns:
         if axis not in model.axes:

@@ -6,14 +6,12 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.excitation.legs import Room
-from slpi_ros.simulation.bouc_wen import BoucWen
-from slpi_ros.simulation.chain import Physics, own_motion, sensed
-from slpi_ros.simulation.dynamics import Amplifier
+from slpi_ros.excitation.legs import DriveSpec
 from slpi_ros.simulation.parameters import StageParameters
 
 from .drives import drive, log_uniform
 from .nature import DRAWS, NAMES, Nature, Setting
+from .physics import Amplifier, BoucWen, Physics, own_motion, sensed
 from .size import beyond_hysteresis, beyond_identified
 
 FloatArray = NDArray[np.float64]
@@ -82,15 +80,15 @@ class Draw:
         duration, rate = _timing(rng, effects, samples)
         self.stage = {axis: _stage(rng, base) for axis in self.axes}
         self.noise = {axis: float(rng.uniform(*NOISE)) for axis in self.axes}
-        rooms = {axis: Room(0.0, float(rng.uniform(70.0, 110.0)), duration, rate) for axis in self.axes}
+        specs = {axis: DriveSpec(0.0, float(rng.uniform(70.0, 110.0)), duration, rate) for axis in self.axes}
         self.v = {
-            axis: drive(room, effects if axis == self.victim else _others(rng), rng) for axis, room in rooms.items()
+            axis: drive(spec, effects if axis == self.victim else _others(rng), rng) for axis, spec in specs.items()
         }
         self.time_ns = _stamps(rng, self.v[self.victim].size, rate)
         self.t = (self.time_ns - self.time_ns[0]) * 1e-9
-        room = rooms[self.victim]
+        spec = specs[self.victim]
         other = next((axis for axis in self.axes if axis != self.victim), "")
-        setting = Setting(self.t, self.v[self.victim], rate, room.low, room.high, other)
+        setting = Setting(self.t, self.v[self.victim], rate, spec.low, spec.high, other)
         self.natures = {effect: DRAWS[effect](rng, setting) for effect in effects}
         self.drives = Drives(self.stage, self.t, self.v)
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.excitation.drives import CALIBRATION, excite
-from slpi_ros.excitation.legs import Path, Room
+from slpi_ros.excitation.legs import DriveSpec, Path
 
 FloatArray = NDArray[np.float64]
 Section = Callable[[Path, np.random.Generator, float], None]
@@ -119,25 +119,25 @@ NEEDED: dict[str, tuple[Section, ...]] = {
 _ANY: tuple[Section, ...] = (varied, nests, tempos, peaks, holds)
 
 
-def drive(room: Room, effects: tuple[str, ...], rng: np.random.Generator) -> FloatArray:
+def drive(spec: DriveSpec, effects: tuple[str, ...], rng: np.random.Generator) -> FloatArray:
     """Draw the voltages of one axis, from rest and back.
 
     Parameters
     ----------
-    room : Room
+    spec : DriveSpec
     effects : tuple of str
         What the record must make visible.
 
     Returns
     -------
-    ndarray, shape (room.steps + 1,), volts
+    ndarray, shape (spec.steps + 1,), volts
     """
     single = [effect for effect in effects if effect != "cross_coupling"]
     if len(single) == 1 and rng.random() < OWN_DRIVES:
-        return _own(room, single[0], int(rng.integers(2**31)))
+        return _own(spec, single[0], int(rng.integers(2**31)))
     sections = list(dict.fromkeys(section for effect in effects for section in NEEDED[effect]))
     sections += [_ANY[index] for index in rng.choice(len(_ANY), 2 if len(sections) < 2 else 1, replace=False)]
-    shares = rng.dirichlet(np.full(len(sections), 8.0)) * 0.9 * room.duration
+    shares = rng.dirichlet(np.full(len(sections), 8.0)) * 0.9 * spec.duration
     path = Path()
     path.hold(float(rng.uniform(0.1, 1.0)))
     for to in (1.0, 0.0, 1.0, 0.0):
@@ -146,38 +146,38 @@ def drive(room: Room, effects: tuple[str, ...], rng: np.random.Generator) -> Flo
         sections[index](path, rng, float(shares[index]))
     path.to(0.0, 1.0)
     path.hold(0.2)
-    return path.voltages(room)
+    return path.voltages(spec)
 
 
-def one_frequency(room: Room, frequency: float, rng: np.random.Generator) -> FloatArray:
-    """Draw the voltages of one axis, shape (room.steps + 1,), whose moves all take as long: a full loop, then others.
+def one_frequency(spec: DriveSpec, frequency: float, rng: np.random.Generator) -> FloatArray:
+    """Draw the voltages of one axis, shape (spec.steps + 1,), whose moves all take as long: a full loop, then others.
 
     Parameters
     ----------
-    room : Room
+    spec : DriveSpec
     frequency : float, hertz
         Two moves take one over it, as nearly as the duration allows.
     """
     path, half = Path(), 0.5 / frequency
-    for _ in range(max(round(room.duration * frequency), 3)):
+    for _ in range(max(round(spec.duration * frequency), 3)):
         path.to(float(rng.uniform(path.at + SMALLEST_MOVE, 1.0)) if path.legs else 1.0, half)
         path.to(float(rng.uniform(0.0, path.at - SMALLEST_MOVE)) if len(path.legs) > 1 else 0.0, half)
-    return path.voltages(room)
+    return path.voltages(spec)
 
 
-def wandering(room: Room, to: float, rng: np.random.Generator) -> FloatArray:
-    """Draw the voltages of one axis, shape (room.steps + 1,), from rest by random turns to a share of the range."""
+def wandering(spec: DriveSpec, to: float, rng: np.random.Generator) -> FloatArray:
+    """Draw the voltages of one axis, shape (spec.steps + 1,), from rest by random turns to a share of the range."""
     path = Path()
-    varied(path, rng, 0.8 * room.duration)
-    path.to(to, 0.1 * room.duration)
-    path.hold(float(rng.uniform(0.0, 0.2)) * room.duration)
-    return path.voltages(room)
+    varied(path, rng, 0.8 * spec.duration)
+    path.to(to, 0.1 * spec.duration)
+    path.hold(float(rng.uniform(0.0, 0.2)) * spec.duration)
+    return path.voltages(spec)
 
 
-def _own(room: Room, effect: str, seed: int) -> FloatArray:
+def _own(spec: DriveSpec, effect: str, seed: int) -> FloatArray:
     """Return a calibration drive and then the drive that is made for an effect, each half of the time."""
-    first = room.steps // 2
-    limits = {"voltage_min": room.low, "voltage_max": room.high, "rate": room.rate, "seed": seed}
-    calibration = excite(duration=first / room.rate, drive=CALIBRATION, **limits)
-    made = excite(duration=(room.steps - first) / room.rate, drive=effect, **limits)
+    first = spec.steps // 2
+    limits = {"voltage_min": spec.low, "voltage_max": spec.high, "rate": spec.rate, "seed": seed}
+    calibration = excite(duration=first / spec.rate, drive=CALIBRATION, **limits)
+    made = excite(duration=(spec.steps - first) / spec.rate, drive=effect, **limits)
     return np.concatenate([calibration.voltage["x"], made.voltage["x"][1:]])

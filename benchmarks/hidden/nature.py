@@ -6,11 +6,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.simulation.chain import Flexure, Physics, SlowDomains
-from slpi_ros.simulation.dynamics import Ageing, Amplifier, Creep, RateLaw, Viscosity
-from slpi_ros.simulation.sensor import Hum, Interferometer, Temperature
+from slpi_ros.simulation.dynamics import Creep
 
 from .drives import log_uniform
+from .physics import (
+    Ageing,
+    Amplifier,
+    Flexure,
+    Hum,
+    Interferometer,
+    Physics,
+    RateLaw,
+    SlowDomains,
+    Temperature,
+    Viscosity,
+)
 
 FloatArray = NDArray[np.float64]
 Parameters = Mapping[str, float | tuple[float, ...] | Mapping[str, float]]

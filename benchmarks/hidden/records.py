@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.excitation.legs import Room
+from slpi_ros.excitation.legs import DriveSpec
 from slpi_ros.io.record import Record
-from slpi_ros.simulation.chain import Physics, own_motion
-from slpi_ros.simulation.sensor import Sensor
+from slpi_ros.simulation.preisach import Sensor
 
 from .attempt import BASES, CLOSE, NOISE, RATE_BEFORE, Base, Draw, Drives, together
 from .drives import log_uniform, wandering
 from .nature import NAMES, Parameters, Setting, another_time
+from .physics import Physics, own_motion
 
 FloatArray = NDArray[np.float64]
 
@@ -181,7 +181,7 @@ def again(
     highs = {axis: float(v.max()) for axis, v in hidden.record.voltage.items()}
     seconds = float(rng.uniform(*SECONDS_BEFORE))
     before = {
-        axis: wandering(Room(0.0, high, seconds, RATE_BEFORE), float(voltage[axis][0]) / high, rng)
+        axis: wandering(DriveSpec(0.0, high, seconds, RATE_BEFORE), float(voltage[axis][0]) / high, rng)
         for axis, high in highs.items()
     }
     t = np.arange(next(iter(voltage.values())).size) / rate

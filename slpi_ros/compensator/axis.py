@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
-from slpi_ros.compensator.model_swap import go_on, take_over, turning_voltages, whole_way
+from slpi_ros.compensator.model_swap import continue_from, take_over, turning_voltages, voltage_history
 from slpi_ros.compensator.persistence import MemoryConfidence
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.validation import Stamps, implausible
@@ -99,7 +99,7 @@ class Axis:
     @property
     def reversal_voltages(self) -> tuple[float, ...]:
         """Voltages (V) of the remembered reversals, oldest first, followed by the present voltage."""
-        return whole_way(self._applied if self._feedback else self.stream)
+        return voltage_history(self._applied if self._feedback else self.stream)
 
     def in_motion(self, now_ns: int) -> bool:
         """Whether the acceleration limit does not allow the voltage to stop at the next sample."""
@@ -138,7 +138,7 @@ class Axis:
         self.model, self.stream, self.driven = model, stream, True
         self.confidence = self.confidence.over(model.voltage_range)
         if self._feedback:
-            self._applied = go_on(model, stream.limits, self._applied)
+            self._applied = continue_from(model, stream.limits, self._applied)
             self._feedback.limits = stream.limits
             self._residuals.forget(self._applied.uncoupled_displacement)
         elif self._loop_settings.enabled:

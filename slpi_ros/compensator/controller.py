@@ -57,7 +57,7 @@ class CommandWatchdog:
     commanded : bool
         Whether a command has been executed since the activation. Before the first command, expiry moves no axis.
     expired : bool
-        Whether the timeout had elapsed at the last call of `look`.
+        Whether the timeout had elapsed at the last call of `update`.
     safe_voltages : tuple of float, length of axes, volts, or None
         Target voltages of the ramp started at expiry; None if the voltages are held.
     """
@@ -76,7 +76,7 @@ class CommandWatchdog:
         self._heard_ns = now_ns
         self.expired, self.safe_voltages = False, None
 
-    def look(self, safety: Safety, now_ns: int, waiting: bool) -> bool:
+    def update(self, safety: Safety, now_ns: int, waiting: bool) -> bool:
         """Update `expired`; return True if the timeout has just elapsed or the reaction in `safety` has changed since.
 
         Parameters
@@ -300,7 +300,7 @@ class Controller:
             counts.by_cause[error.cause] += 1
             raise
         if self.ramping:
-            self._let_go(axes, now_ns)
+            self._release(axes, now_ns)
             self.mode = Mode.STREAMING
         aheads = [axis.stamps.accept(stamp_ns) if stamp_ns else axis.stamps.arrive(arrival_ns) for axis in axes]
         held, slewing = self._move(axes, names, displacements, aheads, now_ns)
@@ -350,7 +350,9 @@ class Controller:
         if self.mode is not Mode.STREAMING or self.model is None:
             self._require_ready()
             if self.mode is Mode.TRAJECTORY:
-                raise RejectedError(rejection.FOLLOWING, f"{self.doing(now_ns)}; wait, or cancel it with an empty one")
+                raise RejectedError(
+                    rejection.FOLLOWING, f"{self.activity(now_ns)}; wait, or cancel it with an empty one"
+                )
         if count != len(names):
             raise RejectedError(rejection.LENGTH, f"{len(names)} axes but {count} displacements; send one for each")
         return self._named(names)
@@ -460,9 +462,9 @@ class Controller:
         self.watchdog.feed(now_ns)
         soon = (self.trajectory.next_deadline_ns or 0) - clock_ns <= MAX_DT_NS
         going = self.trajectory.names if soon or self.trajectory.begun else ()
-        self._let_go([axis for axis in self.axes if axis.name in going], now_ns)
+        self._release([axis for axis in self.axes if axis.name in going], now_ns)
 
-    def doing(self, now_ns: int) -> str:
+    def activity(self, now_ns: int) -> str:
         """Return a text for the present activity."""
         if self.mode is Mode.RESETTING:
             return "resetting the memory"
@@ -479,7 +481,7 @@ class Controller:
         self.watchdog.feed(now_ns)
         if self.mode is Mode.TRAJECTORY:
             self._end_trajectory()
-            self._let_go((), now_ns)
+            self._release((), now_ns)
 
     def _end_trajectory(self) -> None:
         self.trajectory.cancel()
@@ -507,11 +509,11 @@ class Controller:
         self.counts.points_slewing += slewing
         if not self.trajectory.on:
             self._end_trajectory()
-            self._let_go((), now_ns)
+            self._release((), now_ns)
         elif self.trajectory.tracks < tracks:
             # The next trajectory may not include all axes that are in motion.
             going = self.trajectory.names
-            self._let_go([axis for axis in self.axes if axis.name in going], now_ns)
+            self._release([axis for axis in self.axes if axis.name in going], now_ns)
         return True
 
     # Motion without desired displacements
@@ -546,7 +548,7 @@ class Controller:
     def hold(self, now_ns: int) -> None:
         """End all motion: axes hold their voltage, or brake during the next calls of `advance`."""
         self.cancel(now_ns)
-        self._let_go((), now_ns)
+        self._release((), now_ns)
         if self.active:
             self.mode = Mode.STREAMING
 
@@ -581,12 +583,12 @@ class Controller:
         """
         waiting = self.mode in (Mode.STREAMING, Mode.RAMPING)
         before = self.watchdog.safe_voltages
-        news = self.watchdog.look(safety, now_ns, waiting)
+        news = self.watchdog.update(safety, now_ns, waiting)
         if news and self.watchdog.safe_voltages != before:
             if self.watchdog.safe_voltages:
                 self.ramp(safety.voltages, safety.rate, now_ns)
             else:
-                self._let_go((), now_ns)
+                self._release((), now_ns)
                 self.mode = Mode.STREAMING
         return news
 
@@ -629,7 +631,7 @@ class Controller:
             if axis.ramp and axis.ramp.done and axis.model:
                 axis.confidence = MemoryConfidence(KNOWN, spanned=span).over(axis.model.voltage_range)
 
-    def _let_go(self, but: Collection[Axis], now_ns: int) -> None:
+    def _release(self, but: Collection[Axis], now_ns: int) -> None:
         """End all ramps: the axes in `but` continue with new commands, the others hold their voltage or brake."""
         self._end_reset()
         ramped = self.ramping

@@ -206,10 +206,10 @@ class Feedback:
         if self._enabled:
             reach = self.pace.reach(self._voltage, self._dt(t))
             integral, offset = self._next_integral_and_offset(elapsed, error, direct, feedforward, reach)
-            self._give(t, feedforward, direct + offset + integral)
+            self._output(t, feedforward, direct + offset + integral)
             self._integral, self._offset, self._taking_over = integral, offset, False
         else:
-            self._give(t, feedforward, self._without_measurement(t))
+            self._output(t, feedforward, self._without_measurement(t))
         self._error, self._rate = error, rate
         if elapsed > 0.0:
             self._measured_at, self._measured = t, measured
@@ -224,7 +224,7 @@ class Feedback:
             If time (s) runs backwards, or a value is not finite; the state is unchanged.
         """
         self._check(t, feedforward)
-        self._give(t, feedforward, self._without_measurement(t))
+        self._output(t, feedforward, self._without_measurement(t))
         return self._voltage
 
     def measure(self, displacement: float, now_ns: int) -> None:
@@ -301,7 +301,7 @@ class Feedback:
         """Return the time (s) since the last sample; 0 for the first sample."""
         return t - self._t if self._t > -inf else 0.0
 
-    def _give(self, t: float, feedforward: float, correction: float) -> None:
+    def _output(self, t: float, feedforward: float, correction: float) -> None:
         """Move to `feedforward` + `correction` (V) as far as limits and rate limiter allow."""
         wanted = feedforward + correction
         if not isfinite(wanted):

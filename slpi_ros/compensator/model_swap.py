@@ -40,7 +40,7 @@ def take_over(
             "identify kind 'slpi', or use 'slpi compensate'"
         )
     allowed = limits.within(axis.voltage_range)
-    try_out(axis, allowed)
+    check_inverse(axis, allowed)
     if not reversal_voltages:
         return axis.stream_from(axis.memory(start_memory), allowed)
     present = reversal_voltages[-1]
@@ -48,16 +48,16 @@ def take_over(
     memory = axis.memory("start")
     replay(memory, reversal_voltages)
     # No step: a voltage just outside the limits returns with the next samples, within slew and acceleration limits.
-    stream = axis.stream_from(memory, including(allowed, present))
+    stream = axis.stream_from(memory, extended_to(allowed, present))
     stream.limits = allowed
     return stream
 
 
-def go_on(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> StreamingInverse:
+def continue_from(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> StreamingInverse:
     """Return the streaming inverse of a new model in the state of `before`; limits are widened to its voltage."""
     memory = axis.memory("start")
     replay(memory, turning_voltages(before.memory))
-    stream = axis.stream_from(memory, including(including(allowed, before.voltage), memory.voltage))
+    stream = axis.stream_from(memory, extended_to(extended_to(allowed, before.voltage), memory.voltage))
     stream.resume(before)
     return stream
 
@@ -69,7 +69,7 @@ def turning_voltages(memory: Memory) -> tuple[float, ...]:
     return (*(v for v in state.turn_voltages if abs(v) < FAR / 2), state.voltage)
 
 
-def whole_way(stream: StreamingInverse) -> tuple[float, ...]:
+def voltage_history(stream: StreamingInverse) -> tuple[float, ...]:
     """Return the reversal voltages (V), oldest first, the present voltage, and the command if that differs."""
     turns = turning_voltages(stream.memory)
     return turns if turns[-1] == stream.voltage else (*turns, stream.voltage)
@@ -81,7 +81,7 @@ def replay(memory: Memory, voltages: Sequence[float]) -> None:
         memory.forward(v)
 
 
-def try_out(axis: AxisModel, allowed: Limits) -> None:
+def check_inverse(axis: AxisModel, allowed: Limits) -> None:
     """Check the inverse at both ends of the accepted displacements, starting from both voltage limits.
 
     Raises
@@ -117,6 +117,6 @@ def require_near(present: float, allowed: Limits) -> None:
         )
 
 
-def including(limits: Limits, voltage: float) -> Limits:
+def extended_to(limits: Limits, voltage: float) -> Limits:
     """Return the limits, extended to include `voltage` (V)."""
     return replace(limits, lower=min(limits.lower, voltage), upper=max(limits.upper, voltage))

@@ -74,7 +74,7 @@ class LastVoltages:
     Parameters
     ----------
     path : path-like
-        File to write; an existing one is truncated.
+        File of the saved memory; the voltages go to `path`.last, which is truncated.
     mark : int
         Identifier (32 bits) of the saved memory that the entries belong to; may be changed at any time.
 
@@ -85,9 +85,9 @@ class LastVoltages:
     """
 
     def __init__(self, path: str | os.PathLike[str], mark: int) -> None:
-        self._path, self.mark, self._number = path, mark, 0
+        self._path, self.mark, self._number = _beside(path), mark, 0
         try:
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
         except (OSError, ValueError) as error:
             raise ModelError(f"{path}: cannot be written: {error}; choose another path") from None
 
@@ -114,10 +114,10 @@ class LastVoltages:
 
 
 def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tuple[float, ...] | None:
-    """Return the last voltages (V) stored for `axes` axes; None if no intact entry has the identifier `mark`."""
+    """Return the last voltages (V) stored beside a memory; None if no intact entry has the identifier `mark`."""
     size = HEAD.size + VOLTAGE_BYTES * axes + CHECKSUM_BYTES
     try:
-        with Path(path).open("rb") as file:
+        with open(_beside(path), "rb") as file:
             data = file.read(2 * size)
     except (OSError, ValueError):
         return None
@@ -228,17 +228,6 @@ def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
     return _mark(text)
 
 
-def last_voltages(path: str | os.PathLike[str], mark: int) -> LastVoltages:
-    """Return the writer of the voltages output after a memory was saved to `path`, in the order of its axes.
-
-    Raises
-    ------
-    ModelError
-        If the file `path`.last cannot be written.
-    """
-    return LastVoltages(_beside(path), mark)
-
-
 def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
     """Read a saved memory, updated with the last voltages after a crash; None if the file does not exist.
 
@@ -266,7 +255,7 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
     }
     if not document["complete"]:
         saved = tuple(axis.reversal_voltages[-1] for axis in axes.values())
-        last = read_last_voltages(_beside(path), _mark(text), len(axes)) or saved
+        last = read_last_voltages(path, _mark(text), len(axes)) or saved
         axes = {name: axis.after_crash(v) for (name, axis), v in zip(axes.items(), last, strict=True)}
     return SavedMemory(document["model"], document["complete"], axes)
 
@@ -320,7 +309,7 @@ class MemoryFile:
         elif self._last:
             self._last.mark = mark
         elif not complete:
-            self._last = last_voltages(self._path, mark)
+            self._last = LastVoltages(self._path, mark)
 
     def note(self, voltages: bytes) -> None:
         """Store the voltages just output (V, native doubles), for recovery after a crash; called for each command.

@@ -235,17 +235,19 @@ def _given(model: AxisModel, selection: Selection) -> Given:
     """Compare the given model with the records, and refuse one that has nothing to do with them."""
     evidence = selection.now.evidence
     bare = replace(model, effects=())
-    compared = [_compared(bare, one) for one in (selection.base, selection.now)]
-    best = min(compared, key=lambda one: one.hysteresis_rms)
     motion = float(np.ptp(evidence.y[evidence.used]))
+    compared = [replace(_compared(bare, one), motion=motion) for one in (selection.base, selection.now)]
+    # Effects change what a fit to the records makes of the hysteresis: a stage that has changed shows it without them
+    # and beside them.
+    best = min(compared, key=lambda one: (one.changed, one.hysteresis_rms))
     if model.kind in REFITTED:
         span = max(motion, float(np.ptp(model.displacement_range)))
         require_own(best.hysteresis_rms, best.refitted_rms, span)
     runs = [_free_run(model, part) for part in evidence.parts]
     rms = float(np.sqrt(np.mean([run.rms**2 for run in runs])))
-    zero = float(np.median([run.moved for run in runs]))
+    zero = max((run.moved for run in runs), key=abs)
     moved = abs(zero) > ZERO * max(rms, CHANGED * motion)
-    return replace(best, rms=rms, zero_moved=zero if moved else None, motion=motion)
+    return replace(best, rms=rms, zero_moved=zero if moved else None)
 
 
 def _compared(bare: AxisModel, one: Explanation) -> Given:

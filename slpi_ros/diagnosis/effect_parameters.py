@@ -28,7 +28,8 @@ FREE = {
     "sensor_periodic": ("period", "amplitude", "phase"),
     "hum": ("frequency", "amplitude", "phase"),
 }
-# Of a rate dependence that is a coercivity.
+# Of a rate dependence without backlash, and of one that is a coercivity.
+WIDENING = ("widening", "exponent")
 COERCIVE = ("coercivity", "exponent", "onset", "settling", "reversible")
 # Least values; what is not named may have either sign.
 LEAST = {
@@ -45,8 +46,15 @@ LEAST = {
     "onset": 0.1,
     "reversible": -np.inf,
 }
-# Greatest values, of any effect or of one. What is damped more does not ring.
-MOST = {"damping": 0.4, "exponent": 3.0, "settling": 0.05, "cross_coupling.gains": 0.4}
+# Greatest values, of any effect or of one. What is damped more does not ring; what grows as the rate itself is a shift
+# in time.
+MOST = {
+    "damping": 0.4,
+    "displacement.exponent": 0.6,
+    "voltage.exponent": 0.9,
+    "settling": 0.05,
+    "cross_coupling.gains": 0.4,
+}
 # Effects none of whose other parameters may be negative.
 NOT_NEGATIVE = ("creep", "rate_dependence")
 # Parameters that the displacement is linear in, or nearly so at any size.
@@ -56,8 +64,11 @@ LARGEST_STEP = 0.7
 
 
 def _free_fields(effect: Effect) -> tuple[str, ...]:
-    if isinstance(effect, RateDependence) and effect.side == "voltage":
-        return COERCIVE
+    if isinstance(effect, RateDependence):
+        if effect.side == "voltage":
+            return COERCIVE
+        if not effect.backlash:
+            return WIDENING
     return FREE[effect.name]
 
 
@@ -157,7 +168,8 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
     for name in _free_fields(effect):
         value = getattr(effect, name)
         least = LEAST.get(name, 0.0 if effect.name in NOT_NEGATIVE else -np.inf)
-        most = longest if name == "time_constants" else MOST.get(name, MOST.get(f"{effect.name}.{name}", np.inf))
+        keys = (name, f"{effect.name}.{name}", f"{effect.side}.{name}")
+        most = longest if name == "time_constants" else min(MOST.get(key, np.inf) for key in keys)
         if isinstance(value, Mapping):
             changed[name] = {key: min(max(left.pop(0), least), most) for key in value}
         elif isinstance(value, tuple):

@@ -36,7 +36,7 @@ FloatArray = NDArray[np.float64]
 Factor = tuple[FloatArray, bool]
 
 # What effects add is found in turns with the hysteresis, until a turn changes it by less than this share of the error.
-MOST_TURNS, SETTLED = 15, 0.02
+MOST_TURNS, SETTLED = 15, 0.001
 # Voltages at which the middle of the largest loop is found.
 LEVELS = 60
 # Steps towards the best parameters end when they gain less than this share of the error.
@@ -51,6 +51,9 @@ ALIKE = 1e-9
 BEGINNING = 0.08
 # Of more samples every so manieth is fitted and judged, from all that effects and memory do to every one of them.
 MOST_ROWS = 20_000
+# Others cover a parameter of the hysteresis that weighs so much in them (sum of squares), and can predict a sample of
+# which less than this share depends on parameters that they do not cover. A record is judged by so many samples.
+SEEN, UNSEEN, FEWEST_JUDGED = 0.1, 0.02, 200
 # Blocks of a fold are told apart when scores are compared.
 BLOCKS = 40
 
@@ -66,7 +69,8 @@ class Score:
     gains : ndarray, shape (k,)
         Of the columns, fitted to all blocks.
     records : ndarray, shape (records,), m^2
-        Mean square of the errors of each record, its constant apart, by a fit to the others; empty for one record.
+        Mean square of the errors of each record, its constant apart, by a fit to the others; NaN where these cover too
+        little of it, empty for one record.
     """
 
     losses: FloatArray
@@ -81,7 +85,7 @@ class Score:
     @property
     def rms_of_records(self) -> float:
         """Held-out error on records, metres; on blocks where there is one record."""
-        return float(np.sqrt(np.mean(self.records))) if self.records.size else self.rms
+        return float(np.sqrt(np.nanmean(self.records))) if np.isfinite(self.records).any() else self.rms
 
 
 class Joint:
@@ -123,14 +127,26 @@ class Joint:
         grams = [rows.gram() for rows in self.rows]
         everything, whole = range(len(grams)), _sum(grams)
 
-        def held_out(left: Sequence[int]) -> _HeldOut:
-            count = self._ends[-1] - sum(self._groups[group].size for group in left)
-            return _HeldOut(left, self._factored(whole - _sum([grams[group] for group in left]), count))
+        def judged(left: Sequence[int], rest: FloatArray) -> NDArray[np.bool_]:
+            """Return the rows that others can predict, shape (n,): covered by them, whatever the initial history."""
+            rows = np.concatenate([self._groups[group] for group in left])
+            known, design = _judged(self.problem)[rows], self.problem.design.rows(rows)
+            # What only the way before these samples depends on is a constant for them.
+            depends = abs(design.local[known]).sum(axis=0) > 0.0
+            unseen = np.where(depends & (np.diag(rest) < SEEN), 1.0, 0.0)
+            unseen[self.evidence.basis.size :] = 0.0
+            return np.asarray(known & (design.weight(unseen) < UNSEEN))
 
-        folds = [held_out(everything[fold :: FOLDS + 1]) for fold in range(1, FOLDS + 1)]
+        def held_out(left: Sequence[int], *, record: bool) -> _HeldOut:
+            count = self._ends[-1] - sum(self._groups[group].size for group in left)
+            rest = whole - _sum([grams[group] for group in left])
+            rows = judged(left, rest) if record else np.empty(0, dtype=bool)
+            return _HeldOut(left, self._factored(rest, count), rows)
+
+        folds = [held_out(everything[fold :: FOLDS + 1], record=False) for fold in range(1, FOLDS + 1)]
         if len(self.evidence.parts) == 1:
             return folds, []
-        return folds, [held_out(everything[k : k + FOLDS + 1]) for k in everything[:: FOLDS + 1]]
+        return folds, [held_out(everything[k : k + FOLDS + 1], record=True) for k in everything[:: FOLDS + 1]]
 
     @cached_property
     def blocks(self) -> list[NDArray[np.int64]]:
@@ -205,25 +221,29 @@ class Joint:
             x = _solved(record.factor, rest @ _missed(gains))
             missed = [self.rows[group].predict(x) - at[group] @ _missed(gains) for group in record.left]
             began = [at[group][:, 1:][:, starting] for group in record.left]
-            # Others cannot tell what depends on the initial history alone.
-            judged = _judged(self.problem)[np.concatenate([self._groups[group] for group in record.left])]
-            left_out.append(_without_start(np.concatenate(missed)[judged], np.concatenate(began)[judged]))
+            left_out.append(_without_start(np.concatenate(missed)[record.judged], np.concatenate(began)[record.judged]))
         square = self.problem.scale**2
         return Score(losses * square, gains, np.array(left_out) * square)
 
 
 def _without_start(missed: FloatArray, began: FloatArray) -> float:
-    """Return the mean square of errors, shape (n,), without their constant and what columns, shape (n, k), explain."""
+    """Return the mean square of errors, shape (n,), without their constant and what columns, shape (n, k), explain.
+
+    NaN where there are too few to judge by.
+    """
+    if missed.size < FEWEST_JUDGED:
+        return np.nan
     own = np.column_stack([np.ones(missed.size), began[:, began.any(axis=0)]])
     return float(np.mean((missed - own @ np.linalg.lstsq(own, missed, rcond=None)[0]) ** 2))
 
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """Groups that are left out, and the factor of the others' equations."""
+    """Groups that are left out, the factor of the others' equations, and which rows of a record those can predict."""
 
     left: Sequence[int]
     factor: Factor
+    judged: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -384,6 +404,10 @@ class Explanation:
         How much of it, of each record one behind the other.
     """
 
+    h: FloatArray
+    added: FloatArray
+    _middles: "list[Callable[[FloatArray], FloatArray]]"
+
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
         self.u, self._aside = reaching(self.effects, evidence.v, evidence.around)
@@ -394,15 +418,14 @@ class Explanation:
         self._before = np.column_stack([starting, evidence.beside])
         self._starting = range(starting.shape[1])
         beside = self.joint.columns(self._before)
+        behind = any(effect.side == "displacement" for effect in self.effects)
+        self.added = self._aside
+        if not behind or not like:
+            self._fit(beside)
+        if not behind:
+            return
         if like:
             self.h, self.added, self._middles = like.h, like.added, like._middles
-        else:
-            self.added = self._aside
-            self._fit(beside)
-        if not any(effect.side == "displacement" for effect in self.effects):
-            self.added = self._aside
-            self._fit(beside)
-            return
         for _ in range(MOST_TURNS):
             h, before = self.h, self.added
             self.added = self._behind(self.effects, h + self._aside, self.u) - h

@@ -392,13 +392,16 @@ def one_speed(evidence: Evidence) -> bool:
 
 
 def drive_frequency(evidence: Evidence) -> float:
-    """Return the one frequency (Hz) of the drive; 0 where there are several."""
-    # The first move and the last one of each record may be cut off.
-    moves = [Runs.of(part.t, part.v, _dead_band(part.v)).duration[1:-1] for part in evidence.parts]
-    duration = np.concatenate(moves)
-    usual = float(np.median(duration)) if duration.size else 0.0
-    alone = np.mean((duration < ALMOST * usual) & (usual < ALMOST * duration)) > MOST_RUNS
-    return 0.5 / usual if alone and usual > 0.0 else 0.0
+    """Return the one frequency (Hz) of the drive of all records; 0 where there are several."""
+    found = []
+    for part in evidence.parts:
+        # The first move and the last one may be cut off.
+        duration = Runs.of(part.t, part.v, _dead_band(part.v)).duration[1:-1]
+        usual = float(np.median(duration)) if duration.size else 0.0
+        if not (usual > 0.0 and np.mean((duration < ALMOST * usual) & (usual < ALMOST * duration)) > MOST_RUNS):
+            return 0.0
+        found.append(0.5 / usual)
+    return float(np.median(found)) if max(found) < ALMOST * min(found) else 0.0
 
 
 def _dead_band(v: FloatArray) -> float:

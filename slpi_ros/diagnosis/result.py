@@ -267,7 +267,8 @@ class Given:
     gain, gain_deviation : float
         By which share the stage moves more than its hysteresis says, and its standard deviation.
     zero_moved : float or None, metres
-        By how much the zero has moved; None where the records do not tell it from the initial history.
+        By how much the zero has moved, in the record where that is most; None where the records do not tell it from the
+        initial history.
     motion : float, metres
         How far the stage moved.
     """
@@ -459,7 +460,7 @@ def _next(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], 
     steps = [UP_TO_DATE] if stale else []
     steps += [] if verdict == NOTHING_FOUND else [_of_structure(structure) for structure in selection.structures]
     if verdict == AMBIGUOUS:
-        first = next(named for named in effects if named.alternatives)
+        first = next((named for named in effects if named.alternatives), effects[0])
         steps.append(_separating((first.name, *first.alternatives), selection.now.evidence))
     if verdict == UNEXPLAINED and not steps:
         steps.append(_more_loops(selection.now.evidence))

@@ -16,6 +16,7 @@ from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.hum import Hum
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.registry import EFFECTS
+from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import STILL, Saturation, outward_steps
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.thermal_drift import ThermalDrift
@@ -53,6 +54,8 @@ ALTERNATIVE = 0.7
 ALTERNATIVE_AT_ONE_SPEED = 0.4
 # What one drive frequency cannot tell apart.
 DYNAMIC = {"delay", "lag", "rate_dependence", "creep"}
+# What does nothing but shift in time.
+SHIFTS = {"delay", "lag"}
 # What shifts the displacement against the voltage.
 SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
 STEPS = 5
@@ -143,7 +146,7 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
     several = len(now.evidence.parts) > 1
 
     def rank(one: Contender) -> tuple[bool, float]:
-        return several and (is_own(one.name) or not one.counts_beside(now)), one.score.rms
+        return several and (is_own(one.name) or not one.counts_beside(now)), one.rms
 
     return sorted(sound, key=rank)
 
@@ -260,9 +263,10 @@ def gain(before: Score, after: Score) -> float:
 
 def carries_over(before: Score, after: Score) -> bool:
     """Return whether what was found on some records lowers the error on the others; True for one record."""
-    if not before.records.size:
+    both = np.isfinite(before.records) & np.isfinite(after.records) if before.records.size else np.empty(0, dtype=bool)
+    if not both.any():
         return True
-    ratio = np.sqrt(after.records / np.maximum(before.records, TINY))
+    ratio = np.sqrt(after.records[both] / np.maximum(before.records[both], TINY))
     return bool(ratio.max() <= NO_WORSE and after.rms_of_records <= (1.0 - LEAST_GAIN) * before.rms_of_records)
 
 
@@ -277,9 +281,15 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
     """Return whether another effect explains as much as the best one, as far as the record can tell.
 
     At one drive frequency what depends on time and what depends on rate cannot be told apart: a better fit says only
-    which of them bends the loops in a more suitable way. Shifts by less than a sample look the same.
+    which of them bends the loops in a more suitable way. Shifts by less than a sample look the same. Of several records
+    those that are left out decide as well.
     """
     explained, by_other = before.rms**2 - best.score.rms**2, before.rms**2 - other.score.rms**2
+    if best.name in SHIFTS and other.name == Resonance.name:
+        # It is a shift that rings as well: where it does no better nothing rings.
+        return False
+    if best.score.records.size and other.score.rms_of_records > NO_WORSE * best.score.rms_of_records:
+        return False
     if one_speed and {best.name, other.name} <= DYNAMIC:
         return by_other >= ALTERNATIVE_AT_ONE_SPEED * explained
     if {best.name, other.name} == {"delay", "lag"} and _shift(best.effect) < usual_step(best.explanation.t):
@@ -353,6 +363,7 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     # Their effects alone: a fit takes much room.
     rivals: dict[str, list[Effect]] = {}
     dropped: set[str] = set()
+    exchanged = False
     finest = max(FINEST * float(np.ptp(now.y[now.used])), ROUNDING_LEFT * now.evidence.rounding)
     while len(rivals) < MOST_EFFECTS and now.held_out.rms > finest:
         report_progress(f"{len(now.effects)} effects found, {now.held_out.rms * 1e9:.3g} nm left, trying others")
@@ -363,7 +374,11 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
             continue
         dropped |= {one.name for one in found if counts(now.held_out, one.score) and not one.counts_beside(now)}
         if not found or not found[0].counts_beside(now):
-            break
+            before, exchanged = now, not exchanged and len(now.effects) > 1
+            now = _exchanged(now, rivals) if exchanged else now
+            if now is before:
+                break
+            continue
         best = _simplest(found, now)
         rivals[best.name] = [other.effect for other in found if other is not best]
         now = _without_needless(best.explanation.smoothed(), set(rivals) - {best.name})
@@ -399,6 +414,42 @@ def _without_needless(now: Explanation, names: Collection[str]) -> Explanation:
     return now
 
 
+def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
+    """Return it with a rival in the place of an effect that it beats, or that it equals with fewer parameters.
+
+    Which effect came first depends on what else was missing then.
+    """
+    alone = one_speed(now.evidence)
+    for name in [effect.name for effect in now.effects if effect.name in rivals]:
+        rest, best = now.without(name), Contender(name, now)
+        better = [
+            one
+            for one in _tried(name, now, rest, rivals[name])
+            if one.counts_beside(rest)
+            and (
+                one.rms < (1.0 - BETTER) * best.rms
+                or (one.parameters < best.parameters and alike(best, one, rest.held_out, one_speed=alone))
+            )
+        ]
+        if better:
+            one = min(better, key=lambda other: other.rms)
+            rivals[one.name] = [best.effect, *(rival for rival in rivals.pop(name) if rival.name != one.name)]
+            now = one.explanation
+    return now
+
+
+def _tried(name: str, now: Explanation, rest: Explanation, rivals: Sequence[Effect]) -> list[Contender]:
+    """Return rivals in the place of an effect, fitted beside the `rest`, the best one first."""
+    present = {effect.name for effect in now.effects}
+    enough = WORTH_REFINING * (rest.held_out.rms**2 - now.held_out.rms**2)
+    tried = []
+    for rival in rivals:
+        if rival.name not in present:
+            one = Contender(rival.name, rest.adding(rival).refined(1))
+            tried.append(one.refined() if rest.held_out.rms**2 - one.score.rms**2 >= enough else one)
+    return sorted(tried, key=lambda contender: contender.rms)
+
+
 def _best_structure(now: Explanation, taken: tuple[str, ...]) -> tuple[str | None, Explanation]:
     """Return what is wrong with the hysteresis itself, if that counts, and the explanation that allows for it."""
     best: tuple[str | None, Explanation] = (None, now)
@@ -411,7 +462,8 @@ def _best_structure(now: Explanation, taken: tuple[str, ...]) -> tuple[str | Non
 
 
 def _beats(one: Score, other: Score) -> bool:
-    return one.rms < other.rms and chance_of_gain(other, one) <= ALIKE
+    least = (1.0 - LEAST_GAIN) * other.rms_of_records
+    return one.rms_of_records < least and chance_of_gain(other, one) <= ALIKE
 
 
 def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[Effect]]) -> tuple[Named, ...]:
@@ -432,16 +484,8 @@ def _in_its_place(
     name: str, now: Explanation, rivals: Sequence[Effect]
 ) -> tuple[tuple[str, ...], tuple[str, float] | None]:
     """Return which rivals would do as well in the place of an effect, and the best of them."""
-    present = {effect.name for effect in now.effects}
-    rest = now.without(name)
-    tried = []
-    best = Contender(name, now)
-    enough = WORTH_REFINING * (rest.held_out.rms**2 - best.score.rms**2)
-    for rival in rivals:
-        if rival.name not in present:
-            one = Contender(rival.name, rest.adding(rival).refined(1))
-            tried.append(one.refined() if rest.held_out.rms**2 - one.score.rms**2 >= enough else one)
-    tried.sort(key=lambda contender: contender.rms)
+    rest, best = now.without(name), Contender(name, now)
+    tried = _tried(name, now, rest, rivals)
     alone = one_speed(now.evidence)
     alternatives = [other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone)]
     inseparable = [other.name for other in tried if {name, other.name} <= DYNAMIC]

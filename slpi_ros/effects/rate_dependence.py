@@ -227,10 +227,10 @@ class StreamingRateDependence:
 
 
 # Exponents, and transition lengths as shares of the voltage range, of the candidates.
-EXPONENTS, TRANSITIONS = (0.2, 0.5, 0.8), (0.01, 0.04, 0.12)
+EXPONENTS, TRANSITIONS = (0.1, 0.3, 0.6), (0.01, 0.04, 0.12)
 
 # Coercivities (share of the voltage range) at which the search for growing thresholds starts.
-COERCIVE_EXPONENT, COERCIVE_ONSET, SETTLING, COERCIVITIES = 0.3, 0.1, 2e-3, (0.02, 0.06)
+COERCIVE_EXPONENT, COERCIVE_ONSET, SETTLING, COERCIVITIES = 0.3, 0.1, 2e-3, (0.003, 0.02, 0.06)
 # Number of gains of the reversible part.
 POWERS, MOST_POWERS = 3, 6
 
@@ -343,10 +343,12 @@ class RateDependence:
     @classmethod
     def _losing(cls, left: ResidualView, reference: float) -> Iterator[Candidate]:
         for exponent in EXPONENTS:
+            wider = cls(1.0, 0.0, exponent, reference, float(np.ptp(left.u)))
+            widening = wider.apply(left.h, left.around) - left.h
+            yield Candidate(widening[:, None], partial(cls._times, wider), positive=1)
             for transition in (float(share * np.ptp(left.u)) for share in TRANSITIONS):
-                one = cls(1.0, 1e-6, exponent, reference, transition)
-                parts = (replace(one, backlash=0.0), replace(one, widening=0.0))
-                columns = np.column_stack([part.apply(left.h, left.around) - left.h for part in parts])
+                one = cls(0.0, 1e-6, exponent, reference, transition)
+                columns = np.column_stack([widening, one.apply(left.h, left.around) - left.h])
                 yield Candidate(columns, partial(cls._times, one), positive=2)
 
     @classmethod
@@ -367,7 +369,7 @@ class RateDependence:
 
     @staticmethod
     def _times(one: "RateDependence", gains: FloatArray) -> "RateDependence | None":
-        wider, behind = gains.tolist()
+        wider, behind = float(gains[0]), float(gains[1]) if gains.size > 1 else 0.0
         return replace(one, widening=wider, backlash=behind * one.backlash) if gains.max() > 0 else None
 
     def describe(self) -> str:

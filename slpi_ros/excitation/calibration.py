@@ -5,11 +5,11 @@ from itertools import cycle
 
 import numpy as np
 
-from slpi_ros.excitation.legs import FloatArray, Path, Room
+from slpi_ros.excitation.legs import DriveSpec, FloatArray, Path
 
 # Mean speed in voltage ranges per second, and the sequence of relative speeds: for a 100 V stage a mean of 70 V/s and
 # at most about 250 V/s. Different speeds separate time-dependent effects from hysteresis.
-PACE = 0.8
+MEAN_SPEED = 0.8
 SPEEDS = (0.6, 1.0, 1.8)
 FAST, SLOW = 1.8, 0.6
 # Shorter moves take the time of a move over this share of the range, for several samples each.
@@ -23,7 +23,7 @@ FEWEST_LEVELS, USUAL_LEVELS, MOST_LEVELS = 2, 4, 100
 NESTS = (0.3, 0.7)
 
 
-def calibration(room: Room, rng: np.random.Generator) -> Path:
+def calibration(spec: DriveSpec, rng: np.random.Generator) -> Path:
     """Cover the Preisach plane uniformly, at several speeds and with holds.
 
     A sweep over the whole range comes first, to set a known memory. Reversal curves follow in random order, rising from
@@ -32,7 +32,7 @@ def calibration(room: Room, rng: np.random.Generator) -> Path:
 
     Parameters
     ----------
-    room : Room
+    spec : DriveSpec
     rng : numpy.random.Generator
         Random generator for the position of each reversal within its part of the range, and for the order.
 
@@ -44,26 +44,26 @@ def calibration(room: Room, rng: np.random.Generator) -> Path:
     seed = int(rng.integers(2**63))
 
     def planned(levels: int) -> Path:
-        return _Plan(room, np.random.default_rng(seed)).of(levels)
+        return _Plan(spec, np.random.default_rng(seed)).of(levels)
 
     levels = USUAL_LEVELS
-    while levels < MOST_LEVELS and planned(levels + 1).wanted_steps(room).sum() <= room.steps:
+    while levels < MOST_LEVELS and planned(levels + 1).wanted_steps(spec).sum() <= spec.steps:
         levels += 1
-    while levels > FEWEST_LEVELS and planned(levels).fewest_steps(room).sum() > room.steps:
+    while levels > FEWEST_LEVELS and planned(levels).fewest_steps(spec).sum() > spec.steps:
         levels -= 1
     return planned(levels)
 
 
-def sweep(room: Room) -> Path:
+def sweep(spec: DriveSpec) -> Path:
     """Return one sweep over the whole range, up and down, which removes the initial history."""
-    plan = _Plan(room, np.random.default_rng(0))
+    plan = _Plan(spec, np.random.default_rng(0))
     plan.sweep()
     return plan.path
 
 
 class _Plan:
-    def __init__(self, room: Room, rng: np.random.Generator) -> None:
-        self._room, self._rng = room, rng
+    def __init__(self, spec: DriveSpec, rng: np.random.Generator) -> None:
+        self._room, self._rng = spec, rng
         self._speeds: Iterator[float] = cycle(SPEEDS)
         self.path = Path()
 
@@ -110,7 +110,7 @@ class _Plan:
 
     def _move(self, share: float, speed: float) -> None:
         span = abs(share - self.path.at)
-        seconds = max(span, SHORTEST) / (PACE * speed)
+        seconds = max(span, SHORTEST) / (MEAN_SPEED * speed)
         # Under a low slew limit raised cosines have no advantage, and straight moves are faster.
         self.path.to(share, seconds, straight=seconds < self._room.quickest(span))
 

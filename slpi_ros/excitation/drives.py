@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from slpi_ros.errors import UsageError
-from slpi_ros.excitation.calibration import PACE, calibration, sweep
+from slpi_ros.excitation.calibration import MEAN_SPEED, calibration, sweep
 from slpi_ros.excitation.effects import EFFECTS, for_effect
-from slpi_ros.excitation.legs import FEWEST_STEPS, FloatArray, Path, Room
+from slpi_ros.excitation.legs import FEWEST_STEPS, DriveSpec, FloatArray, Path
 
 CALIBRATION, SWEEP = "calibration", "sweep"
 DRIVES = (CALIBRATION, SWEEP, *EFFECTS)
@@ -32,7 +31,7 @@ class Drive:
         From 0, evenly spaced.
     voltage : dict of axis name to ndarray, shape (N,), volts
         Voltages, which start and end at the rest voltage of the axis.
-    rooms : dict of axis name to Room
+    specs : dict of axis name to DriveSpec
         Limits and rate of each axis, with the duration of the whole drive.
     why : str
         Purpose of the drive in one sentence.
@@ -40,7 +39,7 @@ class Drive:
 
     t: FloatArray
     voltage: dict[str, FloatArray]
-    rooms: dict[str, Room]
+    specs: dict[str, DriveSpec]
     why: str
 
     @property
@@ -51,7 +50,7 @@ class Drive:
     @property
     def rate(self) -> float:
         """Samples per second, hertz."""
-        return self.rooms[self.axes[0]].rate
+        return self.specs[self.axes[0]].rate
 
 
 def excite(
@@ -105,19 +104,19 @@ def excite(
         for name, given in (("voltage_min", voltage_min), ("voltage_max", voltage_max), ("slew_limit", slew_limit))
     )
     rests = lows if start is None else _each("start", start, axes)
-    rooms = {
-        axis: Room(low, high, duration, rate, slew)
+    specs = {
+        axis: DriveSpec(low, high, duration, rate, slew)
         for axis, low, high, slew in zip(axes, lows, highs, slews, strict=True)
     }
-    steps = rooms[axes[0]].steps
+    steps = specs[axes[0]].steps
     turns = np.linspace(0, steps, len(axes) + 1).round().astype(int).tolist()
     voltage = {}
     for number, (axis, rest) in enumerate(zip(axes, rests, strict=True)):
         begin, end = turns[number], turns[number + 1]
-        turn = replace(rooms[axis], duration=(end - begin) / rate)
+        turn = replace(specs[axis], duration=(end - begin) / rate)
         voltage[axis] = np.full(steps + 1, rest)
         voltage[axis][begin : end + 1] = _turn(turn, rest, drive, _generator(seed, number))
-    return Drive(np.arange(steps + 1) / rate, voltage, rooms, _why(drive))
+    return Drive(np.arange(steps + 1) / rate, voltage, specs, _why(drive))
 
 
 def calibration_drive(
@@ -128,21 +127,21 @@ def calibration_drive(
     return drive.t, drive.voltage["x"]
 
 
-def _turn(room: Room, rest: float, drive: str, rng: np.random.Generator) -> FloatArray:
-    """Return the voltages (V) of one axis during its motion, shape (room.steps + 1,), from and to the rest voltage."""
-    if not room.low <= rest <= room.high:
-        raise UsageError(f"drive: it starts at {rest:g} V; give a voltage within {room.low:g} to {room.high:g} V")
-    start = (rest - room.low) / room.span
-    approach = max(start / PACE, room.quickest(start))
-    if 2 * approach >= room.duration:
+def _turn(spec: DriveSpec, rest: float, drive: str, rng: np.random.Generator) -> FloatArray:
+    """Return the voltages (V) of one axis during its motion, shape (spec.steps + 1,), from and to the rest voltage."""
+    if not spec.low <= rest <= spec.high:
+        raise UsageError(f"drive: it starts at {rest:g} V; give a voltage within {spec.low:g} to {spec.high:g} V")
+    start = (rest - spec.low) / spec.span
+    approach = max(start / MEAN_SPEED, spec.quickest(start))
+    if 2 * approach >= spec.duration:
         raise UsageError(
-            f"drive: the way from {rest:g} V to {room.low:g} V and back takes {2 * approach:.3g} s of "
-            f"{room.duration:g} s; give more time"
+            f"drive: the way from {rest:g} V to {spec.low:g} V and back takes {2 * approach:.3g} s of "
+            f"{spec.duration:g} s; give more time"
         )
     path = Path(start)
     if start:
         path.to(0.0, approach)
-    within = replace(room, duration=room.duration - 2 * approach)
+    within = replace(spec, duration=spec.duration - 2 * approach)
     match drive:
         case "calibration":
             inner = calibration(within, rng)
@@ -153,7 +152,7 @@ def _turn(room: Room, rest: float, drive: str, rng: np.random.Generator) -> Floa
     path.legs += inner.legs
     if start:
         path.to(start, approach)
-    return path.voltages(room)
+    return path.voltages(spec)
 
 
 def _check(axes: Sequence[str], drive: str) -> None:
@@ -190,8 +189,8 @@ class Playback:
     Parameters
     ----------
     drive : Drive
-    Drive to be played.
-        Restart at the end until stopped; False by default.
+    repeat : bool
+        Whether to restart at the end until stopped; False by default.
 
     Attributes
     ----------
@@ -236,33 +235,25 @@ class Playback:
         if self.stopping:
             return False
         self.stopping = True
-        self._samples, self._next = self._way_back(self._samples[max(self._next - 1, 0)]), 0
+        self._samples, self._next = self._return_path(self._samples[max(self._next - 1, 0)]), 0
         return True
 
-    def _way_back(self, present: FloatArray) -> FloatArray:
+    def _return_path(self, present: FloatArray) -> FloatArray:
         """Return the voltages (V) from `present` to the rest voltages, shape (n, axes), all axes moving at once."""
-        ways = [
-            _Way(room, (now - room.low) / room.span, (voltage[0] - room.low) / room.span)
-            for room, now, voltage in zip(
-                self.drive.rooms.values(), present.tolist(), self.drive.voltage.values(), strict=True
+        moves = [
+            (spec, (now - spec.low) / spec.span, (voltage[0] - spec.low) / spec.span)
+            for spec, now, voltage in zip(
+                self.drive.specs.values(), present.tolist(), self.drive.voltage.values(), strict=True
             )
         ]
+        spans = [(spec, abs(end - start)) for spec, start, end in moves]
         # A margin for rounding to whole steps.
-        seconds = max(way.seconds for way in ways) + FEWEST_STEPS / self.drive.rate
-        return np.column_stack([way.voltages(seconds)[1:] for way in ways])
-
-
-class _Way(NamedTuple):
-    room: Room
-    present: float
-    rest: float
-
-    @property
-    def seconds(self) -> float:
-        span = abs(self.rest - self.present)
-        return max(span / PACE, self.room.quickest(span))
-
-    def voltages(self, seconds: float) -> FloatArray:
-        path = Path(self.present)
-        path.to(self.rest, seconds)
-        return path.voltages(replace(self.room, duration=seconds))
+        seconds = (
+            max(max(span / MEAN_SPEED, spec.quickest(span)) for spec, span in spans) + FEWEST_STEPS / self.drive.rate
+        )
+        columns = []
+        for spec, start, end in moves:
+            path = Path(start)
+            path.to(end, seconds)
+            columns.append(path.voltages(replace(spec, duration=seconds))[1:])
+        return np.column_stack(columns)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slpi_ros.errors import UsageError
-from slpi_ros.excitation.calibration import PACE
-from slpi_ros.excitation.legs import FEWEST_STEPS, STEEPEST, Path, Room
+from slpi_ros.excitation.calibration import MEAN_SPEED
+from slpi_ros.excitation.legs import FEWEST_STEPS, STEEPEST, DriveSpec, Path
 
 # Shares of the duration for the initial hold and for the full loop that wipes the memory.
 WIPED = 0.15
@@ -27,25 +27,25 @@ class EffectDrive:
     why : str
         One sentence: the motion, and why it separates the effect from others.
     draw : callable
-        Appends the legs of the drive to an empty path for a room; see `path`.
+        Appends the legs of the drive to an empty path for a spec; see `path`.
     least_axes : int
         Smallest number of axes.
     """
 
     effect: str
     why: str
-    draw: Callable[[Path, Room], None]
+    draw: Callable[[Path, DriveSpec], None]
     least_axes: int = 1
 
-    def path(self, room: Room) -> Path:
+    def path(self, spec: DriveSpec) -> Path:
         """Return the drive, starting and ending at the low end, with an initial full loop that sets a known memory."""
         path = Path()
-        full = max(WIPED * room.duration / 3, _brisk(1.0))
-        path.hold(WIPED * room.duration / 3)
+        full = max(WIPED * spec.duration / 3, _safe_duration(1.0))
+        path.hold(WIPED * spec.duration / 3)
         path.to(1.0, full)
         path.to(0.0, full)
-        self.draw(path, room)
-        path.to(0.0, max(path.at, 0.1) / PACE)
+        self.draw(path, spec)
+        path.to(0.0, max(path.at, 0.1) / MEAN_SPEED)
         return path
 
 
@@ -67,18 +67,18 @@ def for_effect(name: str) -> EffectDrive:
     return EFFECTS[name]
 
 
-def _brisk(span: float) -> float:
+def _safe_duration(span: float) -> float:
     """Return a duration (s), safe for any stage, of a move over a `span` of the range (share)."""
     return abs(span) * STEEPEST / FASTEST
 
 
-def _left(room: Room) -> float:
+def _remaining(spec: DriveSpec) -> float:
     """Return the time (s) that remains after the memory is wiped."""
-    return (1.0 - WIPED) * room.duration
+    return (1.0 - WIPED) * spec.duration
 
 
-def _go(path: Path, share: float) -> None:
-    path.to(share, max(abs(share - path.at), 0.05) / PACE)
+def _move(path: Path, share: float) -> None:
+    path.to(share, max(abs(share - path.at), 0.05) / MEAN_SPEED)
 
 
 def _loops(path: Path, low: float, high: float, seconds: float, count: int, *, straight: bool = False) -> None:
@@ -88,88 +88,88 @@ def _loops(path: Path, low: float, high: float, seconds: float, count: int, *, s
         path.to(low, seconds, straight=straight)
 
 
-def _tempos(slowest: float, quickest: float, count: int) -> list[float]:
+def _leg_durations(slowest: float, quickest: float, count: int) -> list[float]:
     """Return `count` geometrically spaced leg durations (s), the slowest first."""
     return [float(seconds) for seconds in np.geomspace(max(slowest, quickest), quickest, count)]
 
 
-def _at_tempos(path: Path, room: Room, low: float, high: float, *, straight: bool) -> None:
+def _at_speeds(path: Path, spec: DriveSpec, low: float, high: float, *, straight: bool) -> None:
     """Append one loop at increasing speeds, with about the same time and at least two repeats at each speed."""
     count = 6
-    each = _left(room) / count
+    each = _remaining(spec) / count
     span = high - low
-    quickest = max(room.quickest(span, straight), _brisk(span), 8 / room.rate)
-    _go(path, low)
-    for seconds in _tempos(each / 4, quickest, count):
+    quickest = max(spec.quickest(span, straight), _safe_duration(span), 8 / spec.rate)
+    _move(path, low)
+    for seconds in _leg_durations(each / 4, quickest, count):
         _loops(path, low, high, seconds, max(2, round(each / (2 * seconds))), straight=straight)
 
 
-def _delay(path: Path, room: Room) -> None:
-    _at_tempos(path, room, 0.35, 0.65, straight=True)
+def _delay(path: Path, spec: DriveSpec) -> None:
+    _at_speeds(path, spec, 0.35, 0.65, straight=True)
 
 
-def _lag(path: Path, room: Room) -> None:
-    _at_tempos(path, room, 0.45, 0.55, straight=False)
+def _lag(path: Path, spec: DriveSpec) -> None:
+    _at_speeds(path, spec, 0.45, 0.55, straight=False)
 
 
-def _rate_dependence(path: Path, room: Room) -> None:
+def _rate_dependence(path: Path, spec: DriveSpec) -> None:
     spans, doublings, loops = (0.6, 0.3, 0.15), 3, 2
     # Loops of one span take 2 (1 + 2 + 4) times the shortest leg.
-    quickest = _left(room) / (len(spans) * loops * 2 * (2**doublings - 1))
-    quickest = max(quickest, room.quickest(spans[0]), _brisk(spans[0]))
+    quickest = _remaining(spec) / (len(spans) * loops * 2 * (2**doublings - 1))
+    quickest = max(quickest, spec.quickest(spans[0]), _safe_duration(spans[0]))
     for span in spans:
-        _go(path, 0.5 - span / 2)
+        _move(path, 0.5 - span / 2)
         for doubling in range(doublings):
             _loops(path, 0.5 - span / 2, 0.5 + span / 2, quickest * 2**doubling, loops)
 
 
-def _saturation(path: Path, room: Room) -> None:
+def _saturation(path: Path, spec: DriveSpec) -> None:
     for near in (0.2, 0.1, 0.05, 0.0):
-        for seconds in (_left(room) / 12, _left(room) / 48):
+        for seconds in (_remaining(spec) / 12, _remaining(spec) / 48):
             for end in (1.0 - near, near):
-                path.to(end, max(seconds, _brisk(1.0)))
-                path.hold(0.01 * room.duration)
+                path.to(end, max(seconds, _safe_duration(1.0)))
+                path.hold(0.01 * spec.duration)
 
 
-def _creep(path: Path, room: Room) -> None:
+def _creep(path: Path, spec: DriveSpec) -> None:
     levels, shares = (0.8, 0.2, 0.6, 0.9, 0.4), (1, 2, 4, 8, 8)
     for level, share in zip(levels, shares, strict=True):
-        path.to(level, _brisk(level - path.at))
-        path.hold(_left(room) * share / sum(shares))
+        path.to(level, _safe_duration(level - path.at))
+        path.hold(_remaining(spec) * share / sum(shares))
 
 
-def _resonance(path: Path, room: Room) -> None:
+def _resonance(path: Path, spec: DriveSpec) -> None:
     step, levels, repeats = 0.1, (0.2, 0.5, 0.8), 3
-    ring = 0.5 * _left(room) / (len(levels) * (1 + 2 * repeats))
+    ring = 0.5 * _remaining(spec) / (len(levels) * (1 + 2 * repeats))
     for level in levels:
-        _go(path, level)
+        _move(path, level)
         path.hold(ring)
         for _ in range(repeats):
             for to in (level + step, level):
                 path.to(to, 0.0, straight=True)
                 path.hold(ring)
     # In the sweep each half-wave is one sample shorter than the previous one; two loops of each take 0.3 of the time.
-    _go(path, 0.5)
-    longest = int(math.sqrt(0.3 * _left(room) * room.rate / 2))
+    _move(path, 0.5)
+    longest = int(math.sqrt(0.3 * _remaining(spec) * spec.rate / 2))
     for steps in range(longest, FEWEST_STEPS - 1, -1):
-        _loops(path, 0.5 - step / 4, 0.5 + step / 4, steps / room.rate, 2)
+        _loops(path, 0.5 - step / 4, 0.5 + step / 4, steps / spec.rate, 2)
 
 
-def _cross_coupling(path: Path, room: Room) -> None:
+def _cross_coupling(path: Path, spec: DriveSpec) -> None:
     spans = ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0), (0.25, 0.75))
-    seconds = _left(room) / (len(spans) * 2 * (1 + 2))
+    seconds = _remaining(spec) / (len(spans) * 2 * (1 + 2))
     for low, high in spans:
-        _go(path, low)
+        _move(path, low)
         for each in (2 * seconds, seconds):
             _loops(path, low, high, each, 1)
             path.hold(seconds / 4)
 
 
-def _thermal_drift(path: Path, room: Room) -> None:
+def _thermal_drift(path: Path, spec: DriveSpec) -> None:
     # Motion takes 0.6 of each cycle.
-    shortest = 2 * max(room.quickest(1.0), _brisk(1.0)) / 0.6
-    repeats = min(max(int(_left(room) / shortest), 3), 8)
-    each = _left(room) / repeats
+    shortest = 2 * max(spec.quickest(1.0), _safe_duration(1.0)) / 0.6
+    repeats = min(max(int(_remaining(spec) / shortest), 3), 8)
+    each = _remaining(spec) / repeats
     for _ in range(repeats):
         path.to(1.0, 0.3 * each)
         path.hold(0.2 * each)
@@ -177,21 +177,21 @@ def _thermal_drift(path: Path, room: Room) -> None:
         path.hold(0.2 * each)
 
 
-def _gain_drift(path: Path, room: Room) -> None:
-    shortest = 2 * max(room.quickest(1.0), _brisk(1.0))
-    repeats = min(max(int(_left(room) / shortest), 3), 60)
-    _loops(path, 0.0, 1.0, _left(room) / (2 * repeats), repeats)
+def _gain_drift(path: Path, spec: DriveSpec) -> None:
+    shortest = 2 * max(spec.quickest(1.0), _safe_duration(1.0))
+    repeats = min(max(int(_remaining(spec) / shortest), 3), 60)
+    _loops(path, 0.0, 1.0, _remaining(spec) / (2 * repeats), repeats)
 
 
-def _sensor_periodic(path: Path, room: Room) -> None:
+def _sensor_periodic(path: Path, spec: DriveSpec) -> None:
     for share in (1 / 6, 1 / 3):
-        _loops(path, 0.0, 1.0, share * _left(room), 1, straight=True)
+        _loops(path, 0.0, 1.0, share * _remaining(spec), 1, straight=True)
 
 
-def _hum(path: Path, room: Room) -> None:
+def _hum(path: Path, spec: DriveSpec) -> None:
     for level in (0.1, 0.5, 0.9):
-        _go(path, level)
-        path.hold(_left(room) / 3)
+        _move(path, level)
+        path.hold(_remaining(spec) / 3)
 
 
 EFFECTS = {

@@ -40,7 +40,7 @@ class Leg:
 
 
 @dataclass(frozen=True)
-class Room:
+class DriveSpec:
     """Voltage limits, duration, sampling rate and slew limit of one axis.
 
     Parameters
@@ -133,29 +133,29 @@ class Path:
         """Append a hold of `seconds` at the current position."""
         self.to(self.at, seconds)
 
-    def wanted_steps(self, room: Room) -> FloatArray:
+    def wanted_steps(self, spec: DriveSpec) -> FloatArray:
         """Return the number of steps for the desired duration of each leg, shape (n,)."""
-        wanted = np.array([leg.seconds * room.rate for leg in self.legs])
-        return np.asarray(np.maximum(wanted, self.fewest_steps(room)), dtype=np.float64)
+        wanted = np.array([leg.seconds * spec.rate for leg in self.legs])
+        return np.asarray(np.maximum(wanted, self.fewest_steps(spec)), dtype=np.float64)
 
-    def fewest_steps(self, room: Room) -> NDArray[np.int64]:
+    def fewest_steps(self, spec: DriveSpec) -> NDArray[np.int64]:
         """Return the smallest number of steps of each leg, shape (n,)."""
         spans = np.diff(self._turns).tolist()
-        fewest = [room.fewest_steps(span, leg.straight) for span, leg in zip(spans, self.legs, strict=True)]
+        fewest = [spec.fewest_steps(span, leg.straight) for span, leg in zip(spans, self.legs, strict=True)]
         return np.array(fewest, dtype=np.int64)
 
-    def voltages(self, room: Room) -> FloatArray:
-        """Return the voltages along all legs, with the duration of the room.
+    def voltages(self, spec: DriveSpec) -> FloatArray:
+        """Return the voltages along all legs, with the duration of the drive.
 
         A difference to the desired durations is distributed over the legs in proportion to their duration.
 
         Parameters
         ----------
-        room : Room
+        spec : DriveSpec
 
         Returns
         -------
-        ndarray, shape (room.steps + 1,), volts
+        ndarray, shape (spec.steps + 1,), volts
             Voltages; every reversal coincides with a sample.
 
         Raises
@@ -163,21 +163,21 @@ class Path:
         UsageError
             If the duration is too short for the legs at this slew limit and rate.
         """
-        fewest = self.fewest_steps(room)
-        spare = room.steps - int(fewest.sum())
+        fewest = self.fewest_steps(spec)
+        spare = spec.steps - int(fewest.sum())
         if spare < 0:
             raise UsageError(
-                f"drive: {len(fewest)} moves and holds within {room.low:g} to {room.high:g} V take at least "
-                f"{fewest.sum() / room.rate:.4g} s at {_pace_of(room)}, not {room.duration:g} s; give more time"
+                f"drive: {len(fewest)} moves and holds within {spec.low:g} to {spec.high:g} V take at least "
+                f"{fewest.sum() / spec.rate:.4g} s at {_limits_of(spec)}, not {spec.duration:g} s; give more time"
             )
-        knots = np.concatenate([[0], np.cumsum(fewest) + _shared_out(spare, self.wanted_steps(room) - fewest)])
-        x = np.arange(room.steps + 1)
+        knots = np.concatenate([[0], np.cumsum(fewest) + _shared_out(spare, self.wanted_steps(spec) - fewest)])
+        x = np.arange(spec.steps + 1)
         leg = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, fewest.size - 1)
         phase = (x - knots[leg]) / np.diff(knots)[leg]
         straight = np.array([each.straight for each in self.legs])[leg]
         way = np.where(straight, phase, (1.0 - np.cos(np.pi * phase)) / 2.0)
         share = self._turns[leg] + np.diff(self._turns)[leg] * way
-        return np.asarray(np.clip(room.low + room.span * share, room.low, room.high), dtype=np.float64)
+        return np.asarray(np.clip(spec.low + spec.span * share, spec.low, spec.high), dtype=np.float64)
 
     @property
     def _turns(self) -> FloatArray:
@@ -191,5 +191,5 @@ def _shared_out(steps: int, weights: FloatArray) -> NDArray[np.int64]:
     return np.asarray(np.rint(steps * total / total[-1]), dtype=np.int64)
 
 
-def _pace_of(room: Room) -> str:
-    return f"{room.rate:g} Hz and {room.slew_limit:g} V/s" if room.slew_limit else f"{room.rate:g} Hz"
+def _limits_of(spec: DriveSpec) -> str:
+    return f"{spec.rate:g} Hz and {spec.slew_limit:g} V/s" if spec.slew_limit else f"{spec.rate:g} Hz"

@@ -180,6 +180,11 @@ class Rows:
         result: FloatArray = self.local @ x + self.pick @ (self.at_turns @ x)
         return result
 
+    def weight(self, parameters: FloatArray) -> FloatArray:
+        """Return by how much each row, shape (n,), depends on parameters of some weight, shape (p,)."""
+        result: FloatArray = abs(self.local) @ parameters + self.pick @ (abs(self.at_turns) @ parameters)
+        return result
+
     def project(self, signals: FloatArray) -> FloatArray:
         """Return ``A' J`` for `signals` J, shape (n,) or (n, k)."""
         result: FloatArray = self.local.T @ signals + self.at_turns.T @ (self.pick.T @ signals)

@@ -45,13 +45,19 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
             draft.unlink(missing_ok=True)
 
 
-def make_folder(path: str | os.PathLike[str]) -> None:
-    """Create a folder and its parents if missing, and check that it is writable.
+def make_folder(path: str | os.PathLike[str], *names: str) -> None:
+    """Create a folder and its parents if missing, and check that files can be written there.
+
+    Parameters
+    ----------
+    path : path-like
+    *names : str
+        Names of files that will be written into the folder.
 
     Raises
     ------
     SlpiError
-        If it cannot be made or written to.
+        If it cannot be made or written to, or holds a folder of one of these names.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
@@ -60,3 +66,6 @@ def make_folder(path: str | os.PathLike[str]) -> None:
         reason = str(error.strerror if isinstance(error, OSError) else error)
     if reason:
         raise SlpiError(f"{path}: no folder to write into: {reason}; choose another place") from None
+    for place in (Path(path) / name for name in names):
+        if place.is_dir():
+            raise SlpiError(f"{place}: cannot be written: a folder has that name; choose another place")

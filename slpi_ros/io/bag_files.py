@@ -194,7 +194,7 @@ class BagWatch:
     Attributes
     ----------
     abandoned : tuple of Path
-        Bags that were so at the last look, by name; they stay watched.
+        Abandoned bags at the last `poll`, by name; they stay watched.
 
     Raises
     ------
@@ -209,8 +209,8 @@ class BagWatch:
             raise UsageError(f"{folder}: no such folder to watch for bags; make it, or name another")
         self._seen = set(self._dated(_finished)[:-1])
 
-    def look(self) -> list[Path]:
-        """Return the bags completed since the last look, oldest first; a folder that has gone holds none."""
+    def poll(self) -> list[Path]:
+        """Return the bags completed since the last call, oldest first; none if the folder has gone."""
         new = [bag for bag in self._dated(_finished) if bag not in self._seen]
         self._seen.update(new)
         last = time.time_ns() - int(self.patience * 1e9)
@@ -224,7 +224,7 @@ class BagWatch:
             try:
                 when = date(path)
             except OSError:
-                # Vanished in between: another look will tell.
+                # Deleted in between.
                 continue
             if when is not None:
                 found.append((path, when))

@@ -8,7 +8,6 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -232,9 +231,9 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
     """
     columns, frame_id = _Columns(expected), ""
     for block in blocks:
-        part = _decode(block, msgtype)
-        columns.append(part.columns)
-        frame_id = frame_id or part.frame_id
+        frame, part = _decode(block, msgtype)
+        columns.append(part)
+        frame_id = frame_id or frame
     if not columns.count:
         return None
     arrays = columns.arrays()
@@ -253,15 +252,8 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
 
 # Columns are found by field and name; the times have no field.
 _Key = tuple[str, str]
+_Part = tuple[str, dict[_Key, NDArray[Any]]]
 _LOGGED, _STAMP = ("", "logged"), ("", "stamp")
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A block, decoded: columns of shape (n,)."""
-
-    frame_id: str
-    columns: Mapping[_Key, NDArray[Any]]
 
 
 class _Columns:
@@ -302,10 +294,10 @@ def _alike(block: MessageBlock, first: Message, rows: NDArray[np.void]) -> _Part
     stamp = np.zeros(rows.size, np.int64)
     if "sec" in first.layout.fields:
         stamp = rows["sec"].astype(np.int64) * SECOND_NS + rows["nanosec"]
-    columns = {_LOGGED: block.logged, _STAMP: stamp}
+    columns: dict[_Key, NDArray[Any]] = {_LOGGED: block.logged, _STAMP: stamp}
     for field in first.values:
         columns |= {(field, name): rows[field][:, place] for place, name in enumerate(first.names)}
-    return _Part(first.frame_id, columns)
+    return first.frame_id, columns
 
 
 def _each(block: MessageBlock, msgtype: str, messages: Sequence[Message]) -> _Part:
@@ -319,4 +311,4 @@ def _each(block: MessageBlock, msgtype: str, messages: Sequence[Message]) -> _Pa
             # zip ends with the shorter one: what is behind the end of an array has no value
             for name, number in zip(message.names, numbers, strict=False):
                 columns[field, name][row] = number
-    return _Part(next((message.frame_id for message in messages if message.frame_id), ""), columns)
+    return next((message.frame_id for message in messages if message.frame_id), ""), columns

@@ -6,7 +6,6 @@ No rosbags exception leaves this module.
 import os
 import shutil
 import sqlite3
-from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -14,13 +13,12 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_files import absolute_name, one_line, partial_path
-from slpi_ros.io.messages import JOINT_STATE, JointStateBlock, encode_joint_states
+from slpi_ros.io.messages import JOINT_STATE, encode_joint_states
 from slpi_ros.io.record import Record
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -42,10 +40,8 @@ class BagWriter:
     storage : {"mcap", "sqlite3"}
         File format.
     topic : str, optional
-        Topic of type ``sensor_msgs/JointState`` that ``write`` and ``write_raw`` go to; None to announce
+        Topic of type ``sensor_msgs/JointState`` that ``write`` goes to; None to announce
         all topics by ``add_topic``.
-    hardware_id : str
-        The stage, for messages made by ``write``.
 
     Attributes
     ----------
@@ -70,14 +66,12 @@ class BagWriter:
         *,
         storage: str = "mcap",
         topic: str | None = "/stage_state",
-        hardware_id: str = "",
     ) -> None:
         if storage not in STORAGES:
             raise UsageError(f"no bag storage '{storage}'; choose {' or '.join(STORAGES)}")
         self.path = Path(path).absolute()
         self.partial = partial_path(self.path)
         self.message_count = 0
-        self._hardware_id = hardware_id
         self._topic = topic
         self._connections: dict[str, Any] = {}
         if os.path.lexists(self.path):
@@ -121,29 +115,7 @@ class BagWriter:
         except _WRITE_ERRORS as error:
             raise self._failure(error) from error
 
-    def write(self, stamp_ns: int, names: Sequence[str], displacement: ArrayLike, voltage: ArrayLike) -> None:
-        """Write one sample of all axes.
-
-        Parameters
-        ----------
-        stamp_ns : int, nanoseconds
-            Stamp of the header and time of the log.
-        names : sequence of str, length K
-            Axes.
-        displacement : array_like, shape (K,), metres
-            Measured displacement.
-        voltage : array_like, shape (K,), volts
-            Applied voltage.
-        """
-        row = (1, len(names))
-        block = JointStateBlock(
-            np.array([stamp_ns], np.int64),
-            np.asarray(displacement, float).reshape(row),
-            np.asarray(voltage, float).reshape(row),
-        )
-        self.write_raw(stamp_ns, encode_joint_states(block, tuple(names), self._hardware_id)[0])
-
-    def write_raw(self, stamp_ns: int, message: bytes, topic: str | None = None) -> None:
+    def write(self, stamp_ns: int, message: bytes, topic: str | None = None) -> None:
         """Write a message that is serialised already.
 
         Parameters
@@ -232,13 +204,12 @@ def write_bag(
     """
     displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
     voltage = np.column_stack([record.voltage[axis] for axis in record.axes])
-    block = JointStateBlock(record.time_ns, displacement, voltage)
-    messages = encode_joint_states(block, record.axes, record.hardware_id)
+    messages = encode_joint_states(record.time_ns, displacement, voltage, record.axes, record.hardware_id)
     # readers sort by log time: where stamps run backwards, the order of the record must survive
     logged = np.maximum.accumulate(record.time_ns)
     with BagWriter(path, storage=storage, topic=topic) as bag:
         for stamp, message in zip(logged.tolist(), messages, strict=True):
-            bag.write_raw(stamp, message)
+            bag.write(stamp, message)
 
 
 @cache

@@ -56,7 +56,7 @@ class CdrLayout:
             A view of `rows`.
         """
         size = self.template.size
-        if rows.shape[1] < size or not ((rows[:, :size] == self.template) | ~self.fixed).all():
+        if rows.shape[1] < size or not (rows[:, :size][:, self.fixed] == self.template[self.fixed]).all():
             return None
         return rows.view(self.dtype(rows.shape[1]))[:, 0]
 
@@ -106,12 +106,13 @@ class CdrReader:
         """Return what unpacks all that has been read: the encapsulation's kind, then every value in order."""
         return struct.Struct("".join(self._format))
 
-    def layout(self) -> CdrLayout:
-        """Return the layout of what has been read; values without a name are fixed."""
+    def layout(self, start: int = 0) -> CdrLayout:
+        """Return the layout of what has been read from offset `start` on; values without a name are fixed."""
         fixed = np.zeros(self.at, bool)
         for begin, end in self._fixed:
             fixed[begin:end] = True
-        return CdrLayout(np.frombuffer(self.data, np.uint8, self.at), fixed, dict(self._fields))
+        fields = {name: (kind, offset - start) for name, (kind, offset) in self._fields.items() if offset >= start}
+        return CdrLayout(np.frombuffer(self.data, np.uint8, self.at - start, start), fixed[start:], fields)
 
     def integer(self, kind: str = "I", name: str = "") -> int:
         """Read an integer of 32 bits, signed (``i``) or not (``I``)."""

@@ -56,23 +56,8 @@ class Quantity:
 
 
 _COMMON = frozenset({"%", "percent", "pct", "count", "counts", "lsb", "bit", "bits", "deg", "ma", "hz", "khz", "a.u."})
-_LENGTHS = {
-    "in",
-    "inch",
-    "inches",
-    "mil",
-    "mils",
-    "ft",
-    "cm",
-    "dm",
-    "km",
-    "å",
-    "angstrom",
-    "rad",
-    "mrad",
-    "urad",
-    "µrad",
-}
+_LENGTHS = {"in", "inch", "inches", "mil", "mils", "ft", "cm", "dm", "km", "å", "angstrom"}
+_ANGLES = {"rad", "mrad", "urad", "µrad"}
 
 TIME = Quantity(
     "time",
@@ -87,7 +72,7 @@ DISPLACEMENT = Quantity(
     "um",
     {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12},
     ("displacement", "position"),
-    _COMMON | _LENGTHS,
+    _COMMON | _LENGTHS | _ANGLES,
 )
 QUANTITIES = (TIME, VOLTAGE, DISPLACEMENT)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError
-from slpi_ros.io.cdr import ENCAPSULATION, CdrLayout, CdrReader, serialise
+from slpi_ros.io.cdr import CdrLayout, CdrReader, serialise
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 SECOND_NS = 1_000_000_000
@@ -121,32 +121,22 @@ def read_message(data: bytes, msgtype: str) -> Message:
     return Message(stamp_ns, frame_id, names, {field: reader.array(field) for field in kind.fields}, reader.layout())
 
 
-@dataclass(frozen=True)
-class JointStateBlock:
-    """Many JointStates of the same joints.
+def encode_joint_states(
+    stamp_ns: NDArray[np.int64],
+    position: NDArray[np.float64],
+    effort: NDArray[np.float64],
+    names: tuple[str, ...],
+    frame_id: str = "",
+) -> list[bytes]:
+    """Return one serialised message for each stamp.
 
     Parameters
     ----------
     stamp_ns : ndarray of int64, shape (N,), nanoseconds
         Header stamps.
     position : ndarray, shape (N, K), metres
-        One column for each joint.
     effort : ndarray, shape (N, K), volts
-        One column for each joint; the stage's drivers put the applied voltage here.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    position: NDArray[np.float64]
-    effort: NDArray[np.float64]
-
-
-def encode_joint_states(block: JointStateBlock, names: tuple[str, ...], frame_id: str = "") -> list[bytes]:
-    """Return one serialised message for each stamp.
-
-    Parameters
-    ----------
-    block : JointStateBlock
-        Stamps, positions and efforts.
+        The stage's drivers put the applied voltage here.
     names : tuple of str, length K
         Joint names.
     frame_id : str
@@ -159,18 +149,18 @@ def encode_joint_states(block: JointStateBlock, names: tuple[str, ...], frame_id
     """
     if not names:
         raise RecordError("a stage_state message needs at least one axis name")
-    unfit = (block.stamp_ns < 0) | (block.stamp_ns >= _STAMP_END)
+    unfit = (stamp_ns < 0) | (stamp_ns >= _STAMP_END)
     if unfit.any():
         raise RecordError(
-            f"sample {int(unfit.argmax())}: time {block.stamp_ns[unfit][0] / SECOND_NS:g} s does not "
+            f"sample {int(unfit.argmax())}: time {stamp_ns[unfit][0] / SECOND_NS:g} s does not "
             "fit into a message stamp (0 to 2^31 s); shift the time axis"
         )
     zeros = (0.0,) * len(names)
     template = serialise(0, 0, frame_id, len(names), *names, zeros, (), zeros)
-    data = np.tile(np.frombuffer(template, np.uint8), block.stamp_ns.size)
+    data = np.tile(np.frombuffer(template, np.uint8), stamp_ns.size)
     fields = data.view(read_message(template, JOINT_STATE).layout.dtype(len(template)))
-    fields["sec"], fields["nanosec"] = np.divmod(block.stamp_ns, SECOND_NS)
-    fields["position"], fields["effort"] = block.position, block.effort
+    fields["sec"], fields["nanosec"] = np.divmod(stamp_ns, SECOND_NS)
+    fields["position"], fields["effort"] = position, effort
     stream = data.tobytes()
     return [stream[start : start + len(template)] for start in range(0, len(stream), len(template))]
 
@@ -219,8 +209,6 @@ class JointStates:
         return values
 
 
-# positions, velocities, accelerations, effort
-SEQUENCES = 4
 # Bytes of a point without any numbers.
 SMALLEST_POINT = 24
 
@@ -247,30 +235,6 @@ class TrajectoryArrays:
     positions: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class _PointLayout:
-    """Offsets within a point, bytes from where it begins."""
-
-    counts: tuple[int, ...]
-    count_offsets: tuple[int, ...]
-    positions: int
-    time: int
-    size: int
-
-    @classmethod
-    def read(cls, reader: CdrReader) -> "_PointLayout":
-        begin, counts, offsets, places = reader.at, [], [], []
-        for _ in range(SEQUENCES):
-            offsets.append(reader.at + -(reader.at - ENCAPSULATION) % 4 - begin)
-            count, place = reader.doubles()
-            counts.append(count)
-            places.append(place - begin)
-        reader.integer("i")
-        time = reader.at - 4 - begin
-        reader.integer()
-        return cls(tuple(counts), tuple(offsets), places[0], time, reader.at - begin)
-
-
 def decode_trajectory(data: bytes) -> TrajectoryArrays | None:
     """Decode a serialised JointTrajectory; return None if its points differ in layout or the message is invalid.
 
@@ -291,47 +255,23 @@ def _decode(data: bytes) -> TrajectoryArrays | None:
     if points * SMALLEST_POINT > len(data):
         return None
     times, positions = np.empty(points, np.int64), np.empty((points, len(names)), order="F")
-    # The first point alone may begin at another remainder of eight bytes than those behind it.
     done = 0
     while done < points:
-        begin, layout = reader.at, _PointLayout.read(reader)
-        if layout.counts[0] != len(names):
+        begin = reader.at
+        if reader.doubles("positions")[0] != len(names):
             return None
+        for field in ("velocities", "accelerations", "effort"):
+            reader.doubles(field)
+        reader.integer("i", "sec")
+        reader.integer("I", "nanosec")
+        size = reader.at - begin
+        # The first point alone may begin at another remainder of eight bytes than those behind it.
         alike = 1 if done == 0 else points - done
-        if begin + alike * layout.size > len(data):
+        block = np.frombuffer(data, np.uint8, alike * size, begin).reshape(alike, size)
+        rows = reader.layout(begin).decode(block)
+        if rows is None:
             return None
-        block = _Points(data, reader.order, begin, alike, layout)
-        if not block.is_alike():
-            return None
-        times[done : done + alike] = block.times()
-        positions[done : done + alike] = block.positions()
+        times[done : done + alike] = rows["sec"].astype(np.int64) * SECOND_NS + rows["nanosec"]
+        positions[done : done + alike] = rows["positions"]
         done += alike
     return TrajectoryArrays(start_ns, names, times, positions)
-
-
-@dataclass(frozen=True)
-class _Points:
-    """Adjacent points of one layout."""
-
-    data: bytes
-    order: str
-    begin: int
-    points: int
-    layout: _PointLayout
-
-    def column(self, kind: str, offset: int, width: int = 1) -> NDArray[Any]:
-        dtype = np.dtype(self.order + kind)
-        shape, strides = (self.points, width), (self.layout.size, dtype.itemsize)
-        return np.ndarray(shape, dtype, self.data, self.begin + offset, strides)
-
-    def is_alike(self) -> bool:
-        pairs = zip(self.layout.counts, self.layout.count_offsets, strict=True)
-        return all(bool((self.column("u4", offset) == count).all()) for count, offset in pairs)
-
-    def times(self) -> NDArray[np.int64]:
-        seconds = self.column("i4", self.layout.time)[:, 0].astype(np.int64)
-        nanoseconds = self.column("u4", self.layout.time + 4)[:, 0].astype(np.int64)
-        return seconds * SECOND_NS + nanoseconds
-
-    def positions(self) -> NDArray[Any]:
-        return self.column("f8", self.layout.positions, self.layout.counts[0])

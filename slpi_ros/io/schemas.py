@@ -2,7 +2,7 @@
 
 import json
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -66,6 +66,20 @@ def validate(document: object, name: str, source: str) -> None:
         place = textwrap.shorten(error.json_path.replace("\\n", " "), width=200, placeholder=" ...")
         reason = textwrap.shorten(error.message, width=200, placeholder=" ...")
         raise ModelError(f"{source}: not a valid {name} document: at {place}: {reason}; write it anew")
+
+
+def format_document(document: Mapping[str, Any], name: str) -> str:
+    """Return the JSON text of a new document of the kind `name`.
+
+    Raises
+    ------
+    ModelError
+        If the document does not follow its schema.
+    ValueError
+        If a value is not finite.
+    """
+    validate(document, name, f"the new {name}")
+    return json.dumps(document, allow_nan=False, indent=1)
 
 
 @cache

@@ -244,11 +244,10 @@ def make_executor(kind: str) -> Executor:
     if kind not in ("events", "default"):
         raise UsageError(f"no executor '{kind}'; choose events or default")
     if kind == "events":
-        try:
+        with suppress(ImportError):
             from rclpy.experimental.events_executor import EventsExecutor
-        except ImportError:
-            return SingleThreadedExecutor()
-        return EventsExecutor()
+
+            return EventsExecutor()
     return SingleThreadedExecutor()
 
 
@@ -286,8 +285,12 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
 
 
 def _live(make_node: Callable[[], Node], kind: str) -> None:
-    """Create, spin and destroy the node; raise the error that stopped it."""
-    node = _start(make_node)
+    """Create, spin and destroy the node; raise the error that stopped it, a UsageError for what ROS refuses."""
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        node = make_node()
+    except _START_ERRORS as error:
+        raise UsageError(f"the node cannot start: {' '.join(str(error).split())}") from error
     try:
         executor = make_executor(getattr(node, "executor_kind", kind))
         executor.add_node(node)
@@ -307,15 +310,6 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
             request_stop(error)
     if _stop.failure is not None:
         raise _stop.failure
-
-
-def _start(make_node: Callable[[], Node]) -> Node:
-    """Create the node; an argument or parameter refused by ROS becomes a UsageError."""
-    try:
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        return make_node()
-    except _START_ERRORS as error:
-        raise UsageError(f"the node cannot start: {' '.join(str(error).split())}") from error
 
 
 @contextmanager

@@ -446,7 +446,7 @@ class Compensator(LifecycleNode):
         unsure = [axis for axis in controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
         if controller.model is None or controller.mode is not Mode.STREAMING or not unsure:
             return
-        if self._settings.reset.on_start:
+        if self._settings.values["reset_on_start"]:
             self._start_reset()
             return
         said = "; ".join(f"axis '{axis.name}' {self._assumed(axis)}" for axis in unsure)
@@ -468,9 +468,9 @@ class Compensator(LifecycleNode):
         return text
 
     def _start_reset(self) -> None:
-        reset, controller = self._settings.reset, self._controller
-        finals = self._settings.safety.voltages if reset.to_safe else list(controller.voltages)
-        controller.reset_memory(reset.cycles, reset.rate, finals, time.monotonic_ns())
+        values, controller = self._settings.values, self._controller
+        finals = values["safe_voltage"] if values["reset_to"] == "safe" else list(controller.voltages)
+        controller.reset_memory(values["reset_cycles"], values["reset_rate"], finals, time.monotonic_ns())
         self._schedule()
         self._report()
 
@@ -480,7 +480,7 @@ class Compensator(LifecycleNode):
         if not controller.active or controller.model is None:
             return "not reset: a model is required, and the node must be active"
         if controller.mode is Mode.TRAJECTORY:
-            return f"not reset: {controller.doing(time.monotonic_ns())}; wait, or cancel it with an empty one"
+            return f"not reset: {controller.activity(time.monotonic_ns())}; wait, or cancel it with an empty one"
         if controller.mode is not Mode.RESETTING:
             self._start_reset()
         return ""

@@ -56,7 +56,7 @@ class Reporter:
     def report(self, settings: CompensatorSettings) -> None:
         """Publish the diagnostics."""
         model = self._controller.model
-        values = self._counters() | self._pace() | self._model_values(model)
+        values = self._counters() | self._timing_values() | self._model_values(model)
         if model:
             for axis in self._controller.axes:
                 values |= _axis_values(axis)
@@ -82,12 +82,12 @@ class Reporter:
         controller = self._controller
         if not controller.active or self.finalized:
             return self._state
-        doing = controller.doing(time.monotonic_ns())
+        activity = controller.activity(time.monotonic_ns())
         if controller.mode is Mode.RESETTING:
-            return doing
+            return activity
         axes = controller.axes
         doubts = [f" (axis '{axis.name}': {axis.confidence.doubt})" for axis in axes if axis.confidence.doubt]
-        return f"{doing}; memory {self._memory()}{''.join(doubts)}"
+        return f"{activity}; memory {self._memory()}{''.join(doubts)}"
 
     def _memory(self) -> str:
         return ", ".join(dict.fromkeys(axis.confidence.state for axis in self._controller.axes))
@@ -97,11 +97,11 @@ class Reporter:
         controller, watchdog = self._controller, self._controller.watchdog
         if not watchdog.expired or controller.mode not in (Mode.STREAMING, Mode.RAMPING):
             return ""
-        does = "are held"
+        reaction = "are held"
         if watchdog.safe_voltages:
-            does = "go to the safe ones" if controller.mode is Mode.RAMPING else "are the safe ones"
+            reaction = "go to the safe ones" if controller.mode is Mode.RAMPING else "are the safe ones"
         yet = "" if watchdog.commanded else " yet"
-        return f"no command{yet} for {watchdog.silence(time.monotonic_ns()):.3g} s; voltages {does}"
+        return f"no command{yet} for {watchdog.silence(time.monotonic_ns()):.3g} s; voltages {reaction}"
 
     def _counters(self) -> dict[str, object]:
         counts = self._controller.counts
@@ -128,7 +128,7 @@ class Reporter:
             "memory": self._memory(),
         }
 
-    def _pace(self) -> dict[str, object]:
+    def _timing_values(self) -> dict[str, object]:
         elapsed = max(time.perf_counter() - self._window_start, 1e-3)
         timing = self.timing.report()
         p50, p99, longest = _microseconds(timing)

@@ -11,7 +11,7 @@ from slpi_ros.compensator.validation import TimestampRules
 from slpi_ros.errors import UsageError
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.parameters import Declaration, Values
+from slpi_ros.nodes.parameters import Declaration, Values, validated
 
 VOLTAGE = (-10_000.0, 10_000.0)
 RATE = (0.0, 1e9)
@@ -142,26 +142,6 @@ DECLARATIONS = (
 
 
 @dataclass(frozen=True)
-class ResetSettings:
-    """Settings of the reset of the hysteresis memory.
-
-    Parameters
-    ----------
-    cycles : int
-    rate : float, V/s
-    to_safe : bool
-        Whether the reset ends at the safe voltages; if False, at the voltages before the reset.
-    on_start : bool
-        Whether the memory is reset after each activation.
-    """
-
-    cycles: int
-    rate: float
-    to_safe: bool
-    on_start: bool
-
-
-@dataclass(frozen=True)
 class CompensatorSettings:
     """Validated settings of the compensator.
 
@@ -173,7 +153,6 @@ class CompensatorSettings:
         One for each axis.
     time : TimestampRules
     safety : Safety
-    reset : ResetSettings
     loops : tuple of LoopSettings
         One for each axis.
     """
@@ -182,7 +161,6 @@ class CompensatorSettings:
     limits: tuple[Limits, ...]
     time: TimestampRules
     safety: Safety
-    reset: ResetSettings
     loops: tuple[LoopSettings, ...]
 
     @classmethod
@@ -194,10 +172,7 @@ class CompensatorSettings:
         UsageError
             If a value, or a combination of values, is not valid.
         """
-        axes = given["axes"]
-        if not axes or not all(axes) or len(set(axes)) != len(axes):
-            raise UsageError(f"parameter axes is {list(axes)!r}; name at least one axis, and each once")
-        values = {entry.name: entry.read(given, axes) for entry in DECLARATIONS}
+        axes, values = given["axes"], validated(DECLARATIONS, given)
         if values["desired_type"] == "Float64" and len(axes) > 1:
             raise UsageError(
                 f"desired_type Float64 holds one value, but axes are {', '.join(axes)}; "
@@ -216,9 +191,6 @@ class CompensatorSettings:
                 values["safe_voltage"],
                 values["ramp_rate"],
             ),
-            ResetSettings(
-                values["reset_cycles"], values["reset_rate"], values["reset_to"] == "safe", values["reset_on_start"]
-            ),
             tuple(LoopSettings(values["feedback"], PidGains(*each), timeout) for each in gains),
         )
         settings._require_safe_voltages()
@@ -226,7 +198,7 @@ class CompensatorSettings:
 
     def _require_safe_voltages(self) -> None:
         safety = self.safety
-        if not (safety.ramps_on_timeout or safety.ramps_on_deactivate or self.reset.to_safe):
+        if not (safety.ramps_on_timeout or safety.ramps_on_deactivate or self.values["reset_to"] == "safe"):
             return
         for name, limits, voltage in zip(self.values["axes"], self.limits, safety.voltages, strict=True):
             if not limits.lower <= voltage <= limits.upper:

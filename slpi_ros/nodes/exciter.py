@@ -21,18 +21,13 @@ from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, Drive, Playback, excite
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes.common import COMMANDS, LATCHED, request_stop, run
-from slpi_ros.nodes.parameters import Declaration, Parameters, Values, choice, number, numbers, whole
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 
 # A read-back voltage outside the limits by at most this share of the range counts as at the limit.
 READ_BACK = 0.01
 
 VOLTAGE = (-10_000.0, 10_000.0)
-SLEW = (0.0, 1e9)
-DURATION = (0.1, 86_400.0)
-RATE = (1.0, 10_000.0)
-SETTLE = (0.0, 3600.0)
-SEED = (0, 2**31 - 1)
-LIVE, TRAJECTORY = OUTPUTS = ("live", "trajectory")
+LIVE = "live"
 
 DECLARATIONS = (
     Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
@@ -46,7 +41,7 @@ DECLARATIONS = (
     ),
     Declaration(
         "slew_limit", 0.0, "Maximum rate of a voltage, V/s; 0: no limit. One value, or one for each axis.",
-        between=SLEW, number=True,
+        between=(0.0, 1e9), number=True, each_axis=True,
     ),
     Declaration(
         "start_voltage", math.nan,
@@ -54,20 +49,20 @@ DECLARATIONS = (
         "report. One value, or one for each axis.",
         number=True,
     ),
-    Declaration("duration", 30.0, "Total excitation time of all axes, seconds.", between=DURATION, number=True),
-    Declaration("rate", 200.0, "Sample rate, hertz.", between=RATE, number=True),
+    Declaration("duration", 30.0, "Total excitation time of all axes, seconds.", between=(0.1, 86_400.0), number=True),
+    Declaration("rate", 200.0, "Sample rate, hertz.", between=(1.0, 10_000.0), number=True),
     Declaration(
         "settle", 3.0, "Seconds to wait for further subscribers after the first one.",
-        between=SETTLE, number=True,
+        between=(0.0, 3600.0), number=True,
     ),
-    Declaration("drive", DRIVES[0], f"Excitation drive: {', '.join(DRIVES)}."),
-    Declaration("seed", 0, "Seed of the random parts of the excitation drive.", between=SEED),
+    Declaration("drive", DRIVES[0], f"Excitation drive: {', '.join(DRIVES)}.", choices=DRIVES),
+    Declaration("seed", 0, "Seed of the random parts of the excitation drive.", between=(0, 2**31 - 1)),
     Declaration("repeat", False, "Whether to repeat the excitation until stopped."),
     Declaration(
         "output", LIVE,
         "live: samples on voltage_command at the sample rate. trajectory: all samples in one message on "
         "voltage_trajectory, for a device with its own timing.",
-        read_only=True,
+        read_only=True, choices=(LIVE, "trajectory"),
     ),
     Declaration(
         "autostart", True, "Whether to start at once and exit at the end; if false, ~/start starts.", read_only=True
@@ -77,41 +72,24 @@ DECLARATIONS = (
 
 @dataclass(frozen=True)
 class ExciterSettings:
-    """Validated settings of the exciter; voltages in volts, in the order of `axes`.
+    """Validated settings of the exciter.
 
     Parameters
     ----------
-    axes : tuple of str
-    limits : (list of float, list of float)
-        Lowest and highest voltages.
-    slew_limit : list of float, V/s
-    start : list of float or None
-        Voltage before and after the excitation; None: as reported by ``stage_state``.
-    duration : float, seconds
-    rate : float, hertz
-    settle : float, seconds
-    drive : str
-    seed : int
-    repeat : bool
-    output : str
-    autostart : bool
+    values : mapping of str to object
+        All parameters by name.
+    limits : (list of float, list of float), volts
+        Lowest and highest voltage of each axis.
+    start : list of float or None, volts
+        Voltage of each axis before and after the excitation; None: as reported by ``stage_state``.
     """
 
-    axes: tuple[str, ...]
+    values: Values
     limits: tuple[list[float], list[float]]
-    slew_limit: list[float]
     start: list[float] | None
-    duration: float
-    rate: float
-    settle: float
-    drive: str
-    seed: int
-    repeat: bool
-    output: str
-    autostart: bool
 
     @classmethod
-    def of(cls, values: Values) -> "ExciterSettings":
+    def of(cls, given: Values) -> "ExciterSettings":
         """Return the settings for all parameters by name.
 
         Raises
@@ -119,24 +97,13 @@ class ExciterSettings:
         UsageError
             If a value is not valid, or no excitation drive exists for the values.
         """
-        axes = tuple(values["axes"])
-        start = values["start_voltage"]
-        settings = cls(
-            axes=axes,
-            limits=(numbers(values, "voltage_min", axes, *VOLTAGE), numbers(values, "voltage_max", axes, *VOLTAGE)),
-            slew_limit=numbers(values, "slew_limit", axes, *SLEW),
-            start=None if start != start else numbers(values, "start_voltage", axes, *VOLTAGE),
-            duration=number(values, "duration", *DURATION),
-            rate=number(values, "rate", *RATE),
-            settle=number(values, "settle", *SETTLE),
-            drive=choice(values, "drive", DRIVES),
-            seed=whole(values, "seed", *SEED),
-            repeat=values["repeat"],
-            output=choice(values, "output", OUTPUTS),
-            autostart=values["autostart"],
-        )
-        if settings.repeat and settings.output != LIVE:
-            raise UsageError(f"parameters repeat and output '{settings.output}' do not go together; set one of them")
+        values, axes = validated(DECLARATIONS, given), given["axes"]
+        low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
+        start = given["start_voltage"]
+        start = None if start != start else numbers(given, "start_voltage", axes, *VOLTAGE)
+        if values["repeat"] and values["output"] != LIVE:
+            raise UsageError(f"parameters repeat and output '{values['output']}' do not go together; set one of them")
+        settings = cls(values, (low, high), start)
         settings.drawn(None)
         return settings
 
@@ -151,20 +118,12 @@ class ExciterSettings:
             If a reported voltage is outside the limits.
         """
         start = self._within_limits(heard) if self.start is None and heard else self.start
-        return excite(
-            self.axes,
-            voltage_min=self.limits[0],
-            voltage_max=self.limits[1],
-            slew_limit=self.slew_limit,
-            start=start,
-            duration=self.duration,
-            rate=self.rate,
-            seed=self.seed,
-            drive=self.drive,
-        )
+        low, high = self.limits
+        given = {name: self.values[name] for name in ("axes", "slew_limit", "duration", "rate", "seed", "drive")}
+        return excite(voltage_min=low, voltage_max=high, start=start, **given)
 
     def _within_limits(self, heard: Sequence[float]) -> list[float]:
-        for axis, v, low, high in zip(self.axes, heard, *self.limits, strict=True):
+        for axis, v, low, high in zip(self.values["axes"], heard, *self.limits, strict=True):
             slack = READ_BACK * (high - low)
             if not low - slack <= v <= high + slack:
                 raise SlpiError(
@@ -203,7 +162,7 @@ class Exciter(Node):
         self._playback: Playback | None = None
         self._timer = None
         self._heard: list[float] | None = None
-        self._live = self._settings.output == LIVE
+        self._live = self._values["output"] == LIVE
         if self._live:
             self._publisher = self.create_publisher(Float64MultiArray, "voltage_command", COMMANDS)
         else:
@@ -214,24 +173,24 @@ class Exciter(Node):
         # A simulated clock may stop.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._polls_left = self._listeners = 0
-        self._waiting = self.create_timer(POLL_PERIOD, self._look, clock=self._steady, autostart=False)
-        if self._settings.autostart:
+        self._waiting = self.create_timer(POLL_PERIOD, self._poll_subscribers, clock=self._steady, autostart=False)
+        if self._values["autostart"]:
             self._wait()
 
     def destroy_node(self) -> None:
         """Return the axes to their initial voltage, then destroy the node."""
         if self.context.ok():
             if self._playback:
-                self._turn_back(self._playback)
+                self._return(self._playback)
                 while not self._playback.done:
-                    self._give(self._playback.next())
+                    self._publish_sample(self._playback.next())
                     time.sleep(1.0 / self._playback.drive.rate)
             self._publisher.wait_for_all_acked(PATIENCE)
         super().destroy_node()
 
     @property
-    def _settings(self) -> ExciterSettings:
-        return self._parameter_set.settings
+    def _values(self) -> Values:
+        return self._parameter_set.settings.values
 
     # Before the excitation
 
@@ -241,7 +200,7 @@ class Exciter(Node):
         else:
             self._wait()
             response.success = True
-            response.message = f"drive '{self._settings.drive}' of {self._settings.duration:g} s"
+            response.message = f"drive '{self._values['drive']}' of {self._values['duration']:g} s"
         return response
 
     def _wait(self) -> None:
@@ -249,7 +208,7 @@ class Exciter(Node):
         self._polls_left = 1
         self._waiting.reset()
 
-    def _look(self) -> None:
+    def _poll_subscribers(self) -> None:
         """Start once no subscriber has joined for the settling time, so that no subscriber misses the first samples."""
         listeners = self._publisher.get_subscription_count()
         if not listeners:
@@ -257,7 +216,7 @@ class Exciter(Node):
                 f"waiting for a subscriber of {self._publisher.topic_name}", throttle_duration_sec=LOG_PERIOD
             )
         elif listeners != self._listeners:
-            self._polls_left = 1 + round(self._settings.settle / POLL_PERIOD)
+            self._polls_left = 1 + round(self._values["settle"] / POLL_PERIOD)
         else:
             self._polls_left -= 1
         self._listeners = listeners
@@ -267,39 +226,39 @@ class Exciter(Node):
 
     def _on_state(self, state: JointState) -> None:
         at = dict(zip(state.name, state.effort, strict=False))
-        heard = [at.get(axis, math.nan) for axis in self._settings.axes]
+        heard = [at.get(axis, math.nan) for axis in self._values["axes"]]
         if all(map(math.isfinite, heard)):
             self._heard = heard
 
     # Excitation
 
     def _begin(self) -> None:
-        settings = self._settings
+        values = self._values
         try:
-            drive = settings.drawn(self._heard)
+            drive = self._parameter_set.settings.drawn(self._heard)
         except SlpiError as error:
             self.get_logger().error(str(error))
-            if settings.autostart:
+            if values["autostart"]:
                 request_stop(error)
             return
-        self._playback, self._begun = Playback(drive, repeat=settings.repeat), time.monotonic()
+        self._playback, self._begun = Playback(drive, repeat=values["repeat"]), time.monotonic()
         self._timer = self.create_timer(1.0 / drive.rate, self._step, clock=self._steady)
-        self._hand_over(self._playback)
+        self._publish_trajectory(self._playback)
         if self.count_publishers(self._publisher.topic_name) > 1:
             self.get_logger().warning(f"{self._publisher.topic_name} has other publishers; stop them and repeat")
-        self.get_logger().info(f"exciting {', '.join(drive.axes)} for {settings.duration:g} s. {drive.why}")
+        self.get_logger().info(f"exciting {', '.join(drive.axes)} for {values['duration']:g} s. {drive.why}")
 
     def _step(self) -> None:
         if self._playback:
-            self._give(self._playback.next())
+            self._publish_sample(self._playback.next())
             if self._playback.done:
                 self._end(self._playback)
 
-    def _give(self, voltages: list[float]) -> None:
+    def _publish_sample(self, voltages: list[float]) -> None:
         if self._live:
             self._publisher.publish(Float64MultiArray(data=array("d", voltages)))
 
-    def _hand_over(self, playback: Playback) -> None:
+    def _publish_trajectory(self, playback: Playback) -> None:
         if not self._live:
             self._publisher.publish(trajectory_of(playback))
 
@@ -314,7 +273,7 @@ class Exciter(Node):
                 self.get_logger().warning(
                     f"the excitation took {took:.1f} s instead of {planned:.1f} s; use a lower rate on this machine"
                 )
-            if self._settings.autostart:
+            if self._values["autostart"]:
                 request_stop()
 
     # Stop
@@ -323,13 +282,13 @@ class Exciter(Node):
         response.success = True
         self._waiting.cancel()
         self._polls_left = 0
-        response.message = f"back in {self._turn_back(self._playback):.1f} s" if self._playback else "at rest"
+        response.message = f"back in {self._return(self._playback):.1f} s" if self._playback else "at rest"
         return response
 
-    def _turn_back(self, playback: Playback) -> float:
+    def _return(self, playback: Playback) -> float:
         """Start the return to the initial voltages; return its duration, seconds."""
         if playback.stop():
-            self._hand_over(playback)
+            self._publish_trajectory(playback)
         return playback.seconds_left
 
 

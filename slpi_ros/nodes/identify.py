@@ -23,16 +23,15 @@ from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, run
 from slpi_ros.nodes.jobs import (
     DiagnosisOutcome,
-    DiagnosisProcess,
     DiagnosisRequest,
     FitOutcome,
-    FitProcess,
     FitRequest,
     StageIdentity,
+    WorkerProcess,
+    fit,
+    run_diagnosis,
 )
-from slpi_ros.nodes.parameters import Declaration, Parameters, Values, choice, number
-
-REPORT_PERIOD = (0.05, 3600.0)
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, number, validated
 
 DECLARATIONS = (
     Declaration(
@@ -46,7 +45,7 @@ DECLARATIONS = (
         "another stage than the published model; empty: none.",
     ),
     Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
-    Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}."),
+    Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}.", choices=tuple(KINDS)),
     Declaration("output", "", "File for the model document; empty: none."),
     Declaration(
         "start", math.nan, "Start of the fitted part, seconds from the first stamp; NaN or negative: first stamp.",
@@ -63,7 +62,7 @@ DECLARATIONS = (
     ),
     Declaration(
         "diagnostic_period", 1.0, "Period of /diagnostics, seconds.",
-        read_only=True, between=REPORT_PERIOD, number=True,
+        read_only=True, between=(0.05, 3600.0), number=True,
     ),
 )  # fmt: skip
 
@@ -100,16 +99,16 @@ class IdentifySettings:
         bags = tuple(bag for bag in values["bags"] if bag)
         if not values["topic"]:
             raise UsageError("parameter topic is empty; name the topic of the bag, as in stage_state")
-        kind = choice(values, "kind", KINDS)
+        checked = validated(DECLARATIONS, values)
         start, stop = bound(values, "start"), bound(values, "stop")
         if start is not None and stop is not None and not start < stop:
             raise UsageError(f"parameter start is {start:g} s and stop {stop:g} s; start before you stop")
-        request = FitRequest(bags, values["topic"], kind, start, stop, values["output"])
+        request = FitRequest(bags, values["topic"], values["kind"], start, stop, values["output"])
         folder = values["watch_directory"]
         if folder:
             BagWatch(folder)
         diagnosis = values["diagnosis_directory"] or beside(request.output)
-        return cls(request, folder, diagnosis, number(values, "diagnostic_period", *REPORT_PERIOD))
+        return cls(request, folder, diagnosis, checked["diagnostic_period"])
 
 
 def beside(output: str) -> str:
@@ -128,22 +127,6 @@ def bound(values: Values, name: str) -> float | None:
 
 POLL_PERIOD = 0.1
 NO_MODEL = "nothing to diagnose: no bag has been identified yet"
-
-
-@dataclass(frozen=True)
-class Identified:
-    """An identified model document and its source.
-
-    Parameters
-    ----------
-    bags : tuple of str
-        Those of the fit.
-    topic, document : str
-    """
-
-    bags: tuple[str, ...]
-    topic: str
-    document: str
 
 
 class DiagnosisService:
@@ -165,19 +148,19 @@ class DiagnosisService:
     def __init__(
         self,
         node: Node,
-        identified: Callable[[], Identified | None],
+        identified: Callable[[], DiagnosisRequest | None],
         folder: Callable[[], str],
         report: Callable[[], None],
     ) -> None:
         self._logger = node.get_logger()
         self._identified, self._folder, self._report = identified, folder, report
-        self._job: DiagnosisProcess | None = None
+        self._job: WorkerProcess[DiagnosisRequest, DiagnosisOutcome] | None = None
         self._last: DiagnosisRequest | None = None
         self._outcome = DiagnosisOutcome()
         self._temporary = ""
         self._service = DeferredService(node, "~/diagnose", self._start)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._poll = node.create_timer(POLL_PERIOD, self._look, clock=steady, autostart=False)
+        self._poll = node.create_timer(POLL_PERIOD, self._poll_job, clock=steady, autostart=False)
 
     @property
     def error(self) -> str:
@@ -185,7 +168,7 @@ class DiagnosisService:
         return self._outcome.error
 
     @property
-    def doing(self) -> str:
+    def activity(self) -> str:
         """Text for the running diagnosis; "" if none."""
         return f"diagnosing {self._job.request.source} for {time.monotonic() - self._began:.0f} s" if self._job else ""
 
@@ -222,8 +205,9 @@ class DiagnosisService:
             return NO_MODEL
         try:
             folder = os.path.abspath(self._folder() or self._temporary_folder())
-            request = DiagnosisRequest(identified.bags, identified.topic, identified.document, folder)
-            self._job, self._began = DiagnosisProcess(request), time.monotonic()
+            request = replace(identified, folder=folder)
+            self._job = WorkerProcess(run_diagnosis, request, DiagnosisOutcome, f"{request.source}: the diagnosis")
+            self._began = time.monotonic()
         except OSError as error:
             return f"no diagnosis can be started: {error}; free memory or disk, or set diagnosis_directory"
         self._last, self._outcome = request, DiagnosisOutcome()
@@ -235,7 +219,7 @@ class DiagnosisService:
         self._temporary = self._temporary or tempfile.mkdtemp(prefix="slpi_diagnosis_")
         return self._temporary
 
-    def _look(self) -> None:
+    def _poll_job(self) -> None:
         """Check whether the diagnosis is complete."""
         outcome = self._job.outcome() if self._job else None
         if not self._job or not outcome:
@@ -279,7 +263,7 @@ class Identify(Node):
         self._parameter_set = Parameters(self, DECLARATIONS, IdentifySettings.of)
         self._publisher = self.create_publisher(String, "stage_model", LATCHED)
         self._diagnostics = Diagnostics(self, "identify")
-        self._job: FitProcess | None = None
+        self._job: WorkerProcess[FitRequest, FitOutcome] | None = None
         self._asked: FitRequest | None = None
         self._waiting: deque[Path] = deque()
         self._watch: BagWatch | None = None
@@ -287,14 +271,14 @@ class Identify(Node):
         self._stage: StageIdentity | None = None
         self._failed = 0
         self._model: StageModel | None = None
-        self._identified: Identified | None = None
+        self._identified: DiagnosisRequest | None = None
         self._doubtful: tuple[FitRequest, str] | None = None
         self._error = ""
         # A simulated clock may stop.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._poll = self.create_timer(POLL_PERIOD, self._look, clock=steady, autostart=False)
+        self._poll = self.create_timer(POLL_PERIOD, self._poll_job, clock=steady, autostart=False)
         self.create_timer(self._parameter_set.settings.diagnostic_period, self._report, clock=steady)
-        self._watching = self.create_timer(WATCH_PERIOD, self._look_for_bags, clock=steady)
+        self._watching = self.create_timer(WATCH_PERIOD, self._poll_bags, clock=steady)
         self.create_service(Trigger, "~/identify", self._on_trigger)
         self._diagnosis = DiagnosisService(
             self,
@@ -332,13 +316,13 @@ class Identify(Node):
         self._watch = BagWatch(settings.watch_directory) if settings.watch_directory else None
         if not self._asked and not self._watch:
             self.get_logger().warning(NOTHING_TO_DO)
-        self._look_for_bags()
+        self._poll_bags()
         self._start_next()
         self._report()
 
-    def _look_for_bags(self) -> None:
+    def _poll_bags(self) -> None:
         """Queue newly completed bags of the watched folder; warn once about abandoned ones."""
-        for bag in self._watch.look() if self._watch else ():
+        for bag in self._watch.poll() if self._watch else ():
             self.get_logger().info(f"{bag} is complete")
             self._waiting.append(bag)
         abandoned = set(self._watch.abandoned) if self._watch else set()
@@ -352,10 +336,8 @@ class Identify(Node):
         if self._doubtful:
             (asked, document), self._doubtful = self._doubtful, None
             self._take(asked, FitOutcome(document, self._written(asked, document)))
-            response.success, response.message = (
-                not self._error,
-                self._error or f"published the model of {asked.source}",
-            )
+            response.success = not self._error
+            response.message = self._error or f"published the model of {asked.source}"
             return response
         try:
             self._begin(self._parameter_set.settings)
@@ -370,7 +352,8 @@ class Identify(Node):
         """Start the next queued identification, unless one is running."""
         request = None if self._job else self._next_request()
         if request:
-            self._job, self._job_start = FitProcess(request), time.monotonic()
+            self._job = WorkerProcess(fit, request, FitOutcome, f"{request.source}: the identification")
+            self._job_start = time.monotonic()
             self._poll.reset()
 
     def _next_request(self) -> FitRequest | None:
@@ -389,7 +372,7 @@ class Identify(Node):
             self._job.end()
             self._job = None
 
-    def _look(self) -> None:
+    def _poll_job(self) -> None:
         """Check whether the identification is complete."""
         outcome = self._job.outcome() if self._job else None
         if self._job and outcome:
@@ -418,7 +401,7 @@ class Identify(Node):
         if outcome.document:
             self._model = parse_model(outcome.document, "identify")
             self._stage = StageIdentity.of(self._model, request.stage)
-            self._identified = Identified(request.bags, request.topic, outcome.document)
+            self._identified = DiagnosisRequest(request.bags, request.topic, outcome.document)
             self._diagnosis.forget()
             self._publisher.publish(String(data=outcome.document))
             self.get_logger().info(described(self._model))
@@ -460,12 +443,12 @@ class Identify(Node):
         if self._diagnosis.error:
             problems = (*problems, (WARN, self._diagnosis.error))
         hardware_id = model.hardware_id if model else ""
-        self._diagnostics.report(Health(problems, self._doing(), values, hardware_id))
+        self._diagnostics.report(Health(problems, self._activity(), values, hardware_id))
 
-    def _doing(self) -> str:
+    def _activity(self) -> str:
         if self._job:
             return f"identifying {self._job.request.source} for {time.monotonic() - self._job_start:.0f} s"
-        return self._diagnosis.doing or (described(self._model) if self._model else "")
+        return self._diagnosis.activity or (described(self._model) if self._model else "")
 
 
 def abandonment(bags: Sequence[Path]) -> str:

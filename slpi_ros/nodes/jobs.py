@@ -18,6 +18,7 @@ from slpi_ros.compensator.persistence import model_id
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import ModelError, RecordError, SlpiError
 from slpi_ros.identification.fit import identify
+from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.record import Record
 from slpi_ros.model.document import format_model, model_from, parse_model, save_model
@@ -167,13 +168,6 @@ class FitOutcome:
     doubt: str = ""
 
 
-class FitProcess(WorkerProcess[FitRequest, FitOutcome]):
-    """Worker process of an identification."""
-
-    def __init__(self, request: FitRequest) -> None:
-        super().__init__(fit, request, FitOutcome, f"{request.source}: the identification")
-
-
 def fit(request: FitRequest) -> FitOutcome:
     """Read the bags, identify the model and write it to the output file, if any."""
     document = ""
@@ -234,17 +228,17 @@ class DiagnosisRequest:
     document : str
         Model document.
     folder : str
-        Output folder.
+        Output folder; "" (default) if not chosen yet.
     """
 
     bags: tuple[str, ...]
     topic: str
     document: str
-    folder: str
+    folder: str = ""
 
     @property
     def source(self) -> str:
-        """The bags, in words."""
+        """Text that names the bags."""
         return ", ".join(self.bags)
 
 
@@ -257,21 +251,14 @@ class DiagnosisOutcome:
     error: str = ""
 
 
-class DiagnosisProcess(WorkerProcess[DiagnosisRequest, DiagnosisOutcome]):
-    """Worker process of a diagnosis."""
-
-    def __init__(self, request: DiagnosisRequest) -> None:
-        super().__init__(judge, request, DiagnosisOutcome, f"{request.source}: the diagnosis")
-
-
-def judge(request: DiagnosisRequest) -> DiagnosisOutcome:
+def run_diagnosis(request: DiagnosisRequest) -> DiagnosisOutcome:
     """Read the bags, diagnose the model and write the files."""
     # Plotting is slow to load, and a node that only identifies does without.
-    from slpi_ros.reports.diagnosis import make_room, write_files
+    from slpi_ros.reports.diagnosis import FILES, write_files
 
     folder = Path(request.folder)
     try:
-        make_room(folder)
+        make_folder(folder, *FILES)
         records = [read_bag(bag, request.topic) for bag in request.bags]
         diagnosis = diagnose(records, parse_model(request.document, "stage_model"))
         write_files(folder, diagnosis)
@@ -294,14 +281,6 @@ Read = tuple[StageModel, str]
 
 
 @dataclass(frozen=True)
-class CheckRequest:
-    """Request of a validation: a model document and its source."""
-
-    document: str
-    source: str
-
-
-@dataclass(frozen=True)
 class CheckOutcome:
     """Outcome of a validation: the fingerprint of the model, or an error."""
 
@@ -309,18 +288,10 @@ class CheckOutcome:
     error: str = ""
 
 
-class CheckProcess(WorkerProcess[CheckRequest, CheckOutcome]):
-    """Worker process of a validation."""
-
-    def __init__(self, request: CheckRequest) -> None:
-        with _in_no_hurry():
-            super().__init__(check, request, CheckOutcome, f"{request.source}: the check of the model")
-
-
-def check(request: CheckRequest) -> CheckOutcome:
-    """Validate a model document."""
+def check(request: tuple[str, str]) -> CheckOutcome:
+    """Validate a model document, given with its source."""
     try:
-        return CheckOutcome(fingerprint=model_id(parse_model(request.document, request.source)))
+        return CheckOutcome(fingerprint=model_id(parse_model(*request)))
     except SlpiError as error:
         return CheckOutcome(error=str(error))
 
@@ -365,7 +336,9 @@ class Reading:
             model = parse_model(self._document, self._source)
             return model, model_id(model)
         try:
-            checking = CheckProcess(CheckRequest(self._document, self._source))
+            with _normal_scheduling():
+                request = self._document, self._source
+                checking = WorkerProcess(check, request, CheckOutcome, f"{self._source}: the check of the model")
         except OSError as error:
             raise ModelError(f"{self._source}: cannot be checked: {error.strerror}; send it again") from None
         try:
@@ -380,15 +353,12 @@ class Reading:
 
 
 @contextmanager
-def _in_no_hurry() -> Iterator[None]:
+def _normal_scheduling() -> Iterator[None]:
     """Start child processes with normal scheduling, even if this thread has real-time priority."""
-    if not hasattr(os, "sched_getscheduler"):
+    if not hasattr(os, "sched_getscheduler") or os.sched_getscheduler(0) == os.SCHED_OTHER:
         yield
         return
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    if policy == os.SCHED_OTHER:
-        yield
-        return
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     try:
         yield

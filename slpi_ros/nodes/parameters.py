@@ -56,13 +56,18 @@ class Declaration:
         UsageError
             If the value is not valid; the message names the parameter and the allowed values.
         """
+        given = values[self.name]
         if self.each_axis and self.between:
             return tuple(numbers(values, self.name, axes, *self.between))
         if self.number and self.between:
             return number(values, self.name, *self.between)
         if self.between:
-            return whole(values, self.name, int(self.between[0]), int(self.between[1]))
-        return choice(values, self.name, self.choices) if self.choices else values[self.name]
+            low, high = map(int, self.between)
+            if isinstance(given, bool) or not isinstance(given, int) or not low <= given <= high:
+                raise UsageError(f"parameter {self.name} is {given!r}; give a whole number from {low} to {high}")
+        if self.choices and given not in self.choices:
+            raise UsageError(f"parameter {self.name} is {given!r}; choose one of {', '.join(self.choices)}")
+        return given
 
     def row(self) -> str:
         """Return the row for the README table: name, default, description."""
@@ -83,6 +88,20 @@ class Declaration:
             else:
                 described.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
         return described
+
+
+def validated(declarations: Sequence[Declaration], values: Values) -> dict[str, Any]:
+    """Return all parameters by name, each validated.
+
+    Raises
+    ------
+    UsageError
+        If a value is not valid, or the parameter ``axes`` is empty or holds a name twice.
+    """
+    axes = values.get("axes", ())
+    if "axes" in values and not (axes and all(axes) and len(set(axes)) == len(axes)):
+        raise UsageError(f"parameter axes is {list(axes)!r}; name at least one axis, and each once")
+    return {entry.name: entry.read(values, axes) for entry in declarations}
 
 
 class Parameters(Generic[Settings]):
@@ -169,19 +188,3 @@ def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: fl
         if not (math.isfinite(value) and low <= value <= high):
             raise UsageError(f"parameter {name} is {value:g}; give a value from {low:g} to {high:g}")
     return [float(value) for value in several]
-
-
-def whole(values: Values, name: str, low: int, high: int) -> int:
-    """Return the parameter `name`; UsageError unless it is a whole number from `low` to `high`."""
-    given = values[name]
-    if isinstance(given, bool) or not isinstance(given, int) or not low <= given <= high:
-        raise UsageError(f"parameter {name} is {given!r}; give a whole number from {low} to {high}")
-    return given
-
-
-def choice(values: Values, name: str, known: Sequence[str]) -> str:
-    """Return the parameter `name`; UsageError unless it is one of `known`."""
-    given = values[name]
-    if given not in known:
-        raise UsageError(f"parameter {name} is {given!r}; choose one of {', '.join(known)}")
-    return str(given)

@@ -1,21 +1,20 @@
 """Node ``recorder``: records topics into a bag without rosbag2."""
 
 import importlib
-import math
 import sys
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.io.bag_writer import BagWriter
+from slpi_ros.io.bag_writer import STORAGES, BagWriter
 from slpi_ros.io.messages import JOINT_STATE
 from slpi_ros.nodes.common import request_stop, run
+from slpi_ros.nodes.parameters import Declaration, Parameters, validated
 
 # Queue length for bursts during slow disk writes.
 DEPTH = 10_000
@@ -23,7 +22,16 @@ DISCOVERY_PERIOD = 0.1
 # Discovery of publishers may take several seconds.
 PATIENCE = 5.0
 STAGE_STATE = "stage_state"
-_READ_ONLY = ParameterDescriptor(read_only=True, dynamic_typing=True)
+DECLARATIONS = (
+    Declaration("output", "", "rosbag2 folder to create; required.", read_only=True),
+    Declaration("topics", [STAGE_STATE], "Topics to record.", read_only=True),
+    Declaration("storage", "mcap", "File format: mcap or sqlite3.", read_only=True, choices=tuple(STORAGES)),
+    Declaration(
+        "duration", 0.0,
+        "Seconds from the first message; without any message the node stops 5 s after this time. 0: until a signal.",
+        read_only=True, between=(0.0, 1e9), number=True,
+    ),
+)  # fmt: skip
 
 
 class Recorder(Node):
@@ -31,10 +39,7 @@ class Recorder(Node):
 
     Subscribes the topics named by the parameter ``topics``, with the reliability and durability that the
     publishers offer; messages are not deserialized. An incomplete bag is kept in ``.NAME.partial`` in
-    the folder of the output.
-    Parameters, all read-only: ``output`` (rosbag2 folder to create), ``topics`` (default ``[stage_state]``),
-    ``storage`` (``mcap`` or ``sqlite3``), ``duration`` (s from the first message; without any message the
-    node stops 5 s after this time; 0: record until a signal).
+    the folder of the output. Parameters in `DECLARATIONS`.
 
     Raises
     ------
@@ -46,14 +51,16 @@ class Recorder(Node):
 
     def __init__(self) -> None:
         super().__init__("recorder")
-        output = str(self._parameter("output", ""))
+        values = Parameters(self, DECLARATIONS, partial(validated, DECLARATIONS)).settings
+        output, topics = values["output"], values["topics"]
         if not output:
             raise UsageError("recorder: no output; name the bag with --ros-args -p output:=FOLDER")
+        if not topics or not all(topics):
+            raise UsageError(f"recorder: topics is {topics!r}; give a list of names, as in [stage_state]")
         # Topic names after namespace and remapping.
-        self._awaited = {self.resolve_topic_name(topic): topic for topic in self._topics()}
-        self._duration = self._seconds()
-        storage = str(self._parameter("storage", "mcap"))
-        self._bag: BagWriter | None = BagWriter(output, storage=storage, topic=None)
+        self._awaited = {self.resolve_topic_name(topic): topic for topic in topics}
+        self._duration: float = values["duration"]
+        self._bag: BagWriter | None = BagWriter(output, storage=values["storage"], topic=None)
         self._listening: dict[str, Any] = {}
         for name, topic in self._awaited.items():
             # Subscribed before discovery, as the type is known, so that no message is lost.
@@ -129,7 +136,7 @@ class Recorder(Node):
             self.destroy_timer(self._end)
             self._end = self._stop_in(self._duration)
         try:
-            self._bag.write_raw(self.get_clock().now().nanoseconds, message, name)
+            self._bag.write(self.get_clock().now().nanoseconds, message, name)
         except RecordError as error:
             request_stop(RecordError(f"{error}; its unfinished files are in {self._bag.partial}"))
             self._bag = None
@@ -160,23 +167,6 @@ class Recorder(Node):
         except RecordError as error:
             raise RecordError(f"{error}; its unfinished files are in {bag.partial}") from error
         self.get_logger().info(f"{bag.message_count} messages in {bag.path}")
-
-    def _parameter(self, name: str, default: Any) -> Any:
-        return self.declare_parameter(name, default, _READ_ONLY).value
-
-    def _topics(self) -> list[str]:
-        topics = self._parameter("topics", [STAGE_STATE])
-        if not isinstance(topics, list) or not topics or not all(isinstance(t, str) and t for t in topics):
-            raise UsageError(f"recorder: topics is {topics!r}; give a list of names, as in [stage_state]")
-        return topics
-
-    def _seconds(self) -> float:
-        duration = self._parameter("duration", 0.0)
-        if isinstance(duration, bool) or not isinstance(duration, int | float):
-            raise UsageError(f"recorder: duration is {duration!r}; give seconds, or 0 to record until stopped")
-        if not (math.isfinite(duration) and duration >= 0):
-            raise UsageError(f"recorder: duration is {duration} s; give 0 or more")
-        return float(duration)
 
 
 def _message_class(topic: str, msgtype: str) -> Any:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch
 from numpy.typing import NDArray
 
 from slpi_ros.compensator.feedback import Feedback, PidGains
@@ -14,8 +16,8 @@ from slpi_ros.identification.fit import identify
 from slpi_ros.identification.signal_statistics import ErrorMetrics, error_metrics
 from slpi_ros.model.axis_model import AxisModel, Start
 from slpi_ros.model.limits import Limits
-from slpi_ros.papers.exhibit import Exhibit, Picture, Table, um
-from slpi_ros.papers.mpi_exhibits import ERRORS, errors, followed, scheme
+from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, panels, um
+from slpi_ros.papers.mpi_exhibits import COLOUR, ERROR, ERRORS, UM, errors, legend
 from slpi_ros.papers.mpi_study import (
     COMPOUND_BAND,
     COMPOUND_MEAN,
@@ -27,9 +29,9 @@ from slpi_ros.papers.mpi_study import (
     SMPI,
     TABLE_6,
     triangle_record,
+    triangles,
 )
-from slpi_ros.papers.published import triangles
-from slpi_ros.reports.plots import Run
+from slpi_ros.reports.chart import COLOURS, DESIRED
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage
 from slpi_ros.simulation.stage import p11_stage
@@ -72,12 +74,12 @@ class Outcome:
     displacement: FloatArray
 
     @property
-    def read(self) -> ErrorMetrics:
+    def by_sensor(self) -> ErrorMetrics:
         """Errors by the sensor."""
         return error_metrics(self.desired, self.measured)
 
     @property
-    def done(self) -> ErrorMetrics:
+    def by_truth(self) -> ErrorMetrics:
         """Errors of the stage itself."""
         return error_metrics(self.desired, self.displacement)
 
@@ -99,10 +101,6 @@ class Outcome:
     def within(self, band: float) -> float:
         """Return the share of readings that are within `band` (m) of what was desired."""
         return float(np.mean(np.abs(self.measured - self.desired) <= band))
-
-    def run(self, name: str) -> Run:
-        """Return the readings as a run to be drawn."""
-        return Run(name, np.arange(self.desired.size) / RATE, self.desired, self.measured)
 
 
 @dataclass(frozen=True)
@@ -226,6 +224,59 @@ def _warm(model: AxisModel) -> AxisModel:
     return replace(model, start=Start(0.0, 0.0, (0.0,) if model.causal else ()), end=None)
 
 
+def followed(outcomes: Mapping[str, Outcome], suffix: str, band: float | None) -> Figure:
+    """Draw desired and measured displacement, by model, and the errors below; shade a band (µm)."""
+    figure, (upper, lower) = panels(2, 1, (11, 6.4), height_ratios=(1, 1), sharex=True)
+    for model, outcome in outcomes.items():
+        t, error = np.arange(outcome.desired.size) / RATE, outcome.measured - outcome.desired
+        upper.plot(t, outcome.measured * 1e6, color=COLOUR[model], linewidth=1.0, label=model + suffix)
+        lower.plot(t, error * 1e6, color=COLOUR[model], linewidth=0.8)
+    upper.plot(t, outcome.desired * 1e6, color=DESIRED, linewidth=0.9, linestyle=(0, (4, 3)), label="desired")
+    if band is not None:
+        lower.axhspan(-band, band, color="#eef2f6", zorder=0)
+    label_axes(upper, "", UM)
+    label_axes(lower, "time (s)", ERROR)
+    legend(figure, [upper], 1)
+    return figure
+
+
+def scheme() -> Figure:
+    """Draw the block diagram of feedforward and feedback together."""
+    figure, (panel,) = panels(1, 1, (9, 3.0))
+    panel.set(xlim=(0, 12.6), ylim=(0, 4.2))
+    panel.set_axis_off()
+    for x, y, width, text in (
+        (3.6, 2.8, 2.4, "inverse model\n(feedforward)"),
+        (3.6, 0.9, 2.4, "PID\n(feedback)"),
+        (8.7, 2.8, 1.9, "stage"),
+    ):
+        box = FancyBboxPatch(
+            (x, y - 0.1), width, 1.0, boxstyle="round,pad=0.08", edgecolor=COLOURS[3], facecolor="#f2f5f8"
+        )
+        panel.add_patch(box)
+        panel.text(x + width / 2, y + 0.4, text, ha="center", va="center", color=DESIRED)
+    arrow = {"arrowstyle": "-|>", "color": DESIRED, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0}
+    for x, y in ((2.2, 1.3), (7.3, 3.2)):
+        panel.plot(x, y, "o", markersize=15, markerfacecolor="white", markeredgecolor=DESIRED)
+        panel.text(x, y, "+", ha="center", va="center", color=DESIRED)
+    for route in (
+        ((0.2, 3.2), (3.5, 3.2)),
+        ((2.2, 3.2), (2.2, 1.6)),
+        ((2.45, 1.3), (3.5, 1.3)),
+        ((6.1, 3.2), (7.05, 3.2)),
+        ((6.1, 1.3), (7.3, 1.3), (7.3, 2.9)),
+        ((7.55, 3.2), (8.6, 3.2)),
+        ((10.7, 3.2), (12.4, 3.2)),
+        ((11.4, 3.2), (11.4, 0.3), (2.2, 0.3), (2.2, 1.0)),
+    ):
+        x, y = np.array(route).T
+        panel.plot(x, y, color=DESIRED, linewidth=1.0)
+        panel.annotate("", route[-1], route[-2], arrowprops=arrow)
+    for x, y, text in ((0.2, 3.35, "desired"), (7.65, 3.35, "voltage"), (10.8, 3.35, "measured"), (1.85, 0.75, "−")):
+        panel.text(x, y, text, color=DESIRED)
+    return figure
+
+
 def exhibits(seed: int = 0) -> list[Exhibit]:
     """Run the experiments and return their exhibits; `seed` is that of the sensor noise."""
     return present({name: run_study(axis, name) for name, axis in p11_stage(seed).axes.items()})
@@ -239,7 +290,7 @@ def present(studies: Mapping[str, AxisStudy]) -> list[Exhibit]:
 def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
     outcomes = {(axis, label): o for axis, study in studies.items() for label, o in study.feedforward.items()}
     rows = [
-        (f"{axis}: {label}", *(um(part) for part in _phases(o)), errors(o.read), um(o.done.mean), um(o.scatter))
+        (f"{axis}: {label}", *map(um, _phases(o)), errors(o.by_sensor), um(o.by_truth.mean), um(o.scatter))
         for (axis, label), o in outcomes.items()
     ]
     first = next(iter(studies))
@@ -248,8 +299,9 @@ def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
         title="Fig. 11: SMPI feedforward, 80 V at 1 Hz",
         paper=f"Errors about 0.3 µm in the rise, 0.5 µm in most of the fall, at most {FEEDFORWARD_BAND:g} µm; a mean "
         f"absolute error of {FEEDFORWARD_MEAN} µm and a “mean square error” of {FEEDFORWARD_ROOT} µm.",
-        ours=f"Axis {first}, {um(smpi.desired.max(), 1)} µm: SMPI {um(smpi.read.mean)} µm in the mean "
-        f"({smpi.read.mean * 1e6 / FEEDFORWARD_MEAN:.0f} times the paper's), loop family {um(family.read.mean)} µm; "
+        ours=f"Axis {first}, {um(smpi.desired.max(), 1)} µm: SMPI {um(smpi.by_sensor.mean)} µm in the mean "
+        f"({smpi.by_sensor.mean * 1e6 / FEEDFORWARD_MEAN:.0f} times the paper's), loop family "
+        f"{um(family.by_sensor.mean)} µm; "
         f"about their own means they scatter by {um(smpi.scatter)} and {um(family.scatter)} µm.",
         remark="The paper's two statements exclude each other: errors of 0.3 and 0.5 µm have a mean of about 0.4 µm. "
         "Ours are larger: the models start at the sensor's zero, the end of a fall, where creep is at work and their "
@@ -262,7 +314,7 @@ def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
         ),
         pictures=(
             Picture(
-                followed({label: studies[first].feedforward[label].run(label) for label in KINDS}, None),
+                followed(studies[first].feedforward, "", None),
                 f"Axis {first}: displacement and error by the sensor.",
             ),
         ),
@@ -271,7 +323,7 @@ def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
 
 def _offsets(outcomes: Iterable[Outcome]) -> str:
     """Return a sentence on the share of a constant offset in errors."""
-    shares = [100.0 * (o.offset / o.read.root_mean_square) ** 2 for o in outcomes]
+    shares = [100.0 * (o.offset / o.by_sensor.root_mean_square) ** 2 for o in outcomes]
     return f"A constant offset is {min(shares):.0f} to {max(shares):.0f} % of the mean square error."
 
 
@@ -306,11 +358,11 @@ def _compound(studies: Mapping[str, AxisStudy]) -> Exhibit:
         for (label, fed_back), o in study.compound.items():
             name = f"{axis}: {_way(label, fed_back)}"
             share = f"{100.0 * o.within(COMPOUND_BAND * 1e-6):.1f}"
-            rows.append((name, errors(o.read), um(o.done.mean), um(o.scatter), share))
+            rows.append((name, errors(o.by_sensor), um(o.by_truth.mean), um(o.scatter), share))
             if label and fed_back:
                 deviations[name] = _farthest(o)
-    worst = {label: max(s.compound[label, True].read.mean for s in studies.values()) * 1e6 for label in KINDS}
-    rested = {label: max(s.rested[label].read.mean for s in studies.values()) * 1e6 for label in KINDS}
+    worst = {label: max(s.compound[label, True].by_sensor.mean for s in studies.values()) * 1e6 for label in KINDS}
+    rested = {label: max(s.rested[label].by_sensor.mean for s in studies.values()) * 1e6 for label in KINDS}
     met = all(np.all(np.abs(d) <= COMPOUND_BAND) for d in deviations.values())
     segments = [
         (str(k + 1), str(peak), str(frequency), *(f"{peak + d[k]:.2f}" for d in deviations.values()))
@@ -338,7 +390,7 @@ def _compound(studies: Mapping[str, AxisStudy]) -> Exhibit:
         ),
         pictures=tuple(
             Picture(
-                followed({label: s.compound[label, True].run(f"{label} + {PID}") for label in KINDS}, COMPOUND_BAND),
+                followed({label: s.compound[label, True] for label in KINDS}, f" + {PID}", COMPOUND_BAND),
                 f"Axis {axis}: displacement (Fig. 13) and error (Fig. 14) by the sensor; shaded: ±{COMPOUND_BAND} µm.",
             )
             for axis, s in studies.items()

@@ -1,7 +1,9 @@
-"""An exhibit: a table or figure of a paper, the one computed here beside it, and what differs."""
+"""An exhibit: a table or figure of a paper, the one computed here beside it, and what differs; its pictures."""
 
 from dataclasses import dataclass
+from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 
@@ -51,3 +53,17 @@ class Exhibit:
 def um(metres: float, digits: int = 3) -> str:
     """Return a length as text, in micrometres."""
     return f"{metres * 1e6:.{digits}f}"
+
+
+def panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
+    """Return a figure of a size (inches) and its panels, row by row; `options` are those of ``Figure.subplots``."""
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **options).ravel()
+
+
+def label_axes(panel: Axes, x: str, y: str) -> None:
+    """Label the axes of a panel and add a grid."""
+    panel.set_xlabel(x)
+    panel.set_ylabel(y)
+    panel.grid(color="#e4e9ee", linewidth=0.7)
+    panel.spines[["top", "right"]].set_visible(False)

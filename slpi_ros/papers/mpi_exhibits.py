@@ -7,11 +7,10 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyBboxPatch
 from numpy.typing import NDArray
 
 from slpi_ros.identification.signal_statistics import ErrorMetrics
-from slpi_ros.papers.exhibit import Exhibit, Picture, Table, um
+from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, panels, um
 from slpi_ros.papers.mpi_study import (
     FAMILY,
     KINDS,
@@ -33,7 +32,6 @@ from slpi_ros.papers.mpi_study import (
     run_study,
 )
 from slpi_ros.reports.chart import COLOURS, DESIRED, MEASURED
-from slpi_ros.reports.plots import Run, label, panels
 from slpi_ros.simulation.stage import p11_stage
 
 FloatArray = NDArray[np.float64]
@@ -56,7 +54,7 @@ def loops(groups: Mapping[str, Mapping[str, Drive]], columns: int) -> Figure:
             panel.plot(np.append(v, v[0]), np.append(y, y[0]) * 1e6, color=shade, linewidth=0.9, label=name)
         panel.set_title(title, fontsize=11)
         _outer_labels(panel, V, UM)
-    _legend(figure, drawn, len(groups))
+    legend(figure, drawn, len(groups))
     return figure
 
 
@@ -77,7 +75,7 @@ def peaks(study: Study) -> Figure:
     left.set_zlabel("peak (µm)")
     left.view_init(elev=22, azim=-125)
     left.set_box_aspect(None, zoom=0.86)
-    label(right, "frequency (Hz)", "peak displacement (µm)")
+    label_axes(right, "frequency (Hz)", "peak displacement (µm)")
     right.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
@@ -91,7 +89,7 @@ def fits(drives: Mapping[float, Drive], simulated: Mapping[float, FloatArray], n
         panel.plot(v, y_model * 1e6, color=COLOUR[name], linewidth=1.0, label=name)
         panel.set_title(f"{amplitude:g} V", fontsize=11)
         _outer_labels(panel, V, UM)
-    _legend(figure, drawn, len(simulated))
+    legend(figure, drawn, len(simulated))
     return figure
 
 
@@ -106,7 +104,7 @@ def fit_errors(drives: Mapping[float, Drive], simulated: Mapping[str, Mapping[fl
             panel.plot([], [], color=COLOUR[name], label=name)
         panel.set_title(f"{amplitude:g} V", fontsize=11)
         _outer_labels(panel, "part of the cycle", ERROR)
-    _legend(figure, drawn, len(amplitudes))
+    legend(figure, drawn, len(amplitudes))
     return figure
 
 
@@ -122,62 +120,10 @@ def variable(path: VariablePath) -> Figure:
         upper.text(cycle[part.start], upper.get_ylim()[1], f" {amplitude} V, {frequency} Hz", va="top", color=DESIRED)
         for panel in (upper, lower):
             panel.axvline(cycle[part.start], color=MEASURED, linewidth=0.8, linestyle=":")
-    label(upper, "", UM)
+    label_axes(upper, "", UM)
     lower.axhspan(-1.0, 1.0, color="#eef2f6", zorder=0)
-    label(lower, "cycle", ERROR)
-    _legend(figure, [upper], 1)
-    return figure
-
-
-def followed(runs: Mapping[str, Run], band: float | None) -> Figure:
-    """Draw desired and achieved displacement, by model, and the errors below; shade a band (µm)."""
-    figure, (upper, lower) = panels(2, 1, (11, 6.4), height_ratios=(1, 1), sharex=True)
-    for name, run in runs.items():
-        upper.plot(run.t, run.displacement * 1e6, color=COLOUR[name], linewidth=1.0, label=run.name)
-        lower.plot(run.t, run.error * 1e6, color=COLOUR[name], linewidth=0.8)
-    upper.plot(run.t, run.desired * 1e6, color=DESIRED, linewidth=0.9, linestyle=(0, (4, 3)), label="desired")
-    if band is not None:
-        lower.axhspan(-band, band, color="#eef2f6", zorder=0)
-    label(upper, "", UM)
-    label(lower, "time (s)", ERROR)
-    _legend(figure, [upper], 1)
-    return figure
-
-
-def scheme() -> Figure:
-    """Draw the block diagram of feedforward and feedback together."""
-    figure, (panel,) = panels(1, 1, (9, 3.0))
-    panel.set(xlim=(0, 12.6), ylim=(0, 4.2))
-    panel.set_axis_off()
-    for x, y, width, text in (
-        (3.6, 2.8, 2.4, "inverse model\n(feedforward)"),
-        (3.6, 0.9, 2.4, "PID\n(feedback)"),
-        (8.7, 2.8, 1.9, "stage"),
-    ):
-        box = FancyBboxPatch(
-            (x, y - 0.1), width, 1.0, boxstyle="round,pad=0.08", edgecolor=COLOURS[3], facecolor="#f2f5f8"
-        )
-        panel.add_patch(box)
-        panel.text(x + width / 2, y + 0.4, text, ha="center", va="center", color=DESIRED)
-    arrow = {"arrowstyle": "-|>", "color": DESIRED, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0}
-    for x, y in ((2.2, 1.3), (7.3, 3.2)):
-        panel.plot(x, y, "o", markersize=15, markerfacecolor="white", markeredgecolor=DESIRED)
-        panel.text(x, y, "+", ha="center", va="center", color=DESIRED)
-    for route in (
-        ((0.2, 3.2), (3.5, 3.2)),
-        ((2.2, 3.2), (2.2, 1.6)),
-        ((2.45, 1.3), (3.5, 1.3)),
-        ((6.1, 3.2), (7.05, 3.2)),
-        ((6.1, 1.3), (7.3, 1.3), (7.3, 2.9)),
-        ((7.55, 3.2), (8.6, 3.2)),
-        ((10.7, 3.2), (12.4, 3.2)),
-        ((11.4, 3.2), (11.4, 0.3), (2.2, 0.3), (2.2, 1.0)),
-    ):
-        x, y = np.array(route).T
-        panel.plot(x, y, color=DESIRED, linewidth=1.0)
-        panel.annotate("", route[-1], route[-2], arrowprops=arrow)
-    for x, y, text in ((0.2, 3.35, "desired"), (7.65, 3.35, "voltage"), (10.8, 3.35, "measured"), (1.85, 0.75, "−")):
-        panel.text(x, y, text, color=DESIRED)
+    label_axes(lower, "cycle", ERROR)
+    legend(figure, [upper], 1)
     return figure
 
 
@@ -189,10 +135,10 @@ def _outer_labels(panel: Axes, x: str, y: str) -> None:
     """Name only the axes at the figure's left and lower edge."""
     place = panel.get_subplotspec()
     assert place is not None
-    label(panel, x if place.is_last_row() else "", y if place.is_first_col() else "")
+    label_axes(panel, x if place.is_last_row() else "", y if place.is_first_col() else "")
 
 
-def _legend(figure: Figure, drawn: Sequence[Axes], used: int) -> None:
+def legend(figure: Figure, drawn: Sequence[Axes], used: int) -> None:
     """Put one legend above all panels, and hide those that are not used."""
     handles, names = drawn[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=7, frameon=False)

@@ -14,7 +14,6 @@ from slpi_ros.identification.published_kinds import PeakFrequency, fit_peak_freq
 from slpi_ros.identification.signal_statistics import ErrorMetrics, error_metrics
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel
-from slpi_ros.papers.published import triangles
 from slpi_ros.simulation.preisach import PreisachStage
 
 # By amplitude (V): a (µm) and b of Eq. 1.
@@ -225,6 +224,27 @@ def run_study(
         scaled=_scale(fastest, _shape(fits[MPI][amplitudes[-1]])),
         variable=_variable_path(axis, fits[MPI], peaks, samples),
     )
+
+
+def triangles(amplitude: float, frequency: float, cycles: int, samples: int = 2000) -> tuple[FloatArray, FloatArray]:
+    """Return a triangle wave from 0 to `amplitude` and back.
+
+    Parameters
+    ----------
+    amplitude : float, volts or metres
+    frequency : float, hertz
+    cycles : int
+    samples : int
+        In one cycle; even.
+
+    Returns
+    -------
+    t : ndarray, shape (cycles * samples,), seconds
+    x : ndarray, shape (cycles * samples,), in the unit of `amplitude`
+    """
+    k = np.arange(cycles * samples)
+    phase = (k % samples) / samples
+    return k / (samples * frequency), amplitude * (1.0 - np.abs(2.0 * phase - 1.0))
 
 
 def triangle_record(

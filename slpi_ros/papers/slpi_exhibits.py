@@ -9,18 +9,7 @@ from numpy.typing import NDArray
 from slpi_ros.hysteresis.slpi_published import Loop, SeparatedLoops, Separation
 from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import least_iterations
-from slpi_ros.papers.exhibit import Exhibit, Picture, Table, um
-from slpi_ros.papers.published import (
-    HIGHEST_MEAN,
-    OUTER_MAXIMUM,
-    OVERALL_MEAN,
-    SPREAD,
-    TABLE_2,
-    TABLE_3,
-    TABLE_4,
-    TABLE_5,
-    THRESHOLDS,
-)
+from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, panels, um
 from slpi_ros.papers.slpi_study import (
     AT_REST,
     CLASSICAL,
@@ -28,9 +17,15 @@ from slpi_ros.papers.slpi_study import (
     DOUBLE_INNER_LOOP,
     DRAWN,
     FAMILY,
+    HIGHEST_MEAN,
     MODELS,
+    OUTER_MAXIMUM,
+    OVERALL_MEAN,
     OVERLAPPED,
+    SPREAD,
     STEP_S,
+    TABLES,
+    THRESHOLDS,
     LoopErrors,
     Study,
     UnseenPaths,
@@ -39,7 +34,6 @@ from slpi_ros.papers.slpi_study import (
     unseen_paths,
 )
 from slpi_ros.reports.chart import COLOURS, DESIRED, MEASURED
-from slpi_ros.reports.plots import label, panels
 
 FloatArray = NDArray[np.float64]
 
@@ -47,7 +41,7 @@ COLOUR = dict(zip((CLASSICAL, AT_REST, CLOSING, FAMILY), COLOURS, strict=True))
 ROMAN = ("0", "I", "II", "III", "IV", "V")
 V, UM = "voltage (V)", "displacement (µm)"
 # The weights that the paper prints, by level, and the figures by which it compares SLPI with classical PI.
-PRINTED = {2: TABLE_2, 1: TABLE_3, 0: TABLE_4}
+PRINTED = {2: TABLES[2], 1: TABLES[3], 0: TABLES[4]}
 FIGURES = ("outer loop's maximum", "highest loop's mean", "spread between loops", "overall mean")
 PAPER = (OUTER_MAXIMUM, HIGHEST_MEAN, SPREAD, OVERALL_MEAN)
 
@@ -74,9 +68,9 @@ def path_and_curve(v: FloatArray, y: FloatArray) -> Figure:
     """Draw a path over time, and displacement over voltage."""
     figure, (left, right) = panels(1, 2, (11, 4.2))
     left.plot(STEP_S * np.arange(v.size), v, ".-", color=DESIRED, markersize=3, linewidth=0.8)
-    label(left, "time (s)", V)
+    label_axes(left, "time (s)", V)
     right.plot(v, y * 1e6, ".-", color=MEASURED, markersize=3, linewidth=0.8)
-    label(right, V, UM)
+    label_axes(right, V, UM)
     return figure
 
 
@@ -95,7 +89,7 @@ def separated(separation: Separation) -> Figure:
             )
         panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
         panel.legend(frameon=False, loc="upper left")
-        label(panel, V, UM if panel is drawn[0] else "")
+        label_axes(panel, V, UM if panel is drawn[0] else "")
     return figure
 
 
@@ -105,39 +99,26 @@ def inclinations(separation: Separation) -> Figure:
     for colour, loop in zip(COLOURS, separation.loops, strict=False):
         drive, y = _own(separation, loop)
         panel.plot(drive, y * 1e6, ".-", color=colour, markersize=4, linewidth=0.9, label=f"level {ROMAN[loop.level]}")
-    label(panel, "from the vertex (V)", "from the vertex (µm)")
+    label_axes(panel, "from the vertex (V)", "from the vertex (µm)")
     panel.legend(frameon=False)
     return figure
 
 
-def single_inverses(study: Study) -> Figure:
-    """Draw the inverse of each single loop: voltage over displacement, from the vertex."""
-    loops = study.separation.loops
-    figure, drawn = panels(1, len(loops), (11, 4.0))
-    for number, (panel, loop) in enumerate(zip(drawn, reversed(loops), strict=True)):
-        drive, y = _own(study.separation, loop)
-        panel.plot(y * 1e6, drive, ".", color=MEASURED, markersize=5, label="measured")
-        for name, model in ((AT_REST, study.at_rest), (CLOSING, study.closing)):
-            single = model.loops[len(loops) - 1 - number]
-            panel.plot(y * 1e6, single.memory().inverse_array(y), color=COLOUR[name], linewidth=1.1, label=name)
-        panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
-        label(panel, "from the vertex (µm)", "from the vertex (V)" if panel is drawn[0] else "")
-    drawn[0].legend(frameon=False)
-    return figure
-
-
-def single_models(separation: Separation, models: Mapping[str, SeparatedLoops]) -> Figure:
-    """Draw each single loop in its own coordinates, with the PI models of it."""
+def singles(separation: Separation, models: Mapping[str, SeparatedLoops], *, inverse: bool = False) -> Figure:
+    """Draw each single loop from its vertex and the PI models of it, or their inverses: voltage over displacement."""
     loops = separation.loops
     figure, drawn = panels(1, len(loops), (11, 4.0))
+    order = slice(None, None, -1 if inverse else 1)
     for number, (panel, loop) in enumerate(zip(drawn, reversed(loops), strict=True)):
         drive, y = _own(separation, loop)
-        panel.plot(drive, y * 1e6, ".", color=MEASURED, markersize=5, label="measured")
+        panel.plot(*(drive, y * 1e6)[order], ".", color=MEASURED, markersize=5, label="measured")
         for name, model in models.items():
-            single = model.loops[len(loops) - 1 - number]
-            panel.plot(drive, single.memory().forward_array(drive) * 1e6, color=COLOUR[name], linewidth=1.1, label=name)
+            memory = model.loops[len(loops) - 1 - number].memory()
+            curve = (memory.inverse_array(y), y * 1e6) if inverse else (drive, memory.forward_array(drive) * 1e6)
+            panel.plot(*curve[order], color=COLOUR[name], linewidth=1.1, label=name)
         panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
-        label(panel, "from the vertex (V)", "from the vertex (µm)" if panel is drawn[0] else "")
+        x, up = ("µm", "V") if inverse else ("V", "µm")
+        label_axes(panel, f"from the vertex ({x})", f"from the vertex ({up})" if panel is drawn[0] else "")
     drawn[0].legend(frameon=False)
     return figure
 
@@ -157,9 +138,9 @@ def over_data(separation: Separation, errors: Mapping[str, LoopErrors], names: t
         upper.plot(v, y * 1e6, ".", color=MEASURED, markersize=4, label="measured")
         upper.plot(v, (y + errors[name].error) * 1e6, color=COLOUR[name], linewidth=1.0, label="model")
         upper.set_title(name, fontsize=11)
-        label(upper, "", UM if not column else "")
+        label_axes(upper, "", UM if not column else "")
         lower.plot(v, errors[name].error * 1e6, ".-", color=COLOUR[name], markersize=3, linewidth=0.7)
-        label(lower, V, "error (µm)" if not column else "")
+        label_axes(lower, V, "error (µm)" if not column else "")
     drawn[0].legend(frameon=False)
     return figure
 
@@ -173,7 +154,7 @@ def inverses(study: Study, names: tuple[str, ...]) -> Figure:
         links = [loop.vertex for loop in study.separation.loops[1:]]
         panel.plot(desired[links], voltage[links], "*", color=DESIRED, markersize=10)
         panel.set_title(name, fontsize=11)
-        label(panel, "desired displacement (µm)", V if panel is drawn[0] else "")
+        label_axes(panel, "desired displacement (µm)", V if panel is drawn[0] else "")
     return figure
 
 
@@ -185,10 +166,10 @@ def draw_compensation(study: Study, names: tuple[str, ...]) -> Figure:
         upper, lower = drawn[column], drawn[len(names) + column]
         upper.plot(desired * 1e6, (desired + errors[name].error) * 1e6, color=COLOUR[name], linewidth=1.0)
         upper.set_title(name, fontsize=11)
-        label(upper, "desired (µm)", "achieved (µm)" if not column else "")
+        label_axes(upper, "desired (µm)", "achieved (µm)" if not column else "")
         for loop in study.separation.loops:
             lower.plot(loop.samples, errors[name].error[loop.samples] * 1e6, ".", markersize=4, label=ROMAN[loop.level])
-        label(lower, "sample", "error (µm)" if not column else "")
+        label_axes(lower, "sample", "error (µm)" if not column else "")
     handles, levels = drawn[-1].get_legend_handles_labels()
     figure.legend(
         handles, levels, loc="outside lower center", title="level", ncols=len(handles), markerscale=3, frameon=False
@@ -288,7 +269,7 @@ def _single_models(study: Study) -> Exhibit:
         remark="The weights are those of another stage. The inner loops are fitted closely; the outer one, which is "
         "not symmetric, is not.",
         tables=tuple(_weights(models, level, printed) for level, printed in PRINTED.items()),
-        pictures=(Picture(single_models(study.separation, models), "Single loops in their own coordinates."),),
+        pictures=(Picture(singles(study.separation, models), "Single loops in their own coordinates."),),
     )
 
 
@@ -324,7 +305,7 @@ def _closure(study: Study) -> Exhibit:
 def _classical(study: Study) -> Exhibit:
     rows = [
         (f"{r:.0f}", f"{w:.5f}", f"{ours * 1e6:.5f}")
-        for r, w, ours in zip(THRESHOLDS, TABLE_5, study.classical.weights, strict=True)
+        for r, w, ours in zip(THRESHOLDS, TABLES[5], study.classical.weights, strict=True)
     ]
     better = gain(study.modelled[CLASSICAL].overall, study.modelled[CLOSING].overall)
     return Exhibit(
@@ -345,13 +326,14 @@ def _classical(study: Study) -> Exhibit:
 
 def _inverse(study: Study) -> Exhibit:
     low, high = (float(edge(study.voltages[CLOSING])) for edge in (np.min, np.max))
+    models = {AT_REST: study.at_rest, CLOSING: study.closing}
     return Exhibit(
         title="Fig. 11 to 13: feedforward with the inverse, rebuilt from the loops",
         paper="Inverse models of the single loops, linked at the break points (stars) from level 0 inwards.",
         ours=f"Voltage from {low:.2f} to {high:.2f} V for the desired path of {study.desired.size} samples.",
         remark="Where loops are linked the voltage may jump: each loop keeps the place where it was measured.",
         pictures=(
-            Picture(single_inverses(study), "Fig. 12: inverses of the single loops."),
+            Picture(singles(study.separation, models, inverse=True), "Fig. 12: inverses of the single loops."),
             Picture(inverses(study, DRAWN), "Fig. 13: the rebuilt inverse, voltage over displacement."),
         ),
     )

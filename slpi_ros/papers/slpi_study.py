@@ -1,13 +1,15 @@
 """The SLPI paper's experiment on a simulated stage: one path, four models, the errors of each loop."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.hysteresis.slpi_published import (
     KnownPath,
     Loop,
@@ -21,10 +23,22 @@ from slpi_ros.identification.fit import identify
 from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import default_thresholds, fit_plays, least_iterations
 from slpi_ros.io.record import Record
-from slpi_ros.papers.published import ramps, straight_between_reversals
 from slpi_ros.simulation.stage import flexure_stage
 
 FloatArray = NDArray[np.float64]
+
+# Tables 2 (level II), 3 (level I), 4 (level 0) and 5 (classical PI). They give no unit for the weights, which are taken
+# for micrometres per volt.
+THRESHOLDS = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0)
+TABLES = {
+    2: (0.02943, 0.01351, 0.00040, 0.00206, 0.00230, 0.00265, 0.00249, 0.00550, 0.02802, 0.09411),
+    3: (0.03151, 0.01298, 0.01092, 0.00445, 0.00648, 0.00000, 0.00148, 0.00016, 0.00051, 0.00100),
+    4: (0.04045, 0.00000, 0.00893, 0.00537, 0.00456, 0.01136, 0.00000, 0.00000, 0.00000, 0.00000),
+    5: (0.03040, 0.01116, 0.01516, 0.00478, 0.00000, 0.00000, 0.00823, 0.00057, 0.00000, 0.00000),
+}
+
+# By how much SLPI is better than classical PI, in per cent (section 4.1).
+OUTER_MAXIMUM, HIGHEST_MEAN, SPREAD, OVERALL_MEAN = 10.0, 97.5, 53.7, 50.3
 
 # Like the random path of Fig. 4: up to level II; a sample every 4 V and 0.8 s, and at every turn (2.2).
 RANDOM_PATH = (0.0, 80.0, 12.0, 68.0, 20.0, 80.0, 100.0, 0.0)
@@ -227,6 +241,32 @@ def classical_model(v: FloatArray, y: FloatArray) -> PrandtlIshlinskii:
         iterations=least_iterations(v.size, v.size),
     )
     return PrandtlIshlinskii(thresholds, fit.weights)
+
+
+def ramps(turns: Sequence[float], step: float) -> FloatArray:
+    """Return straight ramps through turning points, a sample every `step`; every turn is a sample too.
+
+    Parameters
+    ----------
+    turns : sequence of float
+        Neighbours differ.
+    step : float
+        In the unit of `turns`.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+    """
+    parts = [np.append(np.arange(a, b, step if b > a else -step)[1:], b) for a, b in pairwise(turns)]
+    return np.concatenate([np.array([turns[0]], dtype=np.float64), *parts])
+
+
+def straight_between_reversals(x: FloatArray, at: FloatArray) -> FloatArray:
+    """Return `x`, shape (N,), made a straight line over `at`, shape (N,), between neighbouring reversals of `at`."""
+    path = x.copy()
+    for a, b in pairwise(stop - 1 for _, stop in monotone_runs(at)):
+        path[a : b + 1] = x[a] + (x[b] - x[a]) * (at[a : b + 1] - at[a]) / (at[b] - at[a])
+    return path
 
 
 def _times(v: FloatArray) -> FloatArray:

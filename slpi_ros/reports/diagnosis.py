@@ -1,6 +1,5 @@
 """The page and the files of a diagnosis: error of the model, its causes, and the suggested next experiment."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,11 +10,12 @@ from slpi_ros.diagnosis.result import AMBIGUOUS, NAMED, NOTHING_FOUND, AxisDiagn
 from slpi_ros.effects.registry import to_document
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
-from slpi_ros.io.schemas import validate
+from slpi_ros.io.schemas import format_document
 from slpi_ros.model.document import format_model
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, NOISE
 from slpi_ros.reports.page import Page, Severity, Share
+from slpi_ros.reports.text import nm
 from slpi_ros.reports.views import Curve, Motion
 
 FloatArray = NDArray[np.float64]
@@ -25,23 +25,36 @@ _NOISE_ONLY = 1.5
 _SAME = 0.01
 
 BEFORE_NAME, AFTER_NAME = "without effects", "with effects"
-DOCUMENT, EXTENDED_MODEL, PAGE = "diagnosis.json", "extended_model.json", "report.html"
+FILES = (_, _, PAGE) = "diagnosis.json", "extended_model.json", "report.html"
 
 
-def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
-    """Write ``report.html`` into `folder` and return its path.
+def write_files(folder: Path, diagnosis: Diagnosis) -> None:
+    """Write ``diagnosis.json``, ``extended_model.json`` and ``report.html`` into `folder`, each atomically.
 
     Parameters
     ----------
     folder : Path
         Created if it does not exist.
-    diagnosis : Diagnosis, the result to be shown
+    diagnosis : Diagnosis, the result to be written
 
     Raises
     ------
     SlpiError
-        If the file cannot be written.
+        If a file cannot be written, or a value is not finite.
     """
+    make_folder(folder, *FILES)
+    try:
+        texts = format_document(diagnosis.to_document(), "diagnosis"), format_model(diagnosis.extended)
+    except ValueError as error:
+        raise SlpiError(f"{diagnosis.source}: no valid diagnosis: {error}; record a longer drive") from None
+    for name, text in zip(FILES, texts, strict=False):
+        with all_or_nothing(folder / name) as file:
+            file.write(text)
+    page_of(diagnosis).write(folder / PAGE)
+
+
+def page_of(diagnosis: Diagnosis) -> Page:
+    """Return the page of a diagnosis."""
     page = Page(f"Diagnosis of {diagnosis.source or 'a record'}")
     page.contents(tuple(diagnosis.axes))
     for name, found in diagnosis.axes.items():
@@ -54,9 +67,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
             page.section("Next step")
             page.text(found.next_experiment)
         _show_charts(page, name, found)
-    path = folder / "report.html"
-    page.write(path)
-    return path
+    return page
 
 
 def _severity(found: AxisDiagnosis) -> Severity:
@@ -69,14 +80,14 @@ def _severity(found: AxisDiagnosis) -> Severity:
 
 def _figures(found: AxisDiagnosis) -> dict[str, str]:
     figures = {
-        "error of the given model, rms": _nm(found.given_rms),
-        "its hysteresis refitted": _nm(found.before_rms),
+        "error of the given model, rms": nm(found.given_rms),
+        "its hysteresis refitted": nm(found.before_rms),
     }
     if found.effects:
-        figures["with the identified effects"] = _nm(found.after_rms)
+        figures["with the identified effects"] = nm(found.after_rms)
         if found.before_rms > 0.0:
             figures["reduction by the effects"] = f"{1.0 - found.after_rms / found.before_rms:.0%}"
-    return figures | {"noise floor, rms": _nm(found.floor_rms)}
+    return figures | {"noise floor, rms": nm(found.floor_rms)}
 
 
 def _show_causes(page: Page, found: AxisDiagnosis) -> None:
@@ -97,8 +108,8 @@ def _show_records(page: Page, found: AxisDiagnosis) -> None:
             [
                 each.source,
                 f"{each.offset * 1e6:+.3g}",
-                *(_nm(rms) for rms in (each.before_rms, each.after_rms)),
-                "-" if each.left_out_rms is None else _nm(each.left_out_rms),
+                *(nm(rms) for rms in (each.before_rms, each.after_rms)),
+                "-" if each.left_out_rms is None else nm(each.left_out_rms),
             ]
             for each in found.records
         ]
@@ -215,11 +226,7 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
         )
     page.section("Model and measurement")
     loops, said = views.loops(v, y, models, motion)
-    page.chart(
-        f"{name}-loops",
-        loops,
-        f"Displacement over voltage; right: deviation of the displacement from its straight-line fit. {said}",
-    )
+    page.chart(f"{name}-loops", loops, f"{views.LOOPS} {said}")
 
 
 def _parts(traces: Traces) -> list[Curve]:
@@ -240,64 +247,6 @@ def _parts(traces: Traces) -> list[Curve]:
             effects.items(), weights.tolist(), _colours(len(effects)), strict=True
         )
     ]
-
-
-def _nm(metres: float) -> str:
-    return f"{metres * 1e9:.1f} nm"
-
-
-def make_room(folder: Path) -> None:
-    """Create the folder of a diagnosis; call this before long computations, so that an unusable folder fails early.
-
-    Raises
-    ------
-    SlpiError
-        If the files cannot be written to the folder.
-    """
-    make_folder(folder)
-    for name in (DOCUMENT, EXTENDED_MODEL, PAGE):
-        if (folder / name).is_dir():
-            raise SlpiError(f"{folder / name}: cannot be written: a folder has that name; choose another place")
-
-
-def write_files(folder: Path, diagnosis: Diagnosis) -> None:
-    """Write ``diagnosis.json``, ``extended_model.json`` and ``report.html`` into `folder`, each atomically.
-
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    diagnosis : Diagnosis, the result to be written
-
-    Raises
-    ------
-    SlpiError
-        If a file cannot be written, or a value is not finite.
-    """
-    make_room(folder)
-    try:
-        texts = {DOCUMENT: format_diagnosis(diagnosis), EXTENDED_MODEL: format_model(diagnosis.extended)}
-    except ValueError as error:
-        raise SlpiError(f"{diagnosis.source}: no valid diagnosis: {error}; record a longer drive") from None
-    for name, text in texts.items():
-        with all_or_nothing(folder / name) as file:
-            file.write(text)
-    write_diagnosis(folder, diagnosis)
-
-
-def format_diagnosis(diagnosis: Diagnosis) -> str:
-    """Return the JSON text of a diagnosis, as defined by ``msg_schemas/diagnosis.schema.json``.
-
-    Raises
-    ------
-    ModelError
-        If the document violates the schema.
-    ValueError
-        If a value is not finite.
-    """
-    document = diagnosis.to_document()
-    validate(document, "diagnosis", "the new diagnosis")
-    return json.dumps(document, allow_nan=False, indent=1)
 
 
 def describe_diagnosis(diagnosis: Diagnosis) -> list[str]:

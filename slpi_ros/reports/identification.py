@@ -1,7 +1,6 @@
 """The page of an identification: the record, the model, its held-out error and its residual."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,25 +15,14 @@ from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE
 from slpi_ros.reports.page import Page, Severity
-from slpi_ros.reports.text import describe_axis
-from slpi_ros.reports.views import Curve, Motion
+from slpi_ros.reports.text import describe_axis, nm
+from slpi_ros.reports.views import Curve
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Held-out errors up to the first multiple of the noise count as noise; from the second on, diagnosis is advised.
 _NOISE_ONLY, _MORE_THAN_NOISE = 1.5, 3.0
-
-
-@dataclass(frozen=True)
-class _Traces:
-    """Signals of one axis: time (s), voltage (V), measured and simulated displacement (m), and the mask of the fit."""
-
-    t: FloatArray
-    v: FloatArray
-    y: FloatArray
-    simulated: FloatArray
-    fitted: Mask
 
 
 def write_report(
@@ -92,7 +80,14 @@ def write_report(
         if t.size:
             floor = told.floor.rms if told else axis.quality.floor_rms
             v, y = record.voltage[name][driven], record.displacement[name][driven]
-            _show(page, name, _Traces(t, v, y, simulated[name], fitted), floor)
+            page.section("Model and measurement")
+            motion = views.show_model(page, name, t, v, y, simulated[name], floor, fitted)
+            page.chart(
+                f"{name}-coverage",
+                views.coverage(v, np.where(fitted, y - simulated[name], np.nan), motion),
+                "Number of fitted samples by start voltage of the branch and present voltage, and the rms error. "
+                "Rising branches are above the diagonal, falling ones below. White: no data, the model extrapolates.",
+            )
         else:
             page.text("The record contains no voltage of this axis: there are no charts.")
     path = folder / "report.html"
@@ -104,15 +99,15 @@ def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None)
     """Return a sentence on the held-out error, and its severity."""
     quality = axis.quality
     error, floor = quality.held_out_rms, quality.floor_rms
-    noise, floor_is = "the sensor noise", f"the sensor noise is {_nm(floor)} rms"
+    noise, floor_is = "the sensor noise", f"the sensor noise is {nm(floor)} rms"
     beside = ""
     if held_out is not None:
         error, floor = held_out.overall.rms, held_out.floor.rms
-        noise, floor_is = "the floor", f"the repeatability floor is {_nm(floor)} rms"
+        noise, floor_is = "the floor", f"the repeatability floor is {nm(floor)} rms"
         if np.isfinite(held_out.overall.classical_rms) and held_out.kind != CLASSICAL:
-            beside = f" Classical PI: {_nm(held_out.overall.classical_rms)}."
+            beside = f" Classical PI: {nm(held_out.overall.classical_rms)}."
     share = f"{error / _stroke(axis):.3%}" if _stroke(axis) > 0.0 else "?"
-    said = f"Axis {name}: the held-out error is {_nm(error)} rms ({share} of the stroke)"
+    said = f"Axis {name}: the held-out error is {nm(error)} rms ({share} of the stroke)"
     if not floor > 0.0:
         return f"{said}; the record has no noise for comparison.{beside}", "warn"
     if error <= _NOISE_ONLY * floor:
@@ -127,18 +122,18 @@ def _figures(axis: AxisModel, held_out: CrossValidationReport | None) -> dict[st
     quality = axis.quality
     if held_out:
         figures = {
-            "held-out error, rms": _nm(held_out.overall.rms),
-            "repeatability floor, rms": _nm(held_out.floor.rms),
-            "classical PI held-out, rms": _nm(held_out.overall.classical_rms),
+            "held-out error, rms": nm(held_out.overall.rms),
+            "repeatability floor, rms": nm(held_out.floor.rms),
+            "classical PI held-out, rms": nm(held_out.overall.classical_rms),
         }
     else:
         figures = {
-            "held-out error, rms": _nm(quality.held_out_rms),
-            "sensor noise, rms": _nm(quality.floor_rms),
+            "held-out error, rms": nm(quality.held_out_rms),
+            "sensor noise, rms": nm(quality.floor_rms),
             "samples fitted": f"{quality.samples:,}",
         }
     return figures | {
-        "maximum error of the fit": _nm(quality.maximum),
+        "maximum error of the fit": nm(quality.maximum),
         "stroke": f"{_stroke(axis) * 1e6:.4g} µm",
         "model covered": f"{quality.covered:.0%}",
     }
@@ -147,10 +142,6 @@ def _figures(axis: AxisModel, held_out: CrossValidationReport | None) -> dict[st
 def _stroke(axis: AxisModel) -> float:
     low, high = axis.displacement_range
     return high - low
-
-
-def _nm(metres: float) -> str:
-    return f"{metres * 1e9:.1f} nm" if np.isfinite(metres) else "none"
 
 
 def _findings(record: Record, name: str, start: float | None, stop: float | None) -> list[Finding]:
@@ -178,7 +169,7 @@ def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> No
         rows,
         best=0,
         caption="Free-run held-out errors; the classical PI model on the same blocks. "
-        f"Floor: {_nm(floor.rms)} rms, {floor.source}.",
+        f"Floor: {nm(floor.rms)} rms, {floor.source}.",
     )
     curves = [Curve(held_out.kind, -held_out.error, AFTER)]
     if held_out.kind != CLASSICAL and np.isfinite(held_out.classical).any():
@@ -208,27 +199,4 @@ def _part(t: FloatArray, fitted: Mask) -> str:
         f"Fitted: the samples from {first:.6g} s to {last:.6g} s, of {t[0]:.6g} s to {t[-1]:.6g} s. The others are "
         f"drawn as '{views.UNUSED}'; figures, histograms and maps exclude these. The voltage before the part that "
         "was fitted still determines the initial history."
-    )
-
-
-def _show(page: Page, name: str, traces: _Traces, noise: float) -> None:
-    """Add the charts of one axis."""
-    t, v, y, fitted = traces.t, traces.v, traces.y, traces.fitted
-    motion, left = Motion.of(t, v), y - traces.simulated
-    models = [Curve("model", traces.simulated, AFTER)]
-    page.section("Record and free-run model")
-    loops, said = views.loops(v, y, models, motion, fitted)
-    beside = "Displacement over voltage; right: deviation from its straight-line fit."
-    page.chart(f"{name}-loops", loops, f"{beside} {said}")
-    over_time, said = views.over_time(t, y, models, noise, fitted=fitted)
-    page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus or minus the noise. {said}")
-    page.section("Measured - model")
-    over_voltage, said = views.over_voltage(v, left, motion, noise, fitted)
-    how = "Over rising and falling voltage, and the histogram."
-    page.chart(f"{name}-residual", over_voltage, f"{how} {said}")
-    page.chart(
-        f"{name}-coverage",
-        views.coverage(v, np.where(fitted, left, np.nan), motion),
-        "Number of fitted samples by start voltage of the branch and present voltage, and the rms error. "
-        "Rising branches are above the diagonal, falling ones below. White: no data; the model extrapolates smoothly.",
     )

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable
 
+import numpy as np
+
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
@@ -9,6 +11,11 @@ from slpi_ros.hysteresis.slpi_published import SeparatedLoops
 from slpi_ros.identification.refit import AxisChange
 from slpi_ros.model.axis_model import AxisModel, StartMemory
 from slpi_ros.model.stage_model import StageModel
+
+
+def nm(metres: float) -> str:
+    """Return a length as text in nanometres; "none" if it is not finite."""
+    return f"{metres * 1e9:.1f} nm" if np.isfinite(metres) else "none"
 
 
 def describe_model(model: StageModel) -> list[str]:
@@ -35,9 +42,9 @@ def describe_axis(axis: AxisModel) -> list[str]:
         f"with {len(end.history)} reversals"
         if end
         else "memory at the end of the record: unknown",
-        f"error on the record: {quality.rms * 1e9:.1f} nm rms ({quality.rms / stroke:.3%} of the displacement range), "
-        f"{quality.maximum * 1e9:.1f} nm at most",
-        f"held-out error: {quality.held_out_rms * 1e9:.1f} nm rms; sensor noise {quality.floor_rms * 1e9:.1f} nm rms",
+        f"error on the record: {nm(quality.rms)} rms ({quality.rms / stroke:.3%} of the displacement range), "
+        f"{nm(quality.maximum)} at most",
+        f"held-out error: {nm(quality.held_out_rms)} rms; sensor noise {nm(quality.floor_rms)} rms",
         f"from {quality.samples} samples of {quality.source}",
         *(f"{effect.name}: {effect.describe()}" for effect in axis.effects),
         *(() if axis.effects else ("effects: none",)),
@@ -75,10 +82,10 @@ def describe_change(axis: str, change: AxisChange) -> list[str]:
     if change.match.known_from:
         verdict += "; the initial history of the new record is unknown and was not evaluated"
     return [
-        f"axis {axis}: {verdict}: the old model's error on the new record is {change.error_before * 1e9:.1f} nm rms, "
-        f"repeatability {change.repeatability * 1e9:.1f} nm",
-        f"axis {axis}: gain {change.gain:+.2%}, branches moved by up to {change.largest * 1e9:.1f} nm; "
-        f"error on the new record now {change.error_after * 1e9:.1f} nm rms",
+        f"axis {axis}: {verdict}: the old model's error on the new record is {nm(change.error_before)} rms, "
+        f"repeatability {nm(change.repeatability)}",
+        f"axis {axis}: gain {change.gain:+.2%}, branches moved by up to {nm(change.largest)}; "
+        f"error on the new record now {nm(change.error_after)} rms",
     ]
 
 

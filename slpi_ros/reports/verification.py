@@ -1,6 +1,5 @@
 """The page and the files of a verification: errors on records not used for the fit, pass or fail."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,9 +15,8 @@ from slpi_ros.diagnosis.verify import (
     Tracking,
     Verification,
 )
-from slpi_ros.errors import SlpiError
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
-from slpi_ros.io.schemas import validate
+from slpi_ros.io.schemas import format_document
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import (
     AFTER,
@@ -35,29 +33,15 @@ from slpi_ros.reports.chart import (
 )
 from slpi_ros.reports.chart import CAUSES as COLOURS
 from slpi_ros.reports.page import Page, Share
-from slpi_ros.reports.views import Curve, Motion
+from slpi_ros.reports.text import nm
 
 FloatArray = NDArray[np.float64]
 
-DOCUMENT, PAGE = "verification.json", "report.html"
+FILES = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
 COLOUR = {**dict(zip(CAUSES, (*COLOURS, AFTER), strict=False)), "model": BEFORE, "noise": NOISE}
 # Smaller shares of the tracking error are not reported.
 _SMALLEST_SHARE = 0.01
-
-
-def make_room(folder: Path) -> None:
-    """Create the folder of a verification; call this before long computations, so that an unusable folder fails early.
-
-    Raises
-    ------
-    SlpiError
-        If the files cannot be written to the folder.
-    """
-    make_folder(folder)
-    for name in (DOCUMENT, PAGE):
-        if (folder / name).is_dir():
-            raise SlpiError(f"{folder / name}: cannot be written: a folder has that name; choose another place")
 
 
 def write_files(folder: Path, found: Verification) -> None:
@@ -74,9 +58,9 @@ def write_files(folder: Path, found: Verification) -> None:
     SlpiError
         If a file cannot be written.
     """
-    make_room(folder)
-    with all_or_nothing(folder / DOCUMENT) as file:
-        file.write(format_verification(found))
+    make_folder(folder, *FILES)
+    with all_or_nothing(folder / FILES[0]) as file:
+        file.write(format_document(found.to_document(), "verification"))
     page = Page("Verification of a model" + (f" of stage {found.hardware_id}" if found.hardware_id else ""))
     page.contents(tuple(found.axes))
     for name, axis in found.axes.items():
@@ -90,20 +74,7 @@ def write_files(folder: Path, found: Verification) -> None:
         page.table(*_parts_table(axis))
         for number, record in enumerate(axis.records):
             _show_record(page, f"{name}-{number}", record)
-    page.write(folder / PAGE)
-
-
-def format_verification(found: Verification) -> str:
-    """Return the JSON text of a verification, as defined by ``msg_schemas/verification.schema.json``.
-
-    Raises
-    ------
-    ModelError
-        If the document violates the schema.
-    """
-    document = found.to_document()
-    validate(document, "verification", "the new verification")
-    return json.dumps(document, allow_nan=False, indent=1)
+    page.write(folder / FILES[1])
 
 
 def describe_verification(found: Verification) -> list[str]:
@@ -136,8 +107,8 @@ def _summary(name: str, axis: AxisVerification) -> str:
 def _error(record: RecordVerification) -> str:
     error = record.error
     return (
-        f"measured - model is {_nm(error.rms)} rms (limit {_nm(record.limit)}), maximum {_nm(error.maximum)}; "
-        f"noise floor {_nm(record.floor_rms)} rms"
+        f"measured - model is {nm(error.rms)} rms (limit {nm(record.limit)}), maximum {nm(error.maximum)}; "
+        f"noise floor {nm(record.floor_rms)} rms"
     )
 
 
@@ -164,7 +135,7 @@ def _tracking_notes(tracking: Tracking) -> list[str]:
     told = sorted(tracking.shares.items(), key=lambda item: -item[1])
     shares = [f"{cause} {share:.0%}" for cause, share in told if abs(share) >= _SMALLEST_SHARE]
     notes = [
-        f"measured - desired is {_nm(error.rms)} rms, {_nm(error.maximum)} at most; of its mean square: "
+        f"measured - desired is {nm(error.rms)} rms, {nm(error.maximum)} at most; of its mean square: "
         f"{', '.join(shares) or 'nothing'}",
         f"largest contribution, {tracking.blame}: {CAUSES[tracking.blame]}",
     ]
@@ -176,14 +147,14 @@ def _tracking_notes(tracking: Tracking) -> list[str]:
 def _figures(axis: AxisVerification) -> dict[str, str]:
     worst = axis.worst
     figures = {
-        "measured - model, rms": _nm(axis.overall.rms),
-        "maximum": _nm(axis.overall.maximum),
-        "limit of the rms": _nm(worst.limit),
-        "noise floor, rms": _nm(worst.floor_rms),
-        "held-out error of the model": _nm(axis.resolution),
+        "measured - model, rms": nm(axis.overall.rms),
+        "maximum": nm(axis.overall.maximum),
+        "limit of the rms": nm(worst.limit),
+        "noise floor, rms": nm(worst.floor_rms),
+        "held-out error of the model": nm(axis.resolution),
     }
     tracked = [record.tracking.error.rms for record in axis.records if record.tracking]
-    return figures | ({"measured - desired, rms": _nm(max(tracked))} if tracked else {})
+    return figures | ({"measured - desired, rms": nm(max(tracked))} if tracked else {})
 
 
 def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[str]], None, str]:
@@ -219,7 +190,7 @@ def _parts_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[s
     groups = {"by loop level": axis.by_level, "by speed": axis.by_speed, "by region": axis.by_region}
     for name, parts in groups.items():
         rows += [name, *map(row, parts)]
-    return ("", "samples", "rms (nm)", "times the floor", "maximum (nm)"), rows, 0, f"All records; floor {_nm(floor)}."
+    return ("", "samples", "rms (nm)", "times the floor", "maximum (nm)"), rows, 0, f"All records; floor {nm(floor)}."
 
 
 def _show_record(page: Page, name: str, record: RecordVerification) -> None:
@@ -228,16 +199,7 @@ def _show_record(page: Page, name: str, record: RecordVerification) -> None:
     page.section(record.error.name)
     if record.tracking:
         _show_tracking(page, name, record.tracking)
-    motion = Motion.of(t, v)
-    models = [Curve("model", record.model, AFTER)]
-    over_time, said = views.over_time(t, y, models, record.floor_rms, fitted=record.judged)
-    not_judged = "" if record.judged.all() else " Shaded: not evaluated, before the initial history is known."
-    page.chart(f"{name}-time", over_time, f"Over time; the grey band is plus or minus the floor.{not_judged} {said}")
-    over_voltage, said = views.over_voltage(v, y - record.model, motion, record.floor_rms, record.judged)
-    page.chart(f"{name}-residual", over_voltage, f"Over rising and falling voltage, and the histogram. {said}")
-    loops, said = views.loops(v, y, models, motion, record.judged)
-    beside = "Displacement over voltage; right: deviation from its straight-line fit."
-    page.chart(f"{name}-loops", loops, f"{beside} {said}")
+    views.show_model(page, name, t, v, y, record.model, record.floor_rms, record.judged)
 
 
 def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
@@ -261,10 +223,6 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
             chart.line(1, cause, t[some], part[some], COLOUR[cause], width=1.0)
     said = views.focus(chart, (1,), [error])
     page.chart(f"{name}-tracking", chart, f"Desired and measured displacement, and the parts of the error. {said}")
-
-
-def _nm(metres: float) -> str:
-    return f"{metres * 1e9:.1f} nm"
 
 
 def _um(metres: float) -> str:

@@ -16,6 +16,7 @@ from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn
 from slpi_ros.identification.signal_statistics import digit, noise
 from slpi_ros.reports.chart import (
+    AFTER,
     COLOURS,
     DESIRED,
     DISPLACEMENT,
@@ -36,6 +37,7 @@ from slpi_ros.reports.chart import (
     thin_cloud,
     thin_line,
 )
+from slpi_ros.reports.page import Page
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -48,6 +50,7 @@ SPEED = Quantity("speed of the voltage", "V/s", digits=".4~g")
 SINCE = Quantity("time since the last reversal or stop", "s", digits=".3~g", logarithmic=True)
 FREQUENCY = Quantity("frequency", "Hz", digits=".4~g", logarithmic=True)
 DENSITY = Quantity("spectral density", "nm/√Hz", 1e9, ".3~g", logarithmic=True)
+LOOPS = "Displacement over voltage; right: deviation of the displacement from its straight-line fit."
 # Legend entry of samples that were not fitted.
 UNUSED = "not used"
 
@@ -135,6 +138,44 @@ class Curve:
     name: str
     values: FloatArray
     colour: str
+
+
+def show_model(
+    page: Page,
+    name: str,
+    t: FloatArray,
+    v: FloatArray,
+    y: FloatArray,
+    simulated: FloatArray,
+    noise: float,
+    fitted: Mask,
+) -> Motion:
+    """Add the charts of a model on a record: loops, time, and residual over voltage; return the motion.
+
+    Parameters
+    ----------
+    page : Page
+    name : str
+        First part of the charts' names.
+    t : ndarray, shape (N,), seconds
+    v : ndarray, shape (N,), volts
+    y, simulated : ndarray, shape (N,), metres
+        Measured and simulated displacement.
+    noise : float, metres
+        Half-width of the shaded noise band; 0 for none.
+    fitted : ndarray of bool, shape (N,)
+        Mask of the samples to be evaluated.
+    """
+    motion, models = Motion.of(t, v), [Curve("model", simulated, AFTER)]
+    chart, said = loops(v, y, models, motion, fitted)
+    page.chart(f"{name}-loops", chart, f"{LOOPS} {said}")
+    chart, said = over_time(t, y, models, noise, fitted=fitted)
+    unused = "" if fitted.all() else f" Shaded: {UNUSED}."
+    page.chart(f"{name}-time", chart, f"Over time; the grey band is plus or minus the noise floor.{unused} {said}")
+    chart, said = over_voltage(v, y - simulated, motion, noise, fitted)
+    how = "Measured - model over rising and falling voltage, and the histogram."
+    page.chart(f"{name}-residual", chart, f"{how} {said}")
+    return motion
 
 
 def loops(

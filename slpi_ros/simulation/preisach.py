@@ -1,6 +1,7 @@
 """One axis of a simulated piezo stage: amplifier, Preisach relays, reversible curve, creep, flexure mode and sensor."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -9,8 +10,6 @@ from numpy.typing import NDArray
 from slpi_ros.errors import UsageError
 from slpi_ros.simulation.dynamics import Dynamics
 from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.paths import measure_loop
-from slpi_ros.simulation.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
 
@@ -268,7 +267,99 @@ class RelayTriangle:
         self._state[block] = after
 
 
-__all__ = ["PreisachStage", "StageParameters"]
+class Sensor:
+    """A sensor with Gaussian noise and quantisation.
+
+    Parameters
+    ----------
+    noise_rms : float, metres
+        Standard deviation of the noise.
+    quantisation : float, metres
+        Resolution of the readings; 0 for none.
+    seed : int
+        The same seed gives the same noise.
+    """
+
+    def __init__(self, noise_rms: float, quantisation: float, seed: int) -> None:
+        self._noise_rms = noise_rms
+        self._quantisation = quantisation
+        self._rng = np.random.default_rng(seed)
+
+    def read(self, displacement: FloatArray) -> FloatArray:
+        """Return the readings for displacements, in order.
+
+        Parameters
+        ----------
+        displacement : ndarray, any shape, metres
+            True displacement.
+
+        Returns
+        -------
+        ndarray, same shape, metres
+            Sensor reading.
+        """
+        reading = displacement + self._noise_rms * self._rng.standard_normal(displacement.shape)
+        if self._quantisation:
+            reading = self._quantisation * np.round(reading / self._quantisation)
+        return np.asarray(reading, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class LoopFigure:
+    """Characteristic values of a closed major loop.
+
+    Parameters
+    ----------
+    start : float, metres
+        Displacement at the lower voltage before the first rise.
+    bottom, top : float, metres
+        Displacement at the lower and the upper voltage of the closed loop.
+    rising_middle, falling_middle : float, metres
+        Displacement at the middle voltage on the rising and on the falling branch.
+    """
+
+    start: float
+    bottom: float
+    top: float
+    rising_middle: float
+    falling_middle: float
+
+    @property
+    def stroke(self) -> float:
+        """Height of the closed loop, metres."""
+        return self.top - self.bottom
+
+    @property
+    def hysteresis(self) -> float:
+        """Width of the loop at the middle voltage, as a share of the stroke."""
+        return (self.falling_middle - self.rising_middle) / self.stroke
+
+    @property
+    def remanence(self) -> float:
+        """Displacement that remains at the lower voltage after the first rise and fall, metres."""
+        return self.bottom - self.start
+
+
+def measure_loop(respond: Callable[[float], float], low: float, high: float) -> LoopFigure:
+    """Drive two major loops and return the characteristic values of the second.
+
+    Parameters
+    ----------
+    respond : callable
+        Maps a voltage (V) to the displacement (m), starting at rest at `low` or below.
+    low, high : float, volts
+        Ends of the loop.
+
+    Returns
+    -------
+    LoopFigure
+        Values of the second loop, which is closed.
+    """
+    middle = (low + high) / 2
+    start, _, bottom = respond(low), respond(high), respond(low)
+    rising_middle, top, falling_middle = respond(middle), respond(high), respond(middle)
+    respond(low)
+    return LoopFigure(start, bottom, top, rising_middle, falling_middle)
 
 
 class PreisachStage:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hidden.physics import Physics
 
 import slpi_ros
 from slpi_ros.diagnosis.result import AxisDiagnosis, Diagnosis, NamedEffect, Traces
 from slpi_ros.effects.creep import Creep
-from slpi_ros.simulation.chain import Physics
 
 BENCHMARKS = str(Path(__file__).resolve().parents[2] / "benchmarks")
 RATE, SECONDS = 200.0, 8.0
@@ -44,9 +44,9 @@ def stage(benchmarks):
 def drive(benchmarks, stage):
     from hidden.drives import one_frequency
 
-    from slpi_ros.excitation.legs import Room
+    from slpi_ros.excitation.legs import DriveSpec
 
-    room = Room(0.0, float(stage.record.voltage["x"].max()), SECONDS, RATE)
+    room = DriveSpec(0.0, float(stage.record.voltage["x"].max()), SECONDS, RATE)
     return {"x": one_frequency(room, 1.0, np.random.default_rng(3))}
 
 

@@ -478,7 +478,7 @@ def test_held_samples_that_make_no_sense_move_nothing(sample):
 def test_voltages_beyond_all_numbers_move_nothing():
     feedback = taken_over(PidGains(1e300, 1e295))
     before = dict(vars(feedback))
-    with pytest.raises(UsageError, match="not finite"):
+    with pytest.raises(UsageError, match=r"1e\+308 V"):
         feedback.correct(1.0, 1e8, 0.0, 1e308)
     assert vars(feedback) == before
 
@@ -515,6 +515,6 @@ def test_gains_beyond_reason_are_refused_at_run_time():
     feedback = taken_over()
     feedback.correct(1.0, 1e3, 0.0, 10.0)
     before = dict(vars(feedback))
-    with pytest.raises(UsageError, match="^[^\n]+check their units$"):
+    with pytest.raises(UsageError, match=r"1e\+306"):
         feedback.retune(PidGains(1e306))
     assert vars(feedback) == before

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import slpi_ros
+from benchmarks.hidden.physics import Amplifier, Physics, own_motion
 from slpi_ros.effects.delay import Delay
 from slpi_ros.io.record import Record
-from slpi_ros.reports.diagnosis import format_diagnosis
-from slpi_ros.simulation.chain import Physics, own_motion
-from slpi_ros.simulation.dynamics import Amplifier
+from slpi_ros.io.schemas import format_document
 from slpi_ros.simulation.parameters import StageParameters
 
 RATE, NOISE, HIGH = 500.0, 6e-9, 100.0
@@ -49,7 +48,7 @@ def model():
 
 def found(records, model):
     diagnosis = slpi_ros.diagnose(records, model)
-    format_diagnosis(diagnosis)
+    format_document(diagnosis.to_document(), "diagnosis")
     return diagnosis.axes["x"], diagnosis.extended.axes["x"]
 
 

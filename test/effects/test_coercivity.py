@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from strategies import FAMILY_CASE, axis_model
 
+from benchmarks.hidden.physics import RateLaw, Viscosity
 from slpi_ros.effects.base import EffectContext
-from slpi_ros.effects.paths import play, settled_rate
 from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.paths import play, settled_rate
 from slpi_ros.effects.rate_dependence import RateDependence, StreamingCoercivity
 from slpi_ros.effects.registry import in_order
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.simulation.dynamics import RateLaw, Viscosity
 
 BARE = replace(axis_model(FAMILY_CASE), voltage_range=(-20.0, 120.0))
 SPAN, DT = 10e-6, 1e-3

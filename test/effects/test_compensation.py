@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import slpi_ros
+from benchmarks.paths import scan_path
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.lag import Lag
@@ -19,7 +20,6 @@ from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.simulation import dynamics as physics
 from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.paths import scan_path
 from slpi_ros.simulation.preisach import PreisachStage
 
 AXES = ("x", "y")

@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model
 
+from benchmarks.hidden.physics import Ageing
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.gain_drift import GainDrift
-from slpi_ros.simulation.dynamics import Ageing
 
 T = np.linspace(0.0, 200.0, 4001)
 # 60 equal loops about 10 um.

@@ -78,16 +78,16 @@ def test_every_drive_says_what_it_is_good_for(drive):
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"axes": ()}, "name at least one"),
-        ({"axes": ("x", "x")}, "a name of its own"),
-        ({"axes": ("x", "")}, "name at least one"),
-        ({"drive": "friction"}, "no drive 'friction'; choose one of calibration, "),
-        ({"axes": ("x", "y"), "voltage_max": (1.0, 2.0, 3.0)}, "3 values of voltage_max for 2 axes"),
-        ({"start": 120.0}, "starts at 120 V; give a voltage within 0 to 100 V"),
-        ({"start": float("nan")}, "starts at nan V"),
-        ({"start": 90.0, "slew_limit": 5.0}, "the way from 90 V to 0 V and back takes"),
-        ({"axes": tuple("abcdefgh"), "slew_limit": 100.0}, "not 3.75 s; give more time"),
-        ({"axes": tuple("abcdefgh"), "duration": 0.01}, "both must be more than 0|give more time"),
+        ({"axes": ()}, r"\[\]"),
+        ({"axes": ("x", "x")}, r"\['x', 'x'\]"),
+        ({"axes": ("x", "")}, r"\['x', ''\]"),
+        ({"drive": "friction"}, "'friction'.*calibration"),
+        ({"axes": ("x", "y"), "voltage_max": (1.0, 2.0, 3.0)}, r"\b3\b.*voltage_max.*\b2\b"),
+        ({"start": 120.0}, "120 V.*0.*100 V"),
+        ({"start": float("nan")}, "nan V"),
+        ({"start": 90.0, "slew_limit": 5.0}, "90 V.*0 V.*30 s"),
+        ({"axes": tuple("abcdefgh"), "slew_limit": 100.0}, "3.75 s"),
+        ({"axes": tuple("abcdefgh"), "duration": 0.01}, "0.0 s|0.00125 s"),
     ],
 )
 def test_drives_that_cannot_be_made(given, says):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slpi_ros.errors import UsageError
-from slpi_ros.excitation.legs import Path, Room
+from slpi_ros.excitation.legs import DriveSpec, Path
 
 shares = st.floats(0.0, 1.0)
 legs = st.lists(st.tuples(shares, st.floats(0.0, 3.0), st.booleans()), min_size=1, max_size=12)
@@ -22,10 +22,10 @@ def path_of(start, moves):
 @given(shares, legs, st.sampled_from([0.0, 1.0, 50.0, 3000.0]), st.floats(1.0, 3.0))
 def test_all_is_kept_to(start, moves, slew, patience):
     path = path_of(start, moves)
-    least = Room(-10.0, 50.0, 1.0, 100.0, slew)
-    room = Room(-10.0, 50.0, patience * path.fewest_steps(least).sum() / 100.0, 100.0, slew)
-    v = path.voltages(room)
-    assert v.shape == (room.steps + 1,)
+    least = DriveSpec(-10.0, 50.0, 1.0, 100.0, slew)
+    spec = DriveSpec(-10.0, 50.0, patience * path.fewest_steps(least).sum() / 100.0, 100.0, slew)
+    v = path.voltages(spec)
+    assert v.shape == (spec.steps + 1,)
     assert v.min() >= -10.0 and v.max() <= 50.0
     if slew:
         assert np.max(np.abs(np.diff(v))) * 100.0 <= slew * (1 + 1e-9)
@@ -40,17 +40,17 @@ def test_all_is_kept_to(start, moves, slew, patience):
 
 @pytest.mark.parametrize(("duration", "turn"), [(4.0, 1.0), (8.0, 2.0), (2.0, 0.5)])
 def test_time_left_over_or_missing_is_shared_out(duration, turn):
-    v = path_of(0.0, [(1.0, 1.0, False), (0.0, 3.0, False)]).voltages(Room(0.0, 1.0, duration, 100.0))
+    v = path_of(0.0, [(1.0, 1.0, False), (0.0, 3.0, False)]).voltages(DriveSpec(0.0, 1.0, duration, 100.0))
     assert int(np.argmax(v)) == pytest.approx(turn * 100.0, abs=2)
 
 
 def test_straight_and_rounded_moves():
-    room = Room(0.0, 100.0, 1.0, 100.0)
+    spec = DriveSpec(0.0, 100.0, 1.0, 100.0)
     straight, rounded = Path(), Path()
     straight.to(1.0, 1.0, straight=True)
     rounded.to(1.0, 1.0)
-    np.testing.assert_allclose(straight.voltages(room), np.arange(101.0), atol=1e-9)
-    v = rounded.voltages(room)
+    np.testing.assert_allclose(straight.voltages(spec), np.arange(101.0), atol=1e-9)
+    v = rounded.voltages(spec)
     np.testing.assert_allclose(v + v[::-1], 100.0, atol=1e-9)
     steps = np.diff(v)
     assert steps[0] < 0.1 and steps[-1] < 0.1 and steps.max() == pytest.approx(np.pi / 2, rel=1e-3)
@@ -58,37 +58,37 @@ def test_straight_and_rounded_moves():
 
 def test_a_slew_limit_takes_as_long_as_it_must():
     for straight, factor in ((True, 1.0), (False, np.pi / 2)):
-        assert Room(0.0, 100.0, 30.0, 100.0, 50.0).quickest(0.5, straight) == pytest.approx(factor)
-    assert Room(0.0, 100.0, 30.0, 100.0).quickest(0.5) == 0.0
+        assert DriveSpec(0.0, 100.0, 30.0, 100.0, 50.0).quickest(0.5, straight) == pytest.approx(factor)
+    assert DriveSpec(0.0, 100.0, 30.0, 100.0).quickest(0.5) == 0.0
 
 
 @pytest.mark.parametrize(
-    ("room", "says"),
+    ("spec", "says"),
     [
-        ((100.0, 0.0, 30.0, 100.0), "lower one"),
-        ((0.0, float("inf"), 30.0, 100.0), "lower one"),
-        ((0.0, float("nan"), 30.0, 100.0), "lower one"),
-        ((0.0, 100.0, 0.0, 100.0), "more than 0"),
-        ((0.0, 100.0, 30.0, float("nan")), "more than 0"),
-        ((0.0, 100.0, 30.0, 100.0, -1.0), "slew limit"),
-        ((0.0, 100.0, 30.0, 100.0, float("nan")), "slew limit"),
-        ((0.0, 100.0, 1e6, 1e3), "more than 10000000 samples"),
+        ((100.0, 0.0, 30.0, 100.0), "100.0 V"),
+        ((0.0, float("inf"), 30.0, 100.0), "inf V"),
+        ((0.0, float("nan"), 30.0, 100.0), "nan V"),
+        ((0.0, 100.0, 0.0, 100.0), "0.0 s"),
+        ((0.0, 100.0, 30.0, float("nan")), "nan Hz"),
+        ((0.0, 100.0, 30.0, 100.0, -1.0), "-1.0 V/s"),
+        ((0.0, 100.0, 30.0, 100.0, float("nan")), "nan V/s"),
+        ((0.0, 100.0, 1e6, 1e3), "10000000"),
     ],
 )
-def test_no_room(room, says):
+def test_specifications_of_no_drive(spec, says):
     with pytest.raises(UsageError, match=says):
-        Room(*room)
+        DriveSpec(*spec)
 
 
 def test_too_little_time_says_how_much_is_needed():
     path = path_of(0.0, [(1.0, 1.0, True), (0.0, 1.0, True)])
     with pytest.raises(UsageError, match=r"\b2\b.*\b4 s\b.*100 Hz.*50 V/s.*3\.5 s"):
-        path.voltages(Room(0.0, 100.0, 3.5, 100.0, 50.0))
-    assert path.voltages(Room(0.0, 100.0, 4.0, 100.0, 50.0)).max() == 100.0
+        path.voltages(DriveSpec(0.0, 100.0, 3.5, 100.0, 50.0))
+    assert path.voltages(DriveSpec(0.0, 100.0, 4.0, 100.0, 50.0)).max() == 100.0
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1e9), (-1e9, 0.0), (0.0, np.nextafter(1e4, np.inf))])
 def test_no_stage_takes_such_voltages(low, high):
     with pytest.raises(UsageError, match="10000 V"):
-        Room(low, high, 1.0, 100.0)
-    assert Room(-1e4, 1e4, 1.0, 100.0).span == 2e4
+        DriveSpec(low, high, 1.0, 100.0)
+    assert DriveSpec(-1e4, 1e4, 1.0, 100.0).span == 2e4

@@ -7,13 +7,13 @@ import pytest
 from identification.records import calibration, record_of, rms, stage
 
 import slpi_ros
+from benchmarks.paths import scan_path
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.fit import KINDS
-from slpi_ros.simulation.paths import scan_path
 
 
 @pytest.fixture(scope="module")

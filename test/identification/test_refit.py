@@ -7,13 +7,13 @@ import pytest
 from identification.records import calibration, record_of, rms, stage
 
 import slpi_ros
+from benchmarks.paths import scan_path
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.refit import refit
 from slpi_ros.model.document import format_model, parse_model
-from slpi_ros.simulation.paths import scan_path
 from slpi_ros.simulation.preisach import PreisachStage
 
 SEED = 1

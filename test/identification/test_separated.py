@@ -13,7 +13,8 @@ from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, separ
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.published_kinds import default_thresholds, least_iterations
 from slpi_ros.model.document import format_model, parse_model
-from slpi_ros.simulation.preisach import PreisachStage, StageParameters
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
 
 
 def ramps(*turns):

@@ -23,11 +23,11 @@ def test_only_the_newest_one_that_is_there_counts_as_new(tmp_path):
     for k, name in enumerate(("b", "a", "c")):
         write(tmp_path / name, 10**18 + k * 10**9)
     watch = BagWatch(tmp_path)
-    assert watch.look() == [tmp_path / "c"]
-    assert watch.look() == []
+    assert watch.poll() == [tmp_path / "c"]
+    assert watch.poll() == []
     write(tmp_path / "d", 2 * 10**18)
     write(tmp_path / "e", 10**18)
-    assert watch.look() == [tmp_path / "e", tmp_path / "d"]
+    assert watch.poll() == [tmp_path / "e", tmp_path / "d"]
 
 
 def test_what_is_being_written_is_no_bag_yet(tmp_path):
@@ -42,12 +42,12 @@ def test_what_is_being_written_is_no_bag_yet(tmp_path):
     (tmp_path / ".hidden.partial" / "metadata.yaml").write_text("x")
     (tmp_path / "notes.txt").write_text("x")
     (tmp_path / "empty.mcap").touch()
-    assert watch.look() == [tmp_path / "whole"]
+    assert watch.poll() == [tmp_path / "whole"]
     (tmp_path / "lone.mcap").write_bytes(data)
     (tmp_path / "folder" / "metadata.yaml").touch()
-    assert watch.look() == [tmp_path / "lone.mcap"]
+    assert watch.poll() == [tmp_path / "lone.mcap"]
     (tmp_path / "folder" / "metadata.yaml").write_text("x")
-    assert watch.look() == [tmp_path / "folder"]
+    assert watch.poll() == [tmp_path / "folder"]
 
 
 def test_a_folder_that_goes_holds_none(tmp_path):
@@ -55,7 +55,7 @@ def test_a_folder_that_goes_holds_none(tmp_path):
     folder.mkdir()
     watch = BagWatch(folder)
     folder.rmdir()
-    assert watch.look() == []
+    assert watch.poll() == []
     assert holds(refusal(UsageError, BagWatch, folder), folder)
 
 
@@ -85,35 +85,35 @@ def unfinished(tmp_path):
 def test_what_has_not_grown_for_long_is_abandoned(unfinished):
     watch = BagWatch(unfinished, patience=30.0)
     names = [".ours.partial", "junk.mcap", "killed", "other"]
-    assert watch.look() == [] and watch.abandoned == ()
+    assert watch.poll() == [] and watch.abandoned == ()
     for path in unfinished.iterdir():
         rest(path, 29.0)
-    assert watch.look() == [] and watch.abandoned == ()
+    assert watch.poll() == [] and watch.abandoned == ()
     for path in unfinished.iterdir():
         rest(path, 31.0)
-    assert watch.look() == [] and watch.abandoned == tuple(unfinished / name for name in names)
+    assert watch.poll() == [] and watch.abandoned == tuple(unfinished / name for name in names)
 
 
 def test_what_was_abandoned_stays_watched(unfinished):
     watch = BagWatch(unfinished, patience=30.0)
     for path in unfinished.iterdir():
         rest(path, 31.0)
-    watch.look()
+    watch.poll()
     # One grows, one goes, one is mended.
     with (unfinished / "junk.mcap").open("ab") as file:
         file.write(b"more")
     for path in ("other_0.db3.zstd", ""):
         (unfinished / "other" / path).unlink() if path else (unfinished / "other").rmdir()
     (unfinished / "killed" / "metadata.yaml").write_text("x")
-    assert watch.look() == [unfinished / "killed"]
+    assert watch.poll() == [unfinished / "killed"]
     assert watch.abandoned == (unfinished / ".ours.partial",)
 
 
 def test_a_part_that_grows_keeps_its_bag(unfinished):
     watch = BagWatch(unfinished, patience=30.0)
     rest(unfinished / "killed", 31.0)
-    watch.look()
+    watch.poll()
     assert unfinished / "killed" in watch.abandoned
     (unfinished / "killed" / "killed_0.mcap").touch()
-    watch.look()
+    watch.poll()
     assert unfinished / "killed" not in watch.abandoned

@@ -20,7 +20,7 @@ from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_files import partial_path
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.bag_writer import BagWriter, write_bag
-from slpi_ros.io.messages import JOINT_STATE
+from slpi_ros.io.messages import JOINT_STATE, encode_joint_states
 from slpi_ros.io.record import Record
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -128,13 +128,19 @@ def test_other_library_reads_what_we_write(tmp_path):
         assert list(states.effort) == [record.voltage[axis][row] for axis in "xy"]
 
 
+def state(stamp, names=("x",), position=(0.0,), effort=(0.0,)):
+    """Return one serialised message of a stage."""
+    (message,) = encode_joint_states(np.array([stamp]), np.array([position]), np.array([effort]), names, "stage-7")
+    return message
+
+
 @both_storages
 def test_writer_sample_by_sample(tmp_path, storage):
     record = make_record(samples=10)
-    with BagWriter(tmp_path / "bag", storage=storage, topic="ns/stage_state", hardware_id="stage-7") as bag:
+    with BagWriter(tmp_path / "bag", storage=storage, topic="ns/stage_state") as bag:
         for row, stamp in enumerate(record.time_ns.tolist()):
             signals = ([signal[axis][row] for axis in "xy"] for signal in (record.displacement, record.voltage))
-            bag.write(stamp, "xy", *signals)
+            bag.write(stamp, state(stamp, ("x", "y"), *signals))
         assert bag.message_count == 10
     assert_same(read_bag(tmp_path / "bag", "/ns/stage_state"), record)
 
@@ -144,10 +150,10 @@ def test_writer_of_several_topics(tmp_path):
     with BagWriter(tmp_path / "bag", topic=None) as bag:
         bag.add_topic("words", "std_msgs/msg/String")
         bag.add_topic("stage_state")
-        bag.write_raw(10, text, "words")
-        bag.write_raw(20, bytes(STORE.serialize_cdr(joint_state(7), JOINT_STATE)), "/stage_state")
-        assert holds(refusal(UsageError, bag.write_raw, 30, text, "other"), "other", "add_topic")
-        assert holds(refusal(UsageError, bag.write_raw, 30, text), "add_topic")
+        bag.write(10, text, "words")
+        bag.write(20, bytes(STORE.serialize_cdr(joint_state(7), JOINT_STATE)), "/stage_state")
+        assert holds(refusal(UsageError, bag.write, 30, text, "other"), "other", "add_topic")
+        assert holds(refusal(UsageError, bag.write, 30, text), "add_topic")
         assert holds(refusal(RecordError, bag.add_topic, "own", "my_msgs/msg/Own"), "own", "my_msgs/msg/Own")
     assert read_bag(tmp_path / "bag").time_ns.tolist() == [7]
     first, second = decoded_by_mcap(tmp_path / "bag" / "bag.mcap")
@@ -290,7 +296,7 @@ def test_metadata_without_its_file(tmp_path):
 def test_recorder_that_was_killed(tmp_path):
     bag = BagWriter(tmp_path / "bag")
     for row in range(20_000):
-        bag.write(row, ["x"], [0.0], [0.0])
+        bag.write(row, state(row))
     assert holds(refusal(RecordError, read_bag, tmp_path / "bag"), bag.partial)
     assert holds(refusal(RecordError, read_bag, bag.partial / "bag"), "mcap recover")
     assert holds(refusal(RecordError, BagWriter, tmp_path / "bag"), bag.partial, "mcap recover")
@@ -317,7 +323,7 @@ def test_nothing_is_overwritten(tmp_path, storage):
 @both_storages
 def test_exception_discards(tmp_path, storage):
     with pytest.raises(KeyError), BagWriter(tmp_path / "bag", storage=storage) as bag:
-        bag.write(0, ["x"], [0.0], [0.0])
+        bag.write(0, state(0))
         assert partial_path(tmp_path / "bag").is_dir()
         assert not (tmp_path / "bag").exists()
         raise KeyError
@@ -326,7 +332,7 @@ def test_exception_discards(tmp_path, storage):
 
 def test_place_taken_meanwhile(tmp_path):
     bag = BagWriter(tmp_path / "bag")
-    bag.write(0, ["x"], [0.0], [0.0])
+    bag.write(0, state(0))
     (tmp_path / "bag").write_text("mine")
     assert holds(refusal(RecordError, bag.close), tmp_path / "bag", os.strerror(errno.ENOTDIR))
     assert (tmp_path / "bag").read_text() == "mine"

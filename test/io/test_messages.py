@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from slpi_ros.errors import RecordError
 from slpi_ros.io.bag_reader import decode_signals
 from slpi_ros.io.bag_storage import MessageBlock
-from slpi_ros.io.messages import JOINT_STATE, JointStateBlock, encode_joint_states, read_message
+from slpi_ros.io.messages import JOINT_STATE, encode_joint_states, read_message
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -46,8 +46,7 @@ def decode(*messages, blocks=1):
 @given(st.lists(texts, min_size=1, max_size=4), texts, stamps, st.data())
 def test_encoded_as_rosbags_does(names, frame_id, stamp, data):
     position, effort = (data.draw(st.lists(numbers, min_size=len(names), max_size=len(names))) for _ in "pe")
-    block = JointStateBlock(np.array([stamp]), np.array([position]), np.array([effort]))
-    encoded = encode_joint_states(block, tuple(names), frame_id)
+    encoded = encode_joint_states(np.array([stamp]), np.array([position]), np.array([effort]), tuple(names), frame_id)
     assert encoded == [serialised(stamp, names, position, effort, frame_id)]
 
 
@@ -125,9 +124,9 @@ def test_garbage_in_padding_and_at_the_end():
 def test_rclpy_both_ways():
     serialization = pytest.importorskip("rclpy.serialization")
     joint_state = pytest.importorskip("sensor_msgs.msg").JointState
-    block = JointStateBlock(np.array([12_000_000_034]), np.array([[1.5, 2.5]]), np.array([[3.5, 4.5]]))
-    names = ("x", "another")
-    read = serialization.deserialize_message(encode_joint_states(block, names, "stage")[0], joint_state)
+    stamp, position, effort = np.array([12_000_000_034]), np.array([[1.5, 2.5]]), np.array([[3.5, 4.5]])
+    (encoded,) = encode_joint_states(stamp, position, effort, ("x", "another"), "stage")
+    read = serialization.deserialize_message(encoded, joint_state)
     assert (read.header.stamp.sec, read.header.stamp.nanosec) == (12, 34)
     assert (read.header.frame_id, list(read.name)) == ("stage", ["x", "another"])
     assert (list(read.position), list(read.effort)) == ([1.5, 2.5], [3.5, 4.5])
@@ -141,6 +140,6 @@ def test_rclpy_both_ways():
 
 @pytest.mark.parametrize("stamp", [-1, 2**31 * 10**9])
 def test_stamp_that_no_header_can_hold(stamp):
-    block = JointStateBlock(np.array([0, stamp]), np.zeros((2, 1)), np.zeros((2, 1)))
-    message = refusal(RecordError, encode_joint_states, block, ("x",))
+    stamps, zeros = np.array([0, stamp]), np.zeros((2, 1))
+    message = refusal(RecordError, encode_joint_states, stamps, zeros, zeros, ("x",))
     assert holds(message, "sample 1", f"{stamp / 1e9:g} s", "2^31 s")

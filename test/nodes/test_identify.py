@@ -36,7 +36,7 @@ from slpi_ros.io.bag_writer import write_bag  # noqa: E402
 from slpi_ros.io.record import Record  # noqa: E402
 from slpi_ros.io.schemas import validate  # noqa: E402
 from slpi_ros.model.document import format_model, load_model, parse_model  # noqa: E402
-from slpi_ros.nodes.jobs import DiagnosisRequest, FitProcess, FitRequest, judge  # noqa: E402
+from slpi_ros.nodes.jobs import DiagnosisRequest, FitOutcome, FitRequest, WorkerProcess, fit, run_diagnosis  # noqa: E402
 
 NAME = "/identify: identify"
 # Quick to fit, and needs no better.
@@ -333,7 +333,7 @@ def test_a_diagnosis_reads_all_bags_of_the_fit(bag, humming_bag, tmp_path, monke
 
     monkeypatch.setattr("slpi_ros.nodes.jobs.diagnose", diagnosed)
     document = format_model(identify(read_bag(bag), "pi"))
-    outcome = judge(DiagnosisRequest((bag, humming_bag), "stage_state", document, str(tmp_path)))
+    outcome = run_diagnosis(DiagnosisRequest((bag, humming_bag), "stage_state", document, str(tmp_path)))
     assert outcome.error == "enough" and seen == [bag, humming_bag]
 
 
@@ -426,7 +426,8 @@ def test_an_endless_diagnosis_blocks_nothing_and_leaves_nothing(bag, humming_bag
 
 
 def test_a_worker_that_dies_is_an_error_not_a_hang(bag):
-    job = FitProcess(FitRequest((bag,), "stage_state", "pi", None, None, ""))
+    request = FitRequest((bag,), "stage_state", "pi", None, None, "")
+    job = WorkerProcess(fit, request, FitOutcome, "the identification")
     job._process.kill()
     deadline = time.monotonic() + PATIENCE_S
     while (outcome := job.outcome()) is None:

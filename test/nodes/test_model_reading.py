@@ -62,7 +62,7 @@ def test_a_large_wrong_document_is_refused_elsewhere(nothing_checked_here, text)
 
 
 def test_a_small_document_needs_no_process(monkeypatch):
-    monkeypatch.setattr(model_reading, "CheckProcess", None)
+    monkeypatch.setattr(model_reading, "WorkerProcess", None)
     model, fingerprint = Reading(format_model(stage_model()), "here").read()
     assert fingerprint == model_id(model)
     with pytest.raises(ModelError, match="^here: [^\n]+$"):

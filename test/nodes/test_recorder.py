@@ -15,6 +15,7 @@ from mcap.reader import make_reader  # noqa: E402
 from mcap_ros2.decoder import DecoderFactory  # noqa: E402
 from rclpy.context import Context  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data  # noqa: E402
+from refusals import holds  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float64, String  # noqa: E402
 
@@ -99,7 +100,7 @@ def test_records_until_a_signal(tmp_path, node, record, storage, number):
     assert os.listdir(tmp_path) == [".bag.partial"]
     code, said = recording.end(number)
     assert code == 0
-    assert f"900 messages in {tmp_path / 'bag'}" in said
+    assert holds(said, 900, tmp_path / "bag")
     assert os.listdir(tmp_path) == ["bag"]
     read = read_bag(tmp_path / "bag")
     assert (read.axes, read.hardware_id) == (("x", "y"), "stage-7")
@@ -144,7 +145,7 @@ def test_duration(tmp_path, node, record):
 def test_nothing_came(tmp_path, record):
     code, said = record(output=tmp_path / "bag", duration=0.1).end()
     assert code == 1
-    assert said.splitlines()[-1] == f"{tmp_path / 'bag'}: not written, as no message came; check the parameter topics"
+    assert holds(said.splitlines()[-1], tmp_path / "bag", "topics")
     assert os.listdir(tmp_path) == []
 
 
@@ -152,7 +153,7 @@ def test_topic_of_another_type(tmp_path, node, record):
     node.create_publisher(Float64, "stage_state", RELIABLE)
     code, said = record(output=tmp_path / "bag").end()
     assert code == 1
-    assert "/stage_state is both sensor_msgs/msg/JointState and std_msgs/msg/Float64" in said.splitlines()[-1]
+    assert holds(said.splitlines()[-1], "/stage_state", "sensor_msgs/msg/JointState", "std_msgs/msg/Float64")
     assert os.listdir(tmp_path) == []
 
 
@@ -160,11 +161,11 @@ def test_bag_exists(tmp_path, node, record):
     publisher = node.create_publisher(JointState, "stage_state", RELIABLE)
     recording = record(output=tmp_path / "bag")
     feed(recording, publisher, 3)
-    assert "unfinished bag of the same name" in record(output=tmp_path / "bag").end()[1]
+    assert holds(record(output=tmp_path / "bag").end()[1], tmp_path / ".bag.partial")
     recording.end(signal.SIGINT)
     read = read_bag(tmp_path / "bag")
     code, said = record(output=tmp_path / "bag").end()
-    assert (code, said) == (1, f"{tmp_path / 'bag'}: exists already; choose another name, or remove it first\n")
+    assert code == 1 and said.startswith(f"{tmp_path / 'bag'}: ") and len(said.splitlines()) == 1
     assert len(read) == len(read_bag(tmp_path / "bag")) == 3
 
 
@@ -175,7 +176,7 @@ def test_place_taken_while_recording(tmp_path, node, record):
     (tmp_path / "bag").write_text("somebody else's")
     code, said = recording.end(signal.SIGINT)
     assert code == 1
-    assert f"unfinished files are in {tmp_path / '.bag.partial'}" in said.splitlines()[-1]
+    assert holds(said.splitlines()[-1], tmp_path / ".bag.partial")
     assert (tmp_path / "bag").read_text() == "somebody else's"
     assert len(read_bag(tmp_path / ".bag.partial" / "bag")) == 3
 
@@ -185,9 +186,9 @@ def test_place_taken_while_recording(tmp_path, node, record):
     [
         ({}, 2, "output"),
         ({"output": "bag", "storage": "zip"}, 2, "'zip'"),
-        ({"output": "bag", "duration": "-1.0"}, 2, "duration is -1.0"),
-        ({"output": "bag", "duration": "soon"}, 2, "duration is 'soon'"),
-        ({"output": "bag", "topics": "one"}, 2, "topics is 'one'"),
+        ({"output": "bag", "duration": "-1.0"}, 2, "duration"),
+        ({"output": "bag", "duration": "soon"}, 2, "'soon'"),
+        ({"output": "bag", "topics": "one"}, 2, "topics"),
         ({"output": "bag", "topics": "['a b']"}, 2, "topic name"),
         ({"output": "/proc/no/bag"}, 1, "/proc/no/bag"),
     ],

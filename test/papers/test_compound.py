@@ -102,8 +102,8 @@ def test_figures_of_an_outcome():
     desired = path([(10e-6, 1.0), (20e-6, 1.0)], 2)
     outcome = Outcome(desired, 1.1 * desired + 1e-6, desired)
     np.testing.assert_allclose(outcome.peaks, [12e-6, 12e-6, 23e-6, 23e-6])
-    assert outcome.done.maximum == 0
-    assert outcome.read.maximum == pytest.approx(3e-6)
+    assert outcome.by_truth.maximum == 0
+    assert outcome.by_sensor.maximum == pytest.approx(3e-6)
     assert outcome.offset == pytest.approx(1e-6 + 0.1 * desired.mean())
     assert outcome.within(2e-6) == pytest.approx(0.75, abs=0.01)
 
@@ -113,12 +113,12 @@ def test_targets_are_met(studies):
     peaks = np.array([peak for peak, _ in published.TABLE_6])
     for label in (SMPI, FAMILY):
         outcome = compound[label, True]
-        assert outcome.read.mean * 1e6 <= published.COMPOUND_MEAN
-        assert outcome.done.mean * 1e6 <= published.COMPOUND_MEAN
+        assert outcome.by_sensor.mean * 1e6 <= published.COMPOUND_MEAN
+        assert outcome.by_truth.mean * 1e6 <= published.COMPOUND_MEAN
         assert np.all(np.abs(outcome.peaks * 1e6 - peaks) <= published.COMPOUND_BAND)
-        assert outcome.read.mean < 0.2 * compound["", True].read.mean
-        assert outcome.read.mean < 0.2 * compound[label, False].read.mean
-    assert compound[FAMILY, True].read.mean < compound[SMPI, True].read.mean
+        assert outcome.by_sensor.mean < 0.2 * compound["", True].by_sensor.mean
+        assert outcome.by_sensor.mean < 0.2 * compound[label, False].by_sensor.mean
+    assert compound[FAMILY, True].by_sensor.mean < compound[SMPI, True].by_sensor.mean
 
 
 def test_the_family_scatters_less_as_feedforward(studies):
@@ -139,7 +139,7 @@ def test_every_exhibit_is_complete(studies):
 def test_exhibits_show_what_was_computed(studies):
     shown = present(studies)[-1]
     outcome = studies["x"].compound[SMPI, True]
-    assert f"{outcome.read.mean * 1e6:.4f} µm on the worse axis, not above the paper's" in shown.ours
+    assert f"{outcome.by_sensor.mean * 1e6:.4f} µm on the worse axis, not above the paper's" in shown.ours
     assert "all segments are met" in shown.ours and "NOT" not in shown.ours
     column = [row[3] for row in shown.tables[0].rows]
     assert column == [f"{peak * 1e6:.2f}" for peak in outcome.peaks]

@@ -5,9 +5,10 @@ import pytest
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis.kinds import from_document, to_document
-from slpi_ros.hysteresis.slpi_published import separate
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, separate
 from slpi_ros.hysteresis.turning_points import Memory
-from slpi_ros.papers.published import TABLES, THRESHOLDS, ramps, table_loops, table_model
+from slpi_ros.papers.slpi_study import TABLES, THRESHOLDS, ramps
 
 FloatArray = NDArray[np.float64]
 
@@ -36,6 +37,32 @@ def inverse(y: FloatArray, weights: FloatArray) -> FloatArray:
         r = sum(weights[j] * (THRESHOLDS[i] - THRESHOLDS[j]) for j in range(i + 1))
         v = v - weights[i] / (total[i - 1] * total[i]) * play(y, r)
     return v
+
+
+def table_model(number: int) -> PrandtlIshlinskii:
+    """Return the PI model of Table 2 (level II), 3 (level I), 4 (level 0) or 5 (classical PI), volts to metres."""
+    return PrandtlIshlinskii(np.array(THRESHOLDS), 1e-6 * np.array(TABLES[number]))
+
+
+def table_loops(vertices: tuple[float, float], spans: tuple[float, float, float], *, at_rest: bool) -> SeparatedLoops:
+    """Return the three loops of Tables 4, 3 and 2, each on the loop before it."""
+    outer = _loop(4, 0, 1, (0.0, 0.0), spans[0], None)
+    run_in = None if at_rest else 0.0
+    first_vertex = vertices[0], outer.memory().forward(vertices[0])
+    first = _loop(3, 1, -1, first_vertex, spans[1], run_in)
+    way_back = first.memory()
+    # Down to the turn, and up again to the next vertex.
+    way_back.forward(spans[1])
+    second_vertex = vertices[1], first_vertex[1] - way_back.forward(vertices[0] - vertices[1])
+    return SeparatedLoops((outer, first, _loop(2, 2, -1, second_vertex, spans[2], run_in)))
+
+
+def _loop(
+    table: int, level: int, direction: int, vertex: tuple[float, float], span: float, run_in: float | None
+) -> SingleLoop:
+    model = table_model(table)
+    height = SingleLoop(level, direction, vertex, (span, 1.0), (0.0, 0.0), model, run_in).memory().forward(span)
+    return SingleLoop(level, direction, vertex, (span, height), (0.0, 0.0), model, run_in)
 
 
 @pytest.mark.parametrize("number", TABLES)

@@ -10,15 +10,18 @@ from hypothesis import strategies as st
 
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.papers import slpi_exhibits
-from slpi_ros.papers.published import OVERALL_MEAN, ramps, straight_between_reversals, triangles
+from slpi_ros.papers.mpi_study import triangles
 from slpi_ros.papers.slpi_study import (
     AT_REST,
     CLASSICAL,
     CLOSING,
     FAMILY,
     MODELS,
+    OVERALL_MEAN,
     LoopErrors,
     gain,
+    ramps,
+    straight_between_reversals,
     unseen_paths,
 )
 

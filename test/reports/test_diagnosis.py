@@ -21,7 +21,7 @@ from slpi_ros.diagnosis.result import (
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.hum import Hum
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.reports.diagnosis import write_diagnosis
+from slpi_ros.reports.diagnosis import PAGE, page_of
 
 CHARTS = ("time", "motion", "frequency", "loops")
 HOSTILE = "</script><img src=x onerror=alert(1)>"
@@ -60,7 +60,8 @@ def found(**changes):
 
 
 def write(folder, axes, source="some bag"):
-    return write_diagnosis(folder, Diagnosis(axes, StageModel({}), source))
+    page_of(Diagnosis(axes, StageModel({}), source)).write(folder / PAGE)
+    return folder / PAGE
 
 
 @pytest.fixture(scope="module")

@@ -118,7 +118,7 @@ def test_what_was_not_fitted_is_marked_and_counts_nowhere(identified, written, t
     ends = ((0.0, 3.0), (9.0, record.t[-1]))
     assert sorted(spans, key=str) == sorted([(x, *span) for x in ("x", "x2") for span in ends], key=str)
     assert [shape["showlegend"] for shape in shaded] == [True, False, False, False]
-    assert "from 3 s to 8.995 s" in path.read_text(encoding="utf-8")
+    assert "8.995 s" in path.read_text(encoding="utf-8")
 
 
 def test_the_legend_hides_what_was_not_fitted(identified, tmp_path):
@@ -239,7 +239,7 @@ def test_many_loops_are_drawn_whole_but_not_all(tmp_path):
     gaps = np.flatnonzero(np.isnan(v_drawn))
     first = v_drawn[: gaps[0]]
     assert np.all(np.diff(first) > 0.0) and np.ptp(first) > 0.99
-    assert "is drawn" in path.read_text(encoding="utf-8")
+    assert "1200 branches" in path.read_text(encoding="utf-8")
 
 
 def test_an_axis_that_the_record_lacks_is_told(tmp_path):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from simulation.oracles import lagged
 
+from benchmarks.hidden.physics import Amplifier
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.dynamics import Amplifier
 
 T = np.arange(2000) / 1000.0
 V = 50 - 45 * np.cos(7 * T) + 3 * np.sin(41 * T)

@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from benchmarks.hidden.physics import BoucWen
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.bouc_wen import BoucWen
 
 voltages = st.floats(-20, 120)
 

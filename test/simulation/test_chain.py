@@ -4,11 +4,22 @@ import numpy as np
 import pytest
 from simulation.oracles import lagged, ringing
 
-from slpi_ros.simulation.bouc_wen import BoucWen
-from slpi_ros.simulation.chain import Flexure, Physics, SlowDomains, own_motion, sensed
-from slpi_ros.simulation.dynamics import Amplifier, RateLaw, Viscosity
-from slpi_ros.simulation.preisach import PreisachStage, StageParameters
-from slpi_ros.simulation.sensor import Hum, Interferometer, Temperature
+from benchmarks.hidden.physics import (
+    Amplifier,
+    BoucWen,
+    Flexure,
+    Hum,
+    Interferometer,
+    Physics,
+    RateLaw,
+    SlowDomains,
+    Temperature,
+    Viscosity,
+    own_motion,
+    sensed,
+)
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
 
 STAGE = StageParameters(levels=140, stiffening=0.02, offset=1e-7)
 T = np.arange(1500) / 2000

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
-from slpi_ros.simulation.paths import measure_loop
 from slpi_ros.simulation.preisach import (
     ExponentialMaterial,
     PowerLawMaterial,
@@ -14,6 +13,7 @@ from slpi_ros.simulation.preisach import (
     RelayTriangle,
     StageParameters,
     material,
+    measure_loop,
 )
 
 POWER_LAW = StageParameters(

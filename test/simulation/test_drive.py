@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.paths import scan_path
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.paths import scan_path
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -6,7 +6,8 @@ from simulation.oracles import lagged, ringing
 
 from slpi_ros.errors import UsageError
 from slpi_ros.simulation.dynamics import Creep
-from slpi_ros.simulation.preisach import PreisachStage, StageParameters
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
 
 STATIC = StageParameters(levels=140, noise_rms=0.0, quantisation=0.0, offset=1e-7, stiffening=0.02)
 LAG = {"amplifier_lag": 2e-3}

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.paths import measure_loop
-from slpi_ros.simulation.preisach import PreisachStage, StageParameters
-from slpi_ros.simulation.sensor import Sensor
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage, Sensor, measure_loop
 
 SEEDS = range(12)
 QUIET = StageParameters(noise_rms=0.0, quantisation=0.0)

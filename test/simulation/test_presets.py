@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slpi_ros.simulation.paths import measure_loop
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.preisach import PreisachStage, measure_loop
 from slpi_ros.simulation.stage import flexure_stage, p11_stage
 
 # Second paper, Table 1: amplitude (V), a (µm), b.

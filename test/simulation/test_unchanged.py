@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from slpi_ros.simulation.preisach import PreisachStage, StageParameters
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
 from slpi_ros.simulation.stage import Stage
 
 # Written down from the stage as it was. The last bits of its sums depend on the processor.

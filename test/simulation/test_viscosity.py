@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from slpi_ros.simulation.dynamics import RateLaw, Viscosity
+from benchmarks.hidden.physics import RateLaw, Viscosity
 
 POWER, LOGARITHM = RateLaw(2.0, exponent=0.5), RateLaw(2.0, onset=4.0)
 

@@ -1,8 +1,6 @@
-"""Reference paths and loop figures for the evaluation of a stage."""
+"""Reference path for the evaluation of models and of the compensation."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,61 +83,3 @@ def _corners(
 def _smooth(path: FloatArray, half_width: int) -> FloatArray:
     kernel = np.hanning(2 * half_width + 3)[1:-1]
     return np.convolve(np.pad(path, half_width, mode="edge"), kernel / kernel.sum(), mode="valid")
-
-
-@dataclass(frozen=True)
-class LoopFigure:
-    """Characteristic values of a closed major loop.
-
-    Parameters
-    ----------
-    start : float, metres
-        Displacement at the lower voltage before the first rise.
-    bottom, top : float, metres
-        Displacement at the lower and the upper voltage of the closed loop.
-    rising_middle, falling_middle : float, metres
-        Displacement at the middle voltage on the rising and on the falling branch.
-    """
-
-    start: float
-    bottom: float
-    top: float
-    rising_middle: float
-    falling_middle: float
-
-    @property
-    def stroke(self) -> float:
-        """Height of the closed loop, metres."""
-        return self.top - self.bottom
-
-    @property
-    def hysteresis(self) -> float:
-        """Width of the loop at the middle voltage, as a share of the stroke."""
-        return (self.falling_middle - self.rising_middle) / self.stroke
-
-    @property
-    def remanence(self) -> float:
-        """Displacement that remains at the lower voltage after the first rise and fall, metres."""
-        return self.bottom - self.start
-
-
-def measure_loop(respond: Callable[[float], float], low: float, high: float) -> LoopFigure:
-    """Drive two major loops and return the characteristic values of the second.
-
-    Parameters
-    ----------
-    respond : callable
-        Maps a voltage (V) to the displacement (m), starting at rest at `low` or below.
-    low, high : float, volts
-        Ends of the loop.
-
-    Returns
-    -------
-    LoopFigure
-        Values of the second loop, which is closed.
-    """
-    middle = (low + high) / 2
-    start, _, bottom = respond(low), respond(high), respond(low)
-    rising_middle, top, falling_middle = respond(middle), respond(high), respond(middle)
-    respond(low)
-    return LoopFigure(start, bottom, top, rising_middle, falling_middle)

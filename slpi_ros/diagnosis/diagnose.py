@@ -292,7 +292,7 @@ def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:
 
 def _outcomes(model: AxisModel, now: Explanation, final: Explanation | None) -> tuple[RecordOutcome, ...]:
     """Return what became of each record; without `final` the model stays as it is."""
-    left_out = np.sqrt(now.held_out.records).tolist() or [None]
+    left_out = [error if np.isfinite(error) else None for error in np.sqrt(now.held_out.records).tolist()] or [None]
     outcomes = []
     for part, rows, other in zip(now.evidence.parts, now.evidence.slices, left_out, strict=True):
         run = _free_run(model, part)

@@ -133,7 +133,8 @@ class RecordOutcome:
     before_rms, after_rms : float, metres
         Error of the given model and of the extended one, free-run, each without its constant.
     left_out_rms : float or None, metres
-        Error of hysteresis and effects that were fitted to the other records; None where there is one record.
+        Error of hysteresis and effects that were fitted to the other records; None where there is no other, or where
+        these cover too little of it.
     """
 
     source: str

@@ -1,0 +1,57 @@
+"""What a diagnosis finds on some measured records of a stage, judged on one that it has not seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import slpi_ros
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.resonance import Resonance
+from slpi_ros.io.tables import import_table
+from slpi_ros.model.axis_model import Start
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def records(measured_data):
+    return {name: import_table(measured_data / f"ntnu_{name}.csv") for name in ("20hz", "40hz", "100hz")}
+
+
+def error(model, record):
+    """Return the free-run error, % of the stroke, without its constant, from the initial history that suits."""
+    (axis,) = record.axes
+    v, y = record.voltage[axis], record.displacement[axis]
+    own = model.axes[axis]
+    own = replace(own, effects=tuple(effect for effect in own.effects if effect.removable != "record"))
+    histories = {(), (float(v[0]),), own.start.history}
+    paths = [replace(own, start=Start(float(v[0]), 0.0, history)).simulate(record.t, v) for history in histories]
+    return 100.0 * min(float(np.std(y - path)) for path in paths) / float(np.ptp(y))
+
+
+def shift(effect):
+    """Return by how much (s) an effect shifts a ramp."""
+    match effect:
+        case Delay():
+            return effect.seconds
+        case Lag():
+            return effect.time_constant
+        case Resonance():
+            return effect.damping / (np.pi * effect.frequency)
+    return 0.0
+
+
+def test_two_records_predict_a_third(records):
+    two = [records["20hz"], records["40hz"]]
+    plain = slpi_ros.identify(two)
+    diagnosis = slpi_ros.diagnose(two, plain)
+    (found,) = diagnosis.axes.values()
+    (extended,) = diagnosis.extended.axes.values()
+    named = {effect.name for effect in found.effects}
+    assert "creep" in named and not named & {"thermal_drift", "saturation", "hum", "gain_drift"}
+    assert 0.07e-3 <= sum(shift(effect) for effect in extended.effects) <= 0.14e-3
+    of_plain, of_extended = (error(model, records["100hz"]) for model in (plain, diagnosis.extended))
+    assert of_extended <= 0.27 and of_extended < 0.5 * of_plain
+    assert all(0.0 < outcome.left_out_rms < outcome.before_rms for outcome in found.records)

@@ -1,6 +1,7 @@
 """The package's architecture: what may import what, and what no module may do."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -132,3 +133,12 @@ def test_only_whole_paths_load_the_compiler() -> None:
     command = [sys.executable, "-c", code]
     said = subprocess.run(command, cwd=ROOT.parent, stdout=subprocess.PIPE, text=True, check=True).stdout
     assert said.strip() == "False"
+
+
+def test_the_objects_of_the_architecture_page_stand_where_it_says():
+    text = (ROOT.parent / "docs" / "architecture.md").read_text()
+    places = re.findall(r"`\w+\.([\w, ]+)` \|.*?\(\.\./(slpi_ros/[\w/]+\.py)#L(\d+)\)", text)
+    assert len(places) >= 6
+    for names, path, line in places:
+        there = (ROOT.parent / path).read_text().splitlines()[int(line) - 1]
+        assert any(f"def {name.strip()}(" in there for name in names.split(",")), (path, line, there)

@@ -4,7 +4,9 @@ PYTHON ?=
 export PYTHON
 
 VENV   := .venv/bin/python
-COLCON := env -u PYTHONDONTWRITEBYTECODE $(VENV) -c 'import sys; from colcon_core.command import main; sys.exit(main())'
+COLCON := $(COMPILED) $(VENV) -c 'import sys; from colcon_core.command import main; sys.exit(main())'
+# hundreds of processes are started: each would compile the sources anew without the files that Python keeps of them
+COMPILED := env -u PYTHONDONTWRITEBYTECODE
 # every command that starts nodes needs the workspace in its environment
 IN_WORKSPACE := . install/setup.sh &&
 
@@ -56,7 +58,7 @@ test: build
 	$(VENV) -m ruff check .
 	$(VENV) -m ruff format --check .
 	$(VENV) -m mypy
-	$(IN_WORKSPACE) $(VENV) -m pytest -n 3 --dist worksteal
+	$(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 3 --dist worksteal
 
 demo: build
 	$(IN_WORKSPACE) $(VENV) demo/run_demo.py

@@ -3,23 +3,39 @@
 SLPI is the Separated Level-loop Prandtl-Ishlinskii model. Nothing here needs a running ROS graph.
 """
 
-import os
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
-from slpi_ros.diagnosis.diagnose import diagnose
-from slpi_ros.diagnosis.verify import verify
-from slpi_ros.errors import SlpiError
-from slpi_ros.identification.fit import identify
-from slpi_ros.identification.record_quality import assess, findings
-from slpi_ros.identification.refit import refit
-from slpi_ros.io.record import Record
-from slpi_ros.model.axis_model import AxisModel
-from slpi_ros.model.document import load_model, save_model
-from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from slpi_ros.io.alignment import SeparateTopics
+    from slpi_ros.diagnosis.diagnose import diagnose
+    from slpi_ros.diagnosis.verify import verify
+    from slpi_ros.errors import SlpiError
+    from slpi_ros.identification.fit import identify
+    from slpi_ros.identification.record_quality import assess, findings
+    from slpi_ros.identification.refit import refit
+    from slpi_ros.io.bag_reader import read_bag
+    from slpi_ros.io.record import Record
+    from slpi_ros.model.axis_model import AxisModel
+    from slpi_ros.model.document import load_model, save_model
+    from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
+
+# Imported at first use: a node that streams needs neither the identification nor the diagnosis.
+_MODULES = {
+    "AxisModel": "model.axis_model",
+    "HeldAtLimitWarning": "model.stage_model",
+    "Record": "io.record",
+    "SlpiError": "errors",
+    "StageModel": "model.stage_model",
+    "assess": "identification.record_quality",
+    "diagnose": "diagnosis.diagnose",
+    "findings": "identification.record_quality",
+    "identify": "identification.fit",
+    "load_model": "model.document",
+    "read_bag": "io.bag_reader",
+    "refit": "identification.refit",
+    "save_model": "model.document",
+    "verify": "diagnosis.verify",
+}
 
 __all__ = [
     "AxisModel",
@@ -39,31 +55,15 @@ __all__ = [
 ]
 
 
-def read_bag(
-    path: str | os.PathLike[str], topic: "str | SeparateTopics" = "stage_state", *, axes: Sequence[str] | None = None
-) -> Record:
-    """Read voltage and displacement of a stage from a bag.
+def __getattr__(name: str) -> Any:
+    """Import a public name at its first use."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = found
+    return found
 
-    Parameters
-    ----------
-    path : path-like
-        A rosbag2 folder, or a lone mcap or sqlite3 file.
-    topic : str or slpi_ros.io.alignment.SeparateTopics
-        A ``sensor_msgs/JointState`` topic with ``position`` in metres and ``effort`` in volts, or a pair of topics.
-    axes : sequence of str, optional
-        Names of the axes to read; by default every axis of the bag.
 
-    Returns
-    -------
-    Record
-        ``t`` in seconds, shape (N,); ``voltage`` and ``displacement`` per axis, shape (N,), in volts and metres.
-
-    Raises
-    ------
-    SlpiError
-        If the bag cannot be read; the message names the remedy.
-    """
-    # Imported here so that simulation and compensation do not require rosbags.
-    from slpi_ros.io.bag_reader import read_bag as read
-
-    return read(path, topic, axes=axes)
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted({*globals(), *__all__})

@@ -7,7 +7,6 @@ from math import isfinite
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from slpi_ros.effects.filters import Uniform
@@ -236,8 +235,10 @@ def strongest_lines(
 
 def rhythms(left: ResidualView, count: int, lowest: float) -> list[float]:
     """Return the strongest frequencies (Hz) in the residual, at or above `lowest` (Hz)."""
+    from scipy.fft import next_fast_len
+
     dt, around = usual_step(left.t), left.around
-    size = 4 * scipy.fft.next_fast_len(round(longest(around) / dt) + 1)
+    size = 4 * next_fast_len(round(longest(around) / dt) + 1)
     frequency = np.fft.rfftfreq(size, dt)
     power = np.zeros(frequency.size)
     residual = np.where(left.used, left.residual, 0.0)

@@ -7,7 +7,6 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from slpi_ros.effects.base import (
     Candidate,
@@ -21,7 +20,7 @@ from slpi_ros.effects.base import (
     require,
     usual_step,
 )
-from slpi_ros.effects.filters import Hold, hold
+from slpi_ros.effects.filters import Hold, filtered, hold
 
 # Shortest time constant (s) of creep; shorter ones are modelled as lag.
 FASTEST = 0.1
@@ -103,7 +102,7 @@ class Creep:
         output = np.array([g * (one.before + one.now * one.kept) for g, one in zip(self.gains, holds, strict=True)])
         zeros = np.linalg.eigvals(np.diag(poles) - output[None, :] / direct)
         for zero, pole in zip(np.sort(zeros), np.sort(poles), strict=True):
-            moved = lfilter([1.0, -pole], [1.0, -zero], moved)
+            moved = filtered([1.0, -pole], [1.0, -zero], moved)
         return signal - grid.off(crept - np.real(moved) / direct)
 
     @classmethod

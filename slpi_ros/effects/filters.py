@@ -5,7 +5,7 @@ from math import cos, exp, expm1, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 
@@ -31,6 +31,14 @@ def hold(dt: float, time_constant: float) -> Hold:
     moved = -expm1(-x)
     now = x / 2 - x**2 / 6 + x**3 / 24 - x**4 / 120 if x < _SMALL else 1 - moved / x
     return Hold(now, moved - now, exp(-x))
+
+
+def filtered(numerator: ArrayLike, denominator: ArrayLike, signal: FloatArray) -> FloatArray:
+    """Return a signal, shape (N,), after a discrete transfer function, from rest."""
+    # A node filters sample by sample and does without the import, which takes a second.
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter(numerator, denominator, signal), dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
-from scipy.signal import lfilter
 
 from slpi_ros.effects.base import (
     Candidate,
@@ -19,7 +18,7 @@ from slpi_ros.effects.base import (
     require,
     usual_step,
 )
-from slpi_ros.effects.filters import Hold, hold
+from slpi_ros.effects.filters import Hold, filtered, hold
 
 # The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
 # of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
@@ -134,4 +133,4 @@ def _damped(real: Hold) -> Hold:
 def _filter(numerator: FloatArray, denominator: FloatArray, signal: FloatArray) -> FloatArray:
     """Filter a signal, shape (N,), that was constant before its start; a constant signal is unchanged."""
     start = signal[:1]
-    return np.asarray(start + lfilter(numerator, denominator, signal - start), dtype=np.float64)
+    return np.asarray(start + filtered(numerator, denominator, signal - start), dtype=np.float64)

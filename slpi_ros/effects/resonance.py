@@ -8,7 +8,6 @@ from math import pi
 from typing import ClassVar
 
 import numpy as np
-from scipy.signal import lfilter
 
 from slpi_ros.effects.base import (
     Candidate,
@@ -22,7 +21,7 @@ from slpi_ros.effects.base import (
     rhythms,
     usual_step,
 )
-from slpi_ros.effects.filters import Mode
+from slpi_ros.effects.filters import Mode, filtered
 
 # Smallest tap spacing, times 1 / w; smaller spacings give larger taps without benefit.
 SPACING = 0.5
@@ -187,7 +186,7 @@ class Resonance:
             return np.full_like(signal, signal[0]) if signal.size else signal.copy()
         numerator, denominator = self.mode.transfer(grid.dt)
         moved = grid.on(signal)
-        return grid.off(moved[0] + lfilter(numerator, denominator, moved - moved[0]))
+        return grid.off(moved[0] + filtered(numerator, denominator, moved - moved[0]))
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the input of the mode, shape (N,), metres, for the displacement `signal`, shape (N,), metres."""

@@ -15,11 +15,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from slpi_ros.compensator.persistence import model_id
-from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.errors import ModelError, RecordError, SlpiError
-from slpi_ros.identification.fit import identify
 from slpi_ros.io.atomic_file import make_folder
-from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.record import Record
 from slpi_ros.model.document import format_model, model_from, parse_model, save_model
 from slpi_ros.model.stage_model import StageModel
@@ -170,6 +167,10 @@ class FitOutcome:
 
 def fit(request: FitRequest) -> FitOutcome:
     """Read the bags, identify the model and write it to the output file, if any."""
+    # The compensator reads models by this module, and does without what is slow to load.
+    from slpi_ros.identification.fit import identify
+    from slpi_ros.io.bag_reader import read_bag
+
     document = ""
     try:
         records = [read_bag(bag, request.topic) for bag in request.bags]
@@ -253,7 +254,8 @@ class DiagnosisOutcome:
 
 def run_diagnosis(request: DiagnosisRequest) -> DiagnosisOutcome:
     """Read the bags, diagnose the model and write the files."""
-    # Plotting is slow to load, and a node that only identifies does without.
+    from slpi_ros.diagnosis.diagnose import diagnose
+    from slpi_ros.io.bag_reader import read_bag
     from slpi_ros.reports.diagnosis import FILES, write_files
 
     folder = Path(request.folder)

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
-from scipy.signal import savgol_filter
 from scipy.special import ndtri
 
 from slpi_ros.errors import RecordError, UsageError
@@ -670,6 +669,9 @@ def without_noise(t: FloatArray, v: FloatArray) -> FloatArray:
     Each reading is replaced by a parabola over the largest window that fits within the noise. Remaining reversals
     within the noise are flattened.
     """
+    # SciPy's signal package takes a second to load, and most commands do without.
+    from scipy.signal import savgol_filter
+
     noise = voltage_noise(t, v)
     if not noise:
         return v

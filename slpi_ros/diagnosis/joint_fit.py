@@ -139,9 +139,10 @@ class Joint:
 
         def held_out(left: Sequence[int], *, record: bool) -> _HeldOut:
             count = self._ends[-1] - sum(self._groups[group].size for group in left)
-            rest = whole - _sum([grams[group] for group in left])
-            rows = judged(left, rest) if record else np.empty(0, dtype=bool)
-            return _HeldOut(left, self._factored(rest, count), rows)
+            gram = whole - _sum([grams[group] for group in left])
+            rows = judged(left, gram) if record else np.empty(0, dtype=bool)
+            rest = [group for group in everything if group not in left]
+            return _HeldOut(left, rest, self._factored(gram, count), rows)
 
         folds = [held_out(everything[fold :: FOLDS + 1], record=False) for fold in range(1, FOLDS + 1)]
         if len(self.evidence.parts) == 1:
@@ -203,13 +204,13 @@ class Joint:
         at = self.grouped(np.column_stack([one.at for one in signals]))
         projected = [np.column_stack(parts) for parts in zip(*(one.projected for one in signals), strict=True)]
         products = [own.T @ own for own in at]
-        whole, inner = _sum(projected), _sum(products)
-        gains = _gains(whole, inner, np.column_stack([one.solved for one in signals]), positive)
+        gains = _gains(_sum(projected), _sum(products), np.column_stack([one.solved for one in signals]), positive)
         errors, (folds, records) = np.full(self.problem.y.size, np.nan), self.held_out
         for k, fold in enumerate(folds):
             solved = np.column_stack([one.solved_of_folds[k] for one in signals])
-            rest = whole - _sum([projected[group] for group in fold.left])
-            of_rest = _gains(rest, inner - _sum([products[group] for group in fold.left]), solved, positive)
+            # Sums, not differences: a column that is zero in the others is exactly zero.
+            rest, inner = (_sum([own[group] for group in fold.rest]) for own in (projected, products))
+            of_rest = _gains(rest, inner, solved, positive)
             x = solved @ _missed(of_rest)
             for group in fold.left:
                 errors[self._groups[group]] = self.rows[group].predict(x) - at[group] @ _missed(of_rest)
@@ -217,7 +218,7 @@ class Joint:
         left_out = []
         for record in records:
             # The gains of the columns are those of all records: one record at one speed does not tell them.
-            rest = whole - _sum([projected[group] for group in record.left])
+            rest = _sum([projected[group] for group in record.rest])
             x = _solved(record.factor, rest @ _missed(gains))
             missed = [self.rows[group].predict(x) - at[group] @ _missed(gains) for group in record.left]
             began = [at[group][:, 1:][:, starting] for group in record.left]
@@ -239,9 +240,10 @@ def _without_start(missed: FloatArray, began: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """Groups that are left out, the factor of the others' equations, and which rows of a record those can predict."""
+    """Groups that are left out, the others, the factor of their equations, and which rows of a record they predict."""
 
     left: Sequence[int]
+    rest: Sequence[int]
     factor: Factor
     judged: NDArray[np.bool_]
 
@@ -279,9 +281,8 @@ class Columns:
     @cached_property
     def solved_of_folds(self) -> list[FloatArray]:
         """The same without each fold."""
-        whole = _sum(self.projected)
         return [
-            _solved(fold.factor, whole - _sum([self.projected[group] for group in fold.left]))
+            _solved(fold.factor, _sum([self.projected[group] for group in fold.rest]))
             for fold in self.joint.held_out[0]
         ]
 

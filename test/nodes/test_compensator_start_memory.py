@@ -66,7 +66,8 @@ def test_a_measurement_that_fits_no_memory_is_a_warning(x_file):
 
 
 def test_a_reset_comes_before_the_first_command_where_that_is_wanted(x_file):
-    told = {"reset_on_start": True, "reset_rate": 400.0, "reset_cycles": 2}
+    # Slow enough to be under way when the client has found the node.
+    told = {"reset_on_start": True, "reset_rate": 100.0, "reset_cycles": 2}
     with compensator(model_file=x_file, **told) as client:
         client.connect()
         client.report(memory="resetting")

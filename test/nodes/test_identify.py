@@ -331,7 +331,7 @@ def test_a_diagnosis_reads_all_bags_of_the_fit(bag, humming_bag, tmp_path, monke
         seen.extend(record.source for record in records)
         raise RecordError("enough")
 
-    monkeypatch.setattr("slpi_ros.nodes.jobs.diagnose", diagnosed)
+    monkeypatch.setattr("slpi_ros.diagnosis.diagnose.diagnose", diagnosed)
     document = format_model(identify(read_bag(bag), "pi"))
     outcome = run_diagnosis(DiagnosisRequest((bag, humming_bag), "stage_state", document, str(tmp_path)))
     assert outcome.error == "enough" and seen == [bag, humming_bag]

@@ -4,9 +4,9 @@ PYTHON ?=
 export PYTHON
 
 VENV   := .venv/bin/python
-COLCON := $(COMPILED) $(VENV) -c 'import sys; from colcon_core.command import main; sys.exit(main())'
 # hundreds of processes are started: each would compile the sources anew without the files that Python keeps of them
 COMPILED := env -u PYTHONDONTWRITEBYTECODE
+COLCON := $(COMPILED) $(VENV) -c 'import sys; from colcon_core.command import main; sys.exit(main())'
 # every command that starts nodes needs the workspace in its environment
 IN_WORKSPACE := . install/setup.sh &&
 

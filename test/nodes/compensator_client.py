@@ -5,6 +5,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from nodes.ros_helpers import RELIABLE, Graph, NodeProcess, on_graph, started, values_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -63,6 +65,11 @@ class Client:
             self.graph.spin_until(self._wishes.get_subscription_count, "the compensator's ears")
         return self
 
+    def change_state(self, transition: int) -> bool:
+        """Ask for a transition of the lifecycle; return whether it succeeded."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return self.graph.call(ChangeState, f"{self.name}/change_state", request).success
+
     def publish(self, message: Any) -> None:
         self._wishes.publish(message)
 
@@ -75,6 +82,10 @@ class Client:
         self.wish(names, displacements, stamp_ns)
         self.graph.spin_until(lambda: len(self._answers) > before, "an answer")
         return self.answers[before]
+
+    def wait_for_rest(self, voltage: float) -> None:
+        """Wait until the last answer of one axis is this voltage, V."""
+        self.graph.spin_until(lambda: self.answers and self.answers[-1] == [voltage], f"{voltage} V")
 
     def follow(self, names: Sequence[str], path: np.ndarray, start_ns: int = START_NS) -> np.ndarray:
         """Return the voltages, shape (N, axes), for a path, shape (N, names), of one sample every `PERIOD_NS`."""

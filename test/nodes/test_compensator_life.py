@@ -12,7 +12,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from lifecycle_msgs.msg import State, Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from lifecycle_msgs.srv import GetState  # noqa: E402
 from nodes.compensator_client import Client, compensator  # noqa: E402
 from nodes.ros_helpers import LATCHED, NodeProcess, on_graph, stage_model, started  # noqa: E402
 from rcl_interfaces.srv import DescribeParameters, GetParameters  # noqa: E402
@@ -39,11 +39,6 @@ def x_file(tmp_path: Path) -> str:
     return str(path)
 
 
-def change_state(client: Client, transition: int) -> bool:
-    request = ChangeState.Request(transition=Transition(id=transition))
-    return client.graph.call(ChangeState, f"{client.name}/change_state", request).success
-
-
 def state(client: Client) -> int:
     return client.graph.call(GetState, f"{client.name}/get_state", GetState.Request()).current_state.id
 
@@ -52,23 +47,23 @@ def test_lifecycle_by_services(x_file):
     with compensator(autostart=False, model_file=x_file) as client:
         client.connect("unconfigured")
         assert not client.graph.node.get_publishers_info_by_topic("/voltage_command")
-        assert change_state(client, CONFIGURE)
+        assert client.change_state(CONFIGURE)
         client.connect("inactive")
         client.wish(["x"], [1e-6])
         client.report("the rejection", **{"rejected.inactive": 1})
-        assert change_state(client, ACTIVATE)
+        assert client.change_state(ACTIVATE)
         status, _ = client.report(state="active")
         before = client.ask(["x"], [5e-6])
-        assert change_state(client, DEACTIVATE) and change_state(client, ACTIVATE)
+        assert client.change_state(DEACTIVATE) and client.change_state(ACTIVATE)
         # Memory and voltage are still there: the same wish again moves nothing.
         assert client.ask(["x"], [5e-6]) == before
-        assert change_state(client, DEACTIVATE) and change_state(client, CLEANUP)
+        assert client.change_state(DEACTIVATE) and client.change_state(CLEANUP)
         client.report(state="unconfigured", **{"model.kind": ""})
         assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
-        assert change_state(client, CONFIGURE) and change_state(client, ACTIVATE)
+        assert client.change_state(CONFIGURE) and client.change_state(ACTIVATE)
         client.connect()
         assert client.ask(["x"], [3e-6]) != before
-        assert change_state(client, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        assert client.change_state(Transition.TRANSITION_ACTIVE_SHUTDOWN)
         client.report(state="finalized")
         assert client.node.stop() == 0
 
@@ -77,7 +72,7 @@ def test_impossible_transitions_are_refused_and_survived():
     with compensator() as client:
         client.connect()
         for transition in (CONFIGURE, ACTIVATE, CLEANUP, 0, 97, 255):
-            assert not change_state(client, transition)
+            assert not client.change_state(transition)
         assert state(client) == State.PRIMARY_STATE_ACTIVE
         assert "Traceback" not in client.node.stderr
 
@@ -85,12 +80,12 @@ def test_impossible_transitions_are_refused_and_survived():
 def test_a_wrong_model_file_keeps_it_unconfigured_until_it_is_right(x_file, tmp_path):
     with compensator(autostart=False, model_file=str(tmp_path / "none.json")) as client:
         client.connect("unconfigured")
-        assert not change_state(client, CONFIGURE)
+        assert not client.change_state(CONFIGURE)
         status, values = client.report(models_refused=1)
         assert status.level == b"\2" and "none.json: cannot read a model" in status.message
         assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
         assert client.graph.set_parameters(client.name, model_file=x_file) == ""
-        assert change_state(client, CONFIGURE) and change_state(client, ACTIVATE)
+        assert client.change_state(CONFIGURE) and client.change_state(ACTIVATE)
         client.connect()
         assert client.ask(["x"], [0.0]) == [0.0]
 

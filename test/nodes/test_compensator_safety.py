@@ -11,7 +11,6 @@ rclpy = pytest.importorskip("rclpy")
 
 from builtin_interfaces.msg import Duration  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from nodes.compensator_client import Client, compensator, last_at_full_pace  # noqa: E402
 from nodes.ros_helpers import LATCHED, stage_model  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
@@ -22,7 +21,8 @@ from slpi_ros.compensator.ramps import PERIOD  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
 from slpi_ros.model.limits import MAX_DT  # noqa: E402
 
-SAFE = {"safe_voltage": 10, "ramp_rate": 200.0}
+RAMP_RATE = 50.0
+SAFE = {"safe_voltage": 10, "ramp_rate": RAMP_RATE}
 MS = 1_000_000
 QUICK_RESET = {"reset_rate": 5000.0, "reset_cycles": 3}
 
@@ -42,20 +42,17 @@ def voltages(client: Client, start: int = 0) -> np.ndarray:
     return np.array(client.answers[start:])[:, 0]
 
 
-def wait_for_rest(client: Client, voltage: float) -> None:
-    client.graph.spin_until(lambda: client.answers and client.answers[-1] == [voltage], f"{voltage} V")
-
-
 def test_silence_leads_to_the_safe_voltage_and_the_next_command_takes_over_from_there(x_file):
     with compensator(model_file=x_file, command_timeout=0.2, on_timeout="safe", slew_limit=2000, **SAFE) as client:
         client.connect()
         while (before := client.ask(["x"], [5e-6])[0]) < 40.0:
             pass
         sent = len(client.answers)
-        wait_for_rest(client, 10.0)
+        client.wait_for_rest(10.0)
         way = np.array([before, *voltages(client, sent)])
-        assert (np.diff(way) < 0).all() and np.abs(np.diff(way)).max() <= 200.0 * MAX_DT
-        assert len(way) > 0.5 * (before - 10.0) / 200.0 / PERIOD
+        assert (np.diff(way) < 0).all() and np.abs(np.diff(way)).max() <= RAMP_RATE * MAX_DT
+        # Timers are late on a busy machine: not every period has its own step.
+        assert len(way) > 0.2 * (before - 10.0) / RAMP_RATE / PERIOD
         ramped = len(client.answers)
         # No time has passed at the first sample of a new path: it starts where the ramp has ended.
         assert client.ask(["x"], [5e-6]) == [10.0]
@@ -86,16 +83,15 @@ def test_an_end_leads_to_the_safe_voltage_first(x_file, how):
         if how == "signal":
             assert client.node.stop(signal.SIGTERM) == 0
             client.graph.tested = None
-            wait_for_rest(client, 10.0)
+            client.wait_for_rest(10.0)
         else:
             number = Transition.TRANSITION_DEACTIVATE
             number = Transition.TRANSITION_ACTIVE_SHUTDOWN if how == "shutdown" else number
-            request = ChangeState.Request(transition=Transition(id=number))
-            assert client.graph.call(ChangeState, f"{client.name}/change_state", request).success
-            wait_for_rest(client, 10.0)
+            assert client.change_state(number)
+            client.wait_for_rest(10.0)
             client.report(state="finalized" if how == "shutdown" else "inactive")
         way = np.array([before, *voltages(client, 1)])
-        assert (np.diff(way) <= 0).all() and np.abs(np.diff(way)).max() <= 200.0 * MAX_DT and len(way) > 20
+        assert (np.diff(way) <= 0).all() and np.abs(np.diff(way)).max() <= RAMP_RATE * MAX_DT and len(way) > 20
 
 
 @pytest.mark.parametrize("how", ["deactivate", "signal"])
@@ -113,8 +109,7 @@ def test_an_end_in_motion_brakes_where_acceleration_is_limited(x_file, how):
             assert client.node.stop(signal.SIGTERM) == 0
             client.graph.tested = None
         else:
-            request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
-            assert client.graph.call(ChangeState, f"{client.name}/change_state", request).success
+            assert client.change_state(Transition.TRANSITION_DEACTIVATE)
             client.report(state="inactive")
         # Voltages may come after the process has ended.
         client.graph.spin_until(lambda: voltages(client)[-1] - last_at_full_pace(voltages(client)) > 5.0, "a way")
@@ -148,7 +143,7 @@ def test_a_reset_brings_the_memory_to_a_known_state_and_answers_when_done(x_file
         answer = reset(client)
         assert answer.success and "memory known" in answer.message
         # The answer may overtake the last voltages.
-        wait_for_rest(client, 10.0)
+        client.wait_for_rest(10.0)
         # With the voltage before it: a late period may lead to the first turn in one step.
         way = voltages(client, 0)
         assert way[-1] == 10.0 and way.min() == 0.0 and way.max() == 100.0
@@ -174,8 +169,7 @@ def test_a_reset_rejects_commands_and_is_cut_short_by_the_end_of_activity(x_file
         client.report(memory="resetting")
         client.wish(["x"], [5e-6])
         client.report("the rejection", **{"rejected.resetting": 1})
-        request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
-        assert client.graph.call(ChangeState, f"{client.name}/change_state", request).success
+        assert client.change_state(Transition.TRANSITION_DEACTIVATE)
         client.graph.spin_until(answer.done, "the answer")
         assert not answer.result().success and "interrupted" in answer.result().message
         client.report(memory="assumed", state="inactive")
@@ -190,14 +184,16 @@ def test_the_memory_comes_back_after_a_restart(x_file, tmp_path):
         client.connect()
         assert reset(client).success
         for y in path[:3]:
-            client.ask(["x"], [y])
-        last = client.answers[-1]
+            client.wish(["x"], [y])
+        # The last voltages of the reset may come after its answer.
+        client.report(accepted=3)
         assert client.node.stop() == 0
+        client.graph.tested = None
     memory = stage_model().axis("x").memory()
     for v in (100.0, 0.0, 100.0, 0.0, 200 / 3, 0.0, 100 / 3, 0.0):
         memory.forward(v)
     expected = [memory.inverse(y) for y in path]
-    assert last == pytest.approx([expected[2]], abs=1e-9)
+    assert client.answers[-1] == pytest.approx([expected[2]], abs=1e-9)
     with compensator(**kept) as client:
         client.connect()
         _, values = client.report(memory="restored")

@@ -8,6 +8,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
+from lifecycle_msgs.msg import Transition  # noqa: E402
 from nodes.compensator_client import Client, compensator  # noqa: E402
 from nodes.ros_helpers import stage_model, values_of  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
@@ -66,14 +67,18 @@ def test_a_measurement_that_fits_no_memory_is_a_warning(x_file):
 
 
 def test_a_reset_comes_before_the_first_command_where_that_is_wanted(x_file):
-    # Slow enough to be under way when the client has found the node.
-    told = {"reset_on_start": True, "reset_rate": 100.0, "reset_cycles": 2}
+    # Activated once the client sees all voltages; slow enough for a command that comes during the reset.
+    told = {"reset_on_start": True, "reset_rate": 100.0, "reset_cycles": 2, "autostart": False}
     with compensator(model_file=x_file, **told) as client:
-        client.connect()
+        client.connect("unconfigured")
+        assert client.change_state(Transition.TRANSITION_CONFIGURE)
+        client.connect("inactive")
+        assert client.change_state(Transition.TRANSITION_ACTIVATE)
         client.report(memory="resetting")
         client.wish(["x"], [5e-6])
         client.report("the rejection", **{"rejected.resetting": 1})
         client.report(memory="known")
+        client.wait_for_rest(60.0)
         assert "the memory is assumed" not in client.node.stderr
         way = np.array(client.answers)[:, 0]
         assert way.max() == pytest.approx(100.0) and way.min() == pytest.approx(0.0, abs=1e-9)

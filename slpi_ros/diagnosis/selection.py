@@ -141,14 +141,29 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
         if error - score.rms > least
     ]
     most = max((error**2 - one.score.rms**2 for one in tried), default=0.0)
-    found = [one.refined() if error**2 - one.score.rms**2 >= WORTH_REFINING * most else one for one in tried]
-    sound = [one for one in found if plausible(one.effect, one.explanation)]
+    sound = [one for one in _refined(tried, now, most) if plausible(one.effect, one.explanation)]
     several = len(now.evidence.parts) > 1
 
     def rank(one: Contender) -> tuple[bool, float]:
         return several and (is_own(one.name) or not one.counts_beside(now)), one.rms
 
     return sorted(sound, key=rank)
+
+
+def _refined(tried: Sequence[Contender], before: Explanation, most: float) -> list[Contender]:
+    """Return contenders with their parameters at their best, where the first step shows that to be worth while.
+
+    Parameters
+    ----------
+    tried : sequence of Contender
+        After one step.
+    before : Explanation
+        Without them.
+    most : float, m^2
+        By how much the best one lowers the mean square of the held-out error.
+    """
+    square, least = before.held_out.rms**2, WORTH_REFINING * most
+    return [one.refined() if square - one.score.rms**2 >= least else one for one in tried]
 
 
 def plausible(effect: Effect, now: Explanation) -> bool:
@@ -374,15 +389,18 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
             continue
         dropped |= {one.name for one in found if counts(now.held_out, one.score) and not one.counts_beside(now)}
         if not found or not found[0].counts_beside(now):
-            before, exchanged = now, not exchanged and len(now.effects) > 1
-            now = _exchanged(now, rivals) if exchanged else now
+            before = now
+            if not exchanged and len(now.effects) > 1:
+                now, exchanged = _exchanged(now, rivals), True
             if now is before:
                 break
             continue
         best = _simplest(found, now)
         rivals[best.name] = [other.effect for other in found if other is not best]
         now = _without_needless(best.explanation.smoothed(), set(rivals) - {best.name})
-    now = _without_needless(now.bare(), set(rivals))
+    with_structures, now = now, now.bare()
+    if now is not with_structures:
+        now = _without_needless(now, set(rivals))
     named = _named(start, now, rivals)
     return Selection(base, now, named, structures, tuple(sorted(dropped - {one.name for one in named})))
 
@@ -441,13 +459,9 @@ def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation
 def _tried(name: str, now: Explanation, rest: Explanation, rivals: Sequence[Effect]) -> list[Contender]:
     """Return rivals in the place of an effect, fitted beside the `rest`, the best one first."""
     present = {effect.name for effect in now.effects}
-    enough = WORTH_REFINING * (rest.held_out.rms**2 - now.held_out.rms**2)
-    tried = []
-    for rival in rivals:
-        if rival.name not in present:
-            one = Contender(rival.name, rest.adding(rival).refined(1))
-            tried.append(one.refined() if rest.held_out.rms**2 - one.score.rms**2 >= enough else one)
-    return sorted(tried, key=lambda contender: contender.rms)
+    tried = [Contender(rival.name, rest.adding(rival).refined(1)) for rival in rivals if rival.name not in present]
+    refined = _refined(tried, rest, rest.held_out.rms**2 - now.held_out.rms**2)
+    return sorted(refined, key=lambda contender: contender.rms)
 
 
 def _best_structure(now: Explanation, taken: tuple[str, ...]) -> tuple[str | None, Explanation]:

@@ -39,16 +39,12 @@ def messages(client: Client) -> list[str]:
     return [status.message for status in client.graph.statuses(f"{client.name}: compensator")]
 
 
-def wait_for_rest(client: Client, voltage: float) -> None:
-    client.graph.spin_until(lambda: client.answers and client.answers[-1] == [voltage], f"{voltage} V")
-
-
 def test_after_a_trajectory_silence_leads_to_the_safe_voltage(x_file):
     with compensator(model_file=x_file, on_timeout="safe", **TIMEOUT) as client:
         client.connect()
         sender(client).publish(trajectory(["x"], [0, 20 * MS], [[3e-6], [6e-6]]))
         client.graph.spin_until(lambda: client.answers and client.answers[-1][0] > 50.0, "the trajectory")
-        wait_for_rest(client, 10.0)
+        client.wait_for_rest(10.0)
         wait_for_message(client, "voltages are the safe ones")
 
 
@@ -82,7 +78,7 @@ def test_a_trajectory_that_waits_is_no_silence_and_says_when_it_begins(x_file):
         # Cancelled, silence counts anew.
         publisher.publish(JointTrajectory())
         wait_for_message(client, "voltages go to the safe ones")
-        wait_for_rest(client, 10.0)
+        client.wait_for_rest(10.0)
 
 
 def test_a_gap_in_a_trajectory_is_no_silence(x_file):
@@ -111,7 +107,7 @@ def test_a_reset_is_no_silence(x_file):
         ]
         assert len(while_resetting) > 3 and set(while_resetting) == {"resetting the memory"}
         # Afterwards the silence goes on: what was commanded before counts.
-        wait_for_rest(client, 10.0)
+        client.wait_for_rest(10.0)
 
 
 def test_on_timeout_changed_in_the_silence_counts_at_once(x_file):
@@ -129,8 +125,10 @@ def test_on_timeout_changed_in_the_silence_counts_at_once(x_file):
         held = client.answers[-1]
         assert held[0] > 10.0
         assert client.graph.set_parameters(client.name, on_timeout="safe", ramp_rate=2000.0) == ""
-        wait_for_rest(client, 10.0)
+        client.wait_for_rest(10.0)
         wait_for_message(client, "voltages are the safe ones")
         assert (np.diff(np.array(client.answers)[:, 0]) <= 0.0).all()
+        # The next silence is not to come before the report.
+        assert client.graph.set_parameters(client.name, command_timeout=60.0) == ""
         client.ask(["x"], [5e-6])
         wait_for_message(client, "compensating")

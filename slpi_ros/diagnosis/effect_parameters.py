@@ -22,7 +22,7 @@ FREE = {
     "rate_dependence": ("widening", "backlash", "exponent", "transition"),
     "creep": ("time_constants", "gains"),
     "resonance": ("frequency", "damping"),
-    "gain_drift": ("gains",),
+    "gain_drift": ("gains", "origin"),
     "cross_coupling": ("gains",),
     "thermal_drift": ("values",),
     "sensor_periodic": ("period", "amplitude", "phase"),
@@ -58,7 +58,7 @@ MOST = {
 # Effects none of whose other parameters may be negative.
 NOT_NEGATIVE = ("creep", "rate_dependence")
 # Parameters that the displacement is linear in, or nearly so at any size.
-LINEAR = ("gains", "values", "widening", "backlash", "seconds", "reversible")
+LINEAR = ("gains", "values", "origin", "widening", "backlash", "seconds", "reversible")
 # At most so many times its own size may a parameter change in one step.
 LARGEST_STEP = 0.7
 
@@ -200,7 +200,7 @@ def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
             found.append(scale[effect.name])
         elif name.partition(".")[0] in ("gains", "widening"):
             found.append(1e-5)
-        elif name.partition(".")[0] in ("values", "backlash"):
+        elif name.partition(".")[0] in ("values", "backlash", "origin"):
             found.append(1e-9)
         else:
             found.append(small.get(name, 1e-4 * abs(value) + 1e-12))

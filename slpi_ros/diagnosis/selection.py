@@ -64,7 +64,9 @@ NO_WORSE = 1.05
 # A shift by less than this share of a sample is how commands are held.
 HELD = 0.6
 # Warmth takes time (s), and moves a stage by no more than this share of its motion in a second.
-DRIFT_TAKES, DRIFT_RATE = 10.0, 2e-3
+DRIFT_TAKES, DRIFT_RATE = 10.0, 1e-2
+# What keeps its place while the sensitivity changes is no further outside the record than this share of its range.
+ORIGIN = 0.3
 # Rounding errors (their rms) repeat with every digit, that is sqrt(12) times as far; what is left of a record is
 # rounding when it is no more than so many times that.
 ROUNDING_PERIOD, ROUNDING_LEFT = 1.3 * 12**0.5, 1.3
@@ -181,7 +183,10 @@ def plausible(effect: Effect, now: Explanation) -> bool:
             pairs = zip(np.diff(effect.values).tolist(), np.diff(effect.times).tolist(), strict=True)
             return effect.times[-1] >= DRIFT_TAKES and all(abs(dy) <= DRIFT_RATE * motion * dt for dy, dt in pairs)
         case GainDrift():
-            return effect.times[-1] >= DRIFT_TAKES
+            # Gains round an origin far away are a thermal drift.
+            y = now.y[now.used]
+            near = float(y.min()) - ORIGIN * motion <= effect.origin <= float(y.max()) + ORIGIN * motion
+            return near and effect.times[-1] >= DRIFT_TAKES
         case Saturation():
             return _stands_still(effect, now)
         case Hum():

@@ -12,8 +12,6 @@ from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removabl
 # Numbers of uniform knots of the candidates. Within the first piece there are others at equal factors of time, so many
 # to a decade, as piezo ageing goes with the logarithm of time; the first one comes after a loop and so many readings.
 UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
-# Weight of what the gains and shifts of all knots have in common: the first piece of the record alone tells it.
-COMMON = 0.01
 
 
 @dataclass(frozen=True)
@@ -75,8 +73,7 @@ class GainDrift:
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield a line, and curves with uniform knots and more of them at the beginning.
 
-        The origin is that of the residual. It is limited to the record's displacements, because otherwise any thermal
-        drift could be fitted as a gain drift.
+        Beside the gains stand shifts at the same knots: both together tell the origin.
         """
         t, end = left.t - left.t[0], float(left.t[-1] - left.t[0])
         travel = np.cumsum(np.abs(np.diff(left.u, prepend=left.u[0])) * left.used)
@@ -86,13 +83,20 @@ class GainDrift:
             knots = np.linspace(0.0, end, count + 1)[1:]
             early = int(np.ceil(PER_DECADE * np.log10(knots[0] / first))) if 0.0 < first < knots[0] else 0
             curves.append(np.append(np.geomspace(first, knots[0], early, endpoint=False), knots))
+        low, high = float(left.h.min()), float(left.h.max())
         for times in curves:
             hats = np.column_stack([np.interp(t, (0.0, *times), (0.0, *row)) for row in np.eye(times.size)])
-            origin = _origin(left, times, hats)
-            yield Candidate(hats * (left.h - origin)[:, None], partial(cls._through, times, origin))
+            columns = np.column_stack([hats * (left.h - low)[:, None], hats * (high - low)])
+            yield Candidate(columns, partial(cls._through, times, low, high))
 
     @classmethod
-    def _through(cls, times: FloatArray, origin: float, gains: FloatArray) -> "GainDrift":
+    def _through(cls, times: FloatArray, low: float, high: float, found: FloatArray) -> "GainDrift":
+        """Return that of gains and shifts; its origin is within the record's displacements from `low` to `high`."""
+        gains, shifts = np.split(found, 2)
+        # A knot tells as much as it has samples.
+        weighted = gains * np.gradient(np.append(0.0, times))[1:]
+        share = -float(weighted @ shifts) / max(float(weighted @ gains), 1e-300)
+        origin = low + min(max(share, 0.0), 1.0) * (high - low)
         return cls(tuple(times.tolist()), tuple(gains.tolist()), origin)
 
     def describe(self) -> str:
@@ -110,25 +114,6 @@ class GainDrift:
     def streaming(self) -> "StreamingGainDrift":
         """Return the sensitivity at the end of the record as a streaming effect."""
         return StreamingGainDrift(self.origin, 1.0 + self.gains[-1])
-
-
-def _origin(left: ResidualView, times: FloatArray, hats: FloatArray) -> float:
-    """Return the displacement (m) that a change of sensitivity, `hats` of shape (N, K), leaves where it is.
-
-    Gains ``a`` and shifts ``b`` of the residual are found beside a constant gain and shift, which the hysteresis has
-    taken; the origin satisfies ``b = -origin a`` best.
-    """
-    low, high = float(left.h.min()), float(left.h.max())
-    half = 0.5 * (high - low) or 1.0
-    moved = (left.h - 0.5 * (low + high)) / half
-    columns = np.column_stack([hats * moved[:, None], hats, moved, np.ones_like(moved)])
-    found = np.linalg.lstsq(columns[left.used], left.residual[left.used], rcond=None)[0]
-    gains, shifts = found[: 2 * times.size].reshape(2, -1)
-    # A knot tells as much as it has samples.
-    weights = np.gradient(np.append(0.0, times))[1:]
-    inner = np.diag(weights) - np.outer(weights, weights) / (1.0 + COMMON) / weights.sum()
-    share = -float(gains @ inner @ shifts) / max(float(gains @ inner @ gains), 1e-300)
-    return 0.5 * (low + high) + half * min(max(share, -1.0), 1.0)
 
 
 class StreamingGainDrift:

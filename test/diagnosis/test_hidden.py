@@ -11,8 +11,8 @@ from benchmarks.hidden.size import beyond_hysteresis
 from slpi_ros.io.bag_writer import write_bag
 
 SAMPLES = 12_000
-# All ten take minutes: `make bench-diagnosis`.
-FAST = ("lag", "creep", "resonance", "cross_coupling", "sensor_periodic", "hum")
+# All eleven take minutes: `make bench-diagnosis`.
+FAST = ("lag", "creep", "resonance", "cross_coupling", "sensor_periodic", "hum", "thermal_drift", "gain_drift")
 # Large enough that nobody should miss it; what is found of smaller ones is for the bench to say.
 LARGE = 10.0
 # A draw of a coercivity by a power law.

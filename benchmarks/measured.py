@@ -12,7 +12,7 @@ import numpy as np
 
 import slpi_ros
 from slpi_ros.identification.fit import KINDS
-from slpi_ros.identification.signal_statistics import floor_of
+from slpi_ros.identification.repeatability_floor import floor_of
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 from slpi_ros.papers.measured import CASES, score

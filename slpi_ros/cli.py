@@ -4,40 +4,25 @@ Exit codes: 0 success, 1 the data do not allow the request, 2 wrong usage. Error
 """
 
 import argparse
+import math
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
-import numpy as np
-
-from slpi_ros.diagnosis.diagnose import diagnose
-from slpi_ros.diagnosis.verify import verify
 from slpi_ros.errors import ModelError, RecordError, SlpiError, UsageError
-from slpi_ros.excitation.drives import DRIVES, excite
-from slpi_ros.identification.cross_validation import cross_validate
-from slpi_ros.identification.fit import KINDS, fit_of, identify
 from slpi_ros.identification.progress import shown_on
-from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
-from slpi_ros.identification.refit import refit
-from slpi_ros.identification.uncertainty import curve_uncertainty, require_known_uncertainty
-from slpi_ros.io import bag_reader as bags
-from slpi_ros.io import tables
-from slpi_ros.io.alignment import SeparateTopics
-from slpi_ros.io.atomic_file import make_folder
-from slpi_ros.io.bag_writer import write_bag
-from slpi_ros.io.columns import ColumnOptions
-from slpi_ros.io.record import FloatArray, Record
-from slpi_ros.io.schemas import format_document
-from slpi_ros.model.axis_model import START_MEMORIES
-from slpi_ros.model.document import load_model, save_model
-from slpi_ros.model.limits import Limits
-from slpi_ros.model.stage_model import StageModel, check_time, held_message
-from slpi_ros.reports.text import describe_change, describe_model, describe_start
+
+# What a command needs is imported where it begins: numerics and plotting are slow to load.
+if TYPE_CHECKING:
+    from slpi_ros.identification.record_quality import Finding
+    from slpi_ros.io.alignment import SeparateTopics
+    from slpi_ros.io.record import FloatArray, Record
+    from slpi_ros.model.stage_model import StageModel
 
 # Default topic with voltage and displacement.
 TOPIC = "stage_state"
@@ -67,24 +52,20 @@ class _UniqueNames(argparse.Action):
         setattr(namespace, self.dest, names)
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands; it stores the name of the chosen command as ``command``."""
+def parser(command: str | None = None) -> argparse.ArgumentParser:
+    """Return the parser of all commands, which stores the name of the chosen one as ``command``.
+
+    Parameters
+    ----------
+    command : str, optional
+        The only one whose options are needed; default: all.
+    """
     whole = _Parser(prog="slpi", description="Hysteresis models of piezo stages: identify, diagnose, compensate.")
     commands = whole.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
-    _import_options(commands.add_parser("import", help="turn a table of measured data into a bag"))
-    _identify_options(commands.add_parser("identify", help="identify the model of a stage from a bag"))
-    _diagnose_options(
-        commands.add_parser("diagnose", help="find the causes of a model's errors on bags and extend the model")
-    )
-    _verify_options(commands.add_parser("verify", help="test a model on bags not used to identify it: pass or fail"))
-    _excite_options(commands.add_parser("excite", help="generate excitation voltages for an identification"))
-    _refit_options(
-        commands.add_parser("refit", help="update a model with a new bag, keeping regions that the bag does not visit")
-    )
-    _simulate_options(commands.add_parser("simulate", help="compute the displacement for a voltage"))
-    _compensate_options(commands.add_parser("compensate", help="compute the voltage for a desired displacement"))
-    _experiments_options(commands.add_parser("experiments", help="reproduce the tables and figures of the two papers"))
-    commands.add_parser("show", help="print the contents of a model").add_argument("model", metavar="MODEL.json")
+    for name, each in COMMANDS.items():
+        own = commands.add_parser(name, help=each.help)
+        if command in (None, name):
+            each.options(own)
     return whole
 
 
@@ -108,6 +89,8 @@ def _import_options(command: Any) -> None:
 
 
 def _identify_options(command: Any) -> None:
+    from slpi_ros.identification.fit import KINDS
+
     command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a single mcap or sqlite3 file")
     command.add_argument("-o", "--output", metavar="MODEL.json", required=True, help="model document to write")
     command.add_argument("--kind", choices=KINDS, default="slpi", help="kind of model; default: slpi")
@@ -137,6 +120,8 @@ def _diagnose_options(command: Any) -> None:
 
 
 def _verify_options(command: Any) -> None:
+    from slpi_ros.io.bag_reader import DESIRED
+
     command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a single mcap or sqlite3 file")
     command.add_argument("--model", metavar="MODEL.json", required=True, help="model of the same stage")
     command.add_argument(
@@ -148,7 +133,7 @@ def _verify_options(command: Any) -> None:
     command.add_argument("--json", action="store_true", help="print the document instead of its summary")
     command.add_argument(
         "--desired-topic", metavar="TOPIC",
-        help=f"also evaluate the tracking error against this topic; default: {bags.DESIRED}, if present in the bag",
+        help=f"also evaluate the tracking error against this topic; default: {DESIRED}, if present in the bag",
     )  # fmt: skip
     _topic_options(command)
     _axes(command, help="default: every axis that bags and model share")
@@ -173,6 +158,8 @@ def _topic_options(command: Any) -> None:
 
 
 def _excite_options(command: Any) -> None:
+    from slpi_ros.excitation.drives import DRIVES
+
     command.add_argument("-o", "--output", metavar="DRIVE.csv", required=True, help="columns time_s, <axis>_V")
     _axes(command, default=("x",), help="axes to excite, one after the other; default: x")
     command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="lowest voltage")
@@ -201,11 +188,13 @@ def _simulate_options(command: Any) -> None:
 
 
 def _compensate_options(command: Any) -> None:
+    from slpi_ros.model.axis_model import START_MEMORIES
+
     command.add_argument("model", metavar="MODEL.json")
     command.add_argument("table", metavar="DESIRED.csv", help="columns time_s, <axis>_m")
     command.add_argument("-o", "--output", metavar="VOLTAGE.csv", required=True)
-    command.add_argument("--voltage-min", metavar="V", type=float, default=-np.inf, help="default: identified range")
-    command.add_argument("--voltage-max", metavar="V", type=float, default=np.inf, help="default: identified range")
+    command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
+    command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
     command.add_argument(
         "--start-memory", choices=START_MEMORIES, default=START_MEMORIES[0],
         help="initial history of the stage: as at the end of the identified record (default), as at its start, "
@@ -218,9 +207,14 @@ def _experiments_options(command: Any) -> None:
     command.add_argument("--data", metavar="DIR", help="folder of measured records to include in the comparison")
 
 
+def _show_options(command: Any) -> None:
+    command.add_argument("model", metavar="MODEL.json")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code."""
-    options = parser().parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = parser(arguments[0] if arguments else "").parse_args(arguments)
     for output in (sys.stdout, sys.stderr):
         # Characters that the terminal encoding lacks are printed as escape sequences.
         if isinstance(output, TextIOWrapper):
@@ -228,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = partial(_show_warning, options.command)
     try:
         with shown_on(sys.stderr):
-            return COMMANDS[options.command](options) or 0
+            return COMMANDS[options.command].run(options) or 0
     except SlpiError as error:
         print(f"slpi {options.command}: {_one_line(error)}", file=sys.stderr)
         return error.exit_code
@@ -248,6 +242,10 @@ def _one_line(error: BaseException) -> str:
 
 
 def _import(options: argparse.Namespace) -> None:
+    from slpi_ros.io.bag_writer import write_bag
+    from slpi_ros.io.columns import ColumnOptions
+    from slpi_ros.io.tables import import_with_summary
+
     columns = ColumnOptions(
         time=options.time,
         voltage=tuple(options.voltage),
@@ -255,7 +253,7 @@ def _import(options: argparse.Namespace) -> None:
         displacement_unit=options.displacement_unit,
         axes=tuple(options.axes),
     )
-    record, lines = tables.import_with_summary(options.table, columns)
+    record, lines = import_with_summary(options.table, columns)
     record = replace(record, hardware_id=options.hardware_id)
     write_bag(options.output, record, storage=options.storage)
     print(f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s")
@@ -263,6 +261,14 @@ def _import(options: argparse.Namespace) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
+    from slpi_ros.identification.cross_validation import cross_validate
+    from slpi_ros.identification.fit import fit_of, identify
+    from slpi_ros.identification.uncertainty import curve_uncertainty, require_known_uncertainty
+    from slpi_ros.io.atomic_file import make_folder
+    from slpi_ros.io.bag_reader import read_bags
+    from slpi_ros.model.document import save_model
+    from slpi_ros.reports.text import describe_model
+
     topics = _topics(options)
     fit_of(options.kind, loops_at_rest=options.loops_at_rest)
     _require_another_file(options.output, *options.bags)
@@ -273,14 +279,13 @@ def _identify(options: argparse.Namespace) -> None:
         require_known_uncertainty(options.kind)
     if options.report:
         make_folder(options.report)
-    records = bags.read_bags(options.bags, topics, axes=options.axis)
+    records = read_bags(options.bags, topics, axes=options.axis)
     found = [_assess_record(record, options) for record in records]
     model = identify(records, options.kind, start=options.start, stop=options.stop, loops_at_rest=options.loops_at_rest)
     save_model(model, options.output)
     lines = []
     part = {"start": options.start, "stop": options.stop}
     if options.report:
-        # Imported here: plotting is slow to load, and most commands do not need it.
         from slpi_ros.reports.identification import write_report
 
         truth = {
@@ -295,8 +300,10 @@ def _identify(options: argparse.Namespace) -> None:
     print("\n".join([*lines, *describe_model(model)]))
 
 
-def _topics(options: argparse.Namespace) -> str | SeparateTopics:
+def _topics(options: argparse.Namespace) -> "str | SeparateTopics":
     """Return the topic or topics of voltage and displacement that the options select."""
+    from slpi_ros.io.alignment import SeparateTopics
+
     voltage, displacement = options.voltage_topic, options.displacement_topic
     if bool(voltage) != bool(displacement):
         raise UsageError("--voltage-topic and --displacement-topic go together; give both, or --topic")
@@ -310,8 +317,10 @@ def _topics(options: argparse.Namespace) -> str | SeparateTopics:
     return TOPIC if options.topic is None else str(options.topic)
 
 
-def _assess_record(record: Record, options: argparse.Namespace) -> dict[str, list[Finding]]:
+def _assess_record(record: "Record", options: argparse.Namespace) -> "dict[str, list[Finding]]":
     """Print and return the findings on a record, per axis; IdentificationError if one prevents a fit."""
+    from slpi_ros.identification.record_quality import assess, findings, require_usable
+
     assessed = {}
     for axis in record.axes:
         assessed[axis] = found = findings(assess(record, axis, start=options.start, stop=options.stop))
@@ -321,7 +330,10 @@ def _assess_record(record: Record, options: argparse.Namespace) -> dict[str, lis
 
 
 def _diagnose(options: argparse.Namespace) -> None:
-    # Imported here: plotting is slow to load, and most commands do not need it.
+    from slpi_ros.diagnosis.diagnose import diagnose
+    from slpi_ros.identification.record_quality import assess, findings, require_usable
+    from slpi_ros.io.atomic_file import make_folder
+    from slpi_ros.model.document import load_model
     from slpi_ros.reports.diagnosis import FILES, PAGE, describe_diagnosis, write_files
 
     topics = _topics(options)
@@ -344,33 +356,42 @@ def _diagnose(options: argparse.Namespace) -> None:
     print(f"{folder / PAGE}: open it in a browser")
 
 
-def _read_all_axes(bag: str, options: argparse.Namespace, topics: str | SeparateTopics) -> Record:
+def _read_all_axes(bag: str, options: argparse.Namespace, topics: "str | SeparateTopics") -> "Record":
     """Read all axes of the bag, to identify cross-coupling; only the requested axes if the others are unreadable."""
+    from slpi_ros.io.alignment import SeparateTopics
+    from slpi_ros.io.bag_reader import read_bag
+
     if options.axis and isinstance(topics, SeparateTopics):
         # Separate topics may not name their axes; the names are then those of the options.
-        return bags.read_bag(bag, topics, axes=options.axis)
+        return read_bag(bag, topics, axes=options.axis)
     try:
-        return bags.read_bag(bag, topics)
+        return read_bag(bag, topics)
     except RecordError:
         if not options.axis:
             raise
-        return bags.read_bag(bag, topics, axes=options.axis)
+        return read_bag(bag, topics, axes=options.axis)
 
 
 def _verify(options: argparse.Namespace) -> int:
+    from slpi_ros.diagnosis.verify import verify
+    from slpi_ros.io.alignment import SeparateTopics
+    from slpi_ros.io.atomic_file import make_folder
+    from slpi_ros.io.bag_reader import read_bags, read_desired
+    from slpi_ros.io.schemas import format_document
+    from slpi_ros.model.document import load_model
     from slpi_ros.reports.verification import FILES, describe_verification, write_files
 
     topics = _topics(options)
-    if options.tolerance is not None and not 0.0 < options.tolerance < np.inf:
+    if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
         raise UsageError(f"--tolerance {options.tolerance:g}: give a positive number of micrometres")
     model = load_model(options.model)
     if options.output:
         make_folder(options.output, *FILES)
     # Read all axes because of cross-coupling; separate topics may not name their axes, so the options name them.
     axes = options.axis if isinstance(topics, SeparateTopics) else None
-    records = bags.read_bags(options.bags, topics, axes=axes)
+    records = read_bags(options.bags, topics, axes=axes)
     desired = [
-        bags.read_desired(bag, record, options.desired_topic) for bag, record in zip(options.bags, records, strict=True)
+        read_desired(bag, record, options.desired_topic) for bag, record in zip(options.bags, records, strict=True)
     ]
     tolerance = None if options.tolerance is None else 1e-6 * options.tolerance
     try:
@@ -386,6 +407,9 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _excite(options: argparse.Namespace) -> None:
+    from slpi_ros.excitation.drives import excite
+    from slpi_ros.io.tables import write_table
+
     drive = excite(
         options.axis,
         voltage_min=options.voltage_min,
@@ -396,23 +420,31 @@ def _excite(options: argparse.Namespace) -> None:
         seed=options.seed,
         drive=options.drive,
     )
-    tables.write_table(options.output, drive.t, drive.voltage, "V")
+    write_table(options.output, drive.t, drive.voltage, "V")
     print(f"{options.output}: {drive.t.size} voltages in {drive.t[-1]:.6g} s; {drive.why}")
 
 
 def _refit(options: argparse.Namespace) -> None:
+    from slpi_ros.identification.refit import refit
+    from slpi_ros.io.bag_reader import read_bag
+    from slpi_ros.model.document import load_model, save_model
+    from slpi_ros.reports.text import describe_change
+
     _require_another_file(options.output, options.bag)
-    model, changes = refit(load_model(options.model), bags.read_bag(options.bag, options.topic))
+    model, changes = refit(load_model(options.model), read_bag(options.bag, options.topic))
     save_model(model, options.output)
     print("\n".join(line for axis, change in changes.items() for line in describe_change(axis, change)))
 
 
 def _simulate(options: argparse.Namespace) -> None:
+    from slpi_ros.io.tables import read_table, write_table
+    from slpi_ros.model.document import load_model
+
     _require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
-    t, voltage = tables.read_table(options.table, "V")
+    t, voltage = read_table(options.table, "V")
     known = _model_columns(voltage, model, options.table)
-    tables.write_table(options.output, t, model.simulate(t, known), "m")
+    write_table(options.output, t, model.simulate(t, known), "m")
     for axis, v in known.items():
         low, high = model.axes[axis].voltage_range
         outside = int(((v < low) | (v > high)).sum())
@@ -425,9 +457,15 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _compensate(options: argparse.Namespace) -> None:
+    from slpi_ros.io.tables import read_table, write_table
+    from slpi_ros.model.document import load_model
+    from slpi_ros.model.limits import Limits
+    from slpi_ros.model.stage_model import check_time, held_message
+    from slpi_ros.reports.text import describe_start
+
     _require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
-    t, desired = tables.read_table(options.table, "m")
+    t, desired = read_table(options.table, "m")
     check_time(t)
     known = _model_columns(desired, model, options.table)
     limits = Limits(options.voltage_min, options.voltage_max)
@@ -438,7 +476,7 @@ def _compensate(options: argparse.Namespace) -> None:
     for axis, (_, held) in answers.items():
         if held.any():
             print(f"slpi compensate: axis '{axis}': {held_message(held)}", file=sys.stderr)
-    tables.write_table(options.output, t, {axis: v for axis, (v, _) in answers.items()}, "V")
+    write_table(options.output, t, {axis: v for axis, (v, _) in answers.items()}, "V")
     print(describe_start(model, answers, options.start_memory))
 
 
@@ -449,7 +487,7 @@ def _require_another_file(output: str, *inputs: str) -> None:
             raise UsageError(f"{output}: is also read from; give another output file (-o)")
 
 
-def _model_columns(columns: dict[str, FloatArray], model: StageModel, table: str) -> dict[str, FloatArray]:
+def _model_columns(columns: "dict[str, FloatArray]", model: "StageModel", table: str) -> "dict[str, FloatArray]":
     """Return the columns of a table; SlpiError if the model lacks one of their axes."""
     for axis in columns:
         if axis not in model.axes:
@@ -469,20 +507,36 @@ def _experiments(options: argparse.Namespace) -> None:
 
 
 def _show(options: argparse.Namespace) -> None:
+    from slpi_ros.model.document import load_model
+    from slpi_ros.reports.text import describe_model
+
     print("\n".join(describe_model(load_model(options.model))))
 
 
-COMMANDS: Mapping[str, Callable[[argparse.Namespace], int | None]] = {
-    "import": _import,
-    "identify": _identify,
-    "diagnose": _diagnose,
-    "verify": _verify,
-    "excite": _excite,
-    "refit": _refit,
-    "simulate": _simulate,
-    "compensate": _compensate,
-    "experiments": _experiments,
-    "show": _show,
+@dataclass(frozen=True)
+class _Command:
+    """One command: what it does, the options that it adds to its parser, and the function that runs it."""
+
+    help: str
+    options: Callable[[Any], None]
+    run: Callable[[argparse.Namespace], int | None]
+
+
+COMMANDS: Mapping[str, _Command] = {
+    "import": _Command("turn a table of measured data into a bag", _import_options, _import),
+    "identify": _Command("identify the model of a stage from a bag", _identify_options, _identify),
+    "diagnose": _Command(
+        "find the causes of a model's errors on bags and extend the model", _diagnose_options, _diagnose
+    ),
+    "verify": _Command("test a model on bags not used to identify it: pass or fail", _verify_options, _verify),
+    "excite": _Command("generate excitation voltages for an identification", _excite_options, _excite),
+    "refit": _Command(
+        "update a model with a new bag, keeping regions that the bag does not visit", _refit_options, _refit
+    ),
+    "simulate": _Command("compute the displacement for a voltage", _simulate_options, _simulate),
+    "compensate": _Command("compute the voltage for a desired displacement", _compensate_options, _compensate),
+    "experiments": _Command("reproduce the tables and figures of the two papers", _experiments_options, _experiments),
+    "show": _Command("print the contents of a model", _show_options, _show),
 }
 
 

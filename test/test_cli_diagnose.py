@@ -284,7 +284,7 @@ ARGUMENTS = (
 @pytest.mark.parametrize("case", ARGUMENTS, ids=lambda case: case.__name__)
 def test_a_wrong_argument_is_told_in_one_line(slpi, folder, tmp_path, monkeypatch, case):
     # All of it must be known before the long work.
-    monkeypatch.setattr("slpi_ros.cli.diagnose", None)
+    monkeypatch.setattr("slpi_ros.diagnosis.diagnose.diagnose", None)
     options, wanted, words = case(folder, tmp_path)
     usual = ["--model", folder / "model.json", "-o", tmp_path / "out"]
     code, said, complaints = slpi("diagnose", folder / "hum", *usual, *options)
@@ -321,7 +321,7 @@ def told(folder, after_rms=2e-9):
 
 
 def test_what_cannot_be_told_apart_comes_with_the_next_experiment(slpi, folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("slpi_ros.cli.diagnose", lambda *_, **__: told(folder))
+    monkeypatch.setattr("slpi_ros.diagnosis.diagnose.diagnose", lambda *_, **__: told(folder))
     code, said, _ = slpi("diagnose", folder / "hum", "--model", folder / "model.json", "-o", tmp_path / "out")
     lines = ["ambiguous", "lag or delay.", "lag: It comes 15 ms late.", "Go faster."]
     assert code == 0 and all(line.startswith("axis x: ") for line in said.splitlines()[:-1])
@@ -331,13 +331,13 @@ def test_what_cannot_be_told_apart_comes_with_the_next_experiment(slpi, folder, 
 
 
 def test_a_figure_that_is_not_finite_leaves_no_file(slpi, folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("slpi_ros.cli.diagnose", lambda *_, **__: told(folder, np.nan))
+    monkeypatch.setattr("slpi_ros.diagnosis.diagnose.diagnose", lambda *_, **__: told(folder, np.nan))
     code, _, complaints = slpi("diagnose", folder / "hum", "--model", folder / "model.json", "-o", tmp_path / "out")
     assert code == 1 and complaints.count("\n") == 1 and not list((tmp_path / "out").iterdir())
 
 
 def test_the_model_given_may_be_the_one_to_be_extended(slpi, folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("slpi_ros.cli.diagnose", lambda *_, **__: told(folder))
+    monkeypatch.setattr("slpi_ros.diagnosis.diagnose.diagnose", lambda *_, **__: told(folder))
     (tmp_path / "extended_model.json").write_text((folder / "model.json").read_text())
     code, _, _ = slpi("diagnose", folder / "hum", "--model", tmp_path / "extended_model.json", "-o", tmp_path)
     assert code == 0 and slpi_ros.load_model(tmp_path / "extended_model.json").hardware_id == "extended"
@@ -354,7 +354,7 @@ def test_the_page_of_an_identification_tells_errors_left_out_and_findings_of_the
 
 
 def test_a_report_that_cannot_be_written_is_told_before_the_fit(slpi, folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("slpi_ros.cli.identify", None)
+    monkeypatch.setattr("slpi_ros.identification.fit.identify", None)
     where = ("-o", tmp_path / "m.json", "--report", folder / "model.json")
     code, said, complaints = slpi("identify", folder / "clean", *where)
     assert code == 1 and said == "" and complaints.count("\n") == 1 and str(folder / "model.json") in complaints

@@ -20,8 +20,8 @@ from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.initial_history import histories
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
+from slpi_ros.identification.repeatability_floor import Floor, floor_of
 from slpi_ros.identification.samples import Samples
-from slpi_ros.identification.signal_statistics import Floor, floor_of
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, Start
 from slpi_ros.model.stage_model import StageModel

@@ -23,7 +23,7 @@ from slpi_ros.diagnosis.selection import (
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
 from slpi_ros.excitation.effects import for_effect
-from slpi_ros.identification.signal_statistics import Floor
+from slpi_ros.identification.repeatability_floor import Floor
 from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]

@@ -24,8 +24,8 @@ from slpi_ros.identification.cross_validation import (
     speeds,
 )
 from slpi_ros.identification.initial_history import Match, match
+from slpi_ros.identification.repeatability_floor import floor_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
-from slpi_ros.identification.signal_statistics import floor_of
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import START_MEMORIES, AxisModel
 from slpi_ros.model.stage_model import StageModel

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
 from slpi_ros.errors import IdentificationError
-from slpi_ros.identification import drive, signal_statistics
+from slpi_ros.identification import bad_readings, drive, signal_statistics
 from slpi_ros.identification.drive import SPEED_FACTOR
 from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, part_of, select_samples
 from slpi_ros.io.record import Record
@@ -253,13 +253,13 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     gain = signal_statistics.spread(y) / signal_statistics.spread(v)
     noise_v, noise_y = signal_statistics.noise(v, t), signal_statistics.noise(y, v, t)
     digit_v, digit_y = signal_statistics.digit(v), signal_statistics.digit(y)
-    stopped = signal_statistics.stopped(v, y, gain, noise_y)
-    frozen = signal_statistics.frozen(y, v, gain, noise_y, digit_y)
-    off_v = signal_statistics.lone_outliers(v, y, 1.0 / gain, max(noise_v, digit_v, _LEAST_SPIKE * np.ptp(v)), noise_y)
-    off_y = signal_statistics.lone_outliers(y, v, gain, max(noise_y, digit_y), noise_v)
+    stopped = bad_readings.stopped(v, y, gain, noise_y)
+    frozen = bad_readings.frozen(y, v, gain, noise_y, digit_y)
+    off_v = bad_readings.lone_outliers(v, y, 1.0 / gain, max(noise_v, digit_v, _LEAST_SPIKE * np.ptp(v)), noise_y)
+    off_y = bad_readings.lone_outliers(y, v, gain, max(noise_y, digit_y), noise_v)
     # Simultaneous outliers of both signals are attributed to the voltage, which the displacement follows.
     off_y = np.setdiff1d(off_y, off_v)
-    mixed, judged, _ = signal_statistics.mixed_readings(y, v)
+    mixed, judged, _ = bad_readings.mixed_readings(y, v)
     displacement = _signal(y, missing[1], noise_y, digit_y, frozen, off_y, mixed)
     if mixed.size:
         # Half of the displacement between the neighbouring readings.
@@ -274,7 +274,7 @@ def _signal(
     missing: int,
     noise: float,
     digit: float,
-    repeats: signal_statistics.Repeats,
+    repeats: bad_readings.Repeats,
     outliers: NDArray[np.int64],
     explained: NDArray[np.int64] | tuple[()] = (),
 ) -> SignalQuality:
@@ -282,7 +282,7 @@ def _signal(
     several = repeats.where(repeats.length > 2)
     single = repeats.where(repeats.length == 2)
     ends = several.where(np.isin(x[several.first], (low, high)))
-    stale = np.setdiff1d(np.union1d(signal_statistics.stale(x, outliers, noise), single.first + 1), explained)
+    stale = np.setdiff1d(np.union1d(bad_readings.stale(x, outliers, noise), single.first + 1), explained)
     return SignalQuality(
         low=low,
         high=high,

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.reversals import monotone_runs
-from slpi_ros.identification.signal_statistics import mixed_beside, mixed_readings, stuck, without_noise
+from slpi_ros.identification.bad_readings import mixed_beside, mixed_readings, stuck
+from slpi_ros.identification.signal_statistics import without_noise
 from slpi_ros.io.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -41,7 +42,7 @@ class Samples:
         Default 0: the axis starts at rest.
     mixed, side : int
         Number of samples that are not fitted because their displacement is late or mixed with that of a neighbour, and
-        which one, as in `slpi_ros.identification.signal_statistics.Mixed`. Default 0: none.
+        which one, as in `slpi_ros.identification.bad_readings.Mixed`. Default 0: none.
     """
 
     v: FloatArray

@@ -1,6 +1,7 @@
 """Text summaries of models and of changes between models."""
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,9 +9,11 @@ from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops
-from slpi_ros.identification.refit import AxisChange
 from slpi_ros.model.axis_model import AxisModel, StartMemory
 from slpi_ros.model.stage_model import StageModel
+
+if TYPE_CHECKING:
+    from slpi_ros.identification.refit import AxisChange
 
 
 def nm(metres: float) -> str:
@@ -64,7 +67,7 @@ def describe_start(model: StageModel, axes: Iterable[str], start_memory: StartMe
     return f"assumed before the first sample: {'; '.join(told)}"
 
 
-def describe_change(axis: str, change: AxisChange) -> list[str]:
+def describe_change(axis: str, change: "AxisChange") -> list[str]:
     """Return a text summary, in nm, of the change of one axis found by a refit."""
     found = change.match
     same = max(abs(found.gain_change), found.gain_uncertainty)

@@ -6,7 +6,7 @@ from identification.records import stage
 
 from slpi_ros.errors import RecordError
 from slpi_ros.excitation.drives import DRIVES, calibration_drive, excite
-from slpi_ros.identification.signal_statistics import floor_of, robust_rms
+from slpi_ros.identification.repeatability_floor import floor_of, robust_rms
 
 NOISE = 8e-9
 

@@ -13,7 +13,7 @@ import slpi_ros
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.cross_validation import CrossValidationReport, Slice
-from slpi_ros.identification.signal_statistics import Floor
+from slpi_ros.identification.repeatability_floor import Floor
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.stage_model import StageModel

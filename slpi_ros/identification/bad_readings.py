@@ -1,0 +1,315 @@
+"""Readings of a sensor that are wrong: repeated values, outliers, stale, early, late and mixed readings.
+
+All tests take the voltage into account: a displacement may rest or reverse where the voltage does.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.special import ndtri
+
+from slpi_ros.identification.signal_statistics import ENOUGH, digit, median_rms, noise, spread
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Expected number of false alarms of each test on a clean record.
+FALSE_ALARMS = 0.01
+# Least gain of a piezo after a reversal, as a share of the mean gain.
+LEAST_GAIN = 0.2
+# Block size, in readings, for long records.
+_BLOCK = 1_000_000
+# Number of preceding readings with which a reading is compared.
+_EARLIER = 3
+# Largest delay of a displacement reversal, and duration of ringing after a jump, in samples.
+_TURN_REACH, _RINGING = 5, 200
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Runs of equal consecutive readings.
+
+    Parameters
+    ----------
+    first : ndarray of int, shape (M,)
+        First reading of each run.
+    length : ndarray of int, shape (M,)
+        Number of readings in each run, at least 2.
+    """
+
+    first: NDArray[np.int64]
+    length: NDArray[np.int64]
+
+    @classmethod
+    def within(cls, x: FloatArray) -> "Repeats":
+        """Find all runs in `x`, shape (N,)."""
+        bounds = np.concatenate([[0], np.flatnonzero(x[1:] != x[:-1]) + 1, [x.size]])
+        length = np.diff(bounds)
+        several = length > 1
+        return cls(bounds[:-1][several], length[several])
+
+    def spans(self, x: FloatArray) -> FloatArray:
+        """Return the range of `x`, shape (N,), during each run, shape (M,)."""
+        if not self.first.size:
+            return np.empty(0)
+        # Every second range of reduceat is one of ours, and what lies between is left out.
+        bounds = np.column_stack([self.first, self.first + self.length]).ravel()
+        padded = np.append(x, x[-1])
+        high, low = (extreme.reduceat(padded, bounds)[::2] for extreme in (np.maximum, np.minimum))
+        return np.asarray(high - low)
+
+    def where(self, chosen: Mask) -> "Repeats":
+        """Return the runs that are `chosen`, a mask of shape (M,)."""
+        return Repeats(self.first[chosen], self.length[chosen])
+
+    @property
+    def readings(self) -> int:
+        """Number of readings that repeat the preceding one."""
+        return int(np.sum(self.length - 1))
+
+
+def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: float) -> Repeats:
+    """Return the repeats of a displacement that are not due to chance.
+
+    Either the voltage moved so that the displacement had to follow, or equal readings are improbable given the noise.
+
+    Parameters
+    ----------
+    y, v : ndarray, shape (N,), metres and volts
+        Displacement and voltage.
+    gain : float, metres per volt
+        Mean gain of the stage.
+    noise_rms, step : float, metres
+        Noise and resolution of the displacement.
+    """
+    repeats = Repeats.within(y)
+    moved = repeats.spans(v)
+    due = LEAST_GAIN * gain * moved > 3.0 * step + 6.0 * noise_rms
+    # Two readings of Gaussian noise have the same digits with probability step / (2 sqrt(pi) noise).
+    with np.errstate(divide="ignore"):
+        alike = np.minimum(np.log(step) - np.log(2.0 * np.sqrt(np.pi) * noise_rms), 0.0) if noise_rms else 0.0
+    improbable = (repeats.length - 1) * alike < np.log(FALSE_ALARMS / y.size)
+    return repeats.where(due | (improbable & (moved > 0.0)))
+
+
+def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
+    """Return repeated readings, in runs of three or more, of a displacement `y` (m) with noise above its resolution.
+
+    If the noise is below the resolution, repeats are expected and none is returned. `v` (V) is the voltage.
+    """
+    repeats = Repeats.within(y)
+    if not np.any(repeats.length > 2):
+        return np.empty(0, np.int64)
+    noise_rms, step = noise(y, v), digit(y)
+    if noise_rms <= step:
+        return np.empty(0, np.int64)
+    repeats = frozen(y, v, spread(y) / spread(v), noise_rms, step)
+    repeats = repeats.where(repeats.length > 2)
+    again = [np.arange(first + 1, first + length) for first, length in zip(repeats.first, repeats.length, strict=True)]
+    return np.concatenate([np.empty(0, np.int64), *again])
+
+
+def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repeats:
+    """Return the repeats of a voltage during which the displacement moves and after which the voltage jumps.
+
+    Parameters as for `frozen`. A hold after a voltage jump is excluded: there the displacement still follows the jump.
+    """
+    repeats = Repeats.within(v)
+    moved = repeats.spans(y) / gain
+    last = repeats.first + repeats.length - 1
+    before = np.abs(v[repeats.first] - v[np.maximum(repeats.first - _TURN_REACH, 0)])
+    after = np.abs(v[np.minimum(last + 1, v.size - 1)] - v[last])
+    least = 0.02 * np.ptp(v) + 6.0 * noise_rms / gain
+    return repeats.where((moved > least) & (before < 0.5 * moved) & (after > 0.5 * moved))
+
+
+def lone_outliers(y: FloatArray, v: FloatArray, gain: float, noise_y: float, noise_v: float) -> NDArray[np.int64]:
+    """Return the readings that deviate from a line through their four neighbours where the voltage does not.
+
+    Parameters
+    ----------
+    y, v : ndarray, shape (N,), metres and volts
+        Displacement and voltage.
+    gain : float, metres per volt
+    noise_y, noise_v : float, metres and volts
+        Their noise.
+
+    Returns
+    -------
+    ndarray of int, shape (M,)
+    """
+    if not noise_y:
+        return np.empty(0, np.int64)
+    limit = -float(ndtri(0.5 * FALSE_ALARMS / y.size)) * np.sqrt(1.25) * noise_y
+    every = max(1, v.size // ENOUGH)
+    jump = 5.0 * np.quantile(np.abs(v[every::every] - v[every - 1 : -1 : every]), 0.9) + 8.0 * noise_v
+    found = [np.empty(0, np.int64)]
+    for start in range(0, y.size, _BLOCK):
+        # A block sees enough of those beside it.
+        first, end = max(start - _RINGING, 0), start + _BLOCK + _RINGING
+        here = _outliers_of_block(y[first:end], v[first:end], gain, noise_y, limit, jump) + first
+        found.append(here[(here >= start) & (here < start + _BLOCK)])
+    return np.concatenate(found)
+
+
+def _outliers_of_block(
+    y: FloatArray, v: FloatArray, gain: float, noise_y: float, limit: float, jump: float
+) -> NDArray[np.int64]:
+    if y.size < 5:
+        return np.empty(0, np.int64)
+    off, turns = _off_neighbours(y), np.abs(_off_neighbours(v))
+    explained = 2.0 * gain * maximum_filter1d(turns, 2 * _TURN_REACH + 1)
+    found = np.flatnonzero((np.abs(off) > limit + explained) & ~_after_jumps(v, jump)[2:-2])
+    # Kinks and ringing bend the line of the neighbours too.
+    before, after = y[found + 1] - y[found], y[found + 4] - y[found + 3]
+    across = y[found + 3] - y[found + 1]
+    size = np.abs(off[found])
+    straight = np.abs(before - after) < np.maximum(8.0 * noise_y, 0.5 * size)
+    straight &= np.abs(across - before - after) < np.maximum(12.0 * noise_y, 0.5 * size)
+    return np.asarray(found[straight] + 2)
+
+
+def _after_jumps(v: FloatArray, jump: float) -> Mask:
+    """Return the mask, shape (N,), of samples within `_RINGING` samples after a voltage jump above `jump` (V)."""
+    jumps = np.flatnonzero(np.abs(np.diff(v, prepend=v[0])) > jump)
+    last = np.zeros(v.size, np.int64)
+    last[jumps] = jumps + _RINGING
+    return np.asarray(np.arange(v.size) < np.maximum.accumulate(last))
+
+
+def _off_neighbours(x: FloatArray) -> FloatArray:
+    return np.asarray(x[2:-2] - 0.25 * (x[:-4] + x[1:-3] + x[3:-1] + x[4:]))
+
+
+def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArray[np.int64]:
+    """Return the outliers that repeat one of the preceding readings within the noise.
+
+    If outliers match later readings about as often, the matches are due to chance and none is returned.
+    """
+    near = 3.0 * np.sqrt(2.0) * noise_rms
+    reach = np.arange(1, _EARLIER + 1)
+    earlier, later = (
+        (np.abs(y[outliers][:, None] - y[np.clip(outliers[:, None] + way * reach, 0, y.size - 1)]) < near).any(axis=1)
+        for way in (-1, 1)
+    )
+    by_chance = np.count_nonzero(earlier) < 2 * np.count_nonzero(later)
+    return outliers[:0] if by_chance else outliers[earlier]
+
+
+# A reading is compared with so many on either side.
+_BESIDE = 3
+# Readings are found to be mixed with the next or the one before where more than this share of them lie off by more than
+# half of the way to it, so many times as many as on the other side; judged by those whose way noise leaves to be seen.
+_MIXED_SHARE, _MIXED_TIMES, _MIXED_NOISE = 0.02, 5.0, 0.12
+# One of them lies off by this share of that way at least, by a line through others and by a model, and by so many
+# robust standard deviations.
+_MIXED_BY_LINE, _MIXED_BY_MODEL, _MIXED_DEVIATIONS = 0.2, 0.05, 4.0
+# Hardly any lies farther off than the next reading.
+_MIXED_MOST = 1.3
+# Fewer readings than this do not tell.
+_FEWEST = 100
+
+
+class Mixed(NamedTuple):
+    """Readings of a displacement that are early, late or a mixture of two neighbouring values.
+
+    Parameters
+    ----------
+    readings : ndarray of int, shape (M,)
+        Those readings.
+    judged : int
+        Number of readings among which they were found; those beside a turn are not.
+    side : int
+        1 where they are mixed with the next one, -1 with the one before, 0 where there are none but by chance.
+    """
+
+    readings: NDArray[np.int64]
+    judged: int
+    side: int
+
+
+def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
+    """Find the readings of a displacement that are early, late or a mixture of two neighbouring values.
+
+    Such a reading lies between its true value and that of a neighbour, as from a link that delivers an old value or
+    parts of two. All deviate to the same side, unlike noise and outliers.
+
+    Parameters
+    ----------
+    y, v : ndarray, shape (N,), metres and volts
+        Displacement and voltage.
+    """
+    off, way = _beside_lines(y[:ENOUGH], v[:ENOUGH])
+    clear = np.abs(way) * _MIXED_NOISE > median_rms(off[way != 0.0]) if way.any() else way != 0.0
+    count = int(np.count_nonzero(clear))
+    ways = off[clear] / way[clear]
+    early, late, far = (np.count_nonzero(at) for at in (ways > 0.5, ways < -0.5, np.abs(ways) > _MIXED_MOST))
+    many, few = max(early, late), min(early, late)
+    if count < _FEWEST or many < max(_MIXED_SHARE * count, _MIXED_TIMES * few) or far > 0.1 * many:
+        return Mixed(np.empty(0, np.int64), count, 0)
+    side = 1 if early > late else -1
+    found, judged = [], 0
+    for start in range(0, y.size, ENOUGH):
+        first = max(start - _RINGING, 0)
+        here = slice(first, start + ENOUGH + _RINGING)
+        off, way = (x[start - first :][:ENOUGH] for x in _beside_lines(y[here], v[here]))
+        found.append(start + _mixed(side * off, way, _MIXED_BY_LINE))
+        judged += int(np.count_nonzero(way))
+    return Mixed(np.concatenate(found), judged, side)
+
+
+def mixed_beside(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> NDArray[np.int64]:
+    """Return the `fitted` readings, of a displacement with mixed ones, that are mixed by a model; those at turns too.
+
+    Parameters
+    ----------
+    path, y : ndarray, shape (N,), metres
+        Displacement by the model, and as it was read.
+    fitted : ndarray of bool, shape (N,)
+    side : int
+        As in `Mixed`.
+    """
+    at = np.flatnonzero(fitted)
+    off = (y - path)[at]
+    # What the model gets wrong is alike in neighbouring readings.
+    off = off - median_filter(off, 4 * _BESIDE + 3)
+    way = np.diff(path, append=path[-1]) if side > 0 else np.diff(path, prepend=path[0])
+    return at[_mixed(side * off, way[at], _MIXED_BY_MODEL)]
+
+
+def _mixed(off: FloatArray, way: FloatArray, least: float) -> NDArray[np.int64]:
+    """Return which readings, `off` by so much (m) and a share of their way to the next one, `way` (m), are mixed."""
+    known, ahead = way != 0.0, np.sign(way) * off
+    noise_off = _MIXED_DEVIATIONS * median_rms(off[known]) if known.any() else 0.0
+    found = ahead > np.maximum(least * np.abs(way), noise_off)
+    # What lies beyond the next reading is something else.
+    return np.flatnonzero(known & found & (ahead < _MIXED_MOST * np.abs(way) + noise_off))
+
+
+def _beside_lines(y: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far each reading, shape (N,), metres, lies from a line through others, and the way between two.
+
+    Both are 0 for readings that are not in the middle of a move.
+    """
+    width = 2 * _BESIDE + 1
+    off, way = np.zeros(y.size), np.zeros(y.size)
+    if y.size < 2 * width:
+        return off, way
+    y_beside, v_beside = sliding_window_view(y, width), sliding_window_view(v, width)
+    steps = np.diff(v_beside, axis=1)
+    one_way = (steps > 0.0).all(axis=1) | (steps < 0.0).all(axis=1)
+    at = np.flatnonzero(one_way)
+    y_beside, steps = y_beside[at], steps[at]
+    gain = np.median(np.diff(y_beside, axis=1) / steps, axis=1)
+    line = np.median(y_beside - gain[:, None] * (v_beside[at] - v[at + _BESIDE][:, None]), axis=1)
+    off[at + _BESIDE] = y[at + _BESIDE] - line
+    way[at + _BESIDE] = gain * np.median(steps, axis=1)
+    known = way != 0.0
+    # A branch bends, so that all readings of a part of it lie beside the line: as many steps, whichever way it goes.
+    steps_off = np.divide(off, way, out=np.zeros_like(off), where=known)
+    off[known] -= (median_filter(steps_off, 2 * width + 1) * way)[known]
+    return np.where(known, off, 0.0), way

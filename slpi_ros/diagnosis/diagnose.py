@@ -234,9 +234,8 @@ def _given_rms(model: AxisModel, evidence: Evidence) -> float:
 def _given(model: AxisModel, selection: Selection) -> Given:
     """Compare the given model with the records, and refuse one that has nothing to do with them."""
     evidence = selection.now.evidence
-    bare = replace(model, effects=())
     motion = float(np.ptp(evidence.y[evidence.used]))
-    compared = [replace(_compared(bare, one), motion=motion) for one in (selection.base, selection.now)]
+    compared = [replace(_compared(model, one), motion=motion) for one in (selection.base, selection.now)]
     # Effects change what a fit to the records makes of the hysteresis: a stage that has changed shows it without them
     # and beside them.
     best = min(compared, key=lambda one: (one.changed, one.hysteresis_rms))
@@ -250,33 +249,49 @@ def _given(model: AxisModel, selection: Selection) -> Given:
     return replace(best, rms=rms, zero_moved=zero if moved else None)
 
 
-def _compared(bare: AxisModel, one: Explanation) -> Given:
-    """Compare the hysteresis of the given model with what effects leave for one to explain."""
-    errors, refitted, gains, deviations = [], [], [], []
+def _compared(model: AxisModel, one: Explanation) -> Given:
+    """Compare the hysteresis of the given model with what effects leave for one to explain.
+
+    What it misses on the record that it was identified from is no change since: of that record it holds effects as
+    well, which others do not show in the same way. So others are compared with that one.
+    """
+    bare = replace(model, effects=())
     # Like the given one, the other hysteresis has branches that rise.
     hysteresis, begins = one.hysteresis()
+    found = []
     for part, rows, begin in zip(one.evidence.parts, one.evidence.slices, begins, strict=True):
         chosen = _known(part)
         target = (one.target - one.settling)[rows][chosen]
         starts = _starts(bare, part)
         tried = [replace(bare, start=start).simulate(part.t, one.u[rows])[chosen] for start in starts]
         h = min(tried, key=lambda h: float(np.std(target - h)))
-        errors.append(np.var(target - h))
         own = replace(bare, hysteresis=hysteresis, start=Start(float(one.u[rows][0]), begin, part.history))
-        refitted.append(np.var(target - own.simulate(part.t, one.u[rows])[chosen]))
-        gain, deviation = _gain(h, target)
-        gains.append(gain)
-        deviations.append(deviation)
-    weights = 1.0 / np.maximum(np.square(deviations), 1e-300)
+        refitted = own.simulate(part.t, one.u[rows])[chosen]
+        found.append((np.var(target - h), np.var(target - refitted), *_gain(h, target)))
+    errors, refits, gains, deviations = np.array(found).T
+    sources = model.quality.source.split(", ")
+    since = np.array([part.source not in sources for part in one.evidence.parts])
+    missed, gain, variance = 0.0, 0.0, 0.0
+    if since.any() and not since.all():
+        missed = max(float(np.mean(errors[~since]) - np.mean(refits[~since])), 0.0)
+        gain, variance = _weighted(gains[~since], deviations[~since])
+        errors, refits, gains, deviations = errors[since], refits[since], gains[since], deviations[since]
+    gain_since, variance_since = _weighted(gains, deviations)
     return Given(
         rms=0.0,
         hysteresis_rms=float(np.sqrt(np.mean(errors))),
-        refitted_rms=float(np.sqrt(np.mean(refitted))),
-        gain=float(weights @ gains / weights.sum()),
-        gain_deviation=float(weights.sum() ** -0.5),
+        refitted_rms=float(np.sqrt(np.mean(refits) + missed)),
+        gain=gain_since - gain,
+        gain_deviation=float(np.sqrt(variance_since + variance)),
         zero_moved=None,
         motion=0.0,
     )
+
+
+def _weighted(values: FloatArray, deviations: FloatArray) -> tuple[float, float]:
+    """Return the mean of values, weighted by their standard deviations, and its variance."""
+    weights = 1.0 / np.maximum(np.square(deviations), 1e-300)
+    return float(weights @ values / weights.sum()), float(1.0 / weights.sum())
 
 
 def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:

@@ -54,6 +54,9 @@ MOST_ROWS = 20_000
 # Others cover a parameter of the hysteresis that weighs so much in them (sum of squares), and can predict a sample of
 # which less than this share depends on parameters that they do not cover. A record is judged by so many samples.
 SEEN, UNSEEN, FEWEST_JUDGED = 0.1, 0.02, 200
+# Nor can they predict a sample where the variance of the prediction is so many times the usual one; it is found at so
+# many samples of a record.
+UNCERTAIN, LOOKED_AT = 10.0, 1000
 # Blocks of a fold are told apart when scores are compared.
 BLOCKS = 40
 
@@ -96,17 +99,21 @@ class Joint:
     evidence : Evidence
     u : ndarray, shape (N,), volts
         What drives the hysteresis.
+    like : Joint, optional
+        Of the same records; they are judged by the same samples.
     """
 
-    def __init__(self, evidence: Evidence, u: FloatArray) -> None:
+    def __init__(self, evidence: Evidence, u: FloatArray, like: "Joint | None" = None) -> None:
+        if like and len(evidence.parts) > 1:
+            self.predictable = like.predictable
         self.problem, self.evidence, self.u = evidence.problem(u), evidence, u
         self._groups = _groups(self.problem, evidence)
         self.everything = self.problem.design.rows(np.concatenate(self._groups))
         self._ends = np.cumsum([0, *(rows.size for rows in self._groups)]).tolist()
-        sample = np.empty(self.problem.y.size, dtype=np.int64)
-        sample[evidence.rows] = np.arange(evidence.rows.size)
-        # Of each row of the equations.
-        self._samples = sample[np.concatenate(self._groups)]
+        # Of each row of the problem, and of each that is fitted.
+        self._sample = np.empty(self.problem.y.size, dtype=np.int64)
+        self._sample[evidence.rows] = np.arange(evidence.rows.size)
+        self._samples = self._sample[np.concatenate(self._groups)]
 
     @cached_property
     def factor(self) -> Factor:
@@ -127,27 +134,35 @@ class Joint:
         grams = [rows.gram() for rows in self.rows]
         everything, whole = range(len(grams)), _sum(grams)
 
-        def judged(left: Sequence[int], rest: FloatArray) -> NDArray[np.bool_]:
-            """Return the rows that others can predict, shape (n,): covered by them, whatever the initial history."""
-            rows = np.concatenate([self._groups[group] for group in left])
-            known, design = _judged(self.problem)[rows], self.problem.design.rows(rows)
-            # What only the way before these samples depends on is a constant for them.
-            depends = abs(design.local[known]).sum(axis=0) > 0.0
-            unseen = np.where(depends & (np.diag(rest) < SEEN), 1.0, 0.0)
-            unseen[self.evidence.basis.size :] = 0.0
-            return np.asarray(known & (design.weight(unseen) < UNSEEN))
-
         def held_out(left: Sequence[int], *, record: bool) -> _HeldOut:
             count = self._ends[-1] - sum(self._groups[group].size for group in left)
             gram = whole - _sum([grams[group] for group in left])
-            rows = judged(left, gram) if record else np.empty(0, dtype=bool)
             rest = [group for group in everything if group not in left]
-            return _HeldOut(left, rest, self._factored(gram, count), rows)
+            samples = self._sample[np.concatenate([self._groups[group] for group in left])]
+            judged = self.predictable[samples] if record else np.empty(0, dtype=bool)
+            return _HeldOut(left, rest, self._factored(gram, count), judged)
 
         folds = [held_out(everything[fold :: FOLDS + 1], record=False) for fold in range(1, FOLDS + 1)]
         if len(self.evidence.parts) == 1:
             return folds, []
         return folds, [held_out(everything[k : k + FOLDS + 1], record=True) for k in everything[:: FOLDS + 1]]
+
+    @cached_property
+    def predictable(self) -> NDArray[np.bool_]:
+        """Samples, shape (N,), that the other records can predict, whatever their record's initial history."""
+        whole = self.everything.gram()
+        found = np.zeros(self.evidence.t.size, dtype=bool)
+        for k, samples in enumerate(self.evidence.slices):
+            rows = np.sort(np.concatenate(self._groups[k * (FOLDS + 1) : (k + 1) * (FOLDS + 1)]))
+            own = self.problem.design.rows(rows)
+            rest = whole - own.gram()
+            factor = self._factored(rest, self._ends[-1] - rows.size)
+            every = -(-rows.size // LOOKED_AT)
+            predicted = _predicted(own, _judged(self.problem)[rows], rest, factor, self.evidence.basis.size, every)
+            # A sample that is not fitted counts like the fitted one before it.
+            place = np.searchsorted(self._sample[rows], np.arange(samples.start, samples.stop), side="right") - 1
+            found[samples] = predicted[np.maximum(place, 0)]
+        return found
 
     @cached_property
     def blocks(self) -> list[NDArray[np.int64]]:
@@ -372,6 +387,43 @@ def _judged(problem: Problem) -> NDArray[np.bool_]:
     return np.asarray((problem.judged & ~walk.first_rise) | (walk.direction == 0))
 
 
+def _predicted(
+    own: Rows, known: NDArray[np.bool_], rest: FloatArray, factor: Factor, size: int, every: int
+) -> NDArray[np.bool_]:
+    """Return which rows of a record, shape (n,), the others can predict.
+
+    Parameters
+    ----------
+    own : Rows
+        Of the record.
+    known : ndarray of bool, shape (n,)
+        Rows that do not depend on the initial history but for a constant.
+    rest, factor : ndarray, shape (p, p), and its factor with the penalty
+        Equations of the other records.
+    size : int
+        Number of parameters of the hysteresis; those behind it are displacements at rest.
+    every : int
+        The variance is found for one of so many rows.
+    """
+    if not known.any():
+        return known
+    # What only the way before these samples depends on is a constant for them.
+    depends = abs(own.local[known]).sum(axis=0) > 0.0
+    unseen = np.where(depends & (np.diag(rest) < SEEN), 1.0, 0.0)
+    unseen[size:] = 0.0
+    covered = np.asarray(known & (own.weight(unseen) < UNSEEN))
+    if not covered.any():
+        return covered
+    some = np.arange(0, known.size, every)
+    matrix = (own.local[some] + own.pick[some] @ own.at_turns).toarray()
+    matrix[:, size:] = 0.0
+    matrix -= matrix[known[some]].mean(axis=0) if known[some].any() else 0.0
+    variance = (scipy.linalg.solve_triangular(factor[0], matrix.T, trans="T", check_finite=False) ** 2).sum(axis=0)
+    usual = covered[some]
+    uncertain = variance > UNCERTAIN * float(np.median(variance[usual] if usual.any() else variance))
+    return np.asarray(covered & ~np.repeat(uncertain, every)[: known.size])
+
+
 def _factor(matrix: FloatArray) -> Factor:
     factor: Factor = scipy.linalg.cho_factor(matrix, check_finite=False)
     return factor
@@ -405,6 +457,7 @@ class Explanation:
         How much of it, of each record one behind the other.
     """
 
+    joint: Joint
     h: FloatArray
     added: FloatArray
     _middles: "list[Callable[[FloatArray], FloatArray]]"
@@ -414,7 +467,10 @@ class Explanation:
         self.u, self._aside = reaching(self.effects, evidence.v, evidence.around)
         if like and not (like.evidence.parts is evidence.parts and like.evidence.smoothness == evidence.smoothness):
             like = None
-        self.joint: Joint = like.joint if like and np.array_equal(like.u, self.u) else Joint(evidence, self.u)
+        if like and np.array_equal(like.u, self.u):
+            self.joint = like.joint
+        else:
+            self.joint = Joint(evidence, self.u, like.joint if like else None)
         starting = settling(self._relaxations, evidence.around, evidence.used)
         self._before = np.column_stack([starting, evidence.beside])
         self._starting = range(starting.shape[1])

@@ -15,6 +15,7 @@ from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, 
 from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, Selection, counts, select
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.initial_history import histories
@@ -235,11 +236,19 @@ def _given(model: AxisModel, selection: Selection) -> Given:
     """Compare the given model with the records, and refuse one that has nothing to do with them."""
     evidence = selection.now.evidence
     motion = float(np.ptp(evidence.y[evidence.used]))
-    compared = [replace(_compared(model, one), motion=motion) for one in (selection.base, selection.now)]
+    sources = model.quality.source.split(", ")
+    own = np.array([part.source in sources for part in evidence.parts])
+    if own.any() and not own.all():
+        # A gain that drifts within each record would explain one that has changed in between.
+        steady = selection.now.without(GainDrift.name)
+        compared = [_since(own, one) for one in (selection.base, steady)]
+    else:
+        compared = [_compared(replace(model, effects=()), one) for one in (selection.base, selection.now)]
+    compared = [replace(one, motion=motion) for one in compared]
     # Effects change what a fit to the records makes of the hysteresis: a stage that has changed shows it without them
     # and beside them.
     best = min(compared, key=lambda one: (one.changed, one.hysteresis_rms))
-    if model.kind in REFITTED:
+    if model.kind in REFITTED and not own.any():
         span = max(motion, float(np.ptp(model.displacement_range)))
         require_own(best.hysteresis_rms, best.refitted_rms, span)
     runs = [_free_run(model, part) for part in evidence.parts]
@@ -249,48 +258,67 @@ def _given(model: AxisModel, selection: Selection) -> Given:
     return replace(best, rms=rms, zero_moved=zero if moved else None)
 
 
-def _compared(model: AxisModel, one: Explanation) -> Given:
-    """Compare the hysteresis of the given model with what effects leave for one to explain.
-
-    What it misses on the record that it was identified from is no change since: of that record it holds effects as
-    well, which others do not show in the same way. So others are compared with that one.
-    """
-    bare = replace(model, effects=())
+def _compared(bare: AxisModel, one: Explanation) -> Given:
+    """Compare the hysteresis of the given model with what effects leave for one to explain."""
+    errors, refitted, gains, deviations = [], [], [], []
     # Like the given one, the other hysteresis has branches that rise.
     hysteresis, begins = one.hysteresis()
-    found = []
     for part, rows, begin in zip(one.evidence.parts, one.evidence.slices, begins, strict=True):
         chosen = _known(part)
         target = (one.target - one.settling)[rows][chosen]
         starts = _starts(bare, part)
         tried = [replace(bare, start=start).simulate(part.t, one.u[rows])[chosen] for start in starts]
         h = min(tried, key=lambda h: float(np.std(target - h)))
+        errors.append(np.var(target - h))
         own = replace(bare, hysteresis=hysteresis, start=Start(float(one.u[rows][0]), begin, part.history))
-        refitted = own.simulate(part.t, one.u[rows])[chosen]
-        found.append((np.var(target - h), np.var(target - refitted), *_gain(h, target)))
-    errors, refits, gains, deviations = np.array(found).T
-    sources = model.quality.source.split(", ")
-    since = np.array([part.source not in sources for part in one.evidence.parts])
-    missed, gain, variance = 0.0, 0.0, 0.0
-    if since.any() and not since.all():
-        missed = max(float(np.mean(errors[~since]) - np.mean(refits[~since])), 0.0)
-        gain, variance = _weighted(gains[~since], deviations[~since])
-        errors, refits, gains, deviations = errors[since], refits[since], gains[since], deviations[since]
-    gain_since, variance_since = _weighted(gains, deviations)
+        refitted.append(np.var(target - own.simulate(part.t, one.u[rows])[chosen]))
+        gain, deviation = _gain(h, target)
+        gains.append(gain)
+        deviations.append(deviation)
+    gain, variance = _weighted(np.array(gains), np.array(deviations))
     return Given(
         rms=0.0,
         hysteresis_rms=float(np.sqrt(np.mean(errors))),
-        refitted_rms=float(np.sqrt(np.mean(refits) + missed)),
-        gain=gain_since - gain,
-        gain_deviation=float(np.sqrt(variance_since + variance)),
+        refitted_rms=float(np.sqrt(np.mean(refitted))),
+        gain=gain,
+        gain_deviation=float(np.sqrt(variance)),
+        zero_moved=None,
+        motion=0.0,
+    )
+
+
+def _since(own: NDArray[np.bool_], one: Explanation) -> Given:
+    """Compare records with those that the given model was identified from, `own`, shape (records,).
+
+    The given model holds what effects did to its own records, and others show them in another way: what one explanation
+    of all records leaves tells whether the stage has changed in between.
+    """
+    found = []
+    for part, rows in zip(one.evidence.parts, one.evidence.slices, strict=True):
+        chosen = _known(part) & one.joint.predictable[rows]
+        enough = np.count_nonzero(chosen) >= FEWEST
+        found.append(_gain(one.h[rows][chosen], (one.target - one.settling)[rows][chosen]) if enough else (0.0, np.inf))
+    gains, deviations = np.array(found).T
+    before, variance = _weighted(gains[own], deviations[own])
+    after, variance_after = _weighted(gains[~own], deviations[~own])
+    left_out = one.held_out.records[own]
+    refitted = one.held_out.rms
+    return Given(
+        rms=0.0,
+        hysteresis_rms=float(np.sqrt(np.nanmean(left_out))) if np.isfinite(left_out).any() else refitted,
+        refitted_rms=refitted,
+        gain=after - before,
+        gain_deviation=float(np.sqrt(variance + variance_after)),
         zero_moved=None,
         motion=0.0,
     )
 
 
 def _weighted(values: FloatArray, deviations: FloatArray) -> tuple[float, float]:
-    """Return the mean of values, weighted by their standard deviations, and its variance."""
+    """Return the mean of values, weighted by their standard deviations, and its variance; 0 where none is known."""
     weights = 1.0 / np.maximum(np.square(deviations), 1e-300)
+    if not weights.sum():
+        return 0.0, np.inf
     return float(weights @ values / weights.sum()), float(1.0 / weights.sum())
 
 

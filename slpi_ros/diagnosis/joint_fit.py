@@ -704,8 +704,9 @@ class Explanation:
         return Explanation(self.evidence, [*self.effects, effect], self)
 
     def only(self, names: Collection[str]) -> "Explanation":
-        """Return it with those of its effects that are named, fitted anew."""
-        return Explanation(self.evidence, [effect for effect in self.effects if effect.name in names], self).refined(2)
+        """Return it with those of its effects that are named, fitted anew if others are gone."""
+        kept = [effect for effect in self.effects if effect.name in names]
+        return self if len(kept) == len(self.effects) else Explanation(self.evidence, kept, self).refined(2)
 
     def without(self, name: str) -> "Explanation":
         """Return it without an effect, the others fitted anew."""

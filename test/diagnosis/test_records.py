@@ -65,6 +65,14 @@ def test_a_change_of_the_gain_is_told(model):
     assert axis.given.gain == pytest.approx(0.01, rel=0.2)
 
 
+def test_a_change_is_one_since_the_record_of_the_model():
+    own = replace(record(1.5, seed=11), source="own")
+    later = replace(record(1.5, seed=12, gain=1.01), source="later")
+    axis, _ = found([own, later], slpi_ros.identify(own))
+    assert axis.given.changed
+    assert axis.given.gain == pytest.approx(0.01, rel=0.2)
+
+
 def test_a_moved_zero_is_no_change_of_the_loops(model):
     axis, _ = found(record(1.5, seed=7, offset=-0.6e-6), model)
     assert not axis.given.changed

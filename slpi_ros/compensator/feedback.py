@@ -372,7 +372,10 @@ class ResidualWindow:
         self._samples = min(self._samples + 1, WINDOW)
 
     def forget(self, expected: float) -> None:
-        """Discard all residuals after a change of model or memory; `expected` (m) is the model displacement."""
+        """Discard all differences between measured and model displacement, as model or hysteresis state has changed.
+
+        `expected` (m) is what the model gives now.
+        """
         self._samples = self._next = 0
         self._before = self._expected = expected
 

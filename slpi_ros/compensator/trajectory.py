@@ -244,7 +244,7 @@ class TrajectoryExecutor:
 
     @property
     def remaining(self) -> int:
-        """Number of pending points."""
+        """Number of trajectory points that are not due yet."""
         return sum(track.stop - track.next for track in self._tracks if track.counted)
 
     @property

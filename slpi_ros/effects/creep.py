@@ -187,7 +187,10 @@ class StreamingCreep:
         return self._origin + (wanted - self._origin - self._crept()) / (1.0 + self._now)
 
     def resume(self, other: "StreamingCreep", x: float) -> None:
-        """Copy the relaxations of equal time constant from `other`, at the displacement `x` (m); the others are 0."""
+        """Take over the state of another model's creep at the input displacement `x` (m).
+
+        Relaxations whose time constant `other` has as well continue from there; all others start settled.
+        """
         moved = other._input
         known = dict(zip(other._creep.time_constants, other._states, strict=True))
         self._origin, self._input = x - moved, moved

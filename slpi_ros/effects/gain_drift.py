@@ -134,7 +134,7 @@ class StreamingGainDrift:
         return self._origin + (wanted - self._origin) / self._factor
 
     def snapshot(self) -> tuple[()]:
-        """Return an empty state."""
+        """Return nothing: the effect has no state."""
         return ()
 
     def restore(self, state: tuple[()]) -> None:

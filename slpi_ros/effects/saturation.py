@@ -113,7 +113,7 @@ class StreamingSaturation:
         return min(max(wanted, self.lower), self.upper)
 
     def snapshot(self) -> tuple[()]:
-        """Return an empty state."""
+        """Return nothing: the effect has no state."""
         return ()
 
     def restore(self, state: tuple[()]) -> None:

@@ -137,7 +137,7 @@ class StreamingSensorError:
         return x
 
     def snapshot(self) -> tuple[()]:
-        """Return an empty state."""
+        """Return nothing: the effect has no state."""
         return ()
 
     def restore(self, state: tuple[()]) -> None:

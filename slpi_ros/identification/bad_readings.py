@@ -46,7 +46,7 @@ class Repeats:
 
     @classmethod
     def within(cls, x: FloatArray) -> "Repeats":
-        """Find all runs in `x`, shape (N,)."""
+        """Find all runs of equal consecutive readings in `x`, shape (N,), in any unit."""
         bounds = np.concatenate([[0], np.flatnonzero(x[1:] != x[:-1]) + 1, [x.size]])
         length = np.diff(bounds)
         several = length > 1

@@ -50,7 +50,7 @@ class Floor:
 
 
 def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray | None = None) -> Floor:
-    """Estimate the repeatability floor of a record, without outliers.
+    """Estimate the repeatability floor of a record: the noise, and whatever else differs when a motion is repeated.
 
     Estimated from repeated moves between the same reversals if there are enough; else from holds; else from the
     sample-to-sample noise. Slow and smooth differences (drift, creep) do not count.
@@ -68,6 +68,7 @@ def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray |
     Returns
     -------
     Floor
+        Rms in metres per reading, outliers left out, and what it was estimated from.
 
     Raises
     ------

@@ -72,7 +72,7 @@ class WorkerProcess(Generic[Request, Outcome]):
         return outcome
 
     def end(self) -> None:
-        """Terminate the process."""
+        """Kill the worker process and wait until it has gone."""
         self._process.kill()
         self._process.join()
         self._receiver.close()

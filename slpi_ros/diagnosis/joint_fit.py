@@ -569,10 +569,12 @@ class Explanation:
         """
         x, first = self._x[: self.evidence.basis.size + 1], float(self.h[self.evidence.slices[k].start])
         levels, whole = self.joint.largest_loops[k]
+        # The function must not hold this object: others keep it, and a fit takes much room.
+        scale = self.joint.problem.scale
 
         @cache
         def middle() -> FloatArray:
-            y = whole.predict(x)[-1 - 3 * LEVELS :] * self.joint.problem.scale
+            y = whole.predict(x)[-1 - 3 * LEVELS :] * scale
             falling, rising = y[1 + LEVELS : 1 + 2 * LEVELS][::-1], y[1 + 2 * LEVELS :]
             centre: FloatArray = 0.5 * (falling + rising) + first - y[0]
             return centre

@@ -13,6 +13,8 @@ import slpi_ros
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.tables import read_table, write_table
 
+pytestmark = pytest.mark.slow
+
 
 def slpi(*arguments):
     command = [sys.executable, "-m", "slpi_ros.cli", *map(str, arguments)]

@@ -21,6 +21,8 @@ from slpi_ros.effects.lag import Lag
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
 
+pytestmark = pytest.mark.slow
+
 SCHEMA = Path(__file__).resolve().parents[1] / "msg_schemas" / "diagnosis.schema.json"
 FILES = {"diagnosis.json", "extended_model.json", "report.html"}
 SAMPLES, NOISE = 3000, 10e-9

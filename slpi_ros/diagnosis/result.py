@@ -108,7 +108,7 @@ class Traces:
         From the first stamp.
     voltage : ndarray, shape (N,), volts
     measured, before, after : ndarray, shape (N,), metres
-        Measured displacement; that of the hysteresis alone, and with effects.
+        Measured displacement; that of the hysteresis alone (`before`), and with effects (`after`).
     contributions : mapping of effect name to ndarray, shape (N,), metres
         What each effect does to the displacement.
     """

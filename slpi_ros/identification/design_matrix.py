@@ -117,7 +117,7 @@ class Design:
 
     @cached_property
     def pick(self) -> sp.csr_array:
-        """Sparse matrix that selects the reversal at which each sample's branch started, shape (N, turns)."""
+        """Sparse matrix that selects the reversal at which each sample's branch started, shape (N, reversals)."""
         on_branch = self._branch >= 0
         pointers = np.concatenate([[0], np.cumsum(on_branch)])
         columns = self._branch[on_branch]

@@ -229,12 +229,12 @@ def make_executor(kind: str) -> Executor:
     Parameters
     ----------
     kind : {"events", "default"}
-        The events executor is several times cheaper; where rclpy does not have it, it is the default one.
+        The events executor takes a fraction of the processor time; where rclpy does not have it, it is the default.
 
     Returns
     -------
     rclpy.executors.Executor
-        To be driven by ``spin_once`` with a timeout only: its ``spin`` may miss signals.
+        To be driven by ``spin_once`` with a timeout only: its ``spin`` may miss SIGINT and SIGTERM.
 
     Raises
     ------

@@ -10,6 +10,8 @@ from benchmarks.hidden import NAMES, calibration_of, hide
 from benchmarks.hidden.size import beyond_hysteresis
 from slpi_ros.io.bag_writer import write_bag
 
+pytestmark = pytest.mark.slow
+
 SAMPLES = 12_000
 # All eleven take minutes: `make bench-diagnosis`.
 FAST = ("lag", "creep", "resonance", "cross_coupling", "sensor_periodic", "hum", "thermal_drift", "gain_drift")

@@ -8,6 +8,8 @@ import slpi_ros
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 
+pytestmark = pytest.mark.slow
+
 
 def part(record, start, stop):
     kept = (record.t >= start) & (record.t < stop)

@@ -12,6 +12,8 @@ from slpi_ros.io.record import Record
 from slpi_ros.io.schemas import format_document
 from slpi_ros.simulation.parameters import StageParameters
 
+pytestmark = pytest.mark.slow
+
 RATE, NOISE, HIGH = 500.0, 6e-9, 100.0
 STAGE = replace(StageParameters.random(3), stiffening=0.0)
 

@@ -9,6 +9,8 @@ from identification.records import calibration, record_of, stage
 import slpi_ros
 from slpi_ros.io.tables import import_table
 
+pytestmark = pytest.mark.slow
+
 SAMPLES, RATE, DRIFT = 3000, 100.0, -0.024
 
 

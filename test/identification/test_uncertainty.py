@@ -9,6 +9,8 @@ from identification.records import calibration, rms, stage
 from slpi_ros.errors import UsageError
 from slpi_ros.identification.uncertainty import curve_uncertainty
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def recorded():

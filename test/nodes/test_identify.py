@@ -38,6 +38,8 @@ from slpi_ros.io.schemas import validate  # noqa: E402
 from slpi_ros.model.document import format_model, load_model, parse_model  # noqa: E402
 from slpi_ros.nodes.jobs import DiagnosisRequest, FitOutcome, FitRequest, WorkerProcess, fit, run_diagnosis  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 NAME = "/identify: identify"
 # Quick to fit, and needs no better.
 QUICK = {"kind": "pi", "diagnostic_period": 0.2}

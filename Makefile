@@ -58,7 +58,7 @@ test: build
 	$(VENV) -m ruff check .
 	$(VENV) -m ruff format --check .
 	$(VENV) -m mypy
-	$(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 4 --dist loadscope --no-loadscope-reorder
+	$(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 3 --dist worksteal
 
 demo: build
 	$(IN_WORKSPACE) $(VENV) demo/run_demo.py

@@ -49,13 +49,12 @@ hypothesis.settings.load_profile("slpi_ros")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs ROS or measured records; put slow modules first, so that none is left to the end."""
+    """Mark what needs ROS and what needs the measured records."""
     for item in items:
         if "nodes" in item.path.parent.name or "rclpy" in getattr(item.module, "__dict__", {}):
             item.add_marker("ros")
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")
-    items.sort(key=lambda item: "slow" not in item.keywords)
 
 
 def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:

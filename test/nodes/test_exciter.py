@@ -210,11 +210,12 @@ def test_a_stage_outside_the_limits_is_left_alone():
 
 
 def test_a_drive_as_one_trajectory():
-    drive = {"duration": 20.0, "axes": ["x", "y"], "drive": "cross_coupling"}
+    drive = {"duration": 60.0, "axes": ["x", "y"], "drive": "cross_coupling"}
     with on_graph() as graph, exciter(graph, **AT_ONCE, **drive, output="trajectory") as node:
         listener, trajectories = Listener(graph), graph.record(JointTrajectory, "voltage_trajectory", LATCHED)
         graph.spin_until(lambda: trajectories, "the trajectory")
-        until = time.monotonic() + 1.0
+        # The axis is up between 1.5 and 3.9 s, however late the signal is.
+        until = time.monotonic() + 2.3
         graph.spin_until(lambda: time.monotonic() > until, "the first full loop")
         node.process.send_signal(signal.SIGINT)
         assert wait_for_end(graph, node) == 0

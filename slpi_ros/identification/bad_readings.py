@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import ndtri
 
-from slpi_ros.identification.signal_statistics import ENOUGH, digit, median_rms, noise, spread
+from slpi_ros.identification.signal_statistics import ENOUGH, FEWEST, digit, median_rms, noise, spread
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -210,8 +210,6 @@ _MIXED_SHARE, _MIXED_TIMES, _MIXED_NOISE = 0.02, 5.0, 0.12
 _MIXED_BY_LINE, _MIXED_BY_MODEL, _MIXED_DEVIATIONS = 0.2, 0.05, 4.0
 # Hardly any lies farther off than the next reading.
 _MIXED_MOST = 1.3
-# Fewer readings than this do not tell.
-_FEWEST = 100
 
 
 class Mixed(NamedTuple):
@@ -249,7 +247,7 @@ def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
     ways = off[clear] / way[clear]
     early, late, far = (np.count_nonzero(at) for at in (ways > 0.5, ways < -0.5, np.abs(ways) > _MIXED_MOST))
     many, few = max(early, late), min(early, late)
-    if count < _FEWEST or many < max(_MIXED_SHARE * count, _MIXED_TIMES * few) or far > 0.1 * many:
+    if count < FEWEST or many < max(_MIXED_SHARE * count, _MIXED_TIMES * few) or far > 0.1 * many:
         return Mixed(np.empty(0, np.int64), count, 0)
     side = 1 if early > late else -1
     found, judged = [], 0

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn
-from slpi_ros.identification.signal_statistics import digit, noise
+from slpi_ros.identification.signal_statistics import FEWEST, digit, noise
 
 FloatArray = NDArray[np.float64]
 
 _FEWEST_READINGS = 5
-# Fewer differences than this do not tell their rms to 10 %.
-FEWEST = 100
 # Enough moves and holds of a long record, taken evenly from all of it, and how far back a move is looked for.
 _ENOUGH_PIECES, _LOOK_BACK = 1000, 1000
 # Turns this close to each other (share of the voltage range) are the same; so are voltages along a move, in rms.
@@ -27,8 +25,6 @@ _LONGEST_PIECE = 2.0
 # What lies farther out, in standard deviations, is an outlier; the rms of a Gaussian cut off there; how often to cut.
 _OUTLIER, _CUT_GAUSSIAN, _CUTS = 2.5, 0.95460, 5
 _ROBUST_FITS = 3
-
-
 # Smaller than this share of the range it is the rounding of numbers.
 NO_NOISE = 1e-9
 

@@ -79,6 +79,8 @@ Mask = NDArray[np.bool_]
 
 # Number of readings from which noise and resolution are estimated.
 ENOUGH = 100_000
+# Fewer differences than this do not tell their rms to 10 %.
+FEWEST = 100
 
 
 def digit(x: FloatArray) -> float:

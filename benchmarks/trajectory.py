@@ -11,12 +11,14 @@ from collections.abc import Callable
 
 import numpy as np
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from round_trip import AXES, compensator, identified_stage
+from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from slpi_ros.model.stage_model import StageModel
@@ -28,7 +30,9 @@ POINTS, REVERSALS, PERIOD_NS, SECOND_NS = 1_000_000, 40_000, 1_000_000, 1_000_00
 # On the wire: two positions with their count, three empty arrays, a time.
 POINT = np.dtype([("count", "=u4"), ("positions", "=f8", 2), ("empty", "=u4", 3), ("time", "=u4", 2)])
 STATUS = "/bench/compensator: compensator"
-PATIENCE_S = 60.0
+PATIENCE_S, HOUR_S = 60.0, 3600.0
+# Long enough for the report of the second in which a trajectory came.
+REPORTED_S = 2.5
 LATENESS = [f"deadline_error_{which}_us" for which in ("p50", "p99", "max")]
 
 
@@ -42,10 +46,14 @@ def paths(model: StageModel) -> FloatArray:
     return np.column_stack(columns)
 
 
-def serialized(positions: FloatArray) -> bytes:
-    """Return a JointTrajectory that starts at once, as bytes: of a million objects it would take a minute to build."""
+def serialized(positions: FloatArray, start: float = 0.0) -> bytes:
+    """Return a JointTrajectory as bytes: of a million objects it would take a minute to build.
+
+    It starts at once, or at a time of the system's clock, seconds.
+    """
     first = JointTrajectoryPoint(positions=positions[0].tolist())
-    message = bytearray(serialize_message(JointTrajectory(joint_names=AXES, points=[first])))
+    header = Header(stamp=Time(sec=int(start)))
+    message = bytearray(serialize_message(JointTrajectory(header=header, joint_names=AXES, points=[first])))
     # Behind the first point, whose numbers may be aligned differently, all look alike.
     first_at = message.index(positions[0].tobytes())
     rest = np.zeros(POINTS - 1, POINT)
@@ -66,13 +74,14 @@ class Bench:
         self._publisher = self._node.create_publisher(JointTrajectory, "/bench/desired_trajectory", QoSProfile(depth=1))
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_report, QoSProfile(depth=100))
         self.reports: list[dict[str, str]] = []
+        self._sent, self._reported = 0, ""
         self._spin_until(lambda: self.reports and self._publisher.get_subscription_count(), "the compensator")
 
-    def send(self, trajectory: bytes, number: int) -> float:
-        """Return the seconds from sending a trajectory, the so manieth, to the report of it."""
-        began = time.monotonic()
+    def send(self, trajectory: bytes) -> float:
+        """Return the seconds from sending a trajectory to the report of it."""
+        began, self._sent = time.monotonic(), self._sent + 1
         self._publisher.publish(trajectory)
-        self._spin_until(lambda: self.reports[-1]["trajectories"] == str(number), "the trajectory")
+        self._spin_until(lambda: self._reported == str(self._sent), "the trajectory")
         return time.monotonic() - began
 
     def watch(self, seconds: float) -> list[dict[str, str]]:
@@ -87,6 +96,7 @@ class Bench:
         for status in array.status:
             if status.name == STATUS:
                 self.reports.append({pair.key: pair.value for pair in status.values})
+                self._reported = self.reports[-1]["trajectories"]
 
     def _spin_until(self, done: Callable[[], object], what: str) -> None:
         deadline = time.monotonic() + PATIENCE_S
@@ -100,17 +110,22 @@ def main(seconds: float = 30.0, tries: int = 3) -> None:
     """Print what was measured."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     model = identified_stage()
-    message, stop = serialized(paths(model)), serialize_message(JointTrajectory())
+    positions, stop = paths(model), serialize_message(JointTrajectory())
+    message = serialized(positions)
     print(f"{POINTS} points, {len(AXES)} axes, {REVERSALS} reversals each, {len(message) / 2**20:.0f} MiB")
     with compensator("bench", model):
         bench = Bench()
-        accepted = []
-        for i in range(tries):
-            accepted.append(bench.send(message, 2 * i + 1))
-            reports = bench.watch(seconds if i + 1 == tries else 1.0)
-            bench.send(stop, 2 * i + 2)
-    took = ", ".join(f"{each:.2f}" for each in accepted)
-    print(f"sent, compensated and reported after {took} s (load of the machine {os.getloadavg()[0]:.2f})")
+        accepted, held_up = [], []
+        for _ in range(tries):
+            accepted.append(bench.send(message))
+            reports = bench.watch(seconds if len(accepted) == tries else 1.0)
+            # The next one starts in an hour: the points of the first go on, and are late by what its check takes.
+            bench.send(serialized(positions, time.time() + HOUR_S))
+            held_up.append(max(float(report[LATENESS[-1]] or 0.0) for report in bench.watch(REPORTED_S)))
+            bench.send(stop)
+    took, late_by = (", ".join(f"{each:.2f}" for each in column) for column in (accepted, np.array(held_up) * 1e-6))
+    print(f"sent, checked and reported after {took} s (load of the machine {os.getloadavg()[0]:.2f})")
+    print(f"points of a trajectory late by {late_by} s while the next one is taken and checked")
     followed = int(reports[0]["points_remaining"]) - int(reports[-1]["points_remaining"])
     skipped = int(reports[-1]["points_skipped"]) - int(reports[0]["points_skipped"])
     late = np.array([[float(report[key]) for key in LATENESS] for report in reports[1:] if report[LATENESS[0]]])

@@ -9,7 +9,7 @@ counted from behind the encapsulation of four bytes.
 
 import struct
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,10 +55,22 @@ class CdrLayout:
         structured ndarray, shape (N,)
             A view of `rows`.
         """
-        size = self.template.size
-        if rows.shape[1] < size or not (rows[:, :size][:, self.fixed] == self.template[self.fixed]).all():
+        if rows.shape[1] < self.template.size or not self._alike(rows):
             return None
         return rows.view(self.dtype(rows.shape[1]))[:, 0]
+
+    def _alike(self, rows: ByteArray) -> bool:
+        """Return whether all messages have the fixed bytes of the template."""
+        # Fixed bytes in a row are compared as one value each: several times faster than byte by byte.
+        ends = np.flatnonzero(np.diff(self.fixed, prepend=False, append=False)).tolist()
+        words = {
+            f"at {at}": (f"u{size}", at)
+            for begin, end in zip(ends[::2], ends[1::2], strict=True)
+            for at, size in _words(begin, end)
+        }
+        layout = CdrLayout(self.template, self.fixed, words)
+        template, others = (some.view(layout.dtype(some.shape[1]))[:, 0] for some in (self.template[None], rows))
+        return not any((others[word] != template[word]).any() for word in words)
 
     def dtype(self, length: int) -> np.dtype[np.void]:
         """Return the structured type of one message of `length` bytes."""
@@ -70,6 +82,14 @@ class CdrLayout:
                 "itemsize": length,
             }
         )
+
+
+def _words(begin: int, end: int) -> Iterator[tuple[int, int]]:
+    """Yield offset and size of the words, of 8, 4, 2 or 1 bytes, that bytes consist of."""
+    while begin < end:
+        size = next(size for size in (8, 4, 2, 1) if size <= end - begin)
+        yield begin, size
+        begin += size
 
 
 class CdrReader:

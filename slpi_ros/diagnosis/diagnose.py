@@ -133,13 +133,20 @@ def _diagnose_axis(
 
 
 def _ambiguous(selection: Selection) -> list[str]:
-    """Return the effects that may be something else, which would do otherwise on other records."""
+    """Return the effects that may be something else, which would do otherwise on other records.
+
+    What every record confirms of the others is told to them by either name.
+    """
     alone = one_speed(selection.now.evidence)
     return [
         named.name
         for named in selection.named
         if (alone and named.name in DYNAMIC)
-        or (named.alternatives and not any({named.name, *named.alternatives} <= same for same in SAME_ELSEWHERE))
+        or (
+            named.alternatives
+            and not named.confirmed
+            and not any({named.name, *named.alternatives} <= same for same in SAME_ELSEWHERE)
+        )
     ]
 
 

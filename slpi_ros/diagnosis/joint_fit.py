@@ -417,9 +417,11 @@ def _predicted(
     some = np.arange(0, known.size, every)
     matrix = (own.local[some] + own.pick[some] @ own.at_turns).toarray()
     matrix[:, size:] = 0.0
+    # While the stage has not moved yet there is nothing to predict.
+    moved = matrix.any(axis=1)
     matrix -= matrix[known[some]].mean(axis=0) if known[some].any() else 0.0
     variance = (scipy.linalg.solve_triangular(factor[0], matrix.T, trans="T", check_finite=False) ** 2).sum(axis=0)
-    usual = covered[some]
+    usual = covered[some] & moved
     uncertain = variance > UNCERTAIN * float(np.median(variance[usual] if usual.any() else variance))
     return np.asarray(covered & ~np.repeat(uncertain, every)[: known.size])
 
@@ -471,7 +473,7 @@ class Explanation:
             self.joint = like.joint
         else:
             self.joint = Joint(evidence, self.u, like.joint if like else None)
-        starting = settling(self._relaxations, evidence.around, evidence.used)
+        starting = settling(self._relaxations, evidence.around, evidence.used, older=evidence.older_moves)
         self._before = np.column_stack([starting, evidence.beside])
         self._starting = range(starting.shape[1])
         beside = self.joint.columns(self._before)
@@ -699,7 +701,9 @@ class Explanation:
         best = problem.smoothness_near(self.evidence.smoothness, SMOOTHNESS)
         if best == self.evidence.smoothness:
             return self
-        return Explanation(replace(self.evidence, smoothness=best), self.effects).refined(2)
+        smoothed = Explanation(replace(self.evidence, smoothness=best), self.effects).refined(2)
+        # The blocks are one choice of several, and leave the effects as they are.
+        return min(self.refined(2), smoothed, key=lambda one: one.held_out.rms_of_records)
 
     def adding(self, effect: Effect) -> "Explanation":
         """Return it with one more effect."""
@@ -718,6 +722,10 @@ class Explanation:
         """Return it with `columns`, shape (N, k), beside the hysteresis, whatever their gains."""
         evidence = replace(self.evidence, beside=np.column_stack([self.evidence.beside, columns]))
         return Explanation(evidence, self.effects, self)
+
+    def with_older_moves(self) -> "Explanation":
+        """Return it with creep that goes on from moves long before each record as well."""
+        return Explanation(replace(self.evidence, older_moves=True), self.effects, self).refined(2)
 
     def bare(self) -> "Explanation":
         """Return it without anything beside the hysteresis but effects, those fitted anew."""

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import EffectContext
+from slpi_ros.effects.base import EffectContext, usual_step
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.loop_family import LoopFamily
@@ -42,6 +42,8 @@ ONE_DRIVE = 0.98
 SMALLEST_TURN = 0.01
 # A record has one drive frequency when this share of its moves from turn to turn takes the same time, up to a factor.
 MOST_RUNS, ALMOST = 0.8, 1.25
+# The power of the voltage rate up to the highest frequency that a drive excites, as a share of all.
+EXCITED = 0.999
 # A sample this many robust standard deviations off, while its neighbours are not half as far, is an outlier.
 OUTLIER = 10.0
 # Of a longer record so many samples in a row are looked at: effects are told apart by what happens between samples, so
@@ -107,12 +109,15 @@ class Evidence:
     smoothness : float
     beside : ndarray, shape (N, k), metres
         Columns that stand beside the hysteresis, whatever their gains.
+    older_moves : bool
+        Whether creep goes on from moves long before a record as well, not only from one just before it.
     """
 
     parts: tuple[Part, ...]
     basis: Basis
     smoothness: float
     beside: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    older_moves: bool = False
 
     def __post_init__(self) -> None:
         """Give `beside` its rows."""
@@ -402,6 +407,17 @@ def drive_frequency(evidence: Evidence) -> float:
             return 0.0
         found.append(0.5 / usual)
     return float(np.median(found)) if max(found) < ALMOST * min(found) else 0.0
+
+
+def excited_frequency(evidence: Evidence) -> float:
+    """Return the frequency (Hz) below which the fastest record has `EXCITED` of the power of its voltage rate."""
+    found = []
+    for part in evidence.parts:
+        grid = np.arange(part.t[0], part.t[-1], usual_step(part.t))
+        rate = np.diff(np.interp(grid, part.t, part.v))
+        power = np.cumsum(np.abs(np.fft.rfft(rate * np.hanning(rate.size))) ** 2)
+        found.append(np.fft.rfftfreq(rate.size, usual_step(part.t))[np.searchsorted(power, EXCITED * power[-1])])
+    return float(max(found))
 
 
 def _dead_band(v: FloatArray) -> float:

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
-from slpi_ros.diagnosis.prepare import Evidence, drive_frequency, one_speed
+from slpi_ros.diagnosis.prepare import Evidence, drive_frequency, excited_frequency, one_speed
 from slpi_ros.effects.base import Candidate, Effect, usual_step
+from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.hum import Hum
@@ -67,6 +68,8 @@ HELD = 0.6
 DRIFT_TAKES, DRIFT_RATE = 10.0, 1e-2
 # What keeps its place while the sensitivity changes is no further outside the record than this share of its range.
 ORIGIN = 0.3
+# A resonance is seen up to so many times the highest frequency that the drive excites.
+RINGS = 2.0
 # Rounding errors (their rms) repeat with every digit, that is sqrt(12) times as far; what is left of a record is
 # rounding when it is no more than so many times that.
 ROUNDING_PERIOD, ROUNDING_LEFT = 1.3 * 12**0.5, 1.3
@@ -108,9 +111,10 @@ class Contender:
         """Number of its parameters that were fitted."""
         return free(self.effect).size
 
-    def refined(self) -> "Contender":
-        """Return it with its parameters at their best."""
-        return Contender(self.name, self.explanation.refined(STEPS))
+    def refined(self, steps: int = STEPS) -> "Contender":
+        """Return it with its parameters at their best, unless that does worse on what is left out."""
+        better = Contender(self.name, self.explanation.refined(steps))
+        return min(self, better, key=lambda one: one.rms)
 
     def counts_beside(self, now: Explanation) -> bool:
         """Return whether it gains enough over what has been found so far."""
@@ -135,14 +139,16 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
     taken = {effect.name for effect in now.effects}
     screened = {name: best for name in names if name not in taken and (best := _screened(name, now))}
     error = now.held_out.rms
-    most = max((error - score.rms for score, _ in screened.values()), default=0.0)
+    # What is not plausible does not set the mark for others.
+    most = max((error - score.rms for score, effect in screened.values() if plausible(effect, now)), default=0.0)
     least = max(WORTH_TRYING * most, LEAST_SCREENED * error)
     tried = [
-        Contender(name, now.adding(effect).refined(1))
+        Contender(name, now.adding(effect)).refined(1)
         for name, (score, effect) in screened.items()
         if error - score.rms > least
     ]
-    most = max((error**2 - one.score.rms**2 for one in tried), default=0.0)
+    sound = [one for one in tried if plausible(one.effect, one.explanation)]
+    most = max((error**2 - one.score.rms**2 for one in sound), default=0.0)
     sound = [one for one in _refined(tried, now, most) if plausible(one.effect, one.explanation)]
     several = len(now.evidence.parts) > 1
 
@@ -191,6 +197,9 @@ def plausible(effect: Effect, now: Explanation) -> bool:
             return _stands_still(effect, now)
         case Hum():
             return not _is_harmonic(effect.frequency, evidence)
+        case Resonance():
+            # Far above all that is excited a resonance is a shift, and bends with the frequency as hysteresis does.
+            return effect.frequency <= RINGS * excited_frequency(evidence)
         case SensorPeriodic():
             return bool(effect.period > ROUNDING_PERIOD * evidence.rounding)
     return True
@@ -282,12 +291,29 @@ def gain(before: Score, after: Score) -> float:
 
 
 def carries_over(before: Score, after: Score) -> bool:
-    """Return whether what was found on some records lowers the error on the others; True for one record."""
-    both = np.isfinite(before.records) & np.isfinite(after.records) if before.records.size else np.empty(0, dtype=bool)
-    if not both.any():
-        return True
-    ratio = np.sqrt(after.records[both] / np.maximum(before.records[both], TINY))
-    return bool(ratio.max() <= NO_WORSE and after.rms_of_records <= (1.0 - LEAST_GAIN) * before.rms_of_records)
+    """Return whether what was found on some records lowers the error on the others; True for one record.
+
+    On each of them, or on all together by the share that counts.
+    """
+    ratio = _ratio_on_records(before, after)
+    lower = ratio.size == 0 or float(ratio.max()) < 1.0
+    return lower or _carries_over_clearly(before, after)
+
+
+def _carries_over_clearly(before: Score, after: Score) -> bool:
+    """Return whether the error on records that were left out falls by the share that counts, and grows on none."""
+    ratio = _ratio_on_records(before, after)
+    less = after.rms_of_records <= (1.0 - LEAST_GAIN) * before.rms_of_records
+    return ratio.size > 0 and float(ratio.max()) <= NO_WORSE and less
+
+
+def _ratio_on_records(before: Score, after: Score) -> FloatArray:
+    """Return after / before of the errors on the records that were left out and could be judged."""
+    if not before.records.size:
+        return np.empty(0)
+    both = np.isfinite(before.records) & np.isfinite(after.records)
+    ratio: FloatArray = np.sqrt(after.records[both] / np.maximum(before.records[both], TINY))
+    return ratio
 
 
 def counts(before: Score, after: Score, *, own: bool = True) -> bool:
@@ -335,6 +361,8 @@ class Named:
         Effects that explain as much, as far as the record can tell.
     runner_up : (str, float) or None
         The next best effect, and the held-out error (m) with it instead.
+    confirmed : bool
+        Whether each record, left out, says that it belongs to the others' explanation.
     """
 
     name: str
@@ -342,6 +370,7 @@ class Named:
     after: Score
     alternatives: tuple[str, ...]
     runner_up: tuple[str, float] | None
+    confirmed: bool
 
 
 @dataclass(frozen=True)
@@ -394,15 +423,19 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
             continue
         dropped |= {one.name for one in found if counts(now.held_out, one.score) and not one.counts_beside(now)}
         if not found or not found[0].counts_beside(now):
-            before = now
+            names = {effect.name for effect in now.effects}
             if not exchanged and len(now.effects) > 1:
-                now, exchanged = _exchanged(now, rivals), True
-            if now is before:
+                # Rivals come with their best parameters.
+                now, exchanged = _exchanged(now.refined(STEPS), rivals), True
+            if {effect.name for effect in now.effects} == names:
                 break
             continue
         best = _simplest(found, now)
         rivals[best.name] = [other.effect for other in found if other is not best]
         now = _without_needless(best.explanation.smoothed(), set(rivals) - {best.name})
+        if {Creep.name, ThermalDrift.name} <= {effect.name for effect in now.effects} and not now.evidence.older_moves:
+            # Creep from long before a record looks like a thermal drift.
+            now = _without_needless(now.with_older_moves(), {ThermalDrift.name})
     with_structures, now = now, now.bare()
     if now is not with_structures:
         now = _without_needless(now, set(rivals))
@@ -501,8 +534,8 @@ def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[E
 
 def _in_its_place(
     name: str, now: Explanation, rivals: Sequence[Effect]
-) -> tuple[tuple[str, ...], tuple[str, float] | None]:
-    """Return which rivals would do as well in the place of an effect, and the best of them."""
+) -> tuple[tuple[str, ...], tuple[str, float] | None, bool]:
+    """Return which rivals would do as well in the place of an effect, the best of them, and whether it is confirmed."""
     rest, best = now.without(name), Contender(name, now)
     tried = _tried(name, now, rest, rivals)
     alone = one_speed(now.evidence)
@@ -511,7 +544,8 @@ def _in_its_place(
     if alone and name in DYNAMIC and not alternatives:
         # A better fit at one frequency says only which of them bends the loops in a more suitable way.
         alternatives = inseparable[:1] or [one for one in ("rate_dependence", "creep") if one != name][:1]
-    return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None
+    confirmed = _carries_over_clearly(rest.held_out, now.held_out)
+    return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None, confirmed
 
 
 def _do_not_close(now: Explanation) -> FloatArray:

@@ -226,23 +226,29 @@ def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[
     return tuple(gain * share if tau < SOON else gain for tau, gain in zip(time_constants, gains, strict=True))
 
 
-def settling(time_constants: Sequence[float], around: EffectContext, used: NDArray[np.bool_]) -> FloatArray:
+def settling(
+    time_constants: Sequence[float], around: EffectContext, used: NDArray[np.bool_], *, older: bool = False
+) -> FloatArray:
     """Return the decay in each record of creep from before it, shape (N, k), one column per identifiable relaxation.
 
-    For the logarithmic law there is a single column, as for one move before the record.
+    For the logarithmic law there is a single column, as for one move just before the record; with `older` another one,
+    as for a move that was as long before it as the record lasts: of that only the slow part still goes on.
     """
     whole = []
     for own in range(max(len(around.records), 1)):
-        for column in _settling_of(time_constants, around.split(around.t)[own], around.split(used)[own]):
+        for column in _settling_of(time_constants, around.split(around.t)[own], around.split(used)[own], older):
             parts = [np.zeros_like(t) for t in around.split(around.t)]
             parts[own] = column
             whole.append(np.concatenate(parts))
     return np.column_stack([np.empty((around.t.size, 0)), *whole])
 
 
-def _settling_of(time_constants: Sequence[float], t: FloatArray, used: NDArray[np.bool_]) -> list[FloatArray]:
+def _settling_of(
+    time_constants: Sequence[float], t: FloatArray, used: NDArray[np.bool_], older: bool
+) -> list[FloatArray]:
     times = t[used]
     since = np.maximum(t - times[0], 0.0)
     if len(time_constants) >= LAW_FEWEST:
-        return [np.sum([np.exp(-since / tau) for tau in time_constants], axis=0)]
+        ages = (0.0, float(times[-1] - times[0])) if older else (0.0,)
+        return [np.sum([np.exp(-(since + age) / tau) for tau in time_constants], axis=0) for age in ages]
     return [np.exp(-since / tau) for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]

@@ -11,13 +11,15 @@ SMOOTHNESS = 0.1
 METRES = 2e-7
 
 
-def evidence(records=1, lead=()):
-    """Return what records of one stage say, and columns of two disturbances."""
+def evidence(records=1, lead=(), hold=0.0):
+    """Return what records of one stage say, and columns of two disturbances; each begins with a hold (s)."""
     parts, columns = [], []
     for seed in range(records):
         rng = np.random.default_rng(seed)
         t = np.arange(1500) / 100
-        v = 50 + 45 * np.sin(2 * np.pi * 0.7 * t + seed) * np.cos(2 * np.pi * 0.05 * t)
+        v = 50 + 45 * np.sin(2 * np.pi * 0.7 * np.maximum(t - hold, 0) + seed) * np.cos(
+            2 * np.pi * 0.05 * np.maximum(t - hold, 0)
+        )
         y = METRES * (v + 4 * np.sin(2 * np.pi * 0.7 * t + seed - 1)) + 1e-8 * rng.normal(size=t.size)
         all_of_it = np.ones(t.size, dtype=bool)
         parts.append(Part(f"record {seed}", t, v, y, all_of_it, all_of_it, all_of_it, lead, {}, 0.0))
@@ -79,6 +81,13 @@ def test_a_record_left_out_has_nothing_but_its_constant():
         judged = np.zeros(y.size, dtype=bool)
         judged[rows] = _judged(joint.problem)[said.rows[rows]]
         assert np.var((predicted - without)[judged]) == pytest.approx(loss, rel=1e-3)
+
+
+def test_a_hold_before_the_motion_does_not_decide_what_others_predict():
+    said, _ = evidence(2, hold=9.0)
+    joint = Joint(said, said.v)
+    moving = np.concatenate([part.t > 9.0 for part in said.parts])
+    assert joint.predictable[moving].mean() > 0.5
 
 
 def test_one_record_cannot_be_left_out():

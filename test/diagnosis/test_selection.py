@@ -45,7 +45,14 @@ def test_a_gain_counts_from_a_least_share_on_however_sure_it_is(share, expected)
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.9 * LEAST_GAIN, False), (0.2, True)])
-def test_a_gain_carries_over_from_the_same_share_on(share, expected):
+def test_a_gain_on_all_together_carries_over_from_the_same_share_on(share, expected):
+    before = score(1e-8, np.full(3, 1e-16))
+    one_grows = np.array([1.01, 1.0 - share, 1.0 - share])
+    assert carries_over(before, score(1e-9, (1e-8 * one_grows) ** 2)) is expected
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.01, True), (-0.01, False)])
+def test_a_gain_on_each_record_that_was_left_out_carries_over(share, expected):
     before = score(1e-8, np.full(3, 1e-16))
     assert carries_over(before, score(1e-9, np.full(3, (1e-8 * (1.0 - share)) ** 2))) is expected
 

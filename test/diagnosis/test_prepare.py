@@ -1,0 +1,34 @@
+"""What records say before anything is fitted to them."""
+
+import numpy as np
+import pytest
+
+from slpi_ros.diagnosis.prepare import Evidence, Part, excited_frequency
+from slpi_ros.identification.bases import SurfaceBasis
+
+T = np.arange(20_000) / 1000
+
+
+def evidence(*voltages):
+    """Return what records with these voltages, shape (N,), say of a straight stage."""
+    used = np.ones(T.size, dtype=bool)
+    parts = [Part(f"record {k}", T, v, 1e-7 * v, used, used, used, (), {}, 0.0) for k, v in enumerate(voltages)]
+    return Evidence(tuple(parts), SurfaceBasis(np.linspace(0, 100, 11)), 0.1)
+
+
+def sine(frequency):
+    return 50 + 40 * np.sin(2 * np.pi * frequency * T)
+
+
+@pytest.mark.parametrize("frequency", [0.5, 7.0, 90.0])
+def test_a_sine_excites_its_own_frequency(frequency):
+    assert excited_frequency(evidence(sine(frequency))) == pytest.approx(frequency, rel=0.1, abs=0.15)
+
+
+def test_the_fastest_record_counts():
+    assert excited_frequency(evidence(sine(20.0), sine(2.0))) == pytest.approx(20.0, rel=0.1)
+
+
+def test_steps_excite_what_they_reach():
+    steps = 50 + 40 * np.sign(np.sin(2 * np.pi * 0.5 * T))
+    assert excited_frequency(evidence(steps)) > 300.0

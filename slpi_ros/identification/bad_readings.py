@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
 from scipy.special import ndtri
 
 from slpi_ros.identification.signal_statistics import ENOUGH, FEWEST, digit, median_rms, noise, spread
@@ -25,6 +25,11 @@ LEAST_GAIN = 0.2
 _BLOCK = 1_000_000
 # Number of preceding readings with which a reading is compared.
 _EARLIER = 3
+# Least size of an outlier as a share of the range; piecewise excitation signals have smaller kinks.
+LEAST_SPIKE = 0.001
+# A reading is an outlier for sure when it lies so many times farther from the median of so many readings than half of
+# those do that are not the median; looked for so many times.
+_FAR, _WINDOW, _PASSES = 15.0, 7, 5
 # Largest delay of a displacement reversal, and duration of ringing after a jump, in samples.
 _TURN_REACH, _RINGING = 5, 200
 
@@ -125,6 +130,68 @@ def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repe
     after = np.abs(v[np.minimum(last + 1, v.size - 1)] - v[last])
     least = 0.02 * np.ptp(v) + 6.0 * noise_rms / gain
     return repeats.where((moved > least) & (before < 0.5 * moved) & (after > 0.5 * moved))
+
+
+def far_outliers(v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the readings of voltage and displacement that are farther from those beside them than the other explains.
+
+    Unlike `lone_outliers` it needs no estimate of noise, which outliers this far would spoil.
+
+    Parameters
+    ----------
+    v, y : ndarray, shape (N,), volts and metres
+
+    Returns
+    -------
+    tuple of ndarray of int, shape (M,) each
+    """
+    found = np.zeros((2, v.size), dtype=bool)
+    for _ in range(_PASSES):
+        # Outliers beside each other hide each other.
+        cleaned = [without(x, np.flatnonzero(off)) for x, off in zip((v, y), found, strict=True)]
+        more = np.array([_far(*cleaned), _far(*cleaned[::-1])])
+        if not more.any():
+            break
+        found |= more
+    return np.flatnonzero(found[0]), np.flatnonzero(found[1])
+
+
+def _far(x: FloatArray, other: FloatArray) -> Mask:
+    middle = median_filter(x, _WINDOW, mode="nearest")
+    off, reach = np.abs(x - middle), 2 * _TURN_REACH + 1
+    if not off.any():
+        return np.zeros(x.size, dtype=bool)
+    moved = maximum_filter1d(other, reach) - minimum_filter1d(other, reach)
+    # On the way from one end to the other the median is the reading itself.
+    least = max(_FAR * float(np.median(off[off > 0.0])), LEAST_SPIKE * spread(middle))
+    gain = spread(middle) / (spread(other) or np.inf)
+    return np.asarray(off > least + 2.0 * gain * moved)
+
+
+def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:
+    """Return readings `x`, shape (N,), with a line between their neighbours in the place of outliers."""
+    if not outliers.size:
+        return x
+    good = np.setdiff1d(np.arange(x.size), outliers)
+    cleaned = x.copy()
+    cleaned[outliers] = np.interp(outliers, good, x[good])
+    return cleaned
+
+
+def lone_of(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the lone outliers of a voltage and of a displacement.
+
+    Outliers of both at once are attributed to the voltage, which the displacement follows.
+
+    Parameters
+    ----------
+    t, v, y : ndarray, shape (N,), seconds, volts and metres
+        Both signals vary.
+    """
+    gain, noise_v, noise_y = spread(y) / spread(v), noise(v, t), noise(y, v, t)
+    off_v = lone_outliers(v, y, 1.0 / gain, max(noise_v, digit(v), LEAST_SPIKE * float(np.ptp(v))), noise_y)
+    off_y = lone_outliers(y, v, gain, max(noise_y, digit(y)), noise_v)
+    return off_v, np.setdiff1d(off_y, off_v)
 
 
 def lone_outliers(y: FloatArray, v: FloatArray, gain: float, noise_y: float, noise_v: float) -> NDArray[np.int64]:

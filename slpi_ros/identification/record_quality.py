@@ -20,8 +20,6 @@ FloatArray = NDArray[np.float64]
 _LOST, _GAP = 1.5, 5.0
 # Number of samples within which stamps recover after a late stamp.
 _CATCHES_UP = 51
-# Least size of a voltage outlier as a share of the range; piecewise excitation signals have smaller kinks.
-_LEAST_SPIKE = 0.001
 
 
 @dataclass(frozen=True)
@@ -250,15 +248,14 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     missing = [int(np.count_nonzero(~np.isfinite(signal))) for signal in (v, y)]
     if not both.all():
         t, v, y = t[both], v[both], y[both]
+    far_v, far_y = bad_readings.far_outliers(v, y)
+    v, y = bad_readings.without(v, far_v), bad_readings.without(y, far_y)
     gain = signal_statistics.spread(y) / signal_statistics.spread(v)
     noise_v, noise_y = signal_statistics.noise(v, t), signal_statistics.noise(y, v, t)
     digit_v, digit_y = signal_statistics.digit(v), signal_statistics.digit(y)
     stopped = bad_readings.stopped(v, y, gain, noise_y)
     frozen = bad_readings.frozen(y, v, gain, noise_y, digit_y)
-    off_v = bad_readings.lone_outliers(v, y, 1.0 / gain, max(noise_v, digit_v, _LEAST_SPIKE * np.ptp(v)), noise_y)
-    off_y = bad_readings.lone_outliers(y, v, gain, max(noise_y, digit_y), noise_v)
-    # Simultaneous outliers of both signals are attributed to the voltage, which the displacement follows.
-    off_y = np.setdiff1d(off_y, off_v)
+    off_v, off_y = bad_readings.lone_of(t, v, y)
     mixed, judged, _ = bad_readings.mixed_readings(y, v)
     displacement = _signal(y, missing[1], noise_y, digit_y, frozen, off_y, mixed)
     if mixed.size:
@@ -266,7 +263,9 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
         ways = np.abs(y[np.minimum(mixed + 1, y.size - 1)] - y[np.maximum(mixed - 1, 0)]) / 2.0
         size, share = float(np.median(ways)), mixed.size / judged
         displacement = replace(displacement, mixed=int(mixed.size), mixed_share=share, mixed_size=size)
-    return _signal(v, missing[0], noise_v, digit_v, stopped, off_v), displacement
+    voltage = _signal(v, missing[0], noise_v, digit_v, stopped, off_v)
+    voltage = replace(voltage, spikes=voltage.spikes + np.setdiff1d(far_v, off_v).size)
+    return voltage, replace(displacement, spikes=displacement.spikes + np.setdiff1d(far_y, off_y).size)
 
 
 def _signal(
@@ -441,8 +440,8 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
         text = f"{name} stale, a reading of before, in {_of(signal.stale, samples)}"
         yield Finding("warn" if signal.stale > _OUTLIERS * samples else "ok", text)
     if signal.spikes:
-        text = f"{name} with lone outliers in {_of(signal.spikes, samples)}"
-        yield Finding("warn" if signal.spikes > _OUTLIERS * samples else "ok", text)
+        text = f"{name} with outliers in {_of(signal.spikes, samples)}"
+        yield Finding("warn", f"{text}: the other signal does not follow; they are not fitted")
 
 
 def _drive_findings(quality: Quality) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.reversals import monotone_runs
-from slpi_ros.identification.bad_readings import mixed_beside, mixed_readings, stuck
+from slpi_ros.identification.bad_readings import far_outliers, lone_of, mixed_beside, mixed_readings, stuck, without
 from slpi_ros.identification.signal_statistics import without_noise
 from slpi_ros.io.record import Record
 
@@ -178,14 +178,21 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
         raise RecordError(f"{where}: {count} usable samples of {len(record)}{part}; at least {FEWEST} are needed")
     if count < fitted.size:
         y = np.where(fitted, y, 0.0)
+    # An outlier of the voltage is no reversal, and no range.
+    when = t if driven.all() else t[driven]
+    far_v, far_y = far_outliers(v, without(y, np.flatnonzero(~fitted)))
+    v = without(v, far_v)
+    fitted[far_y] = False
     _require_motion(v, y, fitted, where)
     # Stuck and mixed readings are not fitted.
     known = np.flatnonzero(fitted)
     fitted[known[stuck(y[known], v[known])]] = False
     known = np.flatnonzero(fitted)
     mixed = mixed_readings(y[known], v[known])
+    off_v, off_y = lone_of(when[known], v[known], y[known])
     fitted[known[mixed.readings]] = False
-    smooth = without_noise(t if driven.all() else t[driven], v)
+    fitted[known[off_y]] = False
+    smooth = without_noise(when, without(v, known[off_v]))
     return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side)
 
 

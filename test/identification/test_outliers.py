@@ -1,0 +1,101 @@
+"""Lone outliers of voltage and displacement: found, counted, and without a say in ranges, reversals and errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import slpi_ros
+from slpi_ros.excitation.drives import calibration_drive
+from slpi_ros.identification.bad_readings import far_outliers
+from slpi_ros.identification.record_quality import assess
+from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.preisach import PreisachStage
+
+NOISE = 5e-9
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """Return a record of a simulated stage."""
+    t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=200.0, seed=1)
+    y = PreisachStage(StageParameters.random(1), 1).run(t, v)[1]
+    return slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y})
+
+
+@pytest.fixture(scope="module")
+def of_clean(clean):
+    return slpi_ros.identify(clean).axes["x"]
+
+
+def spoiled(record, signal, at, by):
+    """Return the record with some readings of a signal off by so much."""
+    x = getattr(record, signal)["x"].copy()
+    x[at] += by
+    return replace(record, **{signal: {"x": x}})
+
+
+def error(model, clean):
+    """Return the error (m, rms) along the clean record."""
+    return float(np.std(model.memory("start").forward_array(clean.voltage["x"]) - clean.displacement["x"]))
+
+
+def judge(record, clean, of_clean):
+    """Assert that a model of a spoiled record is as good as that of the clean one, and good for the same range."""
+    model = slpi_ros.identify(record).axes["x"]
+    assert error(model, clean) <= 1.2 * error(of_clean, clean)
+    noise = 6 * NOISE
+    for mine, its in (
+        (model.voltage_range, of_clean.voltage_range),
+        (model.displacement_range, of_clean.displacement_range),
+    ):
+        assert its[0] - noise <= mine[0] and mine[1] <= its[1] + noise
+    return model
+
+
+@pytest.mark.parametrize("by", [500.0, 20.0, -30.0, 1e5])
+def test_one_voltage_decides_nothing(clean, of_clean, by):
+    record = spoiled(clean, "voltage", 3000, by)
+    model = judge(record, clean, of_clean)
+    assert model.quality.held_out_rms <= 1.2 * of_clean.quality.held_out_rms
+    found = assess(record, "x").voltage
+    assert found.spikes == 1 and found.high == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize(("count", "by"), [(1, 1e-2), (1, -1e-3), (1, 1e-4), (3, 1e-3)])
+def test_displacements_far_away_decide_nothing(clean, of_clean, count, by):
+    record = spoiled(clean, "displacement", np.array([3000, 1000, 5000])[:count], by)
+    model = judge(record, clean, of_clean)
+    assert model.quality.held_out_rms <= 1.2 * of_clean.quality.held_out_rms
+    assert assess(record, "x").displacement.spikes == count
+
+
+@pytest.mark.parametrize("count", [5, 50, 600])
+@pytest.mark.parametrize("times", [2, 100, 10_000])
+def test_many_outliers_of_any_size_leave_the_model_as_it_is(clean, of_clean, count, times):
+    rng = np.random.default_rng(3)
+    at = rng.choice(len(clean), count, replace=False)
+    judged = slpi_ros.identify(spoiled(clean, "displacement", at, times * NOISE * rng.choice([-1, 1], count))).axes["x"]
+    assert error(judged, clean) <= 1.2 * error(of_clean, clean)
+    assert judged.voltage_range == pytest.approx(of_clean.voltage_range)
+
+
+@pytest.mark.parametrize("volts", [1.0, 10.0, 100.0])
+def test_voltages_that_no_displacement_follows_are_no_reversals(clean, of_clean, volts):
+    rng = np.random.default_rng(4)
+    at = rng.choice(len(clean), 50, replace=False)
+    judge(spoiled(clean, "voltage", at, volts * rng.choice([-1, 1], 50)), clean, of_clean)
+
+
+def test_what_the_other_signal_follows_is_none(clean):
+    assert not any(off.size for off in far_outliers(clean.voltage["x"], clean.displacement["x"]))
+
+
+@pytest.mark.parametrize("width", [1, 3, 20])
+def test_pulses_that_the_stage_follows_are_none(width):
+    v = np.interp(np.arange(4000), [0, 500, 1000, 1500, 2000], [20, 100, 0, 100, 20])
+    for at in range(2100, 3900, 200):
+        v[at : at + width] = 60.0
+    y = 2e-7 * v + NOISE * np.random.default_rng(5).standard_normal(v.size)
+    off_v, off_y = far_outliers(v, y)
+    assert not off_v.size and not off_y.size

@@ -8,6 +8,7 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from io import TextIOWrapper
@@ -332,26 +333,27 @@ def _assess_record(record: "Record", options: argparse.Namespace) -> "dict[str, 
 def _diagnose(options: argparse.Namespace) -> None:
     from slpi_ros.diagnosis.diagnose import diagnose
     from slpi_ros.identification.record_quality import assess, findings, require_usable
-    from slpi_ros.io.atomic_file import make_folder
+    from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.model.document import load_model
     from slpi_ros.reports.diagnosis import FILES, PAGE, describe_diagnosis, write_files
 
     topics = _topics(options)
     model = load_model(options.model)
-    folder = Path(options.output)
-    make_folder(folder, *FILES)
-    records = [_read_all_axes(bag, options, topics) for bag in options.bags]
-    try:
-        axes = options.axis or [axis for axis in model.axes if all(axis in record.axes for record in records)]
-        for record, axis in ((record, axis) for record in records for axis in axes):
-            record.require_axis(axis)
-            model.axis(axis)
-            require_usable(findings(assess(record, axis)), f"{record.source}: axis '{axis}'")
-        diagnosis = diagnose(records, model, axes=axes, start=options.start, stop=options.stop)
-    except UsageError as error:
-        # Exit code 1: the mismatch between bag and model is found in the data, not in the call.
-        raise ModelError(str(error)) from None
-    write_files(folder, diagnosis)
+    for name in FILES:
+        _require_another_file(str(Path(options.output) / name), options.model, *options.bags)
+    with output_folder(options.output, *FILES) as folder:
+        records = [_read_all_axes(bag, options, topics) for bag in options.bags]
+        try:
+            axes = options.axis or [axis for axis in model.axes if all(axis in record.axes for record in records)]
+            for record, axis in ((record, axis) for record in records for axis in axes):
+                record.require_axis(axis)
+                model.axis(axis)
+                require_usable(findings(assess(record, axis)), f"{record.source}: axis '{axis}'")
+            diagnosis = diagnose(records, model, axes=axes, start=options.start, stop=options.stop)
+        except UsageError as error:
+            # Exit code 1: the mismatch between bag and model is found in the data, not in the call.
+            raise ModelError(str(error)) from None
+        write_files(folder, diagnosis)
     print("\n".join(describe_diagnosis(diagnosis)))
     print(f"{folder / PAGE}: open it in a browser")
 
@@ -375,7 +377,7 @@ def _read_all_axes(bag: str, options: argparse.Namespace, topics: "str | Separat
 def _verify(options: argparse.Namespace) -> int:
     from slpi_ros.diagnosis.verify import verify
     from slpi_ros.io.alignment import SeparateTopics
-    from slpi_ros.io.atomic_file import make_folder
+    from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.bag_reader import read_bags, read_desired
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
@@ -385,22 +387,24 @@ def _verify(options: argparse.Namespace) -> int:
     if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
         raise UsageError(f"--tolerance {options.tolerance:g}: give a positive number of micrometres")
     model = load_model(options.model)
-    if options.output:
-        make_folder(options.output, *FILES)
+    if options.output is not None:
+        for name in FILES:
+            _require_another_file(str(Path(options.output) / name), options.model, *options.bags)
     # Read all axes because of cross-coupling; separate topics may not name their axes, so the options name them.
     axes = options.axis if isinstance(topics, SeparateTopics) else None
-    records = read_bags(options.bags, topics, axes=axes)
-    desired = [
-        read_desired(bag, record, options.desired_topic) for bag, record in zip(options.bags, records, strict=True)
-    ]
-    tolerance = None if options.tolerance is None else 1e-6 * options.tolerance
-    try:
-        found = verify(records, model, tolerance, axes=options.axis, desired=desired)
-    except UsageError as error:
-        # Exit code 1: the mismatch between bags and model is found in the data, not in the call.
-        raise ModelError(str(error)) from None
-    if options.output:
-        write_files(Path(options.output), found)
+    with nullcontext() if options.output is None else output_folder(options.output, *FILES) as folder:
+        records = read_bags(options.bags, topics, axes=axes)
+        desired = [
+            read_desired(bag, record, options.desired_topic) for bag, record in zip(options.bags, records, strict=True)
+        ]
+        tolerance = None if options.tolerance is None else 1e-6 * options.tolerance
+        try:
+            found = verify(records, model, tolerance, axes=options.axis, desired=desired)
+        except UsageError as error:
+            # Exit code 1: the mismatch between bags and model is found in the data, not in the call.
+            raise ModelError(str(error)) from None
+        if folder:
+            write_files(folder, found)
     document = format_document(found.to_document(), "verification")
     print(document if options.json else "\n".join(describe_verification(found)))
     return 0 if found.passed else 1
@@ -481,10 +485,11 @@ def _compensate(options: argparse.Namespace) -> None:
 
 
 def _require_another_file(output: str, *inputs: str) -> None:
-    """Raise UsageError if the output file is one of the inputs."""
+    """Raise UsageError if the output file is one of the inputs, or would lie in a bag that is one."""
     for path in map(Path, inputs):
-        if path.exists() and Path(output).exists() and path.samefile(output):
-            raise UsageError(f"{output}: is also read from; give another output file (-o)")
+        within = path.is_dir() and path.resolve() in Path(output).resolve().parents
+        if within or (path.exists() and Path(output).exists() and path.samefile(output)):
+            raise UsageError(f"{output}: is also read from; give another output (-o)")
 
 
 def _model_columns(columns: "dict[str, FloatArray]", model: "StageModel", table: str) -> "dict[str, FloatArray]":

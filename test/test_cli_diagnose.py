@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import subprocess
 import sys
 import warnings
@@ -388,3 +389,40 @@ def test_digits_without_noise_are_explained_by_nothing(clean):
     found = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"]
     assert found.verdict == "nothing_found"
     assert 0.5e-12 < found.floor_rms < 10e-12
+
+
+def test_records_of_two_stages_are_refused(slpi, folder, tmp_path, hidden, clean):
+    write_bag(tmp_path / "mine", replace(hidden.record, hardware_id="mine"))
+    model = ("--model", folder / "model.json", "-o", tmp_path / "out")
+    for bags in ((tmp_path / "mine", folder / "clean"), (folder / "clean", tmp_path / "mine")):
+        code, said, complaint = slpi("diagnose", *bags, *model)
+        assert code == 1 and not said and complaint.count("\n") == 1
+        assert "'mine'" in complaint and str(tmp_path / "mine") in complaint
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_record_that_is_there_twice_is_refused(slpi, folder, tmp_path):
+    shutil.copytree(folder / "hum", tmp_path / "copy")
+    for again in (folder / "hum", tmp_path / "copy"):
+        code, _, complaint = slpi(
+            "diagnose", folder / "hum", again, "--model", folder / "model.json", "-o", tmp_path / "out"
+        )
+        assert code == 1 and complaint.count("\n") == 1 and str(again) in complaint
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_is_written_into_a_bag_or_over_the_model(slpi, folder, tmp_path):
+    shutil.copytree(folder / "hum", tmp_path / "bag")
+    shutil.copy(folder / "model.json", tmp_path / "extended_model.json")
+    data, model = tmp_path / "bag" / "bag.mcap", tmp_path / "extended_model.json"
+    before = {path: path.read_bytes() for path in (*(tmp_path / "bag").iterdir(), model)}
+    for command in (
+        ("identify", tmp_path / "bag", "-o", data),
+        ("refit", model, tmp_path / "bag", "-o", tmp_path / "bag" / "metadata.yaml"),
+        ("diagnose", tmp_path / "bag", "--model", model, "-o", tmp_path / "bag"),
+        ("diagnose", tmp_path / "bag", "--model", model, "-o", tmp_path),
+        ("verify", tmp_path / "bag", "--model", model, "-o", tmp_path / "bag" / "below"),
+    ):
+        code, said, complaint = slpi(*command)
+        assert code == 2 and not said and complaint.count("\n") == 1
+    assert before == {path: path.read_bytes() for path in (*(tmp_path / "bag").iterdir(), model)}

@@ -84,11 +84,13 @@ def diagnose(
                 f"this model does not belong to this bag: it is of stage '{model.hardware_id}', {each.source} of "
                 f"'{each.hardware_id}'"
             )
+    _require_different(records)
     source = ", ".join(each.source for each in records)
     common = [axis for axis in records[0].axes if all(axis in each.axes for each in records)]
     chosen = list(axes) if axes else [axis for axis in model.axes if axis in common]
     if not chosen:
-        raise UsageError(f"{source} holds axes {', '.join(common)}, the model {', '.join(model.axes)}: none in common")
+        held = "; ".join(f"{each.source} holds axes {', '.join(each.axes)}" for each in records)
+        raise UsageError(f"{held}; the model {', '.join(model.axes)}: none in common; give bags of the same axes")
     found: dict[str, AxisDiagnosis] = {}
     extended = dict(model.axes)
     for axis in chosen:
@@ -100,6 +102,22 @@ def diagnose(
             raise type(error)(where + str(error).removeprefix(where)) from None
     created = datetime.now(UTC).isoformat(timespec="seconds")
     return Diagnosis(found, replace(model, axes=extended, created=created), source)
+
+
+def _require_different(records: Sequence[Record]) -> None:
+    """Raise UsageError unless all records are of one stage, and none is there twice: it would confirm itself."""
+    for number, record in enumerate(records):
+        for earlier in records[:number]:
+            if record.hardware_id != earlier.hardware_id:
+                raise UsageError(
+                    f"{record.source} is of stage '{record.hardware_id}', {earlier.source} of '{earlier.hardware_id}'; "
+                    "give records of one stage"
+                )
+            if np.array_equal(record.time_ns, earlier.time_ns) and all(
+                axis in earlier.axes and np.array_equal(y, earlier.displacement[axis], equal_nan=True)
+                for axis, y in record.displacement.items()
+            ):
+                raise UsageError(f"{record.source} and {earlier.source} are the same record; give each once")
 
 
 def _diagnose_axis(

@@ -28,8 +28,8 @@ _EARLIER = 3
 # Least size of an outlier as a share of the range; piecewise excitation signals have smaller kinks.
 LEAST_SPIKE = 0.001
 # A reading is an outlier for sure when it lies so many times farther from the median of so many readings than half of
-# those do that are not the median; looked for so many times.
-_FAR, _WINDOW, _PASSES = 15.0, 7, 5
+# those do that are not the median, and than those beside it; looked for so many times.
+_FAR, _APART, _WINDOW, _PASSES = 15.0, 5.0, 7, 5
 # Largest delay of a displacement reversal, and duration of ringing after a jump, in samples.
 _TURN_REACH, _RINGING = 5, 200
 
@@ -165,7 +165,9 @@ def _far(x: FloatArray, other: FloatArray) -> Mask:
     # On the way from one end to the other the median is the reading itself.
     least = max(_FAR * float(np.median(off[off > 0.0])), LEAST_SPIKE * spread(middle))
     gain = spread(middle) / (spread(other) or np.inf)
-    return np.asarray(off > least + 2.0 * gain * moved)
+    # Ringing takes every reading away from the median, an outlier only itself.
+    alone = off > _APART * median_filter(off, _WINDOW, mode="nearest")
+    return np.asarray(alone & (off > least + 2.0 * gain * moved))
 
 
 def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:

@@ -32,6 +32,8 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
     """
     target = Path(path)
     draft = target.parent / f".{target.name}.{os.getpid()}.partial"
+    if not is_replaceable(target):
+        raise failure(f"'{path}': cannot be written: no regular file; choose another place")
     try:
         with draft.open("w", encoding="utf-8") as file:
             yield file
@@ -43,6 +45,32 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
     finally:
         with suppress(OSError, ValueError):
             draft.unlink(missing_ok=True)
+
+
+def is_replaceable(path: Path) -> bool:
+    """Return whether a file can be put in the place of `path`: where nothing is yet, or a regular file."""
+    try:
+        return path.is_file() or not os.path.lexists(path)
+    except (OSError, ValueError):
+        # What is wrong with the name is told when it is opened.
+        return True
+
+
+@contextmanager
+def output_folder(path: str | os.PathLike[str], *names: str) -> Iterator[Path]:
+    """Make a folder for files, see `make_folder`; those made are removed if the ``with`` block ends with an error."""
+    if not str(path):
+        raise SlpiError("'': no folder to write into; name one")
+    missing = [place for place in (Path(path), *Path(path).parents) if not os.path.lexists(place)]
+    make_folder(path, *names)
+    try:
+        yield Path(path)
+    except BaseException:
+        with suppress(OSError):
+            # What others wrote there meanwhile stays.
+            for place in missing:
+                place.rmdir()
+        raise
 
 
 def make_folder(path: str | os.PathLike[str], *names: str) -> None:

@@ -99,3 +99,11 @@ def test_pulses_that_the_stage_follows_are_none(width):
     y = 2e-7 * v + NOISE * np.random.default_rng(5).standard_normal(v.size)
     off_v, off_y = far_outliers(v, y)
     assert not off_v.size and not off_y.size
+
+
+def test_ringing_after_a_jump_is_none():
+    t = np.arange(6000) / 5000
+    v = np.where(t < 0.4, 0.0, 50.0 + 40.0 * np.sin(2 * np.pi * 5.0 * (t - 0.4)))
+    ringing = np.exp(-np.maximum(t - 0.4, 0.0) / 0.03) * np.sin(2 * np.pi * 900.0 * (t - 0.4))
+    y = 2e-7 * v + np.where(t < 0.4, 0.0, 1e-5) * ringing + NOISE * np.random.default_rng(5).standard_normal(t.size)
+    assert not far_outliers(v, y)[1].size

@@ -68,6 +68,8 @@ HELD = 0.6
 DRIFT_TAKES, DRIFT_RATE = 10.0, 1e-2
 # What keeps its place while the sensitivity changes is no further outside the record than this share of its range.
 ORIGIN = 0.3
+# Multiples of the drive's frequency that may be what is left of hysteresis.
+MOST_HARMONICS = 15
 # A resonance is seen up to so many times the highest frequency that the drive excites.
 RINGS = 2.0
 # Rounding errors (their rms) repeat with every digit, that is sqrt(12) times as far; what is left of a record is
@@ -217,10 +219,16 @@ def _stands_still(effect: Saturation, now: Explanation) -> bool:
 
 
 def _is_harmonic(frequency: float, evidence: Evidence) -> bool:
-    """Return whether a frequency (Hz) is a multiple of the only one that drives a record, as far as that can tell."""
+    """Return whether a frequency (Hz) is a low multiple of the only one that drives a record, as far as that can tell.
+
+    What is left of hysteresis fades with the order; of high multiples one is near to any frequency.
+    """
     for k, part in enumerate(evidence.parts):
         drive = drive_frequency(evidence.of_record(k))
-        if drive and abs(frequency / drive - round(frequency / drive)) * drive < 2.0 / float(part.t[-1]):
+        if not drive:
+            continue
+        order = round(frequency / drive)
+        if order <= MOST_HARMONICS and abs(frequency - order * drive) < 2.0 / float(part.t[-1]):
             return True
     return False
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from slpi_ros.diagnosis.prepare import Evidence, Part, excited_frequency
+from slpi_ros.diagnosis.selection import _is_harmonic
 from slpi_ros.identification.bases import SurfaceBasis
 
 T = np.arange(20_000) / 1000
@@ -23,6 +24,12 @@ def sine(frequency):
 @pytest.mark.parametrize("frequency", [0.5, 7.0, 90.0])
 def test_a_sine_excites_its_own_frequency(frequency):
     assert excited_frequency(evidence(sine(frequency))) == pytest.approx(frequency, rel=0.1, abs=0.15)
+
+
+@pytest.mark.parametrize(("frequency", "expected"), [(2.5, True), (12.5, True), (3.1, False), (50.0, False)])
+def test_only_low_multiples_of_the_drive_may_be_hysteresis(frequency, expected):
+    triangle = np.abs((1.25 * T) % 1.0 - 0.5) * 100
+    assert _is_harmonic(frequency, evidence(triangle)) is expected
 
 
 def test_the_fastest_record_counts():

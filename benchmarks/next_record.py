@@ -205,9 +205,10 @@ def pair(case: Case) -> Outcome:
     axis = hidden.truth[0].axis
     outcome, diagnosis = _diagnosed(Outcome(case, names), records, plain, axis)
     effects = diagnosis.axes[axis].effects
-    shared = [each for each in effects if each.name not in OWN]
+    shared = [each for each in effects if each.name in outcome.kept]
     # Where the gain drifts, a hysteresis without effects holds the mean gain of its records, which a third one has not.
-    if not shared or "gain_drift" in names:
+    # One axis alone does not show what another one adds.
+    if not shared or {"gain_drift", "cross_coupling"} & set(names):
         return outcome
     told = 100.0 * (1.0 - np.prod([1.0 - each.gain_percent / 100.0 for each in shared]))
     # What is the record's own, and was named before, is not in the error that the gain is a share of.

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import slpi_ros
+from slpi_ros.effects.creep import Creep
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 from slpi_ros.model.axis_model import AxisModel, Start
@@ -32,9 +33,15 @@ def free_run(model: AxisModel, record: Record, axis: str) -> float:
     v, y = record.voltage[axis], record.displacement[axis]
     known = np.isfinite(y)
     shared = replace(model, effects=tuple(effect for effect in model.effects if effect.removable != "record"))
+    # What creeps on from before a record is the record's own, as its initial history.
+    settled = replace(
+        shared,
+        effects=tuple(replace(one, initial=0.0) if isinstance(one, Creep) else one for one in shared.effects),
+    )
     errors = [
-        replace(shared, start=Start(float(v[0]), 0.0, history)).simulate(record.t, v)[known] - y[known]
+        replace(each, start=Start(float(v[0]), 0.0, history)).simulate(record.t, v)[known] - y[known]
         for history in {(), (float(v[0]),), model.start.history}
+        for each in (shared, settled)
     ]
     return 100.0 * min(float(np.std(error)) for error in errors) / float(np.ptp(y[known]))
 

@@ -705,6 +705,10 @@ class Explanation:
         # The blocks are one choice of several, and leave the effects as they are.
         return min(self.refined(2), smoothed, key=lambda one: one.held_out.rms_of_records)
 
+    def effect(self, name: str) -> Effect:
+        """Return its effect of this name."""
+        return next(effect for effect in self.effects if effect.name == name)
+
     def adding(self, effect: Effect) -> "Explanation":
         """Return it with one more effect."""
         return Explanation(self.evidence, [*self.effects, effect], self)

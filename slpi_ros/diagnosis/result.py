@@ -18,7 +18,6 @@ from slpi_ros.diagnosis.selection import (
     Selection,
     chance_of_gain,
     held_out_error,
-    is_own,
 )
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
@@ -348,7 +347,7 @@ def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
 def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEffect:
     chance = chance_of_gain(named.before, named.after)
     whole, before, after = (
-        held_out_error(named.name, score) for score in (selection.base.held_out, named.before, named.after)
+        held_out_error(score, own=named.own) for score in (selection.base.held_out, named.before, named.after)
     )
     return NamedEffect(
         effect=effect.parts[0] if isinstance(effect, EachRecord) else effect,
@@ -362,8 +361,10 @@ def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEf
 
 def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) -> str:
     sentence = effect.describe()
-    before, after, end = (1e9 * held_out_error(named.name, score) for score in (named.before, named.after, in_the_end))
-    on = "records" if named.after.records.size and not is_own(named.name) else "blocks"
+    before, after, end = (
+        1e9 * held_out_error(score, own=named.own) for score in (named.before, named.after, in_the_end)
+    )
+    on = "records" if named.after.records.size and not named.own else "blocks"
     gained = (
         f"with it the error on {on} left out falls from {before:.3g} to {after:.3g} nm rms "
         f"(chance gains as much in {100 * chance:.2g} % of cases)"

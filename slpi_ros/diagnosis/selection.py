@@ -55,6 +55,8 @@ ALTERNATIVE = 0.7
 ALTERNATIVE_AT_ONE_SPEED = 0.4
 # What one drive frequency cannot tell apart.
 DYNAMIC = {"delay", "lag", "rate_dependence", "creep"}
+# What is shared by all records, or each record's own: where a sensor begins to count it may begin its period.
+MAY_BE_OWN = {"sensor_periodic"}
 # What does nothing but shift in time.
 SHIFTS = {"delay", "lag"}
 # What shifts the displacement against the voltage.
@@ -96,7 +98,7 @@ class Contender:
     @property
     def effect(self) -> Effect:
         """The effect itself."""
-        return next(effect for effect in self.explanation.effects if effect.name == self.name)
+        return self.explanation.effect(self.name)
 
     @property
     def score(self) -> Score:
@@ -106,7 +108,7 @@ class Contender:
     @property
     def rms(self) -> float:
         """Held-out error (m) that it competes with."""
-        return held_out_error(self.name, self.score)
+        return held_out_error(self.score, own=is_own(self.effect))
 
     @property
     def parameters(self) -> int:
@@ -120,17 +122,17 @@ class Contender:
 
     def counts_beside(self, now: Explanation) -> bool:
         """Return whether it gains enough over what has been found so far."""
-        return counts(now.held_out, self.score, own=is_own(self.name))
+        return counts(now.held_out, self.score, own=is_own(self.effect))
 
 
-def is_own(name: str) -> bool:
+def is_own(effect: Effect) -> bool:
     """Return whether an effect is each record's own."""
-    return bool(EFFECTS[name].removable == "record")
+    return effect.removable == "record"
 
 
-def held_out_error(name: str, score: Score) -> float:
+def held_out_error(score: Score, *, own: bool) -> float:
     """Return the held-out error (m) that counts for an effect: on other records, if it is not each record's own."""
-    return score.rms if is_own(name) else score.rms_of_records
+    return score.rms if own else score.rms_of_records
 
 
 def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[Contender]:
@@ -155,7 +157,7 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
     several = len(now.evidence.parts) > 1
 
     def rank(one: Contender) -> tuple[bool, float]:
-        return several and (is_own(one.name) or not one.counts_beside(now)), one.rms
+        return several and (is_own(one.effect) or not one.counts_beside(now)), one.rms
 
     return sorted(sound, key=rank)
 
@@ -242,16 +244,21 @@ def _screened(name: str, now: Explanation) -> tuple[Score, Effect] | None:
     tried = [scored for form in _forms(name, now) if (scored := _scored(form, now))]
     if not tried:
         return None
-    best = min(tried, key=lambda one: held_out_error(name, one[0]))
+
+    def error(one: tuple[Score, Effect]) -> float:
+        return held_out_error(one[0], own=is_own(one[1]))
+
+    best = min(tried, key=error)
     equal = [one for one in tried if one is best or chance_of_gain(one[0], best[0]) > ALIKE]
-    return min(equal, key=lambda one: (free(one[1]).size, held_out_error(name, one[0])))
+    return min(equal, key=lambda one: (free(one[1]).size, error(one)))
 
 
 def _forms(name: str, now: Explanation) -> Iterator[Candidate | Effect]:
-    """Yield what an effect may be; one of every record where it is each record's own."""
-    records = len(now.evidence.parts)
-    if not is_own(name) or records == 1:
+    """Yield what an effect may be; one of every record where it is each record's own, or may be."""
+    records, own = len(now.evidence.parts), EFFECTS[name].removable == "record"
+    if not own or records == 1:
         yield from EFFECTS[name].fit(now)
+    if records == 1 or not (own or name in MAY_BE_OWN):
         return
     for forms in zip(*(EFFECTS[name].fit(now.of_record(k)) for k in range(records)), strict=False):
         yield Candidate(now.evidence.each([form.columns for form in forms]), partial(_each, forms))  # type: ignore[arg-type]
@@ -369,6 +376,8 @@ class Named:
         Effects that explain as much, as far as the record can tell.
     runner_up : (str, float) or None
         The next best effect, and the held-out error (m) with it instead.
+    own : bool
+        Whether it is each record's own.
     confirmed : bool
         Whether each record, left out, says that it belongs to the others' explanation.
     """
@@ -379,6 +388,7 @@ class Named:
     alternatives: tuple[str, ...]
     runner_up: tuple[str, float] | None
     confirmed: bool
+    own: bool
 
 
 @dataclass(frozen=True)
@@ -469,7 +479,7 @@ def _without_needless(now: Explanation, names: Collection[str]) -> Explanation:
     """
     for name in [effect.name for effect in now.effects if effect.name in names]:
         without = now.without(name)
-        if not counts(without.held_out, now.held_out, own=is_own(name)):
+        if not counts(without.held_out, now.held_out, own=is_own(now.effect(name))):
             now = without
         elif without.effects:
             anew = contenders(without, [name])
@@ -533,7 +543,8 @@ def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[E
     while left:
         scores = {name: now.only([*taken, name]).held_out if len(left) > 1 else now.held_out for name in left}
         best = min(left, key=lambda name: scores[name].rms)
-        ordered.append(Named(best, before, scores[best], *_in_its_place(best, now, rivals[best])))
+        beside = _in_its_place(best, now, rivals[best])
+        ordered.append(Named(best, before, scores[best], *beside, own=is_own(now.effect(best))))
         left.remove(best)
         taken.append(best)
         before = scores[best]

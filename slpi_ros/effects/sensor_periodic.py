@@ -82,13 +82,15 @@ class SensorPeriodic:
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
         """Yield the strongest lines of the spectrum of the residual over the displacement."""
-        width = float(np.ptp(left.h)) / BINS
-        place = ((left.h[left.used] - float(left.h.min())) / width).astype(np.int64)
+        # What the sensor sees: other effects move it as well.
+        seen = left.y - left.residual
+        width = float(np.ptp(seen)) / BINS
+        place = ((seen[left.used] - float(seen.min())) / width).astype(np.int64)
         power = np.abs(np.fft.rfft(np.bincount(place, left.residual[left.used], 4 * BINS)[: 4 * BINS])) ** 2
         lines = np.fft.rfftfreq(4 * BINS, width)
         power[(lines < 1 / LONGEST) | (lines > 1 / SHORTEST)] = 0.0
         for line in strongest_lines(power, lines, LINES, width=6):
-            yield Candidate(wave(2 * np.pi * line * left.h), partial(cls._of, 1 / line))
+            yield Candidate(wave(2 * np.pi * line * seen), partial(cls._of, 1 / line))
 
     @classmethod
     def _of(cls, period: float, gains: FloatArray) -> "SensorPeriodic":

@@ -340,7 +340,8 @@ def _diagnose(options: argparse.Namespace) -> None:
     topics = _topics(options)
     model = load_model(options.model)
     for name in FILES:
-        _require_another_file(str(Path(options.output) / name), options.model, *options.bags)
+        # An extended model may be extended again.
+        _require_another_file(str(Path(options.output) / name), *options.bags)
     with output_folder(options.output, *FILES) as folder:
         records = [_read_all_axes(bag, options, topics) for bag in options.bags]
         try:

@@ -190,8 +190,8 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     known = np.flatnonzero(fitted)
     mixed = mixed_readings(y[known], v[known])
     off_v, off_y = lone_of(when[known], v[known], y[known])
-    fitted[known[mixed.readings]] = False
-    fitted[known[off_y]] = False
+    # Where a link mixes readings, those are what is off.
+    fitted[known[mixed.readings if mixed.side else off_y]] = False
     smooth = without_noise(when, without(v, known[off_v]))
     return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side)
 

@@ -32,7 +32,7 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
     """
     target = Path(path)
     draft = target.parent / f".{target.name}.{os.getpid()}.partial"
-    if not is_replaceable(target):
+    if not str(path) or not is_replaceable(target):
         raise failure(f"'{path}': cannot be written: no regular file; choose another place")
     try:
         with draft.open("w", encoding="utf-8") as file:
@@ -48,9 +48,9 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
 
 
 def is_replaceable(path: Path) -> bool:
-    """Return whether a file can be put in the place of `path`: where nothing is yet, or a regular file."""
+    """Return whether there is nothing in the place of a file that it must not replace: a device, a pipe, a socket."""
     try:
-        return path.is_file() or not os.path.lexists(path)
+        return path.is_file() or path.is_dir() or not os.path.lexists(path)
     except (OSError, ValueError):
         # What is wrong with the name is told when it is opened.
         return True

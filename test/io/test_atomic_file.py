@@ -28,7 +28,7 @@ def test_what_is_no_regular_file_stays(tmp_path):
         with all_or_nothing(path) as file:
             file.write("text")
 
-    for path in (tmp_path / "pipe", tmp_path, ""):
+    for path in (tmp_path / "pipe", ""):
         assert f"'{path}'" in refusal(SlpiError, write, path)
     assert (tmp_path / "pipe").is_fifo() and [path.name for path in tmp_path.iterdir()] == ["pipe"]
 

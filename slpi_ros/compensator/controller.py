@@ -262,7 +262,7 @@ class Controller:
 
     @property
     def needs_arrival(self) -> bool:
-        """Whether `update` needs the arrival time of stamped messages too."""
+        """Whether `update` needs the arrival time even of messages that carry a time stamp."""
         return self._max_age_ns > 0
 
     def update(

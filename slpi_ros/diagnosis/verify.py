@@ -300,7 +300,7 @@ def verify(
     axes: Sequence[str] | None = None,
     desired: Sequence[Mapping[str, FloatArray] | None] | None = None,
 ) -> Verification:
-    """Judge a model on records that it has not seen, free-run.
+    """Validate a model on records that it has not seen, by free-run simulation.
 
     Parameters
     ----------
@@ -308,8 +308,8 @@ def verify(
     model : StageModel
         Of the same stage.
     tolerance : float, metres, optional
-        The largest rms error that passes; by default three times the record's noise floor, but at least the share
-        `RESOLUTION` of the stroke, below which no hysteresis model comes.
+        The largest rms error that passes; by default three times the record's noise floor, but at least the fraction
+        `RESOLUTION` of the stroke, the best accuracy that a hysteresis model attains.
     axes : sequence of str, optional
         All that records and model share by default.
     desired : sequence of mapping of axis name to ndarray, shape (N,), metres, or None, optional
@@ -325,7 +325,7 @@ def verify(
     UsageError
         If records and model are not of one stage or share no axis, or the tolerance is not positive.
     RecordError
-        If a record says too little.
+        If a record contains too little data.
     """
     records = [records] if isinstance(records, Record) else list(records)
     if tolerance is not None and not 0.0 < tolerance < np.inf:

@@ -222,7 +222,7 @@ def amplitude_and_phase(gains: FloatArray) -> tuple[float, float]:
 def strongest_lines(
     power: FloatArray, at: NDArray[np.floating[Any]], count: int, width: int = LINE_WIDTH
 ) -> list[float]:
-    """Return the positions of the highest peaks of a spectrum, shape (n,), in units of `at`, strongest first."""
+    """Return the frequencies of the highest peaks of a spectrum, shape (n,), in their unit, strongest first."""
     power, found = power.copy(), []
     for _ in range(count):
         k = int(np.argmax(power))

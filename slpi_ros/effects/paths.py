@@ -49,7 +49,10 @@ def direction(u: FloatArray, transition: float) -> FloatArray:
 
 @compiled
 def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArray:
-    """Return the sum of relaxations of a motion, shape (N,), metres, for gains, shape (K,), and holds, shape (K, 3)."""
+    """Return the sum of first-order relaxations of a displacement, shape (N,), metres.
+
+    For gains, shape (K,), and coefficients of the first-order hold, shape (K, 3), as `slpi_ros.effects.filters.Hold`.
+    """
     crept, before, states = np.empty_like(moved), 0.0, np.zeros(gains.size)
     for k in range(moved.size):
         total = 0.0

@@ -104,7 +104,7 @@ class Design:
 
     @cached_property
     def _branch(self) -> NDArray[np.int64]:
-        """Place in `turns` of the reversal at which each sample's branch started, shape (N,); -1 for none."""
+        """Index into `turns` of the reversal at which each sample's branch started, shape (N,); -1 for none."""
         origin = self.walk.origin
         return np.where(origin >= 0, np.searchsorted(self.turns, origin), -1)
 

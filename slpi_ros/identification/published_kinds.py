@@ -225,7 +225,7 @@ def fit_plays(
     through_zero : bool
         Whether the displacement at the vertex is 0; otherwise it is a parameter of the fit.
     iterations : int
-        Least number of iterations; see `least_iterations`.
+        Minimum number of iterations; see `least_iterations`.
     """
     plays = [at_vertex(play(r), run_in).forward_array(drive)[used] for r in thresholds.tolist()]
     design = np.column_stack(plays if through_zero else [*plays, np.ones(np.count_nonzero(used))])

@@ -358,7 +358,7 @@ class StreamingInverse:
         return missing if abs(missing) > self._rounding else 0.0
 
     def _reaching(self, dt: float, v: float) -> float:
-        """Propagate a command (V) through the effects before the hysteresis; return the resulting voltage (V)."""
+        """Return the voltage (V) that reaches the hysteresis, a command (V) through the effects that precede it."""
         for streaming in self._before.values():
             v = streaming.forward(dt, v)
         return v

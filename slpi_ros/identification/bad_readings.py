@@ -165,9 +165,11 @@ def _far(x: FloatArray, other: FloatArray) -> Mask:
     # On the way from one end to the other the median is the reading itself.
     least = max(_FAR * float(np.median(off[off > 0.0])), LEAST_SPIKE * spread(middle))
     gain = spread(middle) / (spread(other) or np.inf)
+    far: Mask = off > least + 2.0 * gain * moved
+    if not far.any():
+        return far
     # Ringing takes every reading away from the median, an outlier only itself.
-    alone = off > _APART * median_filter(off, _WINDOW, mode="nearest")
-    return np.asarray(alone & (off > least + 2.0 * gain * moved))
+    return np.asarray(far & (off > _APART * median_filter(off, _WINDOW, mode="nearest")))
 
 
 def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:

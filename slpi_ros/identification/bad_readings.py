@@ -182,7 +182,9 @@ def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:
     return cleaned
 
 
-def lone_of(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def lone_of(
+    t: FloatArray, v: FloatArray, y: FloatArray, at_kinks: bool = True
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the lone outliers of a voltage and of a displacement.
 
     Outliers of both at once are attributed to the voltage, which the displacement follows.
@@ -191,14 +193,18 @@ def lone_of(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int
     ----------
     t, v, y : ndarray, shape (N,), seconds, volts and metres
         Both signals vary.
+    at_kinks : bool
+        As for `lone_outliers`.
     """
     gain, noise_v, noise_y = spread(y) / spread(v), noise(v, t), noise(y, v, t)
-    off_v = lone_outliers(v, y, 1.0 / gain, max(noise_v, digit(v), LEAST_SPIKE * float(np.ptp(v))), noise_y)
-    off_y = lone_outliers(y, v, gain, max(noise_y, digit(y)), noise_v)
+    off_v = lone_outliers(v, y, 1.0 / gain, max(noise_v, digit(v), LEAST_SPIKE * float(np.ptp(v))), noise_y, at_kinks)
+    off_y = lone_outliers(y, v, gain, max(noise_y, digit(y)), noise_v, at_kinks)
     return off_v, np.setdiff1d(off_y, off_v)
 
 
-def lone_outliers(y: FloatArray, v: FloatArray, gain: float, noise_y: float, noise_v: float) -> NDArray[np.int64]:
+def lone_outliers(
+    y: FloatArray, v: FloatArray, gain: float, noise_y: float, noise_v: float, at_kinks: bool = True
+) -> NDArray[np.int64]:
     """Return the readings that deviate from a line through their four neighbours where the voltage does not.
 
     Parameters
@@ -208,6 +214,8 @@ def lone_outliers(y: FloatArray, v: FloatArray, gain: float, noise_y: float, noi
     gain : float, metres per volt
     noise_y, noise_v : float, metres and volts
         Their noise.
+    at_kinks : bool
+        Whether those are returned that a kink of the displacement with its noise could be.
 
     Returns
     -------
@@ -215,23 +223,25 @@ def lone_outliers(y: FloatArray, v: FloatArray, gain: float, noise_y: float, noi
     """
     if not noise_y:
         return np.empty(0, np.int64)
-    limit = -float(ndtri(0.5 * FALSE_ALARMS / y.size)) * np.sqrt(1.25) * noise_y
+    deviations = -float(ndtri(0.5 * FALSE_ALARMS / y.size)) * noise_y
+    limit, beyond_kink = np.sqrt(1.25) * deviations, -np.inf if at_kinks else np.sqrt(3.5) * deviations
     every = max(1, v.size // ENOUGH)
     jump = 5.0 * np.quantile(np.abs(v[every::every] - v[every - 1 : -1 : every]), 0.9) + 8.0 * noise_v
     found = [np.empty(0, np.int64)]
     for start in range(0, y.size, _BLOCK):
         # A block sees enough of those beside it.
         first, end = max(start - _RINGING, 0), start + _BLOCK + _RINGING
-        here = _outliers_of_block(y[first:end], v[first:end], gain, noise_y, limit, jump) + first
+        here = _outliers_of_block(y[first:end], v[first:end], gain, noise_y, (limit, beyond_kink), jump) + first
         found.append(here[(here >= start) & (here < start + _BLOCK)])
     return np.concatenate(found)
 
 
 def _outliers_of_block(
-    y: FloatArray, v: FloatArray, gain: float, noise_y: float, limit: float, jump: float
+    y: FloatArray, v: FloatArray, gain: float, noise_y: float, limits: tuple[float, float], jump: float
 ) -> NDArray[np.int64]:
     if y.size < 5:
         return np.empty(0, np.int64)
+    limit, beyond_kink = limits
     off, turns = _off_neighbours(y), np.abs(_off_neighbours(v))
     explained = 2.0 * gain * maximum_filter1d(turns, 2 * _TURN_REACH + 1)
     found = np.flatnonzero((np.abs(off) > limit + explained) & ~_after_jumps(v, jump)[2:-2])
@@ -241,6 +251,8 @@ def _outliers_of_block(
     size = np.abs(off[found])
     straight = np.abs(before - after) < np.maximum(8.0 * noise_y, 0.5 * size)
     straight &= np.abs(across - before - after) < np.maximum(12.0 * noise_y, 0.5 * size)
+    # A kink puts a reading off by 3/4 of its change of slope.
+    straight &= size - 0.75 * np.sign(off[found]) * (before - after) > beyond_kink
     return np.asarray(found[straight] + 2)
 
 

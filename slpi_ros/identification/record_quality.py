@@ -441,7 +441,7 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
         yield Finding("warn" if signal.stale > _OUTLIERS * samples else "ok", text)
     if signal.spikes:
         text = f"{name} with outliers in {_of(signal.spikes, samples)}"
-        yield Finding("warn", f"{text}: the other signal does not follow; they are not fitted")
+        yield Finding("warn", f"{text}: the other signal does not follow; those that no kink explains are not fitted")
 
 
 def _drive_findings(quality: Quality) -> Iterator[Finding]:

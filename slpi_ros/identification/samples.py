@@ -189,7 +189,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     fitted[known[stuck(y[known], v[known])]] = False
     known = np.flatnonzero(fitted)
     mixed = mixed_readings(y[known], v[known])
-    off_v, off_y = lone_of(when[known], v[known], y[known])
+    off_v, off_y = lone_of(when[known], v[known], y[known], at_kinks=False)
     # Where a link mixes readings, those are what is off.
     fitted[known[mixed.readings if mixed.side else off_y]] = False
     smooth = without_noise(when, without(v, known[off_v]))

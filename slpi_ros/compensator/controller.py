@@ -355,11 +355,11 @@ class Controller:
                 )
         if count != len(names):
             raise RejectedError(rejection.LENGTH, f"{len(names)} axes but {count} displacements; send one for each")
-        return self._named(names)
+        # Most senders use the same names in every message.
+        return self._last_axes if names == self._last_names else self._named(names)
 
     def _named(self, names: Sequence[str]) -> list[Axis]:
         """Return the named axes; RejectedError as `require_names`."""
-        # Most senders use the same names in every message.
         if names != self._last_names:
             require_names(names, self._by_name)
             self._last_axes = [self._by_name[name] for name in names]

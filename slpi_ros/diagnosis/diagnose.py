@@ -23,7 +23,7 @@ from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.repeatability_floor import Floor, floor_of
 from slpi_ros.identification.samples import Samples
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, Start
 from slpi_ros.model.stage_model import StageModel
 
@@ -76,14 +76,7 @@ def diagnose(
         If the records say too little.
     """
     records = [record] if isinstance(record, Record) else list(record)
-    if not records:
-        raise UsageError("no record given; give at least one")
-    for each in records:
-        if model.hardware_id and each.hardware_id and model.hardware_id != each.hardware_id:
-            raise UsageError(
-                f"this model does not belong to this bag: it is of stage '{model.hardware_id}', {each.source} of "
-                f"'{each.hardware_id}'"
-            )
+    common_stage(records, model.hardware_id)
     _require_different(records)
     source = ", ".join(each.source for each in records)
     common = [axis for axis in records[0].axes if all(axis in each.axes for each in records)]
@@ -105,14 +98,9 @@ def diagnose(
 
 
 def _require_different(records: Sequence[Record]) -> None:
-    """Raise UsageError unless all records are of one stage, and none is there twice: it would confirm itself."""
+    """Raise UsageError if a record is there twice: it would confirm itself."""
     for number, record in enumerate(records):
         for earlier in records[:number]:
-            if record.hardware_id != earlier.hardware_id:
-                raise UsageError(
-                    f"{record.source} is of stage '{record.hardware_id}', {earlier.source} of '{earlier.hardware_id}'; "
-                    "give records of one stage"
-                )
             if np.array_equal(record.time_ns, earlier.time_ns) and all(
                 axis in earlier.axes and np.array_equal(y, earlier.displacement[axis], equal_nan=True)
                 for axis, y in record.displacement.items()
@@ -263,24 +251,26 @@ def _given(model: AxisModel, selection: Selection) -> Given:
     motion = float(np.ptp(evidence.y[evidence.used]))
     sources = model.quality.source.split(", ")
     own = np.array([part.source in sources for part in evidence.parts])
+    runs = [_free_run(model, part) for part in evidence.parts]
+    rms = float(np.sqrt(np.mean([run.rms**2 for run in runs])))
     if own.any() and not own.all():
         # A gain that drifts within each record would explain one that has changed in between.
         steady = selection.now.without(GainDrift.name)
         compared = [_since(own, one) for one in (selection.base, steady)]
     else:
         compared = [_compared(replace(model, effects=()), one) for one in (selection.base, selection.now)]
-    compared = [replace(one, motion=motion) for one in compared]
+    # A record of the same name may be another one, whose error tells.
+    own_rms = model.quality.rms if own.all() else 0.0
+    compared = [replace(one, rms=rms, motion=motion, own_rms=own_rms) for one in compared]
     # Effects change what a fit to the records makes of the hysteresis: a stage that has changed shows it without them
     # and beside them.
     best = min(compared, key=lambda one: (one.changed, one.hysteresis_rms))
     if model.kind in REFITTED and not own.any():
         span = max(motion, float(np.ptp(model.displacement_range)))
         require_own(best.hysteresis_rms, best.refitted_rms, span)
-    runs = [_free_run(model, part) for part in evidence.parts]
-    rms = float(np.sqrt(np.mean([run.rms**2 for run in runs])))
     zero = max((run.moved for run in runs), key=abs)
     moved = abs(zero) > ZERO * max(rms, CHANGED * motion)
-    return replace(best, rms=rms, zero_moved=zero if moved else None)
+    return replace(best, zero_moved=zero if moved else None)
 
 
 def _compared(bare: AxisModel, one: Explanation) -> Given:
@@ -309,6 +299,7 @@ def _compared(bare: AxisModel, one: Explanation) -> Given:
         gain_deviation=float(np.sqrt(variance)),
         zero_moved=None,
         motion=0.0,
+        own_rms=0.0,
     )
 
 
@@ -336,6 +327,7 @@ def _since(own: NDArray[np.bool_], one: Explanation) -> Given:
         gain_deviation=float(np.sqrt(variance + variance_after)),
         zero_moved=None,
         motion=0.0,
+        own_rms=0.0,
     )
 
 

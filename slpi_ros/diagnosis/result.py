@@ -52,6 +52,8 @@ ANOTHER_HYSTERESIS = {
 }
 # The given model is out of date when its error is so many times that of one fitted to the record.
 STALE = 1.5
+# It is not where its error is at most so many times that on its own records.
+AS_BEFORE = 1.1
 # Below this share of its motion (excess rms), or of its gain, a stage has not changed; its gain is told apart from none
 # at so many standard deviations, and its zero when it moved by so many times the error.
 CHANGED, LEAST_CHANGE, CERTAIN = 1e-3, 3e-3, 5.0
@@ -271,6 +273,8 @@ class Given:
         initial history.
     motion : float, metres
         How far the stage moved.
+    own_rms : float, metres
+        Error on the records that it was identified from, if these are the ones diagnosed; else 0.
     """
 
     rms: float
@@ -280,10 +284,13 @@ class Given:
     gain_deviation: float
     zero_moved: float | None
     motion: float
+    own_rms: float
 
     @property
     def changed(self) -> bool:
-        """Whether its loops are wrong where those of one fitted to the records are not."""
+        """Whether its loops are wrong where those of one fitted to the records are not, and were not from the start."""
+        if self.rms <= AS_BEFORE * self.own_rms:
+            return False
         excess = np.sqrt(max(self.hysteresis_rms**2 - self.refitted_rms**2, 0.0))
         clear = self.hysteresis_rms > STALE * self.refitted_rms and excess > CHANGED * self.motion
         return bool(clear or (abs(self.gain) > LEAST_CHANGE and abs(self.gain) > CERTAIN * self.gain_deviation))

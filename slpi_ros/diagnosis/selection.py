@@ -454,9 +454,8 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
         if {Creep.name, ThermalDrift.name} <= {effect.name for effect in now.effects} and not now.evidence.older_moves:
             # Creep from long before a record looks like a thermal drift.
             now = _without_needless(now.with_older_moves(), {ThermalDrift.name})
-    with_structures, now = now, now.bare()
-    if now is not with_structures:
-        now = _without_needless(now, set(rivals))
+    # Effects that were exchanged, and structures that no longer stand beside them, may make others needless.
+    now = _without_needless(now.bare(), set(rivals))
     named = _named(start, now, rivals)
     return Selection(base, now, named, structures, tuple(sorted(dropped - {one.name for one in named})))
 

@@ -26,7 +26,7 @@ from slpi_ros.identification.cross_validation import (
 from slpi_ros.identification.initial_history import Match, match
 from slpi_ros.identification.repeatability_floor import floor_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import START_MEMORIES, AxisModel
 from slpi_ros.model.stage_model import StageModel
 
@@ -330,14 +330,7 @@ def verify(
     records = [records] if isinstance(records, Record) else list(records)
     if tolerance is not None and not 0.0 < tolerance < np.inf:
         raise UsageError(f"tolerance {tolerance:g} m; give a positive one, or none")
-    if not records:
-        raise UsageError("no record given; give at least one")
-    for record in records:
-        if model.hardware_id and record.hardware_id and model.hardware_id != record.hardware_id:
-            raise UsageError(
-                f"the model is of stage '{model.hardware_id}', {record.source} of '{record.hardware_id}'; "
-                "give records of the same stage"
-            )
+    common_stage(records, model.hardware_id)
     names = axes or [name for name in model.axes if all(name in record.axes for record in records)]
     if not names:
         raise UsageError(

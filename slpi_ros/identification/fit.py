@@ -14,7 +14,7 @@ from slpi_ros.identification.linear_kinds import fit_family, fit_multi_slope, fi
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import fit_amplitude_scaled, fit_at_rest, fit_primed
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, FitQuality
 from slpi_ros.model.stage_model import StageModel
 
@@ -75,7 +75,7 @@ def identify(
     """
     fit = fit_of(kind, loops_at_rest=loops_at_rest)
     records = [record] if isinstance(record, Record) else list(record)
-    hardware_id = _one_stage(records)
+    hardware_id = common_stage(records)
     source = ", ".join(part.source for part in records)
     last = max(range(len(records)), key=lambda number: int(records[number].time_ns.max(initial=0)))
     models = {}
@@ -110,17 +110,6 @@ def fit_of(kind: str, *, loops_at_rest: bool) -> Callable[[Sequence[Samples]], F
     if loops_at_rest and kind != "slpi-published":
         raise UsageError(f"loops at rest are an option of kind 'slpi-published', not of '{kind}'; omit the option")
     return fit_at_rest if loops_at_rest else FITS[kind]
-
-
-def _one_stage(records: Sequence[Record]) -> str:
-    """Return the common hardware id of records; UsageError if there is no record or they are of several stages."""
-    if not records:
-        raise UsageError("no record given; give at least one record")
-    named = {record.hardware_id: record.source for record in records if record.hardware_id}
-    if len(named) > 1:
-        stages = ", ".join(f"'{stage}' ({source})" for stage, source in named.items())
-        raise UsageError(f"records of several stages: {stages}; identify each stage separately")
-    return next(iter(named), "")
 
 
 def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:

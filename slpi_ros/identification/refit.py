@@ -24,7 +24,7 @@ from slpi_ros.identification.initial_history import Match, lasting_effects, matc
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, Start
 from slpi_ros.model.stage_model import StageModel
 
@@ -98,11 +98,7 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
     RecordError, IdentificationError
         If the record does not allow it.
     """
-    if model.hardware_id and record.hardware_id and model.hardware_id != record.hardware_id:
-        raise UsageError(
-            f"the model is of stage '{model.hardware_id}', {record.source} of '{record.hardware_id}'; "
-            "identify each stage by itself"
-        )
+    common_stage([record], model.hardware_id)
     shared = [axis for axis in model.axes if axis in record.axes]
     if not shared:
         raise UsageError(f"{record.source} holds none of the model's axes {', '.join(model.axes)}")

@@ -20,7 +20,7 @@ from slpi_ros.io.alignment import SeparateTopics, Signals, combine, held_at
 from slpi_ros.io.bag_files import absolute_name, locate, match_topic, translated, unpacked
 from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, SECOND_NS, Message, read_message
-from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.io.record import FloatArray, Record, common_stage
 
 _Path = str | os.PathLike[str]
 
@@ -90,9 +90,9 @@ def read_bags(
     Raises
     ------
     UsageError
-        If there is no path, or one of them comes twice.
+        If there is no path, one of them comes twice, or they are of different stages.
     RecordError
-        As from `read_bag`; also if the bags are of different stages.
+        As from `read_bag`.
     """
     places = [Path(path) for path in paths]
     if not places:
@@ -101,12 +101,7 @@ def read_bags(
         if place.resolve() in {earlier.resolve() for earlier in places[:number]}:
             raise UsageError(f"{place}: given twice; name every bag once")
     records = [read_bag(place, topic, axes=axes) for place in places]
-    for record in records[1:]:
-        if record.hardware_id != records[0].hardware_id:
-            raise RecordError(
-                f"{record.source}: of stage '{record.hardware_id}', but {records[0].source} of "
-                f"'{records[0].hardware_id}'; give bags of one stage"
-            )
+    common_stage(records)
     return records
 
 

@@ -1,6 +1,6 @@
 """Record of a stage: voltage and displacement of each axis with common time stamps."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,3 +75,29 @@ class Record:
         """Raise UsageError when the record has no such axis."""
         if axis not in self.axes:
             raise UsageError(f"{self.source}: no axis '{axis}'; it holds {', '.join(self.axes)}")
+
+
+def common_stage(records: Sequence[Record], hardware_id: str = "") -> str:
+    """Return the hardware id of the stage that all records, and a model, belong to.
+
+    Parameters
+    ----------
+    records : sequence of Record
+    hardware_id : str
+        Of the model; "" (default) if unknown. What has none may belong to any stage.
+
+    Raises
+    ------
+    UsageError
+        If there is no record, or they are of several stages.
+    """
+    if not records:
+        raise UsageError("no record given; give at least one")
+    stages = {hardware_id: "the model"} if hardware_id else {}
+    for record in records:
+        if record.hardware_id:
+            stages.setdefault(record.hardware_id, record.source)
+    if len(stages) > 1:
+        listed = ", ".join(f"'{stage}' ({source})" for stage, source in stages.items())
+        raise UsageError(f"several stages: {listed}; use records and a model of one stage")
+    return next(iter(stages), "")

@@ -160,7 +160,9 @@ class StreamingInverse:
     @property
     def missed(self) -> bool:
         """Whether any limit prevented the last desired displacement."""
-        return (self._missing if self._streaming else self._beyond_rounding(self.desired)) != 0.0
+        if self._streaming:
+            return self._missing != 0.0
+        return abs(self.desired - self.memory.displacement) > self._rounding
 
     @property
     def held(self) -> bool:

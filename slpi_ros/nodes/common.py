@@ -1,5 +1,6 @@
 """Start, spin and stop a node: functions shared by all executables."""
 
+import ctypes
 import os
 import signal
 import sys
@@ -34,6 +35,8 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 # Sensor data: only the newest message is relevant.
 MEASUREMENTS = qos_profile_sensor_data
 DIAGNOSTICS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# Freed memory that a process keeps: several times that of a trajectory of a million points. Options as in malloc.h.
+KEPT_BYTES, _M_TRIM_THRESHOLD, _M_MMAP_MAX = 2**29, -1, -4
 
 
 def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
@@ -112,6 +115,18 @@ def ask_for_priority(node: Node, priority: int) -> None:
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:
         node.get_logger().warning(f"no realtime_priority {priority}: {error}; using normal scheduling")
+
+
+def keep_freed_memory() -> None:
+    """Let glibc's malloc keep up to `KEPT_BYTES` of freed memory for later use; without effect on other systems.
+
+    Otherwise each large message is received in new memory pages, and the system takes longer to provide them than the
+    message takes to be copied and decoded.
+    """
+    with suppress(OSError, AttributeError):
+        allocator = ctypes.CDLL(None)
+        allocator.mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)
+        allocator.mallopt(_M_MMAP_MAX, 0)
 
 
 OK: bytes = DiagnosticStatus.OK
@@ -296,9 +311,11 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
         executor.add_node(node)
         try:
             while ok() and not _stop.requested:
-                # A subscription may be destroyed while one of its events waits to be taken.
-                with suppress(rclpy_implementation.InvalidHandle):
+                try:
                     executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+                except rclpy_implementation.InvalidHandle:
+                    # A subscription was destroyed while one of its events waited to be taken.
+                    continue
         finally:
             executor.remove_node(node)
             executor.shutdown()

@@ -40,6 +40,7 @@ from slpi_ros.nodes.common import (
     DeferredService,
     as_rclpy_reads,
     ask_for_priority,
+    keep_freed_memory,
     refuse_impossible_transitions,
     run,
 )
@@ -76,6 +77,7 @@ class Compensator(LifecycleNode):
     """
 
     def __init__(self) -> None:
+        keep_freed_memory()
         super().__init__("compensator")
         refuse_impossible_transitions(self)
         self._parameter_set = Parameters(self, DECLARATIONS, CompensatorSettings.of)

@@ -51,6 +51,21 @@ def test_a_sensor_is_no_cause(kind):
     assert not found.effects and not found.given.changed
 
 
+@pytest.mark.parametrize("seed", [0, 4])
+def test_readings_that_all_come_late_are_no_change(seed):
+    """Of equal triangles the model cannot follow the readings, and their own model is not out of date."""
+    t = np.arange(SAMPLES) / RATE
+    delay = 0.02 * 10.0 ** np.random.default_rng(seed).random()
+    v = 100.0 * (1.0 - np.abs(((t - [[0.0], [delay]]) * RATE / 150) % 2.0 - 1.0))
+    v[1] = np.where(t < delay, v[0, 0], v[1])
+    _, y = stage(seed).run(t, v[1])
+    record = record_of(t, v[0], y)
+    model = slpi_ros.identify(record)
+    diagnosis = slpi_ros.diagnose(record, model)
+    assert not diagnosis.axes["x"].given.changed
+    assert diagnosis.extended.axes["x"] == model.axes["x"]
+
+
 def test_the_measured_record_with_late_readings(measured_data):
     record = import_table(measured_data / "afm_cycles.csv")
     found = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"]

@@ -705,6 +705,12 @@ class Explanation:
         # The blocks are one choice of several, and leave the effects as they are.
         return min(self.refined(2), smoothed, key=lambda one: one.held_out.rms_of_records)
 
+    @cached_property
+    def zeros(self) -> FloatArray:
+        """Displacement of each record, shape (records,), metres, in the middle of the largest loop."""
+        voltage = np.array([0.5 * (float(self.u.min()) + float(self.u.max()))])
+        return np.array([float(middle(voltage)[0]) for middle in self._middles])
+
     def effect(self, name: str) -> Effect:
         """Return its effect of this name."""
         return next(effect for effect in self.effects if effect.name == name)

@@ -57,6 +57,8 @@ ALTERNATIVE_AT_ONE_SPEED = 0.4
 DYNAMIC = {"delay", "lag", "rate_dependence", "creep"}
 # What is shared by all records, or each record's own: where a sensor begins to count it may begin its period.
 MAY_BE_OWN = {"sensor_periodic"}
+# Zeros are alike for a sensor's error when they differ by no more than this share of its period.
+IN_PHASE = 0.1
 # What does nothing but shift in time.
 SHIFTS = {"delay", "lag"}
 # What shifts the displacement against the voltage.
@@ -241,7 +243,7 @@ def _screened(name: str, now: Explanation) -> tuple[Score, Effect] | None:
     A simpler form that does as well, as far as the record can tell, stands for it: what is more than that goes astray
     where the record ends.
     """
-    tried = [scored for form in _forms(name, now) if (scored := _scored(form, now))]
+    tried = [scored for form in _forms(name, now) if (scored := _scored(form, now)) and _in_phase(scored[1], now)]
     if not tried:
         return None
 
@@ -251,6 +253,16 @@ def _screened(name: str, now: Explanation) -> tuple[Score, Effect] | None:
     best = min(tried, key=error)
     equal = [one for one in tried if one is best or chance_of_gain(one[0], best[0]) > ALIKE]
     return min(equal, key=lambda one: (free(one[1]).size, error(one)))
+
+
+def _in_phase(effect: Effect, now: Explanation) -> bool:
+    """Return whether an effect that depends on the reading is at the same displacements in all records.
+
+    Where their zeros differ, those of other records do as well, and nothing tells what the effect is there.
+    """
+    if not isinstance(effect, SensorPeriodic) or len(now.evidence.parts) == 1:
+        return True
+    return float(np.ptp(now.zeros)) <= IN_PHASE * effect.period
 
 
 def _forms(name: str, now: Explanation) -> Iterator[Candidate | Effect]:
@@ -455,7 +467,8 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
             # Creep from long before a record looks like a thermal drift.
             now = _without_needless(now.with_older_moves(), {ThermalDrift.name})
     # Effects that were exchanged, and structures that no longer stand beside them, may make others needless.
-    now = _without_needless(now.bare(), set(rivals))
+    with_structures, now = now, now.bare()
+    now = _without_needless(now, set(rivals), restart=now is not with_structures)
     named = _named(start, now, rivals)
     return Selection(base, now, named, structures, tuple(sorted(dropped - {one.name for one in named})))
 
@@ -471,19 +484,22 @@ def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
     return min(equal, key=lambda contender: (contender.parameters, contender.score.rms))
 
 
-def _without_needless(now: Explanation, names: Collection[str]) -> Explanation:
-    """Return it without those of the named effects that the others make needless, the rest fitted from new starts.
+def _without_needless(now: Explanation, names: Collection[str], *, restart: bool = True) -> Explanation:
+    """Return it without those of the named effects that the others make needless.
 
-    An effect that was found while another one was missing may have settled at parameters that make up for that.
+    With `restart` (default) the rest are fitted from new starts: an effect that was found while another one was missing
+    may have settled at parameters that make up for that.
     """
     for name in [effect.name for effect in now.effects if effect.name in names]:
         without = now.without(name)
-        if not counts(without.held_out, now.held_out, own=is_own(now.effect(name))):
+        needed = counts(without.held_out, now.held_out, own=is_own(now.effect(name)))
+        # The others may have come to their best only without it.
+        anew = contenders(without, [name])[:1] if without.effects and (restart or not needed) else []
+        for one in anew:
+            if one.counts_beside(without) and (not needed or gain(now.held_out, one.score) > BETTER):
+                now, needed = one.explanation, True
+        if not needed:
             now = without
-        elif without.effects:
-            anew = contenders(without, [name])
-            if anew and gain(now.held_out, anew[0].score) > BETTER:
-                now = anew[0].explanation
     return now
 
 

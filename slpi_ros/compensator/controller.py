@@ -632,7 +632,7 @@ class Controller:
                 axis.confidence = MemoryConfidence(KNOWN, spanned=span).over(axis.model.voltage_range)
 
     def _release(self, but: Collection[Axis], now_ns: int) -> None:
-        """End all ramps: the axes in `but` continue with new commands, the others hold their voltage or brake."""
+        """End all ramps. Axes in `but` follow new commands; others hold, and decelerate to rest first if in motion."""
         self._end_reset()
         ramped = self.ramping
         for axis in self.axes:

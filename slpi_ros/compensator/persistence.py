@@ -163,7 +163,7 @@ class SavedAxis:
         return MemoryConfidence(doubt=self.doubt)
 
     def after_crash(self, voltage: float) -> "SavedAxis":
-        """Return the state after a crash in which `voltage` (V) was the last output after saving."""
+        """Return the state after a crash: as saved, then moved to `voltage` (V), the last output before the crash."""
         moved = () if voltage == self.reversal_voltages[-1] else (voltage,)
         return SavedAxis((*self.reversal_voltages, *moved), self.certain, CRASHED)
 

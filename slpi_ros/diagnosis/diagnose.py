@@ -12,7 +12,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, Selection, counts, select
+from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, Selection, counts, in_phase, select
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.gain_drift import GainDrift
@@ -117,6 +117,8 @@ def _diagnose_axis(
     # What belongs to one record says nothing of another.
     shared = [effect for effect in model.effects if same or effect.removable != "record"]
     base = Explanation(evidence, shared)
+    if not all(in_phase(effect, base) for effect in shared):
+        base = Explanation(evidence, [effect for effect in shared if in_phase(effect, base)])
     if model.kind in REFITTED:
         selection = _selected(base, evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None)
         before = base.held_out.rms_of_records
@@ -259,8 +261,8 @@ def _given(model: AxisModel, selection: Selection) -> Given:
         compared = [_since(own, one) for one in (selection.base, steady)]
     else:
         compared = [_compared(replace(model, effects=()), one) for one in (selection.base, selection.now)]
-    # A record of the same name may be another one, whose error tells.
-    own_rms = model.quality.rms if own.all() else 0.0
+    # Records of the same names may be others, whose error tells.
+    own_rms = model.quality.rms if own.all() and len(sources) == own.size else 0.0
     compared = [replace(one, rms=rms, motion=motion, own_rms=own_rms) for one in compared]
     # Effects change what a fit to the records makes of the hysteresis: a stage that has changed shows it without them
     # and beside them.

@@ -52,7 +52,7 @@ ANOTHER_HYSTERESIS = {
 }
 # The given model is out of date when its error is so many times that of one fitted to the record.
 STALE = 1.5
-# It is not where its error is at most so many times that on its own records.
+# It is not where its error is that on its own records, within this factor.
 AS_BEFORE = 1.1
 # Below this share of its motion (excess rms), or of its gain, a stage has not changed; its gain is told apart from none
 # at so many standard deviations, and its zero when it moved by so many times the error.
@@ -289,7 +289,7 @@ class Given:
     @property
     def changed(self) -> bool:
         """Whether its loops are wrong where those of one fitted to the records are not, and were not from the start."""
-        if self.rms <= AS_BEFORE * self.own_rms:
+        if self.own_rms <= AS_BEFORE * self.rms and self.rms <= AS_BEFORE * self.own_rms:
             return False
         excess = np.sqrt(max(self.hysteresis_rms**2 - self.refitted_rms**2, 0.0))
         clear = self.hysteresis_rms > STALE * self.refitted_rms and excess > CHANGED * self.motion
@@ -329,7 +329,7 @@ def judged(
         verdict=verdict,
         summary=_of_given(given, selection, before_rms)
         + _summary(verdict, selection, effects, floor, before_rms)
-        + _not_in_model(left_out_of_model, selection.dropped)
+        + _not_in_model(now, left_out_of_model, selection.dropped)
         + _mixed(now.evidence)
         + _cannot_tell(driven_alike),
         floor_rms=floor.rms,
@@ -422,8 +422,9 @@ def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
     return f"The given model is off by {error:.3g} nm rms on this record. " if BIAS in selection.structures else ""
 
 
-def _not_in_model(left_out: Sequence[str], dropped: Sequence[str]) -> str:
-    said = ""
+def _not_in_model(now: Explanation, left_out: Sequence[str], dropped: Sequence[str]) -> str:
+    own = [effect.name for effect in now.effects if isinstance(effect, EachRecord) and effect.name not in left_out]
+    said = f" Each record's own, and not in the extended model: {', '.join(own)}." if own else ""
     if left_out:
         said += f" The extended model does without {', '.join(left_out)}: these data do not say what that is elsewhere."
     if dropped:

@@ -243,7 +243,7 @@ def _screened(name: str, now: Explanation) -> tuple[Score, Effect] | None:
     A simpler form that does as well, as far as the record can tell, stands for it: what is more than that goes astray
     where the record ends.
     """
-    tried = [scored for form in _forms(name, now) if (scored := _scored(form, now)) and _in_phase(scored[1], now)]
+    tried = [scored for form in _forms(name, now) if (scored := _scored(form, now)) and in_phase(scored[1], now)]
     if not tried:
         return None
 
@@ -255,7 +255,7 @@ def _screened(name: str, now: Explanation) -> tuple[Score, Effect] | None:
     return min(equal, key=lambda one: (free(one[1]).size, error(one)))
 
 
-def _in_phase(effect: Effect, now: Explanation) -> bool:
+def in_phase(effect: Effect, now: Explanation) -> bool:
     """Return whether an effect that depends on the reading is at the same displacements in all records.
 
     Where their zeros differ, those of other records do as well, and nothing tells what the effect is there.
@@ -487,14 +487,14 @@ def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
 def _without_needless(now: Explanation, names: Collection[str], *, restart: bool = True) -> Explanation:
     """Return it without those of the named effects that the others make needless.
 
-    With `restart` (default) the rest are fitted from new starts: an effect that was found while another one was missing
-    may have settled at parameters that make up for that.
+    One that is not needed as it is, with `restart` (default) each one, is tried from a new start: an effect that was
+    found while another one was missing may have settled at parameters that make up for that.
     """
     for name in [effect.name for effect in now.effects if effect.name in names]:
         without = now.without(name)
         needed = counts(without.held_out, now.held_out, own=is_own(now.effect(name)))
         # The others may have come to their best only without it.
-        anew = contenders(without, [name])[:1] if without.effects and (restart or not needed) else []
+        anew = contenders(without, [name]) if without.effects and (restart or not needed) else []
         for one in anew:
             if one.counts_beside(without) and (not needed or gain(now.held_out, one.score) > BETTER):
                 now, needed = one.explanation, True

@@ -78,9 +78,10 @@ class Repeats:
 
 
 def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: float) -> Repeats:
-    """Return the repeats of a displacement that are not due to chance.
+    """Return the runs of equal displacement readings that are not due to chance.
 
-    Either the voltage moved so that the displacement had to follow, or equal readings are improbable given the noise.
+    Either the voltage changed enough that the displacement had to follow, or so many equal readings are improbable
+    given the noise.
 
     Parameters
     ----------
@@ -194,10 +195,10 @@ def lone_of(
     t, v, y : ndarray, shape (N,), seconds, volts and metres
         Both signals vary.
     at_kinks : bool
-        As for `lone_outliers`.
+        As for `lone_outliers`, of the displacement.
     """
     gain, noise_v, noise_y = spread(y) / spread(v), noise(v, t), noise(y, v, t)
-    off_v = lone_outliers(v, y, 1.0 / gain, max(noise_v, digit(v), LEAST_SPIKE * float(np.ptp(v))), noise_y, at_kinks)
+    off_v = lone_outliers(v, y, 1.0 / gain, max(noise_v, digit(v), LEAST_SPIKE * float(np.ptp(v))), noise_y)
     off_y = lone_outliers(y, v, gain, max(noise_y, digit(y)), noise_v, at_kinks)
     return off_v, np.setdiff1d(off_y, off_v)
 
@@ -215,7 +216,7 @@ def lone_outliers(
     noise_y, noise_v : float, metres and volts
         Their noise.
     at_kinks : bool
-        Whether those are returned that a kink of the displacement with its noise could be.
+        Whether those are returned as well that may be a kink and noise. Default True.
 
     Returns
     -------

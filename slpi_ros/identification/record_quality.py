@@ -441,7 +441,10 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
         yield Finding("warn" if signal.stale > _OUTLIERS * samples else "ok", text)
     if signal.spikes:
         text = f"{name} with outliers in {_of(signal.spikes, samples)}"
-        yield Finding("warn", f"{text}: the other signal does not follow; those that no kink explains are not fitted")
+        left = (
+            "a line between their neighbours stands for them" if name == "voltage" else "the small ones stay in the fit"
+        )
+        yield Finding("warn", f"{text}: the other signal does not follow; {left}")
 
 
 def _drive_findings(quality: Quality) -> Iterator[Finding]:

@@ -47,7 +47,7 @@ class Signals:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names that the messages give, or numbers of the columns."""
+        """Joint names as in the messages; "0", "1", ... if the message type has none."""
         return tuple(next(iter(self.fields.values())))
 
 

@@ -90,9 +90,9 @@ def read_bags(
     Raises
     ------
     UsageError
-        If there is no path, one of them comes twice, or they are of different stages.
+        If there is no path, or one of them comes twice.
     RecordError
-        As from `read_bag`.
+        As from `read_bag`; also if the bags are of different stages.
     """
     places = [Path(path) for path in paths]
     if not places:
@@ -101,7 +101,10 @@ def read_bags(
         if place.resolve() in {earlier.resolve() for earlier in places[:number]}:
             raise UsageError(f"{place}: given twice; name every bag once")
     records = [read_bag(place, topic, axes=axes) for place in places]
-    common_stage(records)
+    try:
+        common_stage(records)
+    except UsageError as error:
+        raise RecordError(str(error)) from None
     return records
 
 

@@ -99,5 +99,6 @@ def common_stage(records: Sequence[Record], hardware_id: str = "") -> str:
             stages.setdefault(record.hardware_id, record.source)
     if len(stages) > 1:
         listed = ", ".join(f"'{stage}' ({source})" for stage, source in stages.items())
-        raise UsageError(f"several stages: {listed}; use records and a model of one stage")
+        what = "records and a model" if hardware_id else "records"
+        raise UsageError(f"several stages: {listed}; use {what} of one stage")
     return next(iter(stages), "")

@@ -355,7 +355,7 @@ class StreamingInverse:
         return v, play.between(v, u)
 
     def _beyond_rounding(self, h: float) -> float:
-        """Return setpoint - displacement (m) of the hysteresis; 0 within rounding."""
+        """Return setpoint `h` - displacement of the hysteresis model (m); 0 if not larger than rounding errors."""
         missing = h - self.memory.displacement
         return missing if abs(missing) > self._rounding else 0.0
 

@@ -177,7 +177,7 @@ class Diagnostics:
         self.level = OK
 
     def report(self, health: Health) -> None:
-        """Publish the status and store its level."""
+        """Publish the diagnostic status and store its severity, OK, WARN or ERROR."""
         self.level = health.level
         status = DiagnosticStatus(
             level=health.level,
@@ -331,7 +331,7 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
 
 @contextmanager
 def _signals_to(handler: Callable[..., None]) -> Iterator[None]:
-    """Send SIGINT and SIGTERM to the handler."""
+    """Install a handler for SIGINT and SIGTERM in this block."""
     # Python allows signal handlers in the main thread only; in other threads none is set.
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     previous = {number: signal.signal(number, handler) for number in numbers}

@@ -224,8 +224,9 @@ class DiagnosisRequest:
     Parameters
     ----------
     bags : tuple of str
-        Paths; all in one diagnosis.
+        Paths of the bags, diagnosed together.
     topic : str
+        Topic of the recorded voltages and displacements.
     document : str
         Model document.
     folder : str

@@ -75,6 +75,32 @@ def test_a_change_is_one_since_the_record_of_the_model():
     assert axis.given.gain == pytest.approx(0.01, rel=0.2)
 
 
+def test_a_quieter_record_of_the_same_name_may_show_a_change():
+    own = record(1.5, seed=13)
+    hum = 150e-9 * np.sin(2.0 * np.pi * 37.0 * own.t)
+    loud = replace(own, displacement={"x": own.displacement["x"] + hum})
+    later = replace(record(1.5, seed=14, gain=1.01), source=own.source)
+    axis, _ = found(later, slpi_ros.identify(loud))
+    assert axis.given.changed
+    assert axis.given.gain == pytest.approx(0.01, rel=0.2)
+
+
+@pytest.mark.parametrize("zeros", [(0.0, 170e-9), (0.0, 0.0)], ids=["moved", "alike"])
+def test_an_error_of_the_sensor_is_shared_where_the_zeros_are(zeros):
+    pair = []
+    for seed, zero in zip((15, 16), zeros, strict=True):
+        one = record(1.5, seed=seed)
+        y = one.displacement["x"]
+        read = y + zero + 40e-9 * np.sin(2.0 * np.pi * y / 400e-9)
+        pair.append(replace(one, displacement={"x": read}, source=f"record {seed}"))
+    axis, extended = found(pair, slpi_ros.identify(pair))
+    (effect,) = axis.effects
+    assert effect.name == "sensor_periodic"
+    assert effect.effect.period == pytest.approx(400e-9, rel=0.01)
+    assert [one.name for one in extended.effects] == (["sensor_periodic"] if zeros[1] == 0.0 else [])
+    assert ("own" in axis.summary) == (zeros[1] != 0.0)
+
+
 def test_a_moved_zero_is_no_change_of_the_loops(model):
     axis, _ = found(record(1.5, seed=7, offset=-0.6e-6), model)
     assert not axis.given.changed

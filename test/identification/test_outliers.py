@@ -9,6 +9,7 @@ import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.bad_readings import far_outliers
 from slpi_ros.identification.record_quality import assess
+from slpi_ros.identification.samples import select_samples
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage
 
@@ -107,3 +108,21 @@ def test_ringing_after_a_jump_is_none():
     ringing = np.exp(-np.maximum(t - 0.4, 0.0) / 0.03) * np.sin(2 * np.pi * 900.0 * (t - 0.4))
     y = 2e-7 * v + np.where(t < 0.4, 0.0, 1e-5) * ringing + NOISE * np.random.default_rng(5).standard_normal(t.size)
     assert not far_outliers(v, y)[1].size
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_kinks_stay_in_the_fit(seed):
+    """A stage of few play operators bends sharply; with noise single readings there lie beside their neighbours."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(6000) / 200.0
+    v = 50.0 * (1.0 - np.cos(2.0 * np.pi * 0.2 * t))
+    y = 0.1e-6 * v
+    for threshold in (3.0, 8.0, 15.0, 25.0):
+        z = np.empty_like(v)
+        z[0] = 0.0
+        for k in range(1, v.size):
+            z[k] = min(max(z[k - 1], v[k] - threshold), v[k] + threshold)
+        y = y + 0.15e-6 * z
+    y = y + NOISE * rng.normal(size=y.size)
+    record = slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y})
+    assert select_samples(record, "x", None, None).fitted.all()

@@ -164,15 +164,23 @@ class Readme:
         points = [*map(float, message["position"]), *(low + share * (high - low) for share in SHARES)]
         publisher = self.node.create_publisher(JointState, topic, 100)
         self.until(publisher.get_subscription_count, topic)
-        timer = self.node.create_timer(
-            1.0 / float(rate), lambda: publisher.publish(JointState(name=message["name"], position=[point]))
-        )
-        found = []
+        sent, answers = [], []  # type: ignore[var-annotated]
+
+        def send() -> None:
+            publisher.publish(JointState(name=message["name"], position=[point]))
+            sent.append(point)
+
+        listener = self.node.create_subscription(Float64MultiArray, "/voltage_command", answers.append, 100)
+        timer, found = self.node.create_timer(1.0 / float(rate), send), []
         for point in points:
+            # On a busy machine answers to what was sent before may still be under way.
+            before = len(sent)
+            self.until(lambda: len(answers) > before + 1, f"the voltage for {point} m")  # noqa: B023
             self.readings.clear()
             self.until(lambda: len(self.readings) >= 3 * READINGS // 2, f"the stage at {point} m")
             found.append(float(np.mean(self.readings[READINGS // 2 :])) - point)
         self.node.destroy_timer(timer)
+        self.node.destroy_subscription(listener)
         self.node.destroy_publisher(publisher)
         return 100.0 * np.array(found) / (high - low)
 

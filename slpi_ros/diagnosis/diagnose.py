@@ -117,8 +117,9 @@ def _diagnose_axis(
     # What belongs to one record says nothing of another.
     shared = [effect for effect in model.effects if same or effect.removable != "record"]
     base = Explanation(evidence, shared)
-    if not all(in_phase(effect, base) for effect in shared):
-        base = Explanation(evidence, [effect for effect in shared if in_phase(effect, base)])
+    known = [effect for effect in shared if in_phase(effect, base)]
+    if len(known) < len(shared):
+        base = Explanation(evidence, known)
     if model.kind in REFITTED:
         selection = _selected(base, evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None)
         before = base.held_out.rms_of_records

@@ -334,6 +334,7 @@ def _diagnose(options: argparse.Namespace) -> None:
     from slpi_ros.diagnosis.diagnose import diagnose
     from slpi_ros.identification.record_quality import assess, findings, require_usable
     from slpi_ros.io.atomic_file import output_folder
+    from slpi_ros.io.bag_reader import require_one_stage
     from slpi_ros.model.document import load_model
     from slpi_ros.reports.diagnosis import FILES, PAGE, describe_diagnosis, write_files
 
@@ -344,6 +345,7 @@ def _diagnose(options: argparse.Namespace) -> None:
         _require_another_file(str(Path(options.output) / name), *options.bags)
     with output_folder(options.output, *FILES) as folder:
         records = [_read_all_axes(bag, options, topics) for bag in options.bags]
+        require_one_stage(records)
         try:
             axes = options.axis or [axis for axis in model.axes if all(axis in record.axes for record in records)]
             for record, axis in ((record, axis) for record in records for axis in axes):

@@ -392,14 +392,14 @@ def test_digits_without_noise_are_explained_by_nothing(clean):
 
 
 def test_records_of_two_stages_are_refused(slpi, folder, tmp_path, hidden, clean):
-    mine, other = tmp_path / "mine", tmp_path / "other"
-    write_bag(mine, replace(hidden.record, hardware_id="mine"))
-    write_bag(other, replace(clean, hardware_id="other"))
+    write_bag(tmp_path / "mine", replace(hidden.record, hardware_id="mine"))
+    write_bag(tmp_path / "other", replace(clean, hardware_id="other"))
     model = ("--model", folder / "model.json", "-o", tmp_path / "out")
-    for bags in ((mine, other), (other, mine)):
-        code, said, complaint = slpi("diagnose", *bags, *model)
-        assert code == 1 and not said and complaint.count("\n") == 1
-        assert all(f"'{place.name}' ({place})" in complaint for place in (mine, other))
+    for other in (folder / "clean", tmp_path / "other"):
+        for bags in ((tmp_path / "mine", other), (other, tmp_path / "mine")):
+            code, said, complaint = slpi("diagnose", *bags, *model)
+            assert code == 1 and not said and complaint.count("\n") == 1
+            assert "'mine'" in complaint and str(tmp_path / "mine") in complaint and str(other) in complaint
     assert not (tmp_path / "out").exists()
 
 

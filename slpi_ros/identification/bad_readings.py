@@ -30,6 +30,10 @@ LEAST_SPIKE = 0.001
 # A reading is an outlier for sure when it lies so many times farther from the median of so many readings than half of
 # those do that are not the median, and than those beside it; looked for so many times.
 _FAR, _APART, _WINDOW, _PASSES = 15.0, 5.0, 7, 5
+# The error of a model is compared with the median of so many readings.
+_MODEL_WINDOW = 15
+# Readings beside outliers deviate by less than this share of them.
+_SUDDEN = 0.5
 # Largest delay of a displacement reversal, and duration of ringing after a jump, in samples.
 _TURN_REACH, _RINGING = 5, 200
 
@@ -171,6 +175,51 @@ def _far(x: FloatArray, other: FloatArray) -> Mask:
         return far
     # Ringing takes every reading away from the median, an outlier only itself.
     return np.asarray(far & (off > _APART * median_filter(off, _WINDOW, mode="nearest")))
+
+
+def outliers_beside(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
+    """Return the readings that are off by a model, where neither the others beside them are nor a reversal explains it.
+
+    Outliers beside each other and at kinks are among them, which without a model are not told from motion.
+
+    Parameters
+    ----------
+    path, y, v : ndarray, shape (N,), metres, metres and volts
+        Displacement by the model and as it was read, and voltage.
+    """
+    kept = np.arange(y.size)
+    for _ in range(_PASSES):
+        # Outliers beside each other hide each other.
+        off = _off_path(path[kept], y[kept], v[kept])
+        if not off.any():
+            break
+        kept = kept[~off]
+    return np.setdiff1d(np.arange(y.size), kept)
+
+
+def _off_path(path: FloatArray, y: FloatArray, v: FloatArray) -> Mask:
+    if y.size < 5:
+        return np.zeros(y.size, dtype=bool)
+    off = y - path
+    # What the model gets wrong is alike in neighbouring readings.
+    off = np.abs(off - median_filter(off, _MODEL_WINDOW, mode="mirror"))
+    if not off.any():
+        return np.zeros(y.size, dtype=bool)
+    turned = np.pad(np.abs(_off_neighbours(v)), 2)
+    explained = 2.0 * spread(y) / spread(v) * maximum_filter1d(turned, 2 * _TURN_REACH + 1)
+    # A stage that moves is predicted less well than one at rest.
+    usual = 1.4826 * median_filter(off, 2 * _MODEL_WINDOW + 1, mode="mirror")
+    least = np.maximum(_FAR * np.maximum(usual, median_rms(off[off > 0.0])), LEAST_SPIKE * spread(y))
+    far: Mask = off > least + explained
+    if not far.any():
+        return far
+    # The error of a model grows from reading to reading, an outlier is there at once.
+    bounds = np.flatnonzero(np.diff(far, prepend=False, append=False))
+    padded = np.concatenate([[0.0], off, [0.0]])
+    beside = np.maximum(padded[bounds[::2]], padded[bounds[1::2] + 1])
+    sudden = beside < _SUDDEN * np.minimum.reduceat(padded[1:], bounds)[::2]
+    far[far] = np.repeat(sudden, np.diff(bounds)[::2])
+    return far
 
 
 def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:
@@ -358,7 +407,7 @@ def mixed_beside(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> ND
     at = np.flatnonzero(fitted)
     off = (y - path)[at]
     # What the model gets wrong is alike in neighbouring readings.
-    off = off - median_filter(off, 4 * _BESIDE + 3)
+    off = off - median_filter(off, _MODEL_WINDOW)
     way = np.diff(path, append=path[-1]) if side > 0 else np.diff(path, prepend=path[0])
     return at[_mixed(side * off, way[at], _MIXED_BY_MODEL)]
 

@@ -15,7 +15,7 @@ from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import fit_amplitude_scaled, fit_at_rest, fit_primed
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
-from slpi_ros.model.axis_model import AxisModel, FitQuality
+from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
@@ -87,12 +87,11 @@ def identify(
             with threadpool_limits(1):
                 fitted = fit(samples)
                 model = _axis_model(kind, fitted, source)
-                if model.causal and any(part.side for part in samples):
-                    starts = zip(fitted.starts, samples, strict=True)
-                    paths = [replace(model, start=own).memory("start").forward_array(part.v) for own, part in starts]
-                    samples = [part.without_mixed(path) for part, path in zip(samples, paths, strict=True)]
-                    fitted = fit(samples)
-                    model = _axis_model(kind, fitted, source)
+                if model.causal:
+                    good = _without_bad(samples, model, fitted.starts)
+                    if any(after is not before for after, before in zip(good, samples, strict=True)):
+                        samples, fitted = good, fit(good)
+                        model = _axis_model(kind, fitted, source)
                 if model.causal:
                     # The final state includes the voltage after `stop`.
                     whole = samples[last] if stop is None else select_samples(records[last], axis, None, None)
@@ -101,6 +100,15 @@ def identify(
         except SlpiError as error:
             raise type(error)(f"{source}: axis '{axis}': {error}") from None
     return StageModel(models, hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))
+
+
+def _without_bad(samples: Sequence[Samples], model: AxisModel, starts: Sequence[Start]) -> list[Samples]:
+    """Return the samples of each record without the readings that a first model shows to be bad."""
+    good = []
+    for part, start in zip(samples, starts, strict=True):
+        path = replace(model, start=start).memory("start").forward_array(part.v)
+        good.append(part.without_mixed(path).without_outliers(path))
+    return good
 
 
 def fit_of(kind: str, *, loops_at_rest: bool) -> Callable[[Sequence[Samples]], Fitted]:

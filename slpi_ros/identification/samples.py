@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.reversals import monotone_runs
-from slpi_ros.identification.bad_readings import far_outliers, lone_of, mixed_beside, mixed_readings, stuck, without
+from slpi_ros.identification.bad_readings import (
+    far_outliers,
+    lone_of,
+    mixed_beside,
+    mixed_readings,
+    outliers_beside,
+    stuck,
+    without,
+)
 from slpi_ros.identification.signal_statistics import without_noise
 from slpi_ros.io.record import Record
 
@@ -82,6 +90,16 @@ class Samples:
         fitted, mixed = self.fitted.copy(), mixed_beside(path, self.y, self.fitted, self.side)
         fitted[mixed] = False
         return replace(self, fitted=fitted, mixed=self.mixed + mixed.size)
+
+    def without_outliers(self, path: FloatArray) -> "Samples":
+        """Return the samples without the outliers by the displacement of a model, `path`, shape (N,), metres.
+
+        None are told from mixed readings, which `without_mixed` leaves out.
+        """
+        if self.side:
+            return self
+        off = np.flatnonzero(self.fitted)[outliers_beside(path[self.fitted], self.y[self.fitted], self.v[self.fitted])]
+        return self.only(np.isin(np.arange(self.v.size), off, invert=True)) if off.size else self
 
     def thinned(self, most: int) -> "Samples":
         """Return about `most` evenly spaced samples plus all reversals, which preserves the hysteresis state."""

@@ -20,7 +20,7 @@ from slpi_ros.io.alignment import SeparateTopics, Signals, combine, held_at
 from slpi_ros.io.bag_files import absolute_name, locate, match_topic, translated, unpacked
 from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, SECOND_NS, Message, read_message
-from slpi_ros.io.record import FloatArray, Record, common_stage
+from slpi_ros.io.record import FloatArray, Record
 
 _Path = str | os.PathLike[str]
 
@@ -101,11 +101,18 @@ def read_bags(
         if place.resolve() in {earlier.resolve() for earlier in places[:number]}:
             raise UsageError(f"{place}: given twice; name every bag once")
     records = [read_bag(place, topic, axes=axes) for place in places]
-    try:
-        common_stage(records)
-    except UsageError as error:
-        raise RecordError(str(error)) from None
+    require_one_stage(records)
     return records
+
+
+def require_one_stage(records: Sequence[Record]) -> None:
+    """Raise RecordError unless all records have one hardware id; beside one that has, a bag without may be of any."""
+    for record in records[1:]:
+        if record.hardware_id != records[0].hardware_id:
+            raise RecordError(
+                f"{record.source}: of stage '{record.hardware_id}', but {records[0].source} of "
+                f"'{records[0].hardware_id}'; give bags of one stage"
+            )
 
 
 def read_desired(path: _Path, record: Record, topic: str | None = None) -> dict[str, NDArray[np.float64]] | None:

@@ -7,7 +7,7 @@ import pytest
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.identification.bad_readings import far_outliers
+from slpi_ros.identification.bad_readings import far_outliers, outliers_beside
 from slpi_ros.identification.record_quality import assess
 from slpi_ros.identification.samples import select_samples
 from slpi_ros.simulation.parameters import StageParameters
@@ -79,6 +79,9 @@ def test_many_outliers_of_any_size_leave_the_model_as_it_is(clean, of_clean, cou
     judged = slpi_ros.identify(spoiled(clean, "displacement", at, times * NOISE * rng.choice([-1, 1], count))).axes["x"]
     assert error(judged, clean) <= 1.2 * error(of_clean, clean)
     assert judged.voltage_range == pytest.approx(of_clean.voltage_range)
+    if times >= 100:
+        assert judged.quality.held_out_rms <= 1.2 * of_clean.quality.held_out_rms
+        assert judged.displacement_range == pytest.approx(of_clean.displacement_range, abs=6 * NOISE)
 
 
 @pytest.mark.parametrize("volts", [1.0, 10.0, 100.0])
@@ -126,3 +129,22 @@ def test_kinks_stay_in_the_fit(seed):
     y = y + NOISE * rng.normal(size=y.size)
     record = slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y})
     assert select_samples(record, "x", None, None).fitted.all()
+
+
+@pytest.mark.parametrize("beside", [1, 2, 5])
+def test_outliers_beside_each_other_are_found_with_a_model(clean, of_clean, beside):
+    path = of_clean.memory("start").forward_array(clean.voltage["x"])
+    at = np.concatenate([[0], (np.arange(1500, 4500, 500)[:, None] + np.arange(beside)).ravel(), [5999, 6000]])
+    for signs in (1.0, np.where(np.arange(at.size) % 2, 1.0, -1.0)):
+        y = spoiled(clean, "displacement", at, signs * 100 * NOISE).displacement["x"]
+        assert outliers_beside(path, y, clean.voltage["x"]).tolist() == at.tolist()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1 * NOISE, NOISE])
+@pytest.mark.parametrize("kind", ["slpi", "pi"])
+def test_what_a_model_gets_wrong_is_no_outlier(kind, noise):
+    t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=200.0, seed=2)
+    y = PreisachStage(StageParameters.random(2), 2).run(t, v)[0]
+    y = y + noise * np.random.default_rng(6).standard_normal(t.size)
+    model = slpi_ros.identify(slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y}), kind).axes["x"]
+    assert not outliers_beside(model.memory("start").forward_array(v), y, v).size

@@ -30,6 +30,7 @@ def test_what_is_no_regular_file_stays(tmp_path):
 
     for path in (tmp_path / "pipe", ""):
         assert f"'{path}'" in refusal(SlpiError, write, path)
+    assert str(tmp_path) in refusal(SlpiError, write, tmp_path)
     assert (tmp_path / "pipe").is_fifo() and [path.name for path in tmp_path.iterdir()] == ["pipe"]
 
 

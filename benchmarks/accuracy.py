@@ -1,8 +1,8 @@
-"""How well a path that was not in the record is followed, on simulated stages that are no model of the compensator.
+"""Errors on a path that was not recorded, on simulated stages (Preisach) of another type than the identified models.
 
-Mean and maximum error against the true displacement, in % of stroke; the classical PI model of the same record beside
-it. A classical PI model may lie beside the stage as a whole, which says nothing of its loops: the ratio of the mean
-errors is the smaller one of those with and without each model's constant offset.
+Mean and maximum error against the true displacement, in % of the stroke, compared with a classical PI model of the same
+record. The mean errors are compared with and without the constant offset of each model, and the smaller ratio counts,
+because an offset of the classical PI model says nothing about its loops.
 """
 
 import argparse
@@ -23,7 +23,7 @@ NOISE = 8e-9
 
 
 def fresh(seed: int) -> PreisachStage:
-    """Return the stage of a seed, never moved."""
+    """Return the stage for a seed, never moved before."""
     return PreisachStage(replace(StageParameters.random(seed), noise_rms=NOISE), seed)
 
 
@@ -33,7 +33,7 @@ def record_of(t: FloatArray, v: FloatArray, y: FloatArray) -> slpi_ros.Record:
 
 
 def calibrated(seed: int, duration: float, rate: float) -> tuple[slpi_ros.Record, float, float]:
-    """Drive the stage of a seed; return the record, and the reachable displacements once it has been moved (m)."""
+    """Return the calibration record for a seed, displacement (m) at 0 V after it, and maximum displacement (m)."""
     stage = fresh(seed)
     t, v = calibration_drive(0.0, V_MAX, duration=duration, rate=rate, seed=seed)
     true, measured = stage.run(t, v)
@@ -42,7 +42,7 @@ def calibrated(seed: int, duration: float, rate: float) -> tuple[slpi_ros.Record
 
 
 def errors(model: slpi_ros.StageModel, seed: int, low: float, high: float, duration: float, rate: float) -> FloatArray:
-    """Follow an unseen path with the model's voltages; return the errors, in shares of the stroke."""
+    """Follow a path that was not recorded, with voltages of the model; return the errors as fractions of the stroke."""
     t, desired = scan_path(low, high, duration=duration, rate=rate, seed=1000 + seed)
     achieved, _ = fresh(seed).run(t, model.compensate(t, desired, "start"))
     share: FloatArray = (achieved - desired) / (high - low)
@@ -50,13 +50,13 @@ def errors(model: slpi_ros.StageModel, seed: int, low: float, high: float, durat
 
 
 def smaller_ratio(errors: FloatArray, of_baseline: FloatArray) -> float:
-    """Return the ratio of mean errors, with or without the offset of both, whichever is smaller."""
+    """Return the ratio of the mean errors, with or without the constant offsets of both, whichever is smaller."""
     sizes = [[float(np.mean(np.abs(e - offset))) for offset in (0.0, np.median(e))] for e in (errors, of_baseline)]
     return min(theirs / ours for ours, theirs in zip(*sizes, strict=True))
 
 
 def below_remanence(model: slpi_ros.StageModel, seed: int, low: float, high: float, rate: float) -> tuple[float, float]:
-    """Return the mean error of a path's second half, after an excursion out of reach, and without it."""
+    """Return the mean errors in the second half of a path, with and without an excursion below the reachable range."""
     t, desired = scan_path(low, high, duration=20.0, rate=rate, seed=2000 + seed)
     excursion = desired.copy()
     middle = slice(desired.size // 4, desired.size // 2)

@@ -1,12 +1,12 @@
-"""Hidden effects: how often they are found, by their right name, and how well; full run some hours, see the options.
+"""Diagnosis of hidden effects: detection rate, correct names, parameter errors; a full run takes some hours.
 
-Every record is drawn from a seed, written as a bag, identified and diagnosed; only then is the truth looked at. The
-model comes from the same record, or with ``--second-record`` from one that was made before the effect was there.
+Every record is drawn from a seed, written as a bag, identified and diagnosed, and only then compared with the truth.
+The model is identified from the same record, or with ``--second-record`` from a record made before the effect occurred.
 """
 
 import os
 
-# Before numpy is there: the processes share the cores.
+# To be set before NumPy is imported: the processes share the cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
@@ -24,7 +24,7 @@ SIZES = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
 
 
 def cases(draws: int, seed: int, only: str | None) -> Iterator[Case]:
-    """Yield single effects, clean records, pairs and records of Bouc-Wen stages; with `only` just its own."""
+    """Yield cases of single effects, pairs, clean records and Bouc-Wen stages; with `only`, cases of that effect."""
     chosen = [only] if only else list(NAMES)
     for name in chosen:
         yield from (Case("single", seed + index, (name,)) for index in range(draws))
@@ -38,7 +38,7 @@ def cases(draws: int, seed: int, only: str | None) -> Iterator[Case]:
 
 
 def sized_cases(draws: int, seed: int, only: str | None) -> Iterator[Case]:
-    """Yield single effects of every size."""
+    """Yield cases of single effects with every size."""
     for name in [only] if only else NAMES:
         for size in SIZES:
             yield from (Case("sized", seed + index, (name,), size=size) for index in range(draws))

@@ -1,4 +1,4 @@
-"""One case of the bench of diagnosis: hide, identify, diagnose, and only then compare."""
+"""One case of the benchmark of the diagnosis: hide effects, identify, diagnose, and compare with the truth."""
 
 import tempfile
 import time
@@ -16,7 +16,7 @@ from slpi_ros.io.bag_writer import write_bag
 
 @dataclass(frozen=True)
 class Case:
-    """What to hide; `group` says in which table it counts."""
+    """Effects to hide; `group` is the table to which the case belongs."""
 
     group: str
     seed: int
@@ -28,7 +28,7 @@ class Case:
 
 @dataclass(frozen=True)
 class AxisOutcome:
-    """What a diagnosis said of one axis, and what is true."""
+    """Diagnosis of one axis, and the truth."""
 
     verdict: str
     named: tuple[str, ...]
@@ -46,7 +46,7 @@ class AxisOutcome:
 
     @property
     def first_among(self) -> bool:
-        """Whether a true name is first or an alternative of the first."""
+        """Whether the first named effect, or one of its alternatives, is a true one."""
         return bool(self.named) and bool({self.named[0], *self.alternatives[0]} & set(self.truth))
 
     @property
@@ -55,13 +55,13 @@ class AxisOutcome:
 
     @property
     def alarm(self) -> bool:
-        """Whether something was named although there is nothing."""
+        """Whether an effect was named although there is none (false alarm)."""
         return not self.truth and bool(self.named)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A case and what became of it; `failure` is an error's message, or that it could not be drawn."""
+    """Result of a case; `failure` is an error message, or states that the case could not be drawn."""
 
     case: Case
     axes: Mapping[str, AxisOutcome] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class Outcome:
 
 
 def run(case: Case) -> Outcome:
-    """Hide, write a bag, identify, diagnose the bag alone, compare."""
+    """Hide effects, write a bag, identify and diagnose from this bag, and compare with the truth."""
     try:
         hidden = hide(case.seed, case.effects, base=case.base, size=case.size)
     except RuntimeError as error:
@@ -84,7 +84,7 @@ def run(case: Case) -> Outcome:
         return _diagnosed(case, hidden)
     except slpi_ros.SlpiError as error:
         return Outcome(case, samples=len(hidden.record), failure=f"refused: {error}")
-    # One broken case must not cost the hours of all others; it is printed and counts as not found.
+    # One failing case must not end a run of several hours; it is printed and counts as not found.
     except Exception as error:
         return Outcome(case, samples=len(hidden.record), failure=f"{type(error).__name__}: {error}")
 
@@ -131,22 +131,22 @@ def _compared(hidden: Hidden, axis: str, found) -> AxisOutcome:
 
 
 def _best_rms(hidden: Hidden, axis: str, truth: tuple[Truth, ...]) -> float:
-    """Return the held-out rms (m) of a hysteresis fitted once the true effects are taken off the readings."""
+    """Return the held-out rms (m) of a hysteresis fitted to the readings without the true effects."""
     reading = hidden.record.displacement[axis] - (hidden.reading[axis] - hidden.clean[axis])
     without = replace(hidden.record, voltage={axis: hidden.record.voltage[axis]}, displacement={axis: reading})
     return float(slpi_ros.identify(without).axes[axis].quality.held_out_rms)
 
 
 def contribution_error(v, found, truth) -> float:
-    """Return the rms of what is wrong with a contribution, beyond what hysteresis takes up, relative to the truth."""
+    """Return the relative rms error of a contribution, without the parts that hysteresis can explain."""
     return beyond_hysteresis(v, found - truth) / beyond_hysteresis(v, truth)
 
 
 def parameter_errors(truth: Truth, effect, hidden: Hidden) -> dict[str, float]:
-    """Return relative errors by name; one for a wave with its phase, and one for a list of knots or relaxations.
+    """Return the relative errors by parameter name; a list of knots or relaxations has one error.
 
-    ``saturation``: relative to what is cut off. ``creep``: what a step becomes between 0.1 s and half of the record.
-    ``gain_drift``, ``thermal_drift``: the path, without its mean. ``wave``: the periodic error itself, phase and all.
+    ``saturation``: relative to the voltage that is cut off. ``creep``: step response from 0.1 s to half of the record.
+    ``gain_drift``, ``thermal_drift``: course in time, without its mean. ``wave``: the sine, including its phase.
     """
     true, t = truth.parameters, hidden.record.t
     v = hidden.record.voltage[truth.axis]

@@ -1,4 +1,4 @@
-"""Tables of the bench of diagnosis."""
+"""Tables of the benchmark of the diagnosis."""
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ CLOSE_POINTS = 10.0
 
 
 def line(outcome: Outcome) -> str:
-    """Return a case in a line."""
+    """Return the result of a case as one line of text."""
     case = outcome.case
     hidden = "+".join(case.effects) or case.base or "clean"
     says = [
@@ -41,7 +41,7 @@ def everything(outcomes: Sequence[Outcome]) -> None:
 
 
 def confusion(outcomes: Sequence[Outcome]) -> None:
-    """Print which name came first for which effect."""
+    """Print the confusion matrix: for each hidden effect, how often each effect was named first."""
     drawn = [outcome for outcome in outcomes if not outcome.failure.startswith("not drawn")]
     if not drawn:
         return
@@ -61,7 +61,7 @@ def confusion(outcomes: Sequence[Outcome]) -> None:
 
 
 def clean(outcomes: Sequence[Outcome], everyone: Sequence[Outcome]) -> None:
-    """Print false alarms: on clean records, and on axes without effect beside others."""
+    """Print the false alarms on clean records, and on axes without effects of stages with an effect on another axis."""
     for what, rows in (
         ("clean records", outcomes),
         ("axes without effect beside one that has one", [o for o in everyone if o.case.effects]),
@@ -76,7 +76,7 @@ def clean(outcomes: Sequence[Outcome], everyone: Sequence[Outcome]) -> None:
 
 
 def pairs(outcomes: Sequence[Outcome]) -> None:
-    """Print how often both of two effects were named."""
+    """Print how often both of two hidden effects were named."""
     drawn = [outcome for outcome in outcomes if not outcome.failure.startswith("not drawn")]
     if drawn:
         both = [outcome for outcome in drawn if outcome.victim and outcome.victim.all_named]
@@ -87,7 +87,7 @@ def pairs(outcomes: Sequence[Outcome]) -> None:
 
 
 def gains(outcomes: Sequence[Outcome]) -> None:
-    """Print the held-out gains beside what the true effects give."""
+    """Print by how much the held-out gains are below those of the true effects."""
     short = [axis.true_gain - axis.gain for outcome in outcomes if (axis := outcome.victim)]
     if short:
         close = np.mean(np.array(short) <= CLOSE_POINTS)
@@ -95,7 +95,7 @@ def gains(outcomes: Sequence[Outcome]) -> None:
 
 
 def parameters(outcomes: Sequence[Outcome]) -> None:
-    """Print the median error of every parameter of rightly named effects."""
+    """Print the error statistics of every parameter of the correctly named effects."""
     errors: dict[tuple[str, str], list[float]] = defaultdict(list)
     for outcome in outcomes:
         for key, error in (outcome.victim.errors if outcome.victim else {}).items():
@@ -111,7 +111,7 @@ def parameters(outcomes: Sequence[Outcome]) -> None:
 
 
 def times(outcomes: Sequence[Outcome]) -> None:
-    """Print the time of a diagnosis."""
+    """Print median and maximum time of a diagnosis."""
     done = [outcome for outcome in outcomes if not outcome.failure]
     if done:
         longest = max(done, key=lambda outcome: outcome.seconds)
@@ -120,7 +120,7 @@ def times(outcomes: Sequence[Outcome]) -> None:
 
 
 def bouc_wen(outcomes: Sequence[Outcome]) -> None:
-    """Print what was said of stages whose loops do not close."""
+    """Print the verdicts on Bouc-Wen stages, whose loops do not close."""
     axes = [axis for outcome in outcomes for axis in outcome.axes.values()]
     if axes:
         named = sum(axis.alarm for axis in axes)
@@ -130,7 +130,7 @@ def bouc_wen(outcomes: Sequence[Outcome]) -> None:
 
 
 def sizes(outcomes: Sequence[Outcome]) -> None:
-    """Print how often an effect is found, over its size."""
+    """Print how often each effect is found, as a function of its size."""
     steps = sorted({outcome.case.size for outcome in outcomes})
     print("\nright name first, of those drawn, over the size in noise floors")
     print(" " * 17 + " ".join(f"{step:>7g}" for step in steps))

@@ -1,4 +1,4 @@
-"""The floor: a bare node that answers every desired message with as many numbers, and computes nothing."""
+"""Reference for the latency: a minimal node that answers every message with as many numbers, without a calculation."""
 
 import sys
 from array import array
@@ -13,7 +13,7 @@ from slpi_ros.nodes.common import COMMANDS, run
 
 
 class Echo(Node):
-    """Publishes on ``voltage_command`` for each message on ``desired_displacement``, as rclpy's users write it."""
+    """Publish one ``voltage_command`` for each ``desired_displacement``, with ordinary rclpy message objects."""
 
     def __init__(self) -> None:
         super().__init__("echo")
@@ -29,7 +29,7 @@ class Echo(Node):
 
 
 class BytesEcho(Node):
-    """The same with messages as bytes, as the compensator takes and gives them."""
+    """The same node with serialised messages, as the compensator receives and publishes them."""
 
     def __init__(self) -> None:
         super().__init__("bytes_echo")

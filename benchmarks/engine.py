@@ -1,6 +1,6 @@
-"""Speed of the engine: per sample while streaming, and as a share of ``numpy.interp`` in batch; how it grows.
+"""Speed of the hysteresis engine: per sample in streaming, relative to ``numpy.interp`` in batch, and its scaling.
 
-Times are of the processor, as other programs may run on the machine.
+Except for the percentiles of single samples, times are processor times, as other programs may run on the machine.
 """
 
 import statistics
@@ -31,20 +31,20 @@ def loop_family(vertices: int = 41) -> LoopFamily:
 
 
 def zigzag(samples: int, every: int, seed: int = 0) -> FloatArray:
-    """Return voltages that turn every `every` samples at random places, shape (samples,)."""
+    """Return voltages, shape (samples,), that reverse every `every` samples at random levels."""
     corners = np.random.default_rng(seed).uniform(0.02 * SPAN, 0.98 * SPAN, samples // every + 2)
     corners[1::2], corners[::2] = np.maximum(corners[1::2], SPAN / 2), np.minimum(corners[::2], SPAN / 2)
     return np.interp(np.arange(samples) / every, np.arange(corners.size), corners)
 
 
 def decaying(samples: int, turns: int) -> FloatArray:
-    """Return a decaying oscillation, which fills the memory with turning points, shape (samples,)."""
+    """Return a decaying oscillation, shape (samples,), which fills the memory with turning points."""
     phase = np.linspace(0.0, np.pi * turns, samples)
     return SPAN / 2 * (1 - np.cos(phase) * (1 - phase / phase[-1]))
 
 
 def per_sample(step: Callable[[float], float], values: list[float]) -> tuple[float, float, float]:
-    """Return median, 99.9th percentile and maximum time of one step, microseconds, without that of the clock."""
+    """Return median, 99.9th percentile and maximum time of one step, microseconds, without reading the clock."""
     clock = time.perf_counter_ns
     empty, times = [], []
     for value in values:
@@ -60,7 +60,7 @@ def per_sample(step: Callable[[float], float], values: list[float]) -> tuple[flo
 
 
 def median_time(work: Callable[[], object], repeats: int = 9) -> float:
-    """Return the median processor time of some work, seconds."""
+    """Return the median processor time of a call, seconds."""
     times = []
     for _ in range(repeats):
         before = time.process_time()
@@ -70,12 +70,12 @@ def median_time(work: Callable[[], object], repeats: int = 9) -> float:
 
 
 def wishes(shape: Shape, v: FloatArray) -> FloatArray:
-    """Return the displacements of voltages, shape (N,), metres."""
+    """Return the displacements (m) for voltages (V), both of shape (N,), used as desired displacements."""
     return Memory(shape).forward_array(v)
 
 
 def streaming() -> None:
-    """Print times of the streaming inverse."""
+    """Print the times of the streaming inverse."""
     print("streaming inverse, microseconds per sample      median   p99.9     max")
     for every in (10, 100):
         for name, shape in (("slpi, 41 vertices", loop_family()), ("slpi, 161 vertices", loop_family(161))):
@@ -94,13 +94,13 @@ def streaming() -> None:
 
 
 def oscillation(turns: int, low: float = 0.0, high: float = SPAN) -> FloatArray:
-    """Return 1,000,000 voltages that oscillate with a slowly decreasing amplitude, of at most `low` to `high`."""
+    """Return 1,000,000 voltages (V) that oscillate between `low` and `high` with slowly decreasing amplitude."""
     share = np.cos(np.linspace(0.0, np.pi * turns, 1_000_000)) * np.linspace(0.98, 0.88, 1_000_000)
     return low + (high - low) / 2 * (1 - share)
 
 
 def batch() -> None:
-    """Print times of the batch paths as shares of the speed of numpy.interp."""
+    """Print the speed of batch calculations relative to numpy.interp."""
     print("batch, 1,000,000 samples: numpy.interp, ms, and share of its speed")
     print("                                interp  forward  inverse  partly out of reach   branches of the samples")
     multi_slope = MultiSlope(0.0, SPAN, thresholds_for(SPAN), np.linspace(0.1, 1.0, 11) * 1e-8)
@@ -123,7 +123,7 @@ def batch() -> None:
 
 
 def growth() -> None:
-    """Print how the inverse's time grows."""
+    """Print how the time of the inverse grows with the number of samples, operators and turning points."""
     print("growth of the inverse, batch, ms")
     family = loop_family()
     for samples in (300, 1000, 10_000, 100_000, 1_000_000, 10_000_000):
@@ -143,7 +143,7 @@ def growth() -> None:
 
 
 def main() -> None:
-    """Print all."""
+    """Print all results."""
     before = time.process_time()
     wishes(loop_family(), np.linspace(0.0, SPAN, 1_000_000))
     print(f"first long path of this process, s (more if it had to be compiled): {time.process_time() - before:.2f}")

@@ -1,4 +1,4 @@
-"""Time of an identification beside the time rosbags needs to read the same bag message by message."""
+"""Time of an identification, compared with the time that rosbags needs to read the same bag message by message."""
 
 import argparse
 import multiprocessing
@@ -17,19 +17,19 @@ from rosbags.typesys import Stores, get_typestore
 import slpi_ros
 from slpi_ros.io.bag_writer import write_bag
 
-# Samples, and seconds of the drive.
+# Number of samples, and duration of the excitation (s).
 USUAL = ((12_000, 60.0), (120_000, 120.0), (1_000_000, 100.0))
 LONG_SECONDS = 1000.0
 
 
 def read_by_message(path: Path) -> int:
-    """Deserialise every message as a rosbags user would; return how many."""
+    """Deserialise every message with rosbags; return the number of messages."""
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         return sum(1 for c, _, raw in reader.messages() if reader.deserialize(raw, c.msgtype) is not None)
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """Return how long it takes."""
+    """Return the duration of a call, seconds."""
     began = time.perf_counter()
     work()
     return time.perf_counter() - began
@@ -62,8 +62,8 @@ def _write(path: Path, samples: int) -> None:
 
 
 def _long(path: Path, samples: int) -> None:
-    """Print time and peak memory of `slpi identify` for a long record, each in a process of its own."""
-    # Not here: a child's peak counts from what its parent held.
+    """Print time and peak memory of `slpi identify` for a long record, for each kind in a separate process."""
+    # Written in another process: the peak memory of a child process includes the memory of its parent at the start.
     maker = multiprocessing.get_context("spawn").Process(target=_write, args=(path, samples))
     maker.start()
     maker.join()

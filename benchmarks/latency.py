@@ -1,7 +1,8 @@
-"""Round trip of a two-axis command through the compensator at 1 kHz, a bare rclpy echo node beside it.
+"""Round-trip latency of a two-axis command through the compensator at 1 kHz, compared with a minimal rclpy echo node.
 
-Both run all the time and are asked in turn, a block each: what else the machine does hits them alike. The compensator
-takes and gives messages as bytes, which saves it more than it computes; an echo node that does so too shows the rest.
+All nodes run all the time and receive blocks of messages in turn, so that other load of the machine affects them alike.
+The compensator receives and publishes serialised messages, which saves more time than the compensation takes; a second
+echo node that does the same shows the time of the compensation itself.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from round_trip import Client, Trip, compensator, echo, identified_stage
 from slpi_ros.model.stage_model import StageModel
 
 BLOCK_S = 0.25
-# Processes differ in their luck with memory and cores.
+# Number of process starts: the latency depends on the memory and cores that a process happens to receive.
 STARTS = 5
 
 

@@ -1,6 +1,6 @@
-"""Held-out, free-run errors on measured records, every kind of model.
+"""Held-out free-run errors of every kind of model on measured records.
 
-The folder of measured data is that of SLPI_MEASURED_DATA.
+The environment variable SLPI_MEASURED_DATA gives the folder of the measured data.
 """
 
 import os
@@ -17,11 +17,11 @@ from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 from slpi_ros.papers.measured import CASES, score
 
-# The triangles of this record end there, and sines begin (seconds).
+# End of the triangles and start of the sines in the record afm_triangle_sine, seconds.
 TRIANGLES_END = 2893.0
-# It rests at a remanent offset until 3.26 s. The last sines are predicted.
+# End of the fitted part of piezo_150v_1hz, seconds: rest at a remanent offset until 3.26 s, then sines.
 PIEZO_FITTED = 7.2
-# What issue D asks for, um.
+# Largest errors allowed by issue D, um.
 AFM_MARK, PIEZO_MARK = 0.060, 0.066
 
 
@@ -52,7 +52,7 @@ def main() -> int:
 
 
 def _row(name: str, record: Record, axis: str, until: float, mark: float) -> None:
-    """Print how the part of a record after `until` (s) is predicted from that before."""
+    """Print the errors of models identified before the time `until` (s) of a record on the part after it."""
     v, y = record.voltage[axis], record.displacement[axis]
     predicted, left_out = [], []
     for kind in ("slpi", "pi"):

@@ -1,14 +1,15 @@
-"""From one simulated record to the next: what two records of a stage tell together, judged on a third one.
+"""Diagnosis from two simulated records of a stage, tested on a third record.
 
-advised: a record of one drive frequency is `ambiguous`; the drive that its diagnosis advises is recorded on the same
-stage, and both are diagnosed together. pairs: two effects, two records of one frequency each; the gain told of what
-other records share is compared with the fall of the free-run error on a record of a third frequency.
-Every record has an initial history, zero, hum and drift of its own.
+advised: the diagnosis of a record with one drive frequency is `ambiguous`; the excitation that it recommends is
+recorded on the same stage, and both records are diagnosed together. pairs: two effects, two records with one drive
+frequency each; the gain that the diagnosis states for effects common to all records is compared with the reduction of
+the free-run error on a third record at another frequency.
+Every record has its own initial history, zero offset, hum phase and drift.
 """
 
 import os
 
-# Before numpy is there: the processes share the cores.
+# To be set before NumPy is imported: the processes share the cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
@@ -41,24 +42,24 @@ from slpi_ros.io.tables import read_table
 
 FloatArray = NDArray[np.float64]
 
-# What a record of one frequency cannot tell apart.
+# Effects that a record with one frequency cannot distinguish.
 DYNAMIC = ("lag", "creep", "delay", "rate_dependence")
-# One frequency does not make a flexure ring, and what is each record's own has no gain on another.
+# One low frequency does not excite the resonance, and effects specific to one record have no gain on another record.
 PAIRS = [
     pair
     for pair in combinations([name for name in NAMES if name != "resonance"], 2)
     if set(pair) not in CONFUSABLE and not set(pair) <= set(OWN)
 ]
 FREQUENCIES, FASTER = (0.5, 3.0), (2.5, 6.0)
-# Draws of a seed until a first record is ambiguous, or until two records show both effects.
+# Maximum number of draws per seed to find a first record that is ambiguous, or two records that show both effects.
 TRIES = 8
-# Points of the gain.
+# Tolerance between stated and measured gain, percentage points.
 CLOSE = 10.0
 
 
 @dataclass(frozen=True)
 class Case:
-    """What to draw: `kind` is `advised` or `pair`; seconds and samples per second of every record."""
+    """Settings of a case: `kind` is `advised` or `pair`; duration `seconds` and sample `rate` (Hz) of every record."""
 
     kind: str
     seed: int
@@ -68,10 +69,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a case; `failure` is an error's message, or why there is nothing to judge.
+    """Result of a case; `failure` is an error message, or the reason why the case cannot be evaluated.
 
-    `first` is what the first record alone was said to hold, `told` and `measured` are gains in %, `kept` is in the
-    extended model, and `changed` that the stage is said to have changed, which it never has.
+    `first` contains the effects diagnosed from the first record alone, `told` and `measured` are the stated and the
+    measured gain in %, `kept` are the effects in the extended model. `changed` is True if the diagnosis reports that
+    the stage has changed, which is always wrong.
     """
 
     case: Case
@@ -96,7 +98,7 @@ class Outcome:
 
     @property
     def right(self) -> bool:
-        """Whether all that is hidden is named."""
+        """Whether all hidden effects are named."""
         return bool(self.named) and set(self.truth) <= set(self.named)
 
     @property
@@ -108,7 +110,7 @@ class Outcome:
         return abs(self.told - self.measured) <= CLOSE
 
     def line(self) -> str:
-        """Return the outcome in a line."""
+        """Return the result as one line of text."""
         start = f"{self.case.kind:<8}{self.case.seed:4d}  {'+'.join(self.truth):<32}"
         if self.failure:
             return f"{start} {self.failure}"
@@ -129,19 +131,19 @@ class Outcome:
 
 
 def run(case: Case) -> Outcome:
-    """Draw, record, diagnose, compare."""
+    """Run one case; errors become part of the result."""
     warnings.simplefilter("ignore")
     try:
         return advised(case) if case.kind == "advised" else pair(case)
     except slpi_ros.SlpiError as error:
         return Outcome(case, failure=f"refused: {error}")
-    # One broken case must not cost the hours of all others; it is printed and counts as not found.
+    # One failing case must not end a run of several hours; it is printed and counts as not found.
     except Exception as error:
         return Outcome(case, failure=f"{type(error).__name__}: {error}")
 
 
 def advised(case: Case) -> Outcome:
-    """Diagnose an ambiguous record, make the record that is advised, and diagnose both."""
+    """Diagnose an ambiguous record, simulate the record that the diagnosis recommends, and diagnose both."""
     name = DYNAMIC[case.seed % len(DYNAMIC)]
     for attempt in range(TRIES):
         hidden = hide(1000 * case.seed + attempt, [name], axes=1, samples=round(case.seconds * case.rate) + 1)
@@ -165,7 +167,7 @@ def advised(case: Case) -> Outcome:
 
 
 def advised_drive(next_experiment: str, case: Case) -> tuple[str, FloatArray | None]:
-    """Return the effect that the advised command is for and its voltages, by running it."""
+    """Run the recommended command; return the effect that it is intended for, and its voltages (None on failure)."""
     command = re.search(r"`slpi (excite .*?)`", next_experiment)
     if not command:
         return "", None
@@ -180,7 +182,7 @@ def advised_drive(next_experiment: str, case: Case) -> tuple[str, FloatArray | N
 
 
 def pair(case: Case) -> Outcome:
-    """Diagnose two records of one frequency each, and judge the gain on a third."""
+    """Diagnose two records with one frequency each, and test the stated gain on a third record."""
     for attempt in range(TRIES):
         rng = np.random.default_rng([case.seed, attempt, 2])
         names = PAIRS[int(rng.integers(len(PAIRS)))]
@@ -190,7 +192,7 @@ def pair(case: Case) -> Outcome:
             continue
         slow = log_uniform(rng, *FREQUENCIES)
         fast = slow * log_uniform(rng, *FASTER)
-        # Somewhat beyond the fast one, too.
+        # The third frequency may be somewhat above the fast one.
         third = log_uniform(rng, slow, 1.5 * fast)
         draws = [
             again(hidden, number, _voltages(hidden, case, frequency, rng), case.rate, from_rest=number == 3)
@@ -206,12 +208,12 @@ def pair(case: Case) -> Outcome:
     outcome, diagnosis = _diagnosed(Outcome(case, names), records, plain, axis)
     effects = diagnosis.axes[axis].effects
     shared = [each for each in effects if each.name in outcome.kept]
-    # Where the gain drifts, a hysteresis without effects holds the mean gain of its records, which a third one has not.
-    # One axis alone does not show what another one adds.
+    # With a gain drift, a hysteresis without effects has the mean gain of its records, not that of a third record. The
+    # simulation of a single axis does not contain cross-coupling.
     if not shared or {"gain_drift", "cross_coupling"} & set(names):
         return outcome
     told = 100.0 * (1.0 - np.prod([1.0 - each.gain_percent / 100.0 for each in shared]))
-    # What is the record's own, and was named before, is not in the error that the gain is a share of.
+    # The gain refers to an error without the record-specific effects that were named before.
     earlier = {each.name for each in effects[: effects.index(shared[0])]}
     judge = third_record(draws[2], axis, earlier)
     before, after = (free_run(model.axes[axis], judge, axis) for model in (plain, diagnosis.extended))
@@ -219,19 +221,19 @@ def pair(case: Case) -> Outcome:
 
 
 def visible(draws: Sequence[Hidden]) -> bool:
-    """Return whether records show each effect: no hysteresis that they share explains it."""
+    """Return whether the records show each effect, which means that a common hysteresis cannot explain it."""
     axis = draws[0].truth[0].axis
     v = np.concatenate([draw.record.voltage[axis] for draw in draws])
     for effects in zip(*(draw.truth for draw in draws), strict=True):
         signal = np.concatenate([each.contribution - each.contribution.mean() for each in effects])
-        # A clipped voltage is seen by its kink, which relays explain.
+        # A clipped voltage is visible by its kink, which the relays of this test can explain.
         if effects[0].name != "saturation" and beyond_hysteresis(v, signal) < SIZES[0] * draws[0].floor[axis]:
             return False
     return True
 
 
 def third_record(draw: Hidden, axis: str, without: set[str]) -> Record:
-    """Return a record of one axis once it has been over the whole range, without some of the effects in it."""
+    """Return a record without the given effects on one axis, with NaN until the axis has traversed its whole range."""
     v = draw.record.voltage[axis]
     gone = np.sum([each.contribution for each in draw.truth if each.name in without] or np.zeros((1, v.size)), axis=0)
     y = draw.record.displacement[axis] - gone
@@ -268,14 +270,14 @@ def _diagnosed(
 
 
 def cases(options: argparse.Namespace) -> Iterator[Case]:
-    """Yield the cases that the options ask for."""
+    """Yield the cases that the options select."""
     for kind in [options.only] if options.only else ("advised", "pair"):
         for seed in range(options.seed, options.seed + options.draws):
             yield Case(kind, seed, options.seconds, options.rate)
 
 
 def table(outcomes: Sequence[Outcome]) -> None:
-    """Print how often each effect is named, and the counts."""
+    """Print how often each effect is named, and the total counts."""
     for kind, wanted in (("advised", "28 of 30"), ("pair", "27 of 30")):
         drawn = [each for each in outcomes if each.case.kind == kind and each.drawn]
         if not drawn:

@@ -23,8 +23,8 @@ def scan_path(
     y_min, y_max : float, metres
         Limits of the path, which rises from `y_min`.
     duration : float, seconds
-        Time of the last sample, at least 4 s, divided equally into several tones, ramps as in a raster scan, and random
-        reversals.
+        Time of the last sample, at least 4 s, divided equally into a sum of sines, ramps as in a raster scan, and
+        random reversals.
     rate : float, hertz
         Samples per second.
     seed : int

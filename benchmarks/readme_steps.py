@@ -1,6 +1,6 @@
-"""README's way from a stage to its compensation, as written there, on simulated stages that were never driven before.
+"""Calibration and compensation as described in the README, on simulated stages that were never driven before.
 
-The commands are those of the page. Only ``ros2``, which need not be installed, is replaced: ``ros2 run`` by the
+The commands are taken from the README. Only ``ros2``, which need not be installed, is replaced: ``ros2 run`` by the
 installed programs, ``ros2 topic pub`` by a publisher of the same message at the same rate.
 """
 
@@ -31,17 +31,17 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 PROGRAMS = CHECKOUT / "install" / "slpi_ros" / "lib" / "slpi_ros"
 SECTION = re.compile(r"^## Calibrate a real stage.*?(?=^### )", re.DOTALL | re.MULTILINE)
 BLOCK = re.compile(r"^```\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-# Shares of the identified range that are asked for after README's own set point.
+# Set points after that of the README, as fractions of the identified range.
 SHARES = (0.85, 0.2, 0.65, 0.4)
-# States that are averaged at each set point, after half as many that are not: 8 nm of noise become 1.1 nm.
+# Readings averaged at each set point, after half as many are discarded: 8 nm of noise become 1.1 nm.
 READINGS = 50
 PATIENCE_S = 90.0
-# The graph shows a node a moment before its topics are connected, seconds.
+# Waiting time, seconds: a node appears in the ROS graph shortly before its topics are connected.
 SETTLE_S = 1.0
 
 
 def readme_commands() -> list[str]:
-    """Return the commands of README's section on calibration, in order, without comments."""
+    """Return the commands of the calibration section of the README, in order, without comments."""
     section = SECTION.search((CHECKOUT / "README.md").read_text())
     assert section, "README has no section on calibration"
     lines = [line for block in BLOCK.findall(section[0]) for line in block.splitlines()]
@@ -49,7 +49,7 @@ def readme_commands() -> list[str]:
 
 
 class Readme:
-    """A user who types README's commands in a folder; every program lives until it is interrupted."""
+    """Simulated user who executes commands of the README in a folder; every program runs until it is interrupted."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.commands = folder, readme_commands()
@@ -74,18 +74,18 @@ class Readme:
         self.memory = found[-1] if found else self.memory
 
     def close(self) -> None:
-        """End all programs, the last one first."""
+        """Interrupt all programs, in reverse order of their start."""
         while self._running:
             self.interrupt(self._running[-1])
         self.node.destroy_node()
 
     def command(self, words: str) -> str:
-        """Return the only command that begins with these words."""
+        """Return the only command of the README that begins with these words."""
         (found,) = [command for command in self.commands if command.startswith(words)]
         return found
 
     def start(self, words: str, more: str = "") -> subprocess.Popen[bytes]:
-        """Start the command that begins with these words, with `more` behind it; its console goes to a file."""
+        """Start the command that begins with these words, with the options `more`; its output is written to a file."""
         command = re.sub(r"^(ros2 run slpi_ros |(?=slpi ))", f"{PROGRAMS}/", self.command(words)) + " " + more
         with self.console(words).open("wb") as console:
             process = subprocess.Popen(
@@ -96,11 +96,11 @@ class Readme:
         return process
 
     def console(self, words: str) -> Path:
-        """Return the file that holds what the last such command has written."""
+        """Return the path of the file with the output of the last command that begins with these words."""
         return self.folder / (re.sub(r"\W+", "_", words) + ".log")
 
     def finish(self, words: str, process: subprocess.Popen[bytes]) -> str:
-        """Wait until a program has ended by itself; return what it wrote."""
+        """Wait until a program has ended by itself; return its output."""
         self.until(lambda: process.poll() is not None, f"the end of {words}")
         self._running.remove(process)
         said = self.console(words).read_text()
@@ -108,21 +108,21 @@ class Readme:
         return said
 
     def interrupt(self, process: subprocess.Popen[bytes]) -> None:
-        """Press Ctrl-C."""
+        """Interrupt a program by SIGINT, as Ctrl-C does."""
         self._running.remove(process)
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGINT)
         process.wait(PATIENCE_S)
 
     def until(self, done: Callable[[], object], what: str) -> None:
-        """Take part in the graph until something is so."""
+        """Spin the ROS node until `done` returns True; AssertionError after `PATIENCE_S` seconds."""
         deadline = time.monotonic() + PATIENCE_S
         while not done():
             assert time.monotonic() < deadline, f"waited in vain for {what}"
             rclpy.spin_once(self.node, timeout_sec=0.02)
 
     def spin(self, seconds: float) -> None:
-        """Take part in the graph for a while."""
+        """Spin the ROS node for some seconds."""
         deadline = time.monotonic() + seconds
         self.until(lambda: time.monotonic() >= deadline, "the time")
 
@@ -146,7 +146,7 @@ class Readme:
         return slpi_ros.load_model(self.folder / "stage.json")
 
     def compensator(self, more: str = "") -> subprocess.Popen[bytes]:
-        """Start the compensator and wait until the stage hears it."""
+        """Start the compensator and wait until its topics are visible."""
         process = self.start("ros2 run slpi_ros compensator", more)
         self.until(
             lambda: (
@@ -157,14 +157,15 @@ class Readme:
         return process
 
     def errors(self, model: slpi_ros.StageModel) -> FloatArray:
-        """Return how far the stage is off at README's set point and at others, shape (5,), % of the range."""
+        """Return the displacement errors at the set point of the README and at others, shape (5,), % of the range."""
         _, _, _, _, rate, topic, _, text = self.command("ros2 topic pub").split(maxsplit=7)
         low, high = model.axes["x"].displacement_range
         message = yaml.safe_load(text.strip('"'))
         points = [*map(float, message["position"]), *(low + share * (high - low) for share in SHARES)]
         publisher = self.node.create_publisher(JointState, topic, 100)
         self.until(publisher.get_subscription_count, topic)
-        sent, answers = [], []  # type: ignore[var-annotated]
+        sent: list[float] = []
+        answers: list[Float64MultiArray] = []
 
         def send() -> None:
             publisher.publish(JointState(name=message["name"], position=[point]))
@@ -173,9 +174,9 @@ class Readme:
         listener = self.node.create_subscription(Float64MultiArray, "/voltage_command", answers.append, 100)
         timer, found = self.node.create_timer(1.0 / float(rate), send), []
         for point in points:
-            # On a busy machine answers to what was sent before may still be under way.
-            before = len(sent)
-            self.until(lambda: len(answers) > before + 1, f"the voltage for {point} m")  # noqa: B023
+            # On a busy machine, answers to earlier messages may still arrive.
+            new = len(sent) + 2
+            self.until(lambda new=new: len(answers) >= new, f"the voltage for {point} m")
             self.readings.clear()
             self.until(lambda: len(self.readings) >= 3 * READINGS // 2, f"the stage at {point} m")
             found.append(float(np.mean(self.readings[READINGS // 2 :])) - point)
@@ -185,7 +186,7 @@ class Readme:
         return 100.0 * np.array(found) / (high - low)
 
     def reset(self) -> None:
-        """Call the compensator's reset and wait for its answer."""
+        """Call the service ``reset_memory`` of the compensator and wait for its response."""
         client = self.node.create_client(Trigger, "/compensator/reset_memory")
         self.until(client.service_is_ready, "reset_memory")
         answer = client.call_async(Trigger.Request())
@@ -194,13 +195,13 @@ class Readme:
         self.node.destroy_client(client)
 
     def warnings(self) -> list[str]:
-        """Return the lines by which the compensator warned."""
+        """Return the warnings and errors in the output of the compensator."""
         lines = self.console("ros2 run slpi_ros compensator").read_text().splitlines()
         return [line for line in lines if "[WARN]" in line or "[ERROR]" in line]
 
 
 def as_written(user: Readme, seed: int) -> tuple[slpi_ros.StageModel, FloatArray, list[str]]:
-    """Do what README says; return the model, the errors (% of the range) and the warnings of the compensator."""
+    """Execute the steps of the README; return the model, the errors (% of the range) and the compensator's warnings."""
     stage = user.stage(seed)
     model = user.calibrate()
     compensator = user.compensator()
@@ -211,7 +212,7 @@ def as_written(user: Readme, seed: int) -> tuple[slpi_ros.StageModel, FloatArray
 
 
 def next_day(user: Readme, seed: int, model: slpi_ros.StageModel) -> tuple[FloatArray, list[str]]:
-    """Start both anew, the stage as it was left a day before, with ``reset_on_start``; return errors and warnings."""
+    """Restart the stage one day later, and the compensator with ``reset_on_start``; return errors and warnings."""
     stage = user.stage(seed, f"-p initial_history:='{[round(v, 6) for v in user.turns]}'")
     compensator = user.compensator("-p reset_on_start:=true")
     user.memory = ""
@@ -223,7 +224,7 @@ def next_day(user: Readme, seed: int, model: slpi_ros.StageModel) -> tuple[Float
 
 
 def moved(user: Readme, seed: int, model: slpi_ros.StageModel, history: str, to: float) -> None:
-    """Print what follows where the stage was driven (V) before, stands at `to` (V), and is measured first."""
+    """Print the errors of a stage that was driven through `history` (V) to `to` (V) before one measurement is sent."""
     stage = user.stage(seed, f"-p initial_history:='{history}'")
     voltages = user.node.create_publisher(Float64MultiArray, "/voltage_command", 100)
     user.until(voltages.get_subscription_count, "the stage")
@@ -261,7 +262,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
     parser.add_argument("--moved", action="store_true", help="also stages that were moved after the record")
     options = parser.parse_args()
-    # On this machine only, and in a domain of its own.
+    # On this machine only, and in a separate ROS domain.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.setdefault("ROS_DOMAIN_ID", str(60 + os.getpid() % 40))
     rclpy.init()

@@ -1,8 +1,9 @@
-"""From one measured record to the next: what a diagnosis finds on some records, judged on others of the same stage.
+"""Transfer between measured records: diagnose some records of a stage, test the extended model on its other records.
 
-Errors are free-run, without the constant of each record, in % of its stroke: of a classical Prandtl-Ishlinskii model,
-of a loop family, and of that extended by what the diagnosis found; all are fitted to the same records. Drift and hum
-belong to the record they were found on and are left out. The folder of measured data is that of SLPI_MEASURED_DATA.
+Errors are those of a free-run simulation, without the constant offset of each record, in % of its stroke. The models
+are a classical Prandtl-Ishlinskii model, a loop family, and the loop family extended by the diagnosed effects, all
+fitted to the same records. Drift and hum are specific to a record and are left out. The environment variable
+SLPI_MEASURED_DATA gives the folder of the measured data.
 """
 
 import argparse
@@ -29,11 +30,11 @@ STAGES = {
 
 
 def free_run(model: AxisModel, record: Record, axis: str) -> float:
-    """Return the error, % of the stroke, from the initial history (never moved, or after a long fall) that suits."""
+    """Return the error, % of the stroke, for the best of the possible initial histories (such as never moved)."""
     v, y = record.voltage[axis], record.displacement[axis]
     known = np.isfinite(y)
     shared = replace(model, effects=tuple(effect for effect in model.effects if effect.removable != "record"))
-    # What creeps on from before a record is the record's own, as its initial history.
+    # Creep that continues from before a record is specific to the record, like its initial history.
     settled = replace(
         shared,
         effects=tuple(replace(one, initial=0.0) if isinstance(one, Creep) else one for one in shared.effects),
@@ -47,13 +48,13 @@ def free_run(model: AxisModel, record: Record, axis: str) -> float:
 
 
 def splits(names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield every choice of records that leaves one out."""
+    """Yield every selection of records that leaves at least one out."""
     for count in range(1, len(names)):
         yield from combinations(names, count)
 
 
 def judge(records: dict[str, Record], fitted: tuple[str, ...]) -> None:
-    """Print what is found on some records, and the errors on all."""
+    """Diagnose the records named in `fitted`; print the effects found, and the errors of the models on all records."""
     began, chosen = time.perf_counter(), [records[name] for name in fitted]
     axis = chosen[0].axes[0]
     plain, classical = (slpi_ros.identify(chosen, kind) for kind in ("slpi", "pi"))
@@ -76,7 +77,7 @@ def judge(records: dict[str, Record], fitted: tuple[str, ...]) -> None:
 
 
 def main() -> None:
-    """Judge every choice of records of every stage."""
+    """Test every selection of records of every stage."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", choices=STAGES, help="this stage alone")
     options = parser.parse_args()

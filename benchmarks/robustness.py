@@ -1,7 +1,7 @@
-"""How well an unseen path is followed when the record is spoiled, beside a clean record, on simulated stages.
+"""Errors on a path that was not recorded, for disturbed records compared with clean ones, on simulated stages.
 
-Mean and maximum error against the true displacement, in % of stroke; the ratio to the clean record's error, of all
-seeds together and of the worst one.
+Mean and maximum error against the true displacement, in % of the stroke; ratio to the error with the clean record, for
+all seeds together and for the worst seed.
 """
 
 import argparse
@@ -20,13 +20,14 @@ PATH_SECONDS = 40.0
 
 @dataclass(frozen=True)
 class Recording:
-    """What a calibration gave.
+    """Result of a calibration run.
 
     Parameters
     ----------
     t, v, true, measured : ndarray, shape (N,), seconds, volts and metres
+        Time, voltage, true and measured displacement.
     before : ndarray, shape (M,), volts
-        What moved the stage before the record began.
+        Voltages applied before the record began.
     """
 
     t: FloatArray
@@ -44,12 +45,12 @@ def _with(recording: Recording, **changes: FloatArray) -> Recording:
 
 
 def clean(recording: Recording, rng: np.random.Generator, seed: int) -> Recording:
-    """Return it as it is."""
+    """Return the recording unchanged."""
     return recording
 
 
 def outliers(recording: Recording, rng: np.random.Generator, seed: int) -> Recording:
-    """Make 5 % of the readings ten times as noisy."""
+    """Add noise to 5 % of the readings, ten times as large as the sensor noise."""
     y = recording.measured.copy()
     hit = rng.random(y.size) < 0.05
     y[hit] += rng.normal(0.0, 10 * NOISE, np.count_nonzero(hit))
@@ -57,7 +58,7 @@ def outliers(recording: Recording, rng: np.random.Generator, seed: int) -> Recor
 
 
 def stale(recording: Recording, rng: np.random.Generator, seed: int) -> Recording:
-    """Repeat the reading before, 1 % of all."""
+    """Replace 1 % of the readings by the previous reading."""
     y = recording.measured.copy()
     hit = 1 + np.flatnonzero(rng.random(y.size - 1) < 0.01)
     y[hit] = y[hit - 1]
@@ -65,25 +66,25 @@ def stale(recording: Recording, rng: np.random.Generator, seed: int) -> Recordin
 
 
 def drop_outs(recording: Recording, rng: np.random.Generator, seed: int) -> Recording:
-    """Lose 2 % of the readings."""
+    """Replace 2 % of the readings by NaN."""
     return _with(recording, measured=np.where(rng.random(recording.t.size) < 0.02, np.nan, recording.measured))
 
 
 def coarse(recording: Recording, rng: np.random.Generator, seed: int) -> Recording:
-    """Read displacement and voltage with 12 bits of their range."""
+    """Quantize displacement and voltage with 12 bits over their range."""
     y, v = (np.round(x / step) * step for x, step in ((recording.measured, 25e-6 / 4096), (recording.v, V_MAX / 4096)))
     return _with(recording, measured=y, v=v)
 
 
 def jitter(recording: Recording, rng: np.random.Generator, seed: int) -> Recording:
-    """Read the displacement up to 20 % of the period away from its stamp."""
+    """Sample the displacement up to 20 % of the sampling period before or after its stamp."""
     t, period = recording.t, recording.t[1] - recording.t[0]
     true = np.interp(t + rng.uniform(-0.2, 0.2, t.size) * period, t, recording.true)
     return _with(recording, measured=true + (recording.measured - recording.true))
 
 
 def unknown_memory(recording: Recording, rng: np.random.Generator, seed: int) -> Recording:
-    """Move the stage about before the record begins."""
+    """Move the stage to random levels before the record begins."""
     turns = np.concatenate([[0.0], rng.uniform(0.0, V_MAX, 7), [recording.v[0]]])
     before = np.interp(np.arange(0.0, 8.0, 0.02), np.arange(9), turns)
     stage = fresh(seed)
@@ -93,7 +94,7 @@ def unknown_memory(recording: Recording, rng: np.random.Generator, seed: int) ->
 
 
 def mid_loop(recording: Recording, rng: np.random.Generator, seed: int) -> Recording:
-    """Begin to record when the drive is under way."""
+    """Begin the record in the middle of a loop of the excitation."""
     within = (recording.v > 0.2 * V_MAX) & (recording.v < 0.8 * V_MAX)
     within &= (recording.t > 0.04 * recording.t[-1]) & (recording.t < 0.15 * recording.t[-1])
     first = int(rng.choice(np.flatnonzero(within)))
@@ -103,7 +104,7 @@ def mid_loop(recording: Recording, rng: np.random.Generator, seed: int) -> Recor
 
 
 def voltage_noise(recording: Recording, rng: np.random.Generator, seed: int) -> Recording:
-    """Read the voltage back with noise of 0.05 % of its range."""
+    """Add noise of 0.05 % of the range to the recorded voltage."""
     return _with(recording, v=recording.v + rng.normal(0.0, 0.0005 * V_MAX, recording.v.size))
 
 
@@ -121,13 +122,13 @@ CASES: dict[str, tuple[Spoil, float]] = {
 
 
 def recorded(seed: int, duration: float, rate: float) -> Recording:
-    """Drive the stage of a seed."""
+    """Return the calibration run of the stage for a seed."""
     t, v = calibration_drive(0.0, V_MAX, duration=duration, rate=rate, seed=seed)
     return Recording(t, v, *fresh(seed).run(t, v))
 
 
 def unseen_errors(recording: Recording, seed: int, rate: float, low: float, high: float) -> FloatArray:
-    """Identify the stage, follow an unseen path from where the record began; sizes of the errors, shares of stroke."""
+    """Identify the stage and follow a path that was not recorded; return absolute errors as fractions of the stroke."""
     model = slpi_ros.identify(record_of(recording.t, recording.v, recording.measured))
     t, desired = scan_path(low, high, duration=PATH_SECONDS, rate=rate, seed=1000 + seed)
     stage = fresh(seed)

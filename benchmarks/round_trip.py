@@ -1,4 +1,4 @@
-"""Nodes in processes of their own, and a client that sends them desired displacements and times their answers."""
+"""Nodes in separate processes, and a client that sends them desired displacements and measures their latency."""
 
 import json
 import os
@@ -32,7 +32,7 @@ FloatArray = NDArray[np.float64]
 
 HERE = Path(__file__).resolve().parent
 AXES = ("x", "y")
-# Deep enough that nothing is lost on the client's side.
+# Deep enough that the client loses no message.
 DEEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
 DISCOVERY_S, LAST_ANSWERS_S = 20.0, 5.0
 
@@ -47,7 +47,7 @@ def identified_stage() -> StageModel:
 
 @contextmanager
 def node(namespace: str, *command: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a node in a session of its own; end it at last."""
+    """Run a node in a separate session; terminate it at the end of the ``with`` block."""
     options = [] if "--ros-args" in command else ["--ros-args"]
     remapping = ["-r", f"__ns:=/{namespace}"]
     process = subprocess.Popen([sys.executable, *command, *options, *remapping], start_new_session=True)
@@ -86,17 +86,18 @@ def echo(namespace: str, kind: str = "echo", executor: str = "events") -> Iterat
 
 @dataclass
 class Trip:
-    """What became of the messages to one node.
+    """Result of a measurement: messages sent to one node, and its answers.
 
     Parameters
     ----------
     latency : list of ndarray, seconds
-        Of the answers, block by block.
+        Latencies of the answers, one array for each block of messages.
     sent, answered : int
+        Number of messages sent and answered.
     busy, took : float, seconds
-        Processor time of the node, and time in all.
+        Processor time of the node, and total time.
     resident : list of int, bytes
-        Memory of the node, once a second.
+        Resident memory of the node, sampled once a second.
     """
 
     latency: list[FloatArray] = field(default_factory=list)
@@ -108,24 +109,24 @@ class Trip:
 
     @property
     def lost(self) -> int:
-        """Messages without an answer."""
+        """Number of messages without an answer."""
         return self.sent - self.answered
 
     @property
     def cpu(self) -> float:
-        """Share of a core that the node took."""
+        """Fraction of one processor core that the node used."""
         return self.busy / self.took
 
     def percentiles(self) -> tuple[float, float]:
-        """Return p50 and p99 in microseconds."""
+        """Return median and 99th percentile of the latency, microseconds."""
         p50, p99 = np.percentile(np.concatenate(self.latency or [[np.nan]]) * 1e6, (50, 99))
         return float(p50), float(p99)
 
 
 class Client:
-    """Sends at a steady rate and receives in between, in one thread: its own delay is the same for every node.
+    """Client that sends at a constant rate and receives in the same thread: its delay is the same for all nodes.
 
-    Messages go and come as bytes, so that the client leaves as much as possible of the machine to the nodes.
+    Messages are sent and received in serialised form, so that the client takes little processor time from the nodes.
     """
 
     def __init__(self, namespaces: Sequence[str]) -> None:
@@ -147,12 +148,12 @@ class Client:
         self._index = 0
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Shut down the executor and the node of the client."""
         self._executor.shutdown()
         self._node.destroy_node()
 
     def wait_for_nodes(self) -> None:
-        """Return once all nodes are there, and have answered for a second."""
+        """Wait until all nodes are discovered, then send messages to each of them for one second as a warm-up."""
         deadline = time.monotonic() + DISCOVERY_S
         for namespace, publisher in self._publishers.items():
             answers = f"/{namespace}/voltage_command"
@@ -166,7 +167,7 @@ class Client:
             self._drain(len(self._send_for(namespace, 1000.0, 1.0, [])))
 
     def run(self, namespace: str, process: subprocess.Popen[bytes], rate: float, seconds: float, trip: Trip) -> None:
-        """Send for a while to the node that `process` is, and note what becomes of it."""
+        """Send messages for some `seconds` at `rate` (Hz) to a node running in `process`; add the results to `trip`."""
         self._received.clear()
         busy, began = _cpu_seconds(process.pid), time.monotonic()
         sent = self._send_for(namespace, rate, seconds, trip.resident, process.pid)
@@ -175,7 +176,7 @@ class Client:
         trip.busy += _cpu_seconds(process.pid) - busy
         trip.sent += len(sent)
         trip.answered += len(self._received)
-        # Answers do not tell what they answer: after a loss they cannot be matched.
+        # Answers do not identify the message that they answer: after a loss they cannot be matched.
         if len(self._received) == len(sent):
             trip.latency.append((np.array(self._received) - np.array(sent)) * 1e-9)
 
@@ -196,7 +197,7 @@ class Client:
             sent.append(time.perf_counter_ns())
             if pid and k % round(rate) == 0:
                 resident.append(_resident(pid))
-            # Late for the next: still look for answers now and then.
+            # When sending is late, the loop above does not spin: still receive answers from time to time.
             if k % 8 == 0:
                 self._executor.spin_once(timeout_sec=0.0)
         return sent

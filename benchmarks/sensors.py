@@ -1,8 +1,8 @@
-"""What a diagnosis makes of what the sensor does, on simulated stages that have no effect but that.
+"""Diagnosis of records with sensor imperfections, on simulated stages without other effects.
 
-Coarse sensors (50 to 1000 digits over the stroke), sensors at the end of their range, pure delays at one speed and one
-frequency, and late or mixed readings with and without a gain drift. An unseen path is then simulated by the plain and
-by the extended model: errors against the true displacement, without their constant.
+Coarse sensors (50 to 1000 steps over the stroke), sensors that saturate, pure delays at one speed and one frequency,
+and late or mixed readings with and without a gain drift. A path that was not recorded is then simulated by the plain
+and by the extended model; errors are relative to the true displacement, without their constant offset.
 """
 
 import argparse
@@ -20,22 +20,24 @@ from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.excitation.drives import calibration_drive
 
 RATE, SECONDS, UNSEEN = 100.0, 30.0, 20.0
-# Shares of late or mixed readings, readings from turn to turn, and gain drift.
+# Fractions of late or mixed readings, number of readings between two reversals, and gain drift.
 SHARES, MOVES, DRIFT = (0.05, 0.11, 0.2), (16, 40, 100), -0.024
 
 
 @dataclass(frozen=True)
 class Draw:
-    """What was recorded, and what is true.
+    """A simulated record and its true properties.
 
     Parameters
     ----------
     t, v, y : ndarray, shape (N,), seconds, volts and metres
+        Time, voltage and reading.
     allowed : set of str
-        Causes that are not invented.
+        Causes that do not count as invented.
     delay : float, seconds
+        Delay of the displacement.
     share : float
-        Of late or mixed readings.
+        Fraction of late or mixed readings.
     """
 
     t: FloatArray
@@ -47,7 +49,7 @@ class Draw:
 
 
 def coarse(seed: int, number: int) -> Draw:
-    """Return the readings of a sensor with digits."""
+    """Return a record of a sensor with coarse resolution."""
     t, v = calibration_drive(0.0, V_MAX, duration=SECONDS, rate=RATE, seed=seed)
     _, y = fresh(seed).run(t, v)
     digit = np.ptp(y) / (50.0 * 20.0 ** np.random.default_rng(seed).random())
@@ -55,7 +57,7 @@ def coarse(seed: int, number: int) -> Draw:
 
 
 def clipped(seed: int, number: int) -> Draw:
-    """Return the readings of a sensor that ends before the stroke does, above, below or both."""
+    """Return a record of a sensor that saturates within the stroke, at the top, at the bottom or at both."""
     t, v = calibration_drive(0.0, V_MAX, duration=SECONDS, rate=RATE, seed=seed)
     _, y = fresh(seed).run(t, v)
     margins = np.random.default_rng(seed).uniform(0.02, 0.1, 2) * [number % 3 != 0, number % 3 != 1]
@@ -63,7 +65,7 @@ def clipped(seed: int, number: int) -> Draw:
 
 
 def delayed(seed: int, number: int) -> Draw:
-    """Return readings that come 20 to 200 ms late, of equal triangles."""
+    """Return a record of equal triangles with readings that are delayed by 20 to 200 ms."""
     t, delay = np.arange(0.0, SECONDS, 1.0 / RATE), 0.02 * 10.0 ** np.random.default_rng(seed).random()
     v = triangles(t * RATE, 150)
     _, y = fresh(seed).run(t, np.interp(t - delay, t, v))
@@ -71,7 +73,7 @@ def delayed(seed: int, number: int) -> Draw:
 
 
 def mixed(seed: int, number: int) -> Draw:
-    """Return readings that are mixed with the one before or behind, on half of the draws with a gain drift."""
+    """Return a record in which readings are mixed with the previous or next one; every second draw has a gain drift."""
     random, share = np.random.default_rng(seed), (0.0, *SHARES)[number // 2 % 4]
     k = np.arange(SECONDS * RATE)
     v = triangles(k, MOVES[number % len(MOVES)])
@@ -85,7 +87,7 @@ def mixed(seed: int, number: int) -> Draw:
 
 
 def triangles(k: FloatArray, move: int) -> FloatArray:
-    """Return a voltage, shape (N,), that goes up and down in `move` samples each, at sample numbers `k`."""
+    """Return a triangular voltage, shape (N,), at the sample numbers `k`; each ramp takes `move` samples."""
     return V_MAX * (1.0 - np.abs((k / move) % 2.0 - 1.0))
 
 
@@ -99,7 +101,7 @@ DRAWS: dict[str, tuple[Callable[[int, int], Draw], int]] = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a diagnosis said, and the errors of both models, in % of the stroke."""
+    """Result of a diagnosis, and the errors of the plain and the extended model, in % of the stroke."""
 
     verdict: str
     causes: tuple[str, ...]

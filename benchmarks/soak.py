@@ -1,4 +1,4 @@
-"""The compensator under load for minutes: messages lost, memory, and the rate at which it can no longer follow."""
+"""The compensator under load for minutes: lost messages, memory use, and the message rate that it cannot sustain."""
 
 import argparse
 import os
@@ -8,17 +8,17 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 from round_trip import Client, Trip, compensator, identified_stage
 
-# At 5 kHz the usual depth of 100 bridges 20 ms: on a machine with two cores others may take longer than that.
+# At 5 kHz the usual queue depth of 100 covers 20 ms; on a machine with two cores, other processes may run longer.
 DEEP = {
     f"qos_overrides./soak/{topic}.{side}.depth": 20_000
     for topic, side in (("desired_displacement", "subscription"), ("voltage_command", "publisher"))
 }
-# Seconds until all that is made once has been made.
+# Warm-up time, seconds, after which growth of the memory is measured.
 WARM = 30
 
 
 def described(trip: Trip, rate: float) -> str:
-    """Return one line of the table."""
+    """Return the line of the table for one rate (Hz)."""
     p50, p99 = trip.percentiles()
     resident = np.array(trip.resident[min(WARM, len(trip.resident) // 2) :])
     grown = (resident[-1] - resident[0]) / 1024

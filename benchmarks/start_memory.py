@@ -1,7 +1,7 @@
-"""Records of one stage from different memories: a change must be told where there is one, and only there.
+"""Records of one stage with different initial histories: a change must be reported if, and only if, there is one.
 
-A stage is identified, then recorded again for a few seconds, each time after another drive: unchanged, with another
-gain, and with another zero.
+A stage is identified, then recorded again for a few seconds, each time after other voltages: unchanged, with another
+gain, and with another zero offset.
 """
 
 import argparse
@@ -21,14 +21,14 @@ from slpi_ros.simulation.preisach import PreisachStage
 
 FloatArray = NDArray[np.float64]
 RATE, NOISE, GAIN, ZERO = 200.0, 8e-9, 0.01, 0.3e-6
-# Relative gain and zero (m) of the stage when it is recorded again.
+# Relative gain and zero offset (m) of the stage when it is recorded again.
 CASES = {"unchanged": (1.0, 0.0), "gain": (1.0 + GAIN, 0.0), "zero": (1.0, ZERO)}
-# What a figure that is told may be off by, as a share of it.
+# Relative tolerance of a reported change.
 WITHIN = 0.2
 
 
 def record(seed: int, t: FloatArray, v: FloatArray, before: FloatArray, gain: float, zero: float) -> slpi_ros.Record:
-    """Return a record of a stage, never moved but by `before` (V), of a relative gain and with a zero (m)."""
+    """Return a record of a stage with a relative gain and a zero offset (m), after the voltages `before` (V) only."""
     own = StageParameters.random(seed)
     stage = PreisachStage(replace(own, noise_rms=NOISE, stroke=gain * own.stroke), seed)
     stage.run(np.arange(before.size) / RATE - 1e4, before)
@@ -37,19 +37,19 @@ def record(seed: int, t: FloatArray, v: FloatArray, before: FloatArray, gain: fl
 
 
 def drives(number: int, seconds: float, random: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times (s) and voltages (V) of a record, and voltages (V) that went before it."""
+    """Return times (s) and voltages (V) of a record, and the voltages (V) applied before it."""
     turns = random.uniform(0.0, 100.0, 12)
     before = np.interp(np.arange(2400), np.linspace(0, 2399, turns.size), turns)
     t, v = calibration_drive(0.0, 100.0, duration=seconds, rate=RATE, seed=100 + number)
     if number % 2:
-        # A sine that grows about where the stage is, to a share of the range that differs.
+        # A sine of growing amplitude about the middle of the range, up to a random fraction of the range.
         reach = random.uniform(0.2, 0.5)
         v = 50.0 + 100.0 * reach * np.minimum(1.0, t / t[-1]) * np.sin(2.0 * np.pi * 0.5 * t)
     return t, v, np.append(before, v[0])
 
 
 def judged(case: str, model: slpi_ros.StageModel, again: slpi_ros.Record, whole: bool) -> dict[str, str]:
-    """Return what each says of a record of the `whole` range or of a part of it, where that is wrong, else ""."""
+    """Return the wrong result of each function for a record of the `whole` range or of a part of it; "" if correct."""
     found = match(model.axes["x"], select_samples(again, "x", None, None))
     matched = (
         f"gain {found.gain_change:+.3%} +- {found.gain_uncertainty:.3%}, width {found.width_change:+.2%} +- "
@@ -57,7 +57,7 @@ def judged(case: str, model: slpi_ros.StageModel, again: slpi_ros.Record, whole:
         f"error {found.rms * 1e9:.1f} nm"
     )
     if case == "zero":
-        # A record of a part of the range cannot tell a moved zero from another history.
+        # A record of a part of the range cannot distinguish a shifted zero from another history.
         off = abs(found.offset - ZERO)
         right = found.zero_moved and off <= WITHIN * ZERO if whole else off <= found.offset_uncertainty
         return {"match": "" if right else matched}
@@ -77,7 +77,7 @@ def judged(case: str, model: slpi_ros.StageModel, again: slpi_ros.Record, whole:
 
 
 def main() -> None:
-    """Print how often a change is told."""
+    """Print how often each function gives the correct result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=10, help="stages")
     parser.add_argument("--seed", type=int, default=0, help="of the first stage")

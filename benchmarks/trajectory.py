@@ -1,6 +1,6 @@
-"""A trajectory of a million points on two axes: how long the compensator takes to accept it, and how it keeps time.
+"""A trajectory of a million points on two axes: time until the compensator accepts it, and deadline errors of points.
 
-Points are 1 ms apart, and the path of each axis turns every 25 of them.
+Points are 1 ms apart, and the path of each axis reverses every 25 points.
 """
 
 import argparse
@@ -27,17 +27,17 @@ from slpi_ros.nodes.common import make_executor
 FloatArray = NDArray[np.float64]
 
 POINTS, REVERSALS, PERIOD_NS, SECOND_NS = 1_000_000, 40_000, 1_000_000, 1_000_000_000
-# On the wire: two positions with their count, three empty arrays, a time.
+# Layout of a serialised point: two positions with their count, three empty arrays, a time.
 POINT = np.dtype([("count", "=u4"), ("positions", "=f8", 2), ("empty", "=u4", 3), ("time", "=u4", 2)])
 STATUS = "/bench/compensator: compensator"
 PATIENCE_S, HOUR_S = 60.0, 3600.0
-# Long enough for the report of the second in which a trajectory came.
+# Long enough to receive the diagnostics of the second in which a trajectory arrived.
 REPORTED_S = 2.5
 LATENESS = [f"deadline_error_{which}_us" for which in ("p50", "p99", "max")]
 
 
 def paths(model: StageModel) -> FloatArray:
-    """Return a path for each axis, shape (POINTS, axes), metres, through turns on all levels."""
+    """Return a path for each axis, shape (POINTS, axes), metres, with reversals at random levels."""
     columns = []
     for seed, axis in enumerate(AXES):
         low, high = model.axis(axis).displacement_range
@@ -47,14 +47,14 @@ def paths(model: StageModel) -> FloatArray:
 
 
 def serialized(positions: FloatArray, start: float = 0.0) -> bytes:
-    """Return a JointTrajectory as bytes: of a million objects it would take a minute to build.
+    """Return a serialised JointTrajectory; with a million point objects, building it would take a minute.
 
-    It starts at once, or at a time of the system's clock, seconds.
+    It starts at once, or at the time `start` (s) of the system clock.
     """
     first = JointTrajectoryPoint(positions=positions[0].tolist())
     header = Header(stamp=Time(sec=int(start)))
     message = bytearray(serialize_message(JointTrajectory(header=header, joint_names=AXES, points=[first])))
-    # Behind the first point, whose numbers may be aligned differently, all look alike.
+    # All points after the first one, which may be aligned differently, have the same layout.
     first_at = message.index(positions[0].tobytes())
     rest = np.zeros(POINTS - 1, POINT)
     rest["count"], rest["positions"] = len(AXES), positions[1:]
@@ -65,7 +65,7 @@ def serialized(positions: FloatArray, start: float = 0.0) -> bytes:
 
 
 class Bench:
-    """Sends trajectories to one compensator, and reads its diagnostics."""
+    """Client that sends trajectories to a compensator and receives its diagnostics."""
 
     def __init__(self) -> None:
         self._node = rclpy.create_node("trajectory_bench")
@@ -78,14 +78,14 @@ class Bench:
         self._spin_until(lambda: self.reports and self._publisher.get_subscription_count(), "the compensator")
 
     def send(self, trajectory: bytes) -> float:
-        """Return the seconds from sending a trajectory to the report of it."""
+        """Send a trajectory; return the time (s) until the diagnostics report it."""
         began, self._sent = time.monotonic(), self._sent + 1
         self._publisher.publish(trajectory)
         self._spin_until(lambda: self._reported == str(self._sent), "the trajectory")
         return time.monotonic() - began
 
     def watch(self, seconds: float) -> list[dict[str, str]]:
-        """Return the reports of a while."""
+        """Return the diagnostics received during some seconds."""
         self.reports.clear()
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -107,7 +107,7 @@ class Bench:
 
 
 def main(seconds: float = 30.0, tries: int = 3) -> None:
-    """Print what was measured."""
+    """Print the results."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     model = identified_stage()
     positions, stop = paths(model), serialize_message(JointTrajectory())
@@ -119,7 +119,7 @@ def main(seconds: float = 30.0, tries: int = 3) -> None:
         for _ in range(tries):
             accepted.append(bench.send(message))
             reports = bench.watch(seconds if len(accepted) == tries else 1.0)
-            # The next one starts in an hour: the points of the first go on, and are late by what its check takes.
+            # The next trajectory starts in an hour: points of the first one continue, delayed by its validation.
             bench.send(serialized(positions, time.time() + HOUR_S))
             held_up.append(max(float(report[LATENESS[-1]] or 0.0) for report in bench.watch(REPORTED_S)))
             bench.send(stop)

@@ -1,7 +1,7 @@
 """A simulated XY stage driven through the compensator over DDS: the MPI paper's five segments, and a scan in open loop.
 
-Both nodes are processes of their own. Time is simulated, and a sample is sent once the stage has answered the one
-before, so that no figure depends on how busy the machine is.
+Both nodes run in separate processes. Time is simulated, and each sample is sent after the stage has answered the
+previous one, so that the results do not depend on the load of the machine.
 """
 
 import time
@@ -36,12 +36,12 @@ FloatArray = NDArray[np.float64]
 DEPTH = QoSProfile(depth=100)
 SECOND_NS = 1_000_000_000
 FIRST_ANSWER_S = 5.0
-# Of the quasi-static stage, on which the model knows no more than 100 V.
+# Scan of the quasi-static stage: seed, duration (s) and sample rate (Hz).
 SEED, SCAN_S, SCAN_RATE = 3, 30.0, 200.0
 
 
 class XyStage:
-    """Both nodes, taken from sample to sample."""
+    """Client that drives the simulator and the compensator sample by sample, in simulated time."""
 
     def __init__(self) -> None:
         self._node = rclpy.create_node("xy_bench")
@@ -55,18 +55,18 @@ class XyStage:
         self._now_ns = 0
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Shut down the executor and the node of the client."""
         self._executor.shutdown()
         self._node.destroy_node()
 
     def warm_up(self, amplitude: float) -> list[float]:
-        """Drive cycles at 1 Hz down to 0 V past the compensator; return the readings (m) at their end."""
+        """Drive the stage without compensator through cycles at 1 Hz that end at 0 V; return the last readings (m)."""
         for v in (*triangles(amplitude, 1.0, WARM_UP, RECORD_SAMPLES)[1].tolist(), 0.0):
             state = self._ask(self._voltages, Float64MultiArray(data=[v] * len(AXES)), RECORD_SAMPLES)
         return state
 
     def follow(self, desired: FloatArray, rate: float) -> FloatArray:
-        """Return the readings, shape (N, axes), along desired displacements, shape (N, axes), metres."""
+        """Return the readings for desired displacements, both of shape (N, axes), metres."""
         states, message = [], JointState(name=list(AXES))
         for row in desired.tolist():
             message.position = row
@@ -74,7 +74,7 @@ class XyStage:
         return np.array(states)
 
     def _ask(self, publisher: Publisher, message: Float64MultiArray | JointState, rate: float) -> list[float]:
-        """Let time pass, send a message, and return the readings that answer it."""
+        """Advance the simulated clock, send a message, and return the readings that the stage publishes in response."""
         self._states.clear()
         while not self._states:
             self._now_ns += round(SECOND_NS / rate)
@@ -83,7 +83,7 @@ class XyStage:
             if isinstance(message, JointState):
                 message.header.stamp = now
             publisher.publish(message)
-            # Until all know of each other, the first one may have to be sent again.
+            # Until discovery is complete, the first message may have to be sent again.
             self._spin_for(FIRST_ANSWER_S)
         return self._states[0]
 
@@ -98,7 +98,7 @@ class XyStage:
 
 @contextmanager
 def simulator(**parameters: object) -> Iterator[XyStage]:
-    """Run the simulated stage, on simulated time."""
+    """Run the simulated stage on the simulated clock."""
     given = {"axes": list(AXES), "use_sim_time": True, **parameters}
     options = [part for name, value in given.items() for part in ("-p", f"{name}:={value}".replace("'", '"'))]
     with node("bench", "-m", "slpi_ros.nodes.stage_simulator", "--ros-args", *options):
@@ -110,7 +110,7 @@ def simulator(**parameters: object) -> Iterator[XyStage]:
 
 
 def segments(models: Mapping[str, slpi_ros.AxisModel], feedback: bool) -> str:
-    """Follow the five segments on the stage that creeps and rings; return what was measured."""
+    """Follow the five segments on the stage with creep and resonance; return the errors as text."""
     top = max(RECORD)
     stages = p11_stage().axes
     gains = [tune(stages[axis].parameters, models[axis].displacement_range[1] / top) for axis in AXES]
@@ -127,7 +127,7 @@ def segments(models: Mapping[str, slpi_ros.AxisModel], feedback: bool) -> str:
 
 
 def scan() -> str:
-    """Scan a stage that has hysteresis only, without feedback; return what was measured."""
+    """Scan a stage that has hysteresis only, without feedback; return the errors as text."""
     t, v = calibration_drive(0.0, 100.0, duration=120.0, rate=200.0, seed=SEED)
     drawn = Stage.random(AXES, SEED).axes
     stamps = np.round(t * 1e9).astype(np.int64)
@@ -146,14 +146,14 @@ def scan() -> str:
 
 
 def described(errors: FloatArray) -> str:
-    """Say how large errors, shape (N, axes), metres, are."""
+    """Return mean and maximum of errors, shape (N, axes), metres, as text."""
     apart = np.abs(errors) * 1e6
     means = ", ".join(f"{axis} {mean:.4f} um" for axis, mean in zip(AXES, apart.mean(axis=0), strict=True))
     return f"{len(errors)} samples, mean error {means}; max {apart.max():.3f} um"
 
 
 def main() -> None:
-    """Print what was measured."""
+    """Print the results."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     np.set_printoptions(precision=3)
     models = {}

@@ -1,6 +1,6 @@
 """Hysteresis compensation for piezo stages: identify a model from a bag, simulate it, invert it.
 
-SLPI is the Separated Level-loop Prandtl-Ishlinskii model. Nothing here needs a running ROS graph.
+SLPI is the Separated Level-loop Prandtl-Ishlinskii model. The names exported here do not need a running ROS graph.
 """
 
 from importlib import import_module
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from slpi_ros.model.document import load_model, save_model
     from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
 
-# Imported at first use: a node that streams needs neither the identification nor the diagnosis.
+# Imported at first use: the compensator needs neither the identification nor the diagnosis.
 _MODULES = {
     "AxisModel": "model.axis_model",
     "HeldAtLimitWarning": "model.stage_model",

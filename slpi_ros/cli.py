@@ -1,6 +1,7 @@
 """The command line ``slpi``, usable without a running ROS graph.
 
-Exit codes: 0 success, 1 the data do not allow the request, 2 wrong usage. Errors are reported on one line.
+Exit codes: 0 success, 1 the data do not allow the request or a verification failed, 2 wrong usage. Errors are reported
+on one line.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from slpi_ros.errors import ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.identification.progress import shown_on
 
-# What a command needs is imported where it begins: numerics and plotting are slow to load.
+# Each command imports its modules when it runs: the numerical and plotting modules load slowly.
 if TYPE_CHECKING:
     from slpi_ros.identification.record_quality import Finding
     from slpi_ros.io.alignment import SeparateTopics
@@ -54,12 +55,12 @@ class _UniqueNames(argparse.Action):
 
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser of all commands, which stores the name of the chosen one as ``command``.
+    """Return the parser of all commands; its result contains the name of the chosen command as ``command``.
 
     Parameters
     ----------
     command : str, optional
-        The only one whose options are needed; default: all.
+        Add the options of this command only; default: of all commands.
     """
     whole = _Parser(prog="slpi", description="Hysteresis models of piezo stages: identify, diagnose, compensate.")
     commands = whole.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
@@ -341,7 +342,7 @@ def _diagnose(options: argparse.Namespace) -> None:
     topics = _topics(options)
     model = load_model(options.model)
     for name in FILES:
-        # An extended model may be extended again.
+        # The model is not checked: an extended model may be extended again.
         _require_another_file(str(Path(options.output) / name), *options.bags)
     with output_folder(options.output, *FILES) as folder:
         records = [_read_all_axes(bag, options, topics) for bag in options.bags]
@@ -488,7 +489,7 @@ def _compensate(options: argparse.Namespace) -> None:
 
 
 def _require_another_file(output: str, *inputs: str) -> None:
-    """Raise UsageError if the output file is one of the inputs, or would lie in a bag that is one."""
+    """Raise UsageError if the output file is one of the inputs, or lies in the folder of an input bag."""
     for path in map(Path, inputs):
         within = path.is_dir() and path.resolve() in Path(output).resolve().parents
         if within or (path.exists() and Path(output).exists() and path.samefile(output)):
@@ -523,7 +524,7 @@ def _show(options: argparse.Namespace) -> None:
 
 @dataclass(frozen=True)
 class _Command:
-    """One command: what it does, the options that it adds to its parser, and the function that runs it."""
+    """One command: help text, function that adds its options to a parser, and function that runs it."""
 
     help: str
     options: Callable[[Any], None]

@@ -2,7 +2,7 @@
 
 
 class SlpiError(Exception):
-    """Base class: the data or a document do not allow the request; the message names the cause, place and remedy."""
+    """Base class: the data or a document do not allow the request; the message states cause, location and remedy."""
 
     exit_code = 1
 

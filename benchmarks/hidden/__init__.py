@@ -1,4 +1,4 @@
-"""Seeded records of simulated stages in which effects are hidden, for the tests and the bench of diagnosis."""
+"""Simulated records with hidden effects, drawn from a seed, for the tests and the benchmarks of the diagnosis."""
 
 from .nature import CONFUSABLE, NAMES, OWN
 from .records import SIZES, Hidden, Truth, again, calibration_of, hide

@@ -1,4 +1,4 @@
-"""An attempt at a hidden record: the stage, its drives, and effects of a strength that is still open."""
+"""One attempt to draw a record with hidden effects: stage, excitation, and effects whose strength is set afterwards."""
 
 from collections.abc import Iterable
 from dataclasses import fields, replace
@@ -19,18 +19,18 @@ Base = StageParameters | BoucWen
 
 BASES = ("preisach", "stiffening", "bouc_wen")
 NOISE = (3e-9, 15e-9)
-# A size that was asked for is met within this share of it.
+# Relative tolerance of a requested size.
 CLOSE = 0.15
-# Effects that take their time.
+# Slow effects, which need long records.
 SLOW = {"creep", "gain_drift", "thermal_drift"}
-# Samples per second of what goes before a record.
+# Sample rate of the voltages before a record, hertz.
 RATE_BEFORE = 100.0
-# Seconds. Where the samples allow, records take no less.
+# Shortest duration of a record if the number of samples allows it, seconds.
 SHORTEST = 20.0
 
 
 class Drives:
-    """Voltages of one record of a stage, and those before its first sample, from rest.
+    """Voltages of one record of a stage, and the voltages before its first sample, starting from rest.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Drives:
         self._own: dict[tuple[object, ...], FloatArray] = {}
 
     def reading(self, axis: str, physics: Physics) -> FloatArray:
-        """Return what the sensor of an axis shows without noise; the other axes have no effects."""
+        """Return the noise-free sensor reading of an axis with the given physics; the other axes have no effects."""
         motion = {name: self._motion(name, physics if name == axis else Physics()) for name in self.v}
         return sensed(physics, self.t, motion, axis)
 
@@ -72,7 +72,7 @@ class Drives:
 
 
 class Draw:
-    """One attempt: a stage, its drives, and effects of a strength that is still open."""
+    """One attempt: a stage, its excitation, and effects whose strength is set afterwards."""
 
     def __init__(self, rng: np.random.Generator, effects: tuple[str, ...], base: str, axes: int, samples: int) -> None:
         self.rng, self.axes = rng, ("x", "y")[:axes]
@@ -93,14 +93,14 @@ class Draw:
         self.drives = Drives(self.stage, self.t, self.v)
 
     def rms(self, physics: Physics) -> float:
-        """Return what a refit of the hysteresis leaves of an effect, metres."""
+        """Return the rms (m) of the part of an effect that a refit of the hysteresis cannot explain."""
         with_it, without = (self.drives.reading(self.victim, part) for part in (physics, Physics()))
         if physics.amplifier and physics.amplifier.clips:
             return beyond_identified(self.time_ns, self.v[self.victim], with_it)
         return beyond_hysteresis(self.v[self.victim], with_it - without)
 
     def strength(self, nature: Nature, wanted: float) -> tuple[float, float]:
-        """Return a strength that leaves about the wanted rms (m), and what it does leave."""
+        """Return a strength for which `rms` is about the wanted value (m), and the value (m) for this strength."""
         strength = float(np.sqrt(nature.weakest * nature.strongest))
         found = self.rms(nature.physics(strength))
         for _ in range(3):
@@ -114,7 +114,7 @@ class Draw:
 
 
 def _timing(rng: np.random.Generator, effects: tuple[str, ...], samples: int) -> tuple[float, float]:
-    """Return duration (s) and samples per second."""
+    """Return duration (s) and sample rate (Hz)."""
     rates = [1000.0, 2000.0] if {"resonance", "delay"} & set(effects) else [500.0, 1000.0, 2000.0]
     rate = float(rng.choice([rate for rate in rates if rate * SHORTEST < samples] or rates[:1]))
     shortest = 40.0 if SLOW & set(effects) else SHORTEST
@@ -136,7 +136,7 @@ def _stage(rng: np.random.Generator, base: str) -> Base:
 
 
 def _others(rng: np.random.Generator) -> tuple[str, ...]:
-    """Return what the drive of an axis without effects looks as if it were made for."""
+    """Return a random effect for which the excitation of an axis without effects is designed."""
     return (str(rng.choice([name for name in NAMES if name != "cross_coupling"])),)
 
 
@@ -147,7 +147,7 @@ def _stamps(rng: np.random.Generator, count: int, rate: float) -> NDArray[np.int
 
 
 def together(parts: Iterable[Physics]) -> Physics:
-    """Return the physics that has all that each of several has."""
+    """Return the physics that combines the parts of several."""
     found: dict[str, object] = {}
     for part in parts:
         for item in fields(part):

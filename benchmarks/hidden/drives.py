@@ -1,4 +1,4 @@
-"""Voltages of hidden records: sections of many kinds, so that no two records are alike."""
+"""Excitation voltages of the records with hidden effects, composed of random sections of many kinds."""
 
 from collections.abc import Callable
 
@@ -11,11 +11,11 @@ from slpi_ros.excitation.legs import DriveSpec, Path
 FloatArray = NDArray[np.float64]
 Section = Callable[[Path, np.random.Generator, float], None]
 
-# Ranges of travel per second.
+# Limits of the speed, voltage ranges per second.
 SLOWEST, FASTEST = 0.15, 4.0
-# Share of the range, of records with one frequency.
+# Smallest voltage change in records with one frequency, as a fraction of the range.
 SMALLEST_MOVE = 0.1
-# So often the package's own drives take the place of the sections.
+# Fraction of records with an excitation of the package instead of random sections.
 OWN_DRIVES = 0.25
 
 
@@ -33,7 +33,7 @@ def _spent(path: Path) -> float:
 
 
 def varied(path: Path, rng: np.random.Generator, seconds: float) -> None:
-    """Go to random levels at random speeds, with a hold now and then."""
+    """Move to random levels at random speeds, with occasional holds."""
     end = _spent(path) + seconds
     while _spent(path) < end:
         _move(path, rng, float(rng.uniform(0.0, 1.0)))
@@ -54,7 +54,7 @@ def tempos(path: Path, rng: np.random.Generator, seconds: float) -> None:
 
 
 def peaks(path: Path, rng: np.random.Generator, seconds: float) -> None:
-    """Come up to both ends of the range, at random speeds, and turn at random depths between."""
+    """Move to the upper end of the range at random speeds, and back to the lower end or to a random level."""
     end = _spent(path) + seconds
     while _spent(path) < end:
         _move(path, rng, float(rng.uniform(0.9, 1.0)))
@@ -64,7 +64,7 @@ def peaks(path: Path, rng: np.random.Generator, seconds: float) -> None:
 
 
 def holds(path: Path, rng: np.random.Generator, seconds: float) -> None:
-    """Move quickly and stay, for short and for long."""
+    """Move quickly to random levels and hold them for random times."""
     end = _spent(path) + seconds
     while _spent(path) < end:
         _move(path, rng, float(rng.uniform(0.0, 1.0)), 1.0, FASTEST)
@@ -72,7 +72,7 @@ def holds(path: Path, rng: np.random.Generator, seconds: float) -> None:
 
 
 def steps(path: Path, rng: np.random.Generator, seconds: float) -> None:
-    """Jump by a small step and stay until it has rung down."""
+    """Make small steps, each followed by a hold until the oscillation has decayed."""
     step, pause = log_uniform(rng, 0.004, 0.06), rng.uniform(0.15, 0.5)
     end = _spent(path) + seconds
     while _spent(path) < end:
@@ -84,7 +84,7 @@ def steps(path: Path, rng: np.random.Generator, seconds: float) -> None:
 
 
 def ramps(path: Path, rng: np.random.Generator, seconds: float) -> None:
-    """Go up and down slowly and steadily."""
+    """Move up and down in slow linear ramps."""
     end = _spent(path) + seconds
     while _spent(path) < end:
         to = float(rng.uniform(0.6, 1.0) if path.at < 0.5 else rng.uniform(0.0, 0.4))
@@ -92,7 +92,7 @@ def ramps(path: Path, rng: np.random.Generator, seconds: float) -> None:
 
 
 def nests(path: Path, rng: np.random.Generator, seconds: float) -> None:
-    """Run loops within loops that close in on random levels."""
+    """Run nested loops of decreasing span about random levels."""
     end = _spent(path) + seconds
     while _spent(path) < end:
         centre, left = rng.uniform(0.2, 0.8), 1.0
@@ -102,7 +102,7 @@ def nests(path: Path, rng: np.random.Generator, seconds: float) -> None:
             left *= rng.uniform(0.5, 0.85)
 
 
-# What a record must hold so that an effect can be told from others.
+# Sections that a record must contain so that an effect can be distinguished from others.
 NEEDED: dict[str, tuple[Section, ...]] = {
     "delay": (tempos, varied),
     "lag": (tempos, varied),
@@ -120,13 +120,13 @@ _ANY: tuple[Section, ...] = (varied, nests, tempos, peaks, holds)
 
 
 def drive(spec: DriveSpec, effects: tuple[str, ...], rng: np.random.Generator) -> FloatArray:
-    """Draw the voltages of one axis, from rest and back.
+    """Draw the voltages of one axis, starting and ending at the lowest voltage.
 
     Parameters
     ----------
     spec : DriveSpec
     effects : tuple of str
-        What the record must make visible.
+        Effects that the record must make visible.
 
     Returns
     -------
@@ -150,13 +150,13 @@ def drive(spec: DriveSpec, effects: tuple[str, ...], rng: np.random.Generator) -
 
 
 def one_frequency(spec: DriveSpec, frequency: float, rng: np.random.Generator) -> FloatArray:
-    """Draw the voltages of one axis, shape (spec.steps + 1,), whose moves all take as long: a full loop, then others.
+    """Draw voltages of one axis, shape (spec.steps + 1,), in moves of equal duration: a full loop, then random loops.
 
     Parameters
     ----------
     spec : DriveSpec
     frequency : float, hertz
-        Two moves take one over it, as nearly as the duration allows.
+        Two moves take one period, as nearly as the duration allows.
     """
     path, half = Path(), 0.5 / frequency
     for _ in range(max(round(spec.duration * frequency), 3)):
@@ -166,7 +166,7 @@ def one_frequency(spec: DriveSpec, frequency: float, rng: np.random.Generator) -
 
 
 def wandering(spec: DriveSpec, to: float, rng: np.random.Generator) -> FloatArray:
-    """Draw the voltages of one axis, shape (spec.steps + 1,), from rest by random turns to a share of the range."""
+    """Draw voltages of one axis, shape (spec.steps + 1,), from rest via random levels to a fraction of the range."""
     path = Path()
     varied(path, rng, 0.8 * spec.duration)
     path.to(to, 0.1 * spec.duration)
@@ -175,7 +175,7 @@ def wandering(spec: DriveSpec, to: float, rng: np.random.Generator) -> FloatArra
 
 
 def _own(spec: DriveSpec, effect: str, seed: int) -> FloatArray:
-    """Return a calibration drive and then the drive that is made for an effect, each half of the time."""
+    """Return the calibration excitation followed by the excitation for an effect, each for half of the time."""
     first = spec.steps // 2
     limits = {"voltage_min": spec.low, "voltage_max": spec.high, "rate": spec.rate, "seed": seed}
     calibration = excite(duration=first / spec.rate, drive=CALIBRATION, **limits)

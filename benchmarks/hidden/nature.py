@@ -1,4 +1,4 @@
-"""Draws of the eleven effects: the physics of each and the parameters by which it is known."""
+"""Random draws of the eleven effects: the physics of each, and its parameters by their names in the package."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -25,15 +25,15 @@ from .physics import (
 FloatArray = NDArray[np.float64]
 Parameters = Mapping[str, float | tuple[float, ...] | Mapping[str, float]]
 
-# Pairs of which nobody could tell that they are two.
+# Pairs of effects that cannot be distinguished from a single effect.
 CONFUSABLE = ({"delay", "lag"},)
-# What another record of the same stage has in its own way.
+# Effects that differ between records of the same stage.
 OWN = ("gain_drift", "thermal_drift", "hum")
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a draw may look at."""
+    """Properties of the record that a draw may use."""
 
     t: FloatArray
     v: FloatArray
@@ -44,22 +44,22 @@ class Setting:
 
     @property
     def travel(self) -> float:
-        """How far the voltage goes in all, volts."""
+        """Accumulated voltage change of the record, volts."""
         return float(np.abs(np.diff(self.v)).sum())
 
 
 @dataclass(frozen=True)
 class Nature:
-    """One effect of a strength that is still open, within bounds.
+    """One effect whose strength is set afterwards.
 
     Parameters
     ----------
     weakest, strongest : float
         Bounds of the strength.
     physics : callable
-        Strength in, the only part of a stage's physics that is not empty out.
+        Returns, for a strength, the physics with this effect only.
     parameters : callable
-        Strength in, parameters by the package's names out.
+        Returns, for a strength, the parameters by their names in the package.
     """
 
     weakest: float
@@ -77,7 +77,8 @@ def _lag(rng: np.random.Generator, setting: Setting) -> Nature:
 
 
 def _saturation(rng: np.random.Generator, setting: Setting) -> Nature:
-    # The strength is the share of the range that is cut off. What a refit leaves of it does not grow with it.
+    # The strength is the fraction of the range that is cut off. The part that a refit cannot explain does not grow with
+    # it, so it is drawn here.
     depth = log_uniform(rng, 0.03, 0.25)
     softness = float(rng.uniform(0.05, 0.4)) if rng.random() < 0.3 else 0.0
     below = float(rng.uniform(0.3, 1.0)) if rng.random() < 0.3 else 0.0
@@ -124,7 +125,7 @@ def _creep(rng: np.random.Generator, setting: Setting) -> Nature:
 
 
 def _resonance(rng: np.random.Generator, setting: Setting) -> Nature:
-    # The strength is one over the damping, of which only the noise can make a weak effect.
+    # The strength is the reciprocal of the damping; only a larger noise can make this effect weak.
     frequency, damping = log_uniform(rng, 50.0, min(400.0, setting.rate / 5)), log_uniform(rng, 0.012, 0.08)
     return Nature(
         1 / (1.2 * damping),
@@ -142,7 +143,7 @@ def _gain_drift(rng: np.random.Generator, setting: Setting) -> Nature:
         "cycles": float(rng.uniform(0.15, 0.7)) * setting.travel,
         "sine": float(rng.uniform(1.0, 3.0)) * duration,
     }.get(form, 1.0)
-    # About the rest position, or about one that the sensor's mounting makes the fixed one.
+    # Displacement that does not change: the rest position, or another one, depending on the mounting of the sensor.
     pivot = float(rng.choice([0.0, rng.uniform(0.0, 15e-6)]))
 
     def ageing(strength: float) -> Ageing:
@@ -231,11 +232,11 @@ NAMES = tuple(DRAWS)
 def another_time(
     name: str, physics: Physics, parameters: Parameters, strength: float, setting: Setting, rng: np.random.Generator
 ) -> tuple[Physics, Parameters]:
-    """Return an effect as another record of the same stage has it: physics and parameters."""
+    """Return physics and parameters that an effect has in another record of the same stage."""
     if name not in OWN:
         return physics, parameters
     if physics.hum:
-        # The mains are the same.
+        # Only the phase of the mains changes.
         phase = float(rng.uniform(-np.pi, np.pi))
         return Physics(hum=replace(physics.hum, phase=phase)), {**parameters, "phase": phase}
     nature = DRAWS[name](rng, setting)

@@ -1,4 +1,4 @@
-"""Physics that only hidden records have: a Bouc-Wen stage, amplifier, rate dependence, ageing and disturbances."""
+"""Physics of the records with hidden effects: Bouc-Wen stage, amplifier, rate dependence, ageing, disturbances."""
 
 import math
 from collections.abc import Mapping
@@ -397,7 +397,7 @@ class Interferometer:
         angle = wave * y + self.phase
         if self.form == "sine":
             return np.asarray(y + self.amplitude * np.sin(angle))
-        # Angle of the pointer e^(i fringe) relative to a centre with an offset of this share of its length.
+        # Angle of the phasor e^(i fringe) relative to a centre with an offset of this fraction of its length.
         return np.asarray(y + np.angle(1.0 - wave * self.amplitude * np.exp(-1j * angle)) / wave)
 
 

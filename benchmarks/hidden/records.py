@@ -1,4 +1,4 @@
-"""Draw a stage, hide effects in it, and record it."""
+"""Draw a stage, hide effects in it, and simulate a record."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,15 +18,15 @@ from .physics import Physics, own_motion
 
 FloatArray = NDArray[np.float64]
 
-# How large a hidden effect is beside the noise floor.
+# Limits of the size of a hidden effect relative to the noise floor.
 SIZES = (3.0, 20.0)
-# Where a size is asked for that the strength cannot give, other sensors are allowed too.
+# Limits of the sensor noise (m rms) if a requested size cannot be reached by the strength of the effect.
 ANY_NOISE = (1.5e-9, 40e-9)
 ATTEMPTS = 60
-# Metres; the last digit of every sensor.
+# Resolution of all sensors, metres.
 _DIGIT = 1e-9
 MOST_SAMPLES = 80_000
-# Of further records: how long a stage is moved before (s), by how much its zero may have moved (m), and nanoseconds.
+# For further records: duration of the motion before the record (s), largest shift of the zero (m), one hour (ns).
 SECONDS_BEFORE, LARGEST_ZERO, HOUR = (8.0, 20.0), 1e-6, 3_600_000_000_000
 
 
@@ -38,17 +38,18 @@ class Truth:
     ----------
     axis : str
     name : str
-        Of the package's vocabulary.
+        Name of the effect in the package.
     parameters : mapping
-        By the package's names, SI; where the physics is another, only those that it shares.
+        Parameters by their names in the package, SI units; if the simulated physics differs from the effect in the
+        package, only the common ones.
     strength : float
     physics : Physics
-        This alone.
+        Physics with this effect only.
     size_over_floor : float
-        What a refit of the hysteresis would leave of it were it alone (rms, `size.beyond_hysteresis`; of a saturation
-        `size.beyond_identified`), over the noise; of further records that of the first.
+        Rms of the part of this effect alone that a refit of the hysteresis cannot explain (`size.beyond_hysteresis`,
+        for saturation `size.beyond_identified`), divided by the noise floor. Further records keep the first value.
     contribution : ndarray, shape (N,), metres
-        The reading with everything less the reading without this.
+        Reading with all effects minus the reading without this one.
     """
 
     axis: str
@@ -62,24 +63,24 @@ class Truth:
 
 @dataclass(frozen=True)
 class Hidden:
-    """A record and what is in it.
+    """A record and the effects hidden in it.
 
     Parameters
     ----------
     record : Record
-        All that a diagnosis may see.
+        The only input of a diagnosis.
     truth : tuple of Truth
-        Empty for a clean stage.
+        Hidden effects; empty for a clean stage.
     base : str
-        One of `BASES`.
+        Kind of hysteresis, one of `BASES`.
     reading : dict of axis name to ndarray, shape (N,), metres
-        Without noise.
+        Readings without noise.
     clean : dict of axis name to ndarray, shape (N,), metres
-        Without noise and without any effect.
+        Readings without noise and without any effect.
     floor : dict of axis name to float, metres
-        Noise and last digit of the sensor, rms.
+        Noise floor of the sensor: noise and quantization, rms.
     stage : dict of axis name to StageParameters or BoucWen
-        The hysteresis.
+        Hysteresis of each axis.
     seed : int
     """
 
@@ -93,7 +94,7 @@ class Hidden:
     seed: int
 
     def best_gain_percent(self, axis: str) -> float:
-        """Return the fall of the rms error, %, from a refitted hysteresis alone to one with the true effects."""
+        """Return the reduction of the rms error, %, from a refitted hysteresis alone to one with the true effects."""
         sizes = [truth.size_over_floor for truth in self.truth if truth.axis == axis]
         size = float(np.linalg.norm(sizes))
         return 100.0 * (1.0 - 1.0 / np.hypot(1.0, size))
@@ -108,22 +109,22 @@ def hide(
     axes: int | None = None,
     samples: int = MOST_SAMPLES,
 ) -> Hidden:
-    """Draw a stage, hide effects on one of its axes, and record it.
+    """Draw a stage, hide effects on one of its axes, and simulate a record.
 
     Parameters
     ----------
     seed : int
         The same arguments give the same record.
     effects : sequence of str
-        None, one or two of `NAMES`.
+        No, one or two of `NAMES`.
     base : str, optional
         One of `BASES`; drawn from the first two by default.
     size : float, optional
-        Of each effect, over the noise floor; drawn from `SIZES` by default.
+        Size of each effect relative to the noise floor; drawn between `SIZES` by default.
     axes : int, optional
-        1 or 2; by default mostly 1, but 2 where one axis is to show on another.
+        Number of axes, 1 or 2; by default mostly 1, but 2 for cross-coupling.
     samples : int
-        The most that the record may have.
+        Maximum number of samples of the record.
 
     Returns
     -------
@@ -147,7 +148,7 @@ def hide(
 
 
 def calibration_of(hidden: Hidden, duration: float = 40.0, rate: float = 500.0) -> Record:
-    """Return a record of the calibration drive of the same stage, before any effect befell it."""
+    """Return a record of the same stage under calibration excitation, without any effects."""
     rng = np.random.default_rng([hidden.seed, 4711])
     records = {}
     for number, (axis, stage) in enumerate(hidden.stage.items()):
@@ -163,19 +164,19 @@ def calibration_of(hidden: Hidden, duration: float = 40.0, rate: float = 500.0) 
 def again(
     hidden: Hidden, number: int, voltage: dict[str, FloatArray], rate: float, *, from_rest: bool = False
 ) -> Hidden:
-    """Return another record of the same stage: other voltages, another initial history, another zero.
+    """Return another record of the same stage: other voltages, another initial history, another zero offset.
 
-    Drift of zero and sensitivity take another course, and hum another phase; all else is that of `hidden`.
+    Drift of zero and sensitivity follow another course, and hum has another phase; all else is as in `hidden`.
 
     Parameters
     ----------
     hidden : Hidden
     number : int
-        Of the record; the same one has the same history, zero, noise and drift.
+        Number of the record; the same number gives the same history, zero, noise and drift.
     voltage : dict of axis name to ndarray, shape (N,), volts
     rate : float, hertz
     from_rest : bool
-        Whether the stage was never moved before.
+        Whether the stage was never moved before the record.
     """
     rng = np.random.default_rng([hidden.seed, number, 815])
     highs = {axis: float(v.max()) for axis, v in hidden.record.voltage.items()}
@@ -216,19 +217,19 @@ def _another_time(
 
 
 def _noise(hidden: Hidden, axis: str) -> float:
-    """Return the noise of a sensor without its last digit, rms, metres."""
+    """Return the noise (m rms) of a sensor without its quantization."""
     return float(np.sqrt(hidden.floor[axis] ** 2 - _DIGIT**2 / 12))
 
 
 def _strengths(draw: Draw, size: float | None) -> dict[str, tuple[float, float]] | None:
-    """Return strength and rms (m) of each effect; None where one cannot be of the wanted size."""
+    """Return strength and rms (m) of each effect; None if an effect cannot have the wanted size."""
     found: dict[str, tuple[float, float]] = {}
     for name, nature in draw.natures.items():
         wanted = size or log_uniform(draw.rng, 1.15 * SIZES[0], SIZES[1] / 1.15)
         noise = draw.noise[draw.victim]
         strength, rms = draw.strength(nature, wanted * noise)
         if not found:
-            # The noise gives way where the strength has come to a bound.
+            # If the strength has reached a bound, the noise is adapted instead.
             noise = draw.noise[draw.victim] = float(np.clip(rms / wanted, *(ANY_NOISE if size else NOISE)))
         over = rms / noise
         low, high = ((1 - CLOSE) * size, (1 + CLOSE) * size) if size else SIZES
@@ -267,6 +268,6 @@ def _readings(drives: Drives, victim: str, parts: Mapping[str, Physics]) -> dict
 
 
 def _contribution(drives: Drives, victim: str, parts: Mapping[str, Physics], name: str) -> FloatArray:
-    """Return the reading with all parts less the reading without one of them."""
+    """Return the reading with all effects minus the reading without one of them."""
     without = together(part for other, part in parts.items() if other != name)
     return drives.reading(victim, together(parts.values())) - drives.reading(victim, without)

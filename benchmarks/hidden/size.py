@@ -1,4 +1,4 @@
-"""How much of a signal no rate-independent hysteresis could explain."""
+"""Size of the part of a signal that no rate-independent hysteresis can explain."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,26 +10,27 @@ from slpi_ros.simulation.preisach import RelayTriangle
 FloatArray = NDArray[np.float64]
 
 LEVELS = 30
-# Relays below the lowest voltage stay up once they are: so the first rise may differ from all later ones.
+# Extension of the thresholds below the lowest voltage, as a fraction of the range. Relays there never switch back, so
+# that the first rise may differ from all later ones.
 BELOW = 0.2
 SAMPLES = 4000
-# Relays that the drive hardly ever switches have no say.
+# Relative ridge regularization, which suppresses relays that are rarely switched.
 RIDGE = 1e-7
 
 
 def beyond_hysteresis(v: FloatArray, signal: FloatArray) -> float:
-    """Return the rms of what is left of a signal after the best fit by relays, a curve of the voltage and an offset.
+    """Return the rms residual of a signal after the best fit by relays, a function of the voltage and an offset.
 
-    The fit is that of a Preisach operator with `LEVELS` levels of thresholds from somewhat below the lowest voltage to
-    the highest, weights of either sign, least squares over `SAMPLES` random samples. It takes up of an effect what a
-    model identified from the record itself does.
+    The relays form a Preisach operator with `LEVELS` threshold levels, from somewhat below the lowest voltage to the
+    highest one, and weights of either sign, fitted by least squares to `SAMPLES` random samples. It explains as much of
+    an effect as a model identified from the record itself.
 
     Parameters
     ----------
     v : ndarray, shape (N,), volts
-        What the record says.
+        Recorded voltage.
     signal : ndarray, shape (N,), metres
-        The reading with an effect less the one without.
+        Reading with an effect minus the reading without it.
 
     Returns
     -------
@@ -47,10 +48,10 @@ def beyond_hysteresis(v: FloatArray, signal: FloatArray) -> float:
 
 
 def beyond_identified(time_ns: NDArray[np.int64], v: FloatArray, reading: FloatArray) -> float:
-    """Return the rms of what a model identified from the record itself leaves of a reading without noise, metres.
+    """Return the rms error (m) of a model identified from the noise-free reading itself.
 
-    For effects without memory of their own, as a clipped voltage: relays take up all of them but a kink between two
-    vertices, and how much that is depends on how fine a grid the identification takes.
+    For effects without memory, such as a clipped voltage: relays explain them except for a kink between two vertices,
+    whose size depends on the grid that the identification chooses.
     """
     return float(identify(Record(time_ns, {"x": v}, {"x": reading})).axes["x"].quality.rms)
 

@@ -14,8 +14,8 @@ from slpi_ros.model.limits import MAX_DT, Limits
 from slpi_ros.model.streaming import StreamingInverse
 
 MAX_DT_NS = int(MAX_DT * SECOND_NS)
-# A first measurement matches an initial history within this share of the identified displacements, or this many times
-# the held-out error. Overnight changes of sensor zero, creep and temperature are smaller; another history is larger.
+# An initial history matches the first measurement if its error is at most this fraction of the identified displacement
+# range, or this multiple of the held-out error: more than overnight drift, less than the error of a wrong history.
 FIT_SHARE, FIT_SIGMAS = 0.005, 4.0
 
 
@@ -52,7 +52,7 @@ class Axis:
     given_ns : int, nanoseconds
         Time of the last output voltage.
     point_ns : int or None, nanoseconds
-        Deadline of the last sample on the clock of trajectories; None if it was not a trajectory point.
+        Deadline of the last sample on the trajectory clock; None if it was not a trajectory point.
     """
 
     stream: StreamingInverse
@@ -81,7 +81,7 @@ class Axis:
 
     @property
     def correction(self) -> float:
-        """Correction by the feedback in the present voltage, volts."""
+        """Feedback correction contained in the present voltage, volts."""
         return self._feedback.correction if self._feedback else 0.0
 
     @property
@@ -102,7 +102,7 @@ class Axis:
         return voltage_history(self._applied if self._feedback else self.stream)
 
     def in_motion(self, now_ns: int) -> bool:
-        """Whether the acceleration limit does not allow the voltage to stop at the next sample."""
+        """Whether the voltage changes so fast that the acceleration limit prevents a stop at the next sample."""
         if not self.driven or now_ns - self.given_ns > MAX_DT_NS:
             return False
         return (self._feedback if self._feedback and not self.ramp else self.stream).pace.in_motion
@@ -118,7 +118,7 @@ class Axis:
         ----------
         model : AxisModel
         reversal_voltages : sequence of float, volts
-            Reversals to replay, oldest first, and the voltage; None (default) uses those of this axis.
+            Voltages of the reversals to replay, oldest first, then the present one; default: those of this axis.
         start_memory : str
             Initial history of an axis without known reversals; default "end".
 
@@ -215,7 +215,7 @@ class Axis:
         Parameters
         ----------
         ahead : float, seconds
-            Zero or negative counts as no elapsed time. At most `MAX_DT` counts for the slew limit.
+            Zero or negative counts as no elapsed time. The slew limit takes at most `MAX_DT` into account.
         y : float, metres
         now_ns : int, nanoseconds
         """
@@ -326,7 +326,7 @@ class Axis:
         self.ramp, self.point_ns, self.start_memory = ramp, None, None
 
     def brake(self, now_ns: int) -> None:
-        """Start to brake within the acceleration limit; `step_ramp` executes it."""
+        """Start to decelerate to rest within the acceleration limit; `step_ramp` executes it."""
         if not isinstance(self.ramp, Brake):
             self.start_ramp(Brake(), now_ns)
 
@@ -355,7 +355,7 @@ class Axis:
         self.stamps.restart((now_ns - self.given_ns) * 1e-9 if self.in_motion(now_ns) else 0.0)
 
     def rest(self) -> None:
-        """Start the next sample from a voltage at rest."""
+        """Set the rate of the voltage to zero, so that the next sample starts from rest."""
         if self.driven:
             self.stream.pace.rest()
         if self._feedback:

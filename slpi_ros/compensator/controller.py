@@ -1,11 +1,11 @@
 """Compensation of all axes, independent of ROS: converts desired displacements into voltages.
 
-`Controller.update` validates a sample as a whole and then moves every named axis. Trajectory points are processed in
-the same way when they are due. `Controller.advance` executes motion without desired displacements: ramps to the safe
-voltages, the reset of the hysteresis memory, and braking. `Controller.mode` is the operating mode of the stage.
+`Controller.update` validates a message as a whole and then moves every axis named in it. `Controller.advance` executes
+the trajectory points that are due, and motion without desired displacements: ramps to the safe voltages, the reset of
+the hysteresis memory, and the deceleration of an axis to rest. `Controller.mode` is the operating mode of the stage.
 
-All times `now_ns` are nanoseconds on a monotonic clock. All times `clock_ns` are nanoseconds on the clock of
-trajectories, which is the monotonic clock or a simulated one.
+All times `now_ns` are nanoseconds on a monotonic clock. All times `clock_ns` are nanoseconds on the trajectory clock,
+which is the monotonic clock or, in a simulation, the simulated clock.
 """
 
 from array import array
@@ -55,7 +55,7 @@ class CommandWatchdog:
     Attributes
     ----------
     commanded : bool
-        Whether a command has been executed since the activation. Before the first command, expiry moves no axis.
+        Whether a command has been executed since the activation. Before the first command, a timeout moves no axis.
     expired : bool
         Whether the timeout had elapsed at the last call of `update`.
     safe_voltages : tuple of float, length of axes, volts, or None
@@ -77,12 +77,12 @@ class CommandWatchdog:
         self.expired, self.safe_voltages = False, None
 
     def update(self, safety: Safety, now_ns: int, waiting: bool) -> bool:
-        """Update `expired`; return True if the timeout has just elapsed or the reaction in `safety` has changed since.
+        """Update `expired`; return True at expiry, and again if the reaction in `safety` changes afterwards.
 
         Parameters
         ----------
         safety : Safety
-            Timeout and reaction to it.
+            Command timeout, and the reaction to it.
         now_ns : int, nanoseconds
         waiting : bool
             Whether commands are expected; if False, the watchdog does not expire.
@@ -94,7 +94,7 @@ class CommandWatchdog:
         return self.expired and (self.expired, self.safe_voltages) != before
 
     def silence(self, now_ns: int) -> float:
-        """Return the time (s) since the last command at `now_ns` (ns)."""
+        """Return the time (s) from the last command, or from `start`, to `now_ns` (ns)."""
         return (now_ns - self._heard_ns) * 1e-9
 
 
@@ -152,7 +152,7 @@ class Controller:
         # Lowest and highest voltage (V) of each axis during a reset.
         self._spans: list[tuple[float, float]] = []
         self._next_step_ns = 0
-        # Offset of the clock of trajectories from the monotonic clock at the last call, nanoseconds.
+        # Offset of the trajectory clock from the monotonic clock at the last call, nanoseconds.
         self._clock_ahead_ns = 0
         self.use_time(time or TimestampRules())
 
@@ -177,13 +177,13 @@ class Controller:
         self.mode, self.model = Mode.UNCONFIGURED, None
 
     def activate(self, now_ns: int) -> None:
-        """Start to process messages at `now_ns` (ns), from the present voltages at rest."""
+        """Start processing messages at `now_ns` (ns), with all axes at rest at their present voltages."""
         self.mode = Mode.STREAMING
         self.watchdog.start(now_ns)
         self._rest_all(now_ns)
 
     def deactivate(self, now_ns: int) -> None:
-        """Stop to process messages at `now_ns` (ns); the voltages are held."""
+        """Stop processing messages at `now_ns` (ns); the voltages are held."""
         self.hold(now_ns)
         self._rest_all(now_ns)
         self.mode = Mode.INACTIVE
@@ -204,7 +204,7 @@ class Controller:
         Raises
         ------
         SlpiError
-            If the model lacks an axis or cannot be used within the limits; the previous model remains in use.
+            If the model is of another stage, lacks an axis or cannot be used within the limits; the old model is kept.
         """
         if self._hardware_id and model.hardware_id and model.hardware_id != self._hardware_id:
             raise UsageError(
@@ -231,7 +231,7 @@ class Controller:
     # Settings
 
     def check_limits(self, limits: Sequence[Limits]) -> None:
-        """Raise the error that `use_limits` would raise, without a change."""
+        """Raise the error that `use_limits` would raise, without changing anything."""
         for axis, new in zip(self.axes, limits, strict=True):
             axis.check_limits(new)
 
@@ -273,13 +273,13 @@ class Controller:
         Parameters
         ----------
         stamp_ns : int, nanoseconds
-            Time stamp of the message; 0 if it has none, then `arrival_ns` is used.
+            Time stamp of the message; if it is 0 (no stamp), `arrival_ns` is used instead.
         names : sequence of str
         displacements : sequence of float, length of names, metres
             Desired displacement of each named axis.
         now_ns : int, nanoseconds
         arrival_ns : int, nanoseconds
-            Arrival time on the clock of the stamps; required without a stamp or if `needs_arrival`. Default 0.
+            Arrival time on the clock of the stamps; required if there is no stamp, or if `needs_arrival`. Default 0.
 
         Returns
         -------
@@ -326,7 +326,7 @@ class Controller:
         Raises
         ------
         RejectedError
-            If a displacement is not plausible; it is counted and not used, the other axes are processed.
+            If a displacement is not finite or out of range; it is counted but not used, the other axes are processed.
         """
         rejected: RejectedError | None = None
         changed = []
@@ -355,11 +355,11 @@ class Controller:
                 )
         if count != len(names):
             raise RejectedError(rejection.LENGTH, f"{len(names)} axes but {count} displacements; send one for each")
-        # Most senders use the same names in every message.
-        return self._last_axes if names == self._last_names else self._named(names)
+        return self._named(names)
 
     def _named(self, names: Sequence[str]) -> list[Axis]:
-        """Return the named axes; RejectedError as `require_names`."""
+        """Return the named axes; raise RejectedError as `require_names` does."""
+        # Most senders use the same names in every message.
         if names != self._last_names:
             require_names(names, self._by_name)
             self._last_axes = [self._by_name[name] for name in names]
@@ -368,7 +368,7 @@ class Controller:
         return self._last_axes
 
     def _check(self, axes: Sequence[Axis], stamp_ns: int, displacements: Sequence[float], arrival_ns: int) -> None:
-        """Reject the sample if a displacement, a time stamp, or its age is not acceptable, in this order."""
+        """Reject the message if a displacement, its stamp or its age is not acceptable, checked in this order."""
         axis = axes[0]
         try:
             for axis, y in zip(axes, displacements, strict=True):
@@ -401,7 +401,7 @@ class Controller:
         aheads: Sequence[float],
         now_ns: int,
     ) -> tuple[bool, bool]:
-        """Move axes to displacements (m), `aheads` (s) after the last sample of each; return (held, slew limited)."""
+        """Move each axis to its displacement (m), `aheads` (s) after its last sample; return (held, slew limited)."""
         if self._stage:
             self._stage.decouple(dict(zip(names, displacements, strict=True)))
         held = slewing = began = False
@@ -429,7 +429,7 @@ class Controller:
         now_ns: int,
         clock_ns: int,
     ) -> None:
-        """Start a trajectory at once, or when its first point is due; without points, cancel the current one.
+        """Start a trajectory at once, or when its first point is due; an empty one cancels the current trajectory.
 
         Parameters
         ----------
@@ -437,7 +437,7 @@ class Controller:
         time_from_start_ns : array_like of int, shape (N,), nanoseconds
         positions : array_like, shape (N, K), metres
         start_ns : int, nanoseconds
-            Start time on the clock of trajectories; 0 starts at once.
+            Start time on the trajectory clock; 0 starts at once.
         now_ns, clock_ns : int, nanoseconds
 
         Raises
@@ -465,7 +465,7 @@ class Controller:
         self._release([axis for axis in self.axes if axis.name in going], now_ns)
 
     def activity(self, now_ns: int) -> str:
-        """Return a text for the present activity."""
+        """Return a text that describes the present activity."""
         if self.mode is Mode.RESETTING:
             return "resetting the memory"
         deadline_ns = self.trajectory.next_deadline_ns
@@ -477,7 +477,7 @@ class Controller:
         return f"waiting for a trajectory that {'goes on' if self.trajectory.begun else 'begins'} in {wait:.0f} s"
 
     def cancel(self, now_ns: int) -> None:
-        """Cancel the trajectory, if any; its axes stop within their acceleration limit."""
+        """Cancel the trajectory, if any; its axes decelerate to rest within their acceleration limit."""
         self.watchdog.feed(now_ns)
         if self.mode is Mode.TRAJECTORY:
             self._end_trajectory()
@@ -520,7 +520,7 @@ class Controller:
 
     @property
     def ramping(self) -> bool:
-        """Whether a ramp or braking is active on any axis."""
+        """Whether any axis executes a ramp or decelerates to rest."""
         for axis in self.axes:  # noqa: SIM110, 1 us faster than any() for each command
             if axis.ramp is not None:
                 return True
@@ -536,7 +536,7 @@ class Controller:
         return point if step is None else min(point, step)
 
     def advance(self, now_ns: int, clock_ns: int) -> bool:
-        """Execute one step of all ramps and one trajectory point that are due; return whether `voltages` changed."""
+        """Execute the ramp step and one trajectory point, if due; return whether there are new `voltages` to output."""
         new, self._clock_ahead_ns = False, clock_ns - now_ns
         if self.ramping and now_ns >= self._next_step_ns:
             self._step_ramps(now_ns)
@@ -546,7 +546,7 @@ class Controller:
         return new
 
     def hold(self, now_ns: int) -> None:
-        """End all motion: axes hold their voltage, or brake during the next calls of `advance`."""
+        """End all motion: axes in motion decelerate to rest during the next calls of `advance`, the others hold."""
         self.cancel(now_ns)
         self._release((), now_ns)
         if self.active:
@@ -632,7 +632,7 @@ class Controller:
                 axis.confidence = MemoryConfidence(KNOWN, spanned=span).over(axis.model.voltage_range)
 
     def _release(self, but: Collection[Axis], now_ns: int) -> None:
-        """End all ramps. Axes in `but` follow new commands; others hold, and decelerate to rest first if in motion."""
+        """End all ramps; axes in `but` follow new commands, the others decelerate to rest if in motion, then hold."""
         self._end_reset()
         ramped = self.ramping
         for axis in self.axes:
@@ -654,7 +654,7 @@ class Controller:
             axis.given_ns, axis.point_ns, axis.ramp = now_ns, None, None
 
     def _couple(self) -> None:
-        """Build the cross-coupling of the axes and update `voltages`."""
+        """Set up the compensation of cross-coupling between the axes and update `voltages`."""
         assert self.model
         coupling = Coupling({axis.name: self.model.axis(axis.name).chain.gains for axis in self.axes})
         streams = {axis.name: axis.stream for axis in self.axes}

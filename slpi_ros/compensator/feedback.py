@@ -1,4 +1,4 @@
-"""Feedback of one axis: feedforward plus PID (second paper, Fig. 12), and residuals measured - model."""
+"""Feedback of one axis: feedforward plus PID (MPI paper, Fig. 12), and residuals measured - model."""
 
 from array import array
 from dataclasses import dataclass, fields
@@ -48,14 +48,14 @@ class PidGains:
 class Feedback:
     """Feedforward plus PID of one axis: ``v = correct(t, desired, measured, feedforward)``; initially disabled.
 
-    Enabling, disabling and retuning are bumpless: a step of the correction becomes an offset that decays with the time
-    constant `release_time`, so the error at the moment of enabling takes effect gradually and finally in full.
+    Enabling, disabling and retuning are bumpless: an offset cancels the step of the correction and then decays with the
+    time constant `release_time`, so that the error at the moment of enabling is corrected gradually, but completely.
 
     Windup is avoided by conditional integration: the integral grows only as far as the voltage can follow. Unlike
     back-calculation, this keeps the integral while the voltage is slew limited on the way to a distant feedforward.
 
-    `step` calls `correct` or `hold` with the last measurement stored by `measure`, which acts once, and only within its
-    timeout. The error is taken against the setpoint at the time of the measurement, not against the present one.
+    `step` calls `correct` with the last measurement stored by `measure`, or `hold` if that was used before or is too
+    old. The error refers to the setpoint at the time of the measurement, not to the present setpoint.
 
     Parameters
     ----------
@@ -66,9 +66,9 @@ class Feedback:
     voltage : float, volts
         Voltage of the axis at the start; default 0.
     release_time : float, seconds
-        Decay time of the offset, or of the correction after disabling; inf keeps both. Default 0.1.
+        Time constant of the decay of the offset, and of the correction after disabling; inf keeps both. Default 0.1.
     longest_gap : float, seconds
-        Upper limit of the time between samples in the integral and in the decay; default 0.1.
+        Longer intervals between samples count as this long in the integration and in the decay; default 0.1.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class Feedback:
 
     @property
     def enabled(self) -> bool:
-        """Whether measurements act on the voltage."""
+        """Whether measurements correct the voltage."""
         return self._enabled
 
     @property
@@ -144,11 +144,11 @@ class Feedback:
 
     @property
     def correction(self) -> float:
-        """Correction added to the feedforward voltage, volts, restricted by the voltage limits."""
+        """Correction added to the feedforward voltage, volts, after clipping to the voltage limits."""
         return self._correction
 
     def enable(self) -> None:
-        """Enable the PID, bumpless, from the next measurement on; without effect if already enabled."""
+        """Enable the PID without a voltage step at the next measurement; no effect if it is enabled already."""
         if not self._enabled:
             self._enabled = self._taking_over = True
 
@@ -157,7 +157,7 @@ class Feedback:
         self._enabled = False
 
     def forget(self) -> None:
-        """Discard the last measurement; the PID restarts, bumpless, at the next one."""
+        """Discard the last measurement; the PID restarts without a voltage step at the next one."""
         self._error = self._rate = 0.0
         self._measured_at = -inf
         self._taking_over = self._enabled
@@ -243,7 +243,7 @@ class Feedback:
         now_ns : int, nanoseconds
             Time of the sample on the clock of `measure`.
         timeout : float, seconds
-            Older measurements are ignored and the correction is held.
+            Measurements older than this are ignored; the correction is then held.
         """
         t = self._t + dt if self._t > -inf else 0.0
         latest, self._latest = self._latest, None
@@ -265,7 +265,7 @@ class Feedback:
             raise UsageError(f"time runs backwards: {t:.9g} s after {self._t:.9g} s; send samples in order")
 
     def _next_rate(self, elapsed: float, measured: float) -> float:
-        """Return the low-pass filtered slope (m/s) between two measurements, exact for any sample time."""
+        """Return the low-pass filtered rate (m/s) of the measured displacement, exact for any sampling period."""
         if elapsed == 0.0:
             return self._rate
         # At the first measurement the elapsed time is infinite and the slope is 0.
@@ -278,7 +278,7 @@ class Feedback:
     def _next_integral_and_offset(
         self, elapsed: float, error: float, direct: float, feedforward: float, reach: tuple[float, float]
     ) -> tuple[float, float]:
-        """Return the next integral and offset (V); at enabling both are chosen to keep the correction."""
+        """Return the next integral and offset (V); when enabled, both are set such that the correction is unchanged."""
         if self._taking_over:
             return self._correction, -direct
         dt = min(elapsed, self._longest_gap)
@@ -302,7 +302,7 @@ class Feedback:
         return t - self._t if self._t > -inf else 0.0
 
     def _output(self, t: float, feedforward: float, correction: float) -> None:
-        """Move to `feedforward` + `correction` (V) as far as limits and rate limiter allow."""
+        """Move to `feedforward` + `correction` (V) as far as the voltage limits and the rate limiter allow."""
         wanted = feedforward + correction
         if not isfinite(wanted):
             raise UsageError(f"feedforward {feedforward} V, correction {correction} V is not finite; check the gains")
@@ -315,7 +315,7 @@ class Feedback:
 
 
 def part_within(step: float, low: float, high: float) -> float:
-    """Return `step` limited to low..high; 0 where `step` leads away from that interval."""
+    """Return `step` limited to low..high, or 0 if `step` points away from that interval."""
     return min(max(step, min(low, 0.0)), max(high, 0.0))
 
 
@@ -341,8 +341,8 @@ class Drift:
 class ResidualWindow:
     """Residuals measured - model of the last `WINDOW` measurements.
 
-    As the stage responds with a delay, the residual is the distance of a measurement from the interval of the model
-    displacements of the last two samples; at rest this is the complete residual.
+    Because the stage responds with a delay, the residual is the signed distance of a measurement from the interval
+    between the model displacements of the last two samples; at rest it is measured - model.
 
     Parameters
     ----------
@@ -372,9 +372,9 @@ class ResidualWindow:
         self._samples = min(self._samples + 1, WINDOW)
 
     def forget(self, expected: float) -> None:
-        """Discard all differences between measured and model displacement, as model or hysteresis state has changed.
+        """Discard all residuals because the model or its hysteresis state has changed.
 
-        `expected` (m) is what the model gives now.
+        `expected` (m) is the present displacement of the model.
         """
         self._samples = self._next = 0
         self._before = self._expected = expected
@@ -395,10 +395,10 @@ class LoopSettings:
     Parameters
     ----------
     enabled : bool
-        Whether measurements correct the voltage; if False, they only serve the diagnostics.
+        Whether measurements correct the voltage; if False, they are used for the diagnostics only.
     gains : PidGains
     timeout : float, seconds
-        Older measurements are ignored.
+        Measurements older than this are ignored.
     """
 
     enabled: bool

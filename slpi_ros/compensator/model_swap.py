@@ -14,7 +14,7 @@ from slpi_ros.model.streaming import TOLERATED_SHARE, StreamingInverse
 def take_over(
     axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = (), start_memory: StartMemory = "end"
 ) -> StreamingInverse:
-    """Return the streaming inverse of a new model, with its memory at the present state of the axis.
+    """Return the streaming inverse of a new model, with its memory in the present hysteresis state of the axis.
 
     Parameters
     ----------
@@ -23,16 +23,16 @@ def take_over(
     limits : Limits
         Limits of the node; the inverse is further limited to the identified voltages.
     reversal_voltages : sequence of float, volts
-        Reversals of the voltage, oldest first, followed by the present voltage; they are replayed from the model's
-        start. Empty (default): the reversals are unknown, and the initial history is `start_memory`.
+        Voltages of the reversals, oldest first, followed by the present voltage; they are replayed on the initial
+        history "start". Empty (default): the reversals are unknown, and the initial history is `start_memory`.
     start_memory : str
         Initial history, see `AxisModel.initial`; default "end".
 
     Raises
     ------
     SlpiError
-        If the model does not allow streaming, has no voltage within the limits, was identified far from the present
-        voltage, or its displacement range contradicts its curves.
+        If the model is not causal, was identified entirely outside the limits or far from the present voltage, or its
+        inverse gives a voltage outside the limits.
     """
     if not axis.causal:
         raise UsageError(
@@ -54,7 +54,7 @@ def take_over(
 
 
 def continue_from(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> StreamingInverse:
-    """Return the streaming inverse of a new model in the state of `before`; limits are widened to its voltage."""
+    """Return a streaming inverse of a new model in the state of `before`; limits are widened to include its voltage."""
     memory = axis.memory("start")
     replay(memory, turning_voltages(before.memory))
     stream = axis.stream_from(memory, extended_to(extended_to(allowed, before.voltage), memory.voltage))
@@ -65,12 +65,12 @@ def continue_from(axis: AxisModel, allowed: Limits, before: StreamingInverse) ->
 def turning_voltages(memory: Memory) -> tuple[float, ...]:
     """Return the voltages (V) of the remembered reversals, oldest first, followed by the present voltage."""
     state = memory.snapshot()
-    # A primed memory contains a reversal far outside the voltage range of any stage.
+    # A primed memory (major loop, falling branch) contains a reversal far outside the voltage range of any stage.
     return (*(v for v in state.turn_voltages if abs(v) < FAR / 2), state.voltage)
 
 
 def voltage_history(stream: StreamingInverse) -> tuple[float, ...]:
-    """Return the reversal voltages (V), oldest first, the present voltage, and the command if that differs."""
+    """Return `turning_voltages` of the memory (V), followed by the command (V) if it differs, for instance by a lag."""
     turns = turning_voltages(stream.memory)
     return turns if turns[-1] == stream.voltage else (*turns, stream.voltage)
 

@@ -17,9 +17,9 @@ from slpi_ros.model.document import format_model
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 
-# Taken from the model, not verified; being reset; reset since; restored after a restart.
+# States of the memory: taken from the model and not verified; being reset; reset; restored after a restart.
 ASSUMED, RESETTING, KNOWN, RESTORED = "assumed", "resetting", "known", "restored"
-# Tolerance for each end of the identified voltage range, as a share of its span: measured ends are noisy.
+# Tolerance for each end of the identified voltage range, as a fraction of its span: measured ends are noisy.
 TOLERATED_SHARE = 0.01
 
 
@@ -32,7 +32,7 @@ class MemoryConfidence:
     state : str
         `ASSUMED` (default), `RESETTING`, `KNOWN` or `RESTORED`.
     doubt : str
-        Reason for the state `ASSUMED`; "" (default) if the memory has merely not been verified.
+        Reason for the state `ASSUMED`; "" (default) if the only reason is that the memory has not been verified.
     spanned : (float, float), volts
         Lowest and highest voltage of the reset.
     contradicted : bool
@@ -47,7 +47,7 @@ class MemoryConfidence:
     def over(self, identified: tuple[float, float]) -> "MemoryConfidence":
         """Return the confidence for a model identified on the voltage range `identified` (V).
 
-        A reset does not erase loops wider than its own voltage span, so the earlier history there remains effective.
+        The state becomes `ASSUMED` if the reset did not cover this range: reversals outside its span are not erased.
         """
         (low, high), (lowest, highest) = self.spanned, identified
         margin = TOLERATED_SHARE * (highest - lowest)
@@ -66,7 +66,7 @@ VOLTAGE_BYTES, CHECKSUM_BYTES = 8, 4
 
 
 class LastVoltages:
-    """Store the voltages of every command in a file, in about two microseconds.
+    """Store the voltages of every command in a file; one write takes about two microseconds.
 
     Two entries with checksums are written alternately, so one of them is intact after a crash of the process. The data
     is not flushed to the disk: it survives the end of the process, but may be lost at a power failure.
@@ -114,7 +114,7 @@ class LastVoltages:
 
 
 def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tuple[float, ...] | None:
-    """Return the last voltages (V) stored beside a memory; None if no intact entry has the identifier `mark`."""
+    """Return the last voltages (V) stored with a saved memory; None if no intact entry has the identifier `mark`."""
     size = HEAD.size + VOLTAGE_BYTES * axes + CHECKSUM_BYTES
     try:
         with open(_beside(path), "rb") as file:
@@ -132,7 +132,7 @@ def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tu
 
 
 SCHEMA = "slpi_ros/saved_memory/1"
-# Maximum length of a document, characters; one of many axes has a few thousand.
+# Maximum length of a document, characters; a document with many axes has a few thousand.
 LONGEST = 1_000_000
 INTERRUPTED = "the reset was interrupted"
 CRASHED = "restored from before a crash: the last voltage is correct, the latest reversals may be missing; reset it"
@@ -149,7 +149,7 @@ class SavedAxis:
     certain : bool
         Whether the memory was known (reset or restored) when it was saved.
     doubt : str
-        Reason why the saved state may be incomplete; "" (default) if none. Not saved.
+        Reason why the saved state may be incomplete; "" (default) if none. Not written to the file.
     """
 
     reversal_voltages: tuple[float, ...]
@@ -157,13 +157,13 @@ class SavedAxis:
     doubt: str = ""
 
     def confidence(self, identified: tuple[float, float]) -> MemoryConfidence:
-        """Return the confidence in the restored memory for a model identified on the voltages `identified` (V)."""
+        """Return the confidence in the restored memory for a model identified on the voltage range `identified` (V)."""
         if self.certain and not self.doubt:
             return MemoryConfidence(RESTORED, spanned=identified)
         return MemoryConfidence(doubt=self.doubt)
 
     def after_crash(self, voltage: float) -> "SavedAxis":
-        """Return the state after a crash: as saved, then moved to `voltage` (V), the last output before the crash."""
+        """Return the state recovered after a crash: the saved reversals, then the last output `voltage` (V)."""
         moved = () if voltage == self.reversal_voltages[-1] else (voltage,)
         return SavedAxis((*self.reversal_voltages, *moved), self.certain, CRASHED)
 
@@ -177,7 +177,7 @@ class SavedMemory:
     model : str
         `model_id` of the model that the state belongs to.
     complete : bool
-        Whether the node was shut down in order after saving; if False, reversals may be missing.
+        Whether the node was shut down cleanly after saving; if False (crash), reversals may be missing.
     axes : mapping of axis name to SavedAxis
     """
 
@@ -275,7 +275,7 @@ class MemoryFile:
         self._last: LastVoltages | None = None
 
     def find(self, model: StageModel, names: Sequence[str], limits: Sequence[Limits]) -> Mapping[str, SavedAxis] | None:
-        """Return the hysteresis state saved at the last shutdown, or None if no file exists.
+        """Return the saved hysteresis state of each axis, or None if no file exists.
 
         Raises
         ------
@@ -289,7 +289,7 @@ class MemoryFile:
         return saved.axes
 
     def save(self, model: StageModel | None, axes: Mapping[str, SavedAxis], complete: bool) -> None:
-        """Write the state of `axes` if it has changed; `complete`: no further voltage is output before shutdown.
+        """Write the state of `axes` if it has changed; `complete` means that no further voltage is output afterwards.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Motion of an axis without desired displacements: ramps through given voltages, and braking to rest."""
+"""Motion of an axis without desired displacements: voltage ramps, and deceleration to rest."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ from slpi_ros.model.limits import RateLimiter
 
 # Sample period of a ramp, seconds.
 PERIOD = 0.004
-# Distance at which a voltage counts as reached, volts: rounding, and the slow end of an acceleration-limited stop.
+# Distance at which a target voltage counts as reached, volts: covers rounding, and the slow end of a deceleration.
 NEAR = 1e-9
 
 
@@ -20,9 +20,9 @@ class Safety:
     Parameters
     ----------
     command_timeout : float, seconds
-        Timeout of the watchdog; 0 disables it.
+        Timeout of the command watchdog; 0 disables the watchdog.
     ramps_on_timeout, ramps_on_deactivate : bool
-        Whether to ramp to the safe voltages at that event; if False, the voltages are held.
+        Whether to ramp to the safe voltages at a timeout, and at deactivation; if False, the voltages are held.
     voltages : tuple of float, length of axes, volts
         Safe voltage of each axis.
     rate : float, V/s
@@ -63,7 +63,7 @@ class Ramp:
         return not self._goals
 
     def step(self, present: float, dt: float, pace: RateLimiter) -> float:
-        """Return the next voltage (V) after `present` (V), `dt` (s) later (at most `MAX_DT`), limited by `pace`."""
+        """Return the voltage (V) `dt` (s, at most `MAX_DT`) after `present` (V), as the rate limiter `pace` allows."""
         if self.done:
             return present
         limits, dt = pace.limits, pace.clamp_dt(dt)
@@ -80,7 +80,7 @@ class Ramp:
 
 
 class Brake:
-    """Braking to rest within the acceleration limit.
+    """Deceleration to rest within the acceleration limit.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Brake:
         self.done = False
 
     def step(self, present: float, dt: float, pace: RateLimiter) -> float:
-        """Return the next voltage (V) after `present` (V), `dt` (s) later, limited by `pace`."""
+        """Return the voltage (V) `dt` (s) after `present` (V), as the rate limiter `pace` allows."""
         v = pace.step(present, present, pace.clamp_dt(dt))
         self.done = not pace.in_motion
         return v

@@ -65,13 +65,13 @@ class Counts:
         return replace(self, by_cause=dict(self.by_cause), measured_by_cause=dict(self.measured_by_cause))
 
 
-# Number of messages in the statistics.
+# Maximum number of messages in the statistics.
 WINDOW = 8192
 
 
 @dataclass(frozen=True)
 class TimingReport:
-    """Timing of the messages since the last restart, at most of the last `WINDOW` messages.
+    """Timing of the messages since the last `Timing.restart`, at most of the last `WINDOW` messages.
 
     Parameters
     ----------

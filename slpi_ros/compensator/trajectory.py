@@ -108,7 +108,7 @@ class Trajectory:
                 raise RejectedError(rejection.OUT_OF_RANGE, what)
 
     def useful_at(self, now_ns: int) -> "Trajectory":
-        """Return the points that are not in the past at `now_ns` (ns); all points if `start_ns` is 0.
+        """Return the trajectory without the points before `now_ns` (ns), or with all points if `start_ns` is 0.
 
         Raises
         ------
@@ -133,7 +133,7 @@ def _as_array(values: ArrayLike, dtype: type | None = None) -> NDArray[Any]:
 
 
 def _check_times(times: NDArray[Any], start_ns: int) -> None:
-    """Reject times from a start (ns), shape (N,), N >= 1, that are not integers or not strictly increasing."""
+    """Reject times since the start (ns), shape (N,), N >= 1, that are not integers, too large or not increasing."""
     if times.dtype.kind not in "iu":
         raise RejectedError(rejection.NOT_FINITE, f"times are of type {times.dtype}; give whole nanoseconds")
     if abs(start_ns) >= LATEST_NS or times.max() >= LATEST_NS:
@@ -166,7 +166,7 @@ class Point(NamedTuple):
 
 
 class _Track:
-    """Points of the axes with the same delay, executed in order.
+    """Points of one trajectory for all axes with the same delay, executed in order.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ class _Track:
     first : int
         Index of the first point to execute.
     counted : bool
-        Whether `remaining` counts the points: only one track of each trajectory is counted.
+        Whether `TrajectoryExecutor.remaining` counts the points: only one track of each trajectory is counted.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class TrajectoryExecutor:
     A new trajectory replaces the current points as in joint_trajectory_controller: at once, or, if it starts in the
     future, from its first deadline on. Any number of trajectories may be pending.
 
-    All times are nanoseconds on one clock of the caller.
+    All times are nanoseconds on the same clock, which the caller chooses.
 
     Attributes
     ----------
@@ -260,7 +260,7 @@ class TrajectoryExecutor:
 
     @property
     def tracks(self) -> int:
-        """Number of pending trajectories, each counted once for every different delay of its axes."""
+        """Number of tracks: each pending trajectory has one for every different delay of its axes."""
         return len(self._tracks)
 
     @property
@@ -308,7 +308,7 @@ class TrajectoryExecutor:
     def due(self, now_ns: int) -> Point | None:
         """Return the latest point that is due and not yet returned, or None; to be called until it returns None.
 
-        Earlier points are skipped, except the last one before another trajectory, which may move other axes.
+        Earlier points of the same track are skipped. Every track is returned separately, as it may move other axes.
         """
         if not self._tracks:
             return None

@@ -78,9 +78,9 @@ class TimestampRules:
     Parameters
     ----------
     jump : float, seconds
-        A stamp older than the last by at most this is late; by more, the clock was set back; newer by more is a gap.
+        Largest backward step of a late stamp; a larger one means a clock set back, a larger forward step a gap.
     max_age : float, seconds
-        A message stamped longer ago is rejected as stale; 0 (default) disables the check.
+        Messages stamped longer ago than this are rejected as stale; 0 (default) disables the check.
     """
 
     jump: float = 1.0
@@ -93,8 +93,8 @@ class Stamps:
     Parameters
     ----------
     jump_ns : int, nanoseconds
-        A stamp that is older than the last one by at most this is late; by more, the clock was set back and the
-        elapsed time restarts. Default 1 s.
+        A stamp that is older than the last one by at most this is late. If it is older by more than this, the clock
+        was set back, and the elapsed time restarts. Default 1 s.
     """
 
     __slots__ = ("_last_ns", "_restarted", "jump_ns")
@@ -124,7 +124,7 @@ class Stamps:
     def accept(self, stamp_ns: int) -> float:
         """Store a stamp (ns) accepted by `check`; return the time (s) since the last stamp.
 
-        The time is 0 for the first stamp, as set by `restart` after a restart, negative if the clock was set back.
+        It is 0 for the first stamp, `elapsed` for the first one after `restart`, negative if the clock was set back.
         """
         last, self._last_ns = self._last_ns, stamp_ns
         elapsed = self._restarted
@@ -142,5 +142,5 @@ class Stamps:
         return self.accept(now_ns)
 
     def restart(self, elapsed: float = 0.0) -> None:
-        """Count the next stamp as `elapsed` (s) after the present voltage; stamps older than the last remain late."""
+        """Make `accept` return `elapsed` (s) for the next stamp; stamps older than the last one are still late."""
         self._restarted = elapsed

@@ -1,1 +1,1 @@
-"""What a model gets wrong on a record, and why."""
+"""Diagnosis of model errors on records, and verification of models."""

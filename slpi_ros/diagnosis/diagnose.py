@@ -1,4 +1,4 @@
-"""From records and a model to what the model gets wrong, why, and the model that gets it right."""
+"""Diagnosis of a model on records: its errors, their causes, and the model extended by them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,15 +29,15 @@ from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
-# Kinds that are fitted to the record together with effects. Of another kind is said that it is the wrong one where its
-# error is so many times that of the loop family.
+# Kinds that are refitted together with the effects. Any other kind is reported as unsuitable if its error exceeds that
+# of the loop family by this factor.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
-# Effects that do the same wherever they are not told apart: one of them may stand for the other.
+# Effects with the same predictions wherever they cannot be distinguished: the model may contain either of them.
 SAME_ELSEWHERE = ({"delay", "lag"},)
-# What creeps on from before a record is the stage's where all records agree within this share.
+# Creep from a move before the records is part of the model if all records agree on the move within this share.
 BEGAN_ALIKE = 0.3
-# Initial histories explain a record as well as the best one with so many times its error; a zero has moved when that is
-# so many times the error. The gain is compared on so many stretches, of so many samples at least.
+# An initial history is possible up to this multiple of the lowest error; a zero has moved if its shift exceeds this
+# multiple of the error; number of parts for the uncertainty of a gain; fewest samples of a comparison.
 AS_WELL, ZERO, STRETCHES, FEWEST = 1.1, 4.0, 8, 50
 
 
@@ -49,31 +49,31 @@ def diagnose(
     start: float | None = None,
     stop: float | None = None,
 ) -> Diagnosis:
-    """Find what a model gets wrong on records, name the causes, and extend the model by them.
+    """Find the causes of the errors of a model on records, and extend the model by them.
 
     Parameters
     ----------
     record : Record or sequence of Record
-        Of the same stage. Several share hysteresis and effects; initial history, constant, drift and hum are each
-        record's own, and each record is left out in turn.
+        Records of one stage. Hysteresis and effects are common to all records; initial history, offset, drift and hum
+        are fitted to each record. Each of several records is held out once.
     model : StageModel
-        Of the same stage.
+        Model of the same stage.
     axes : sequence of str, optional
-        All that records and model share by default.
+        Axes to be diagnosed; by default all that the model and every record contain.
     start, stop : float, seconds, optional
-        Explain only samples with ``start <= t < stop``, t from the record's first stamp.
+        Fit only samples with ``start <= t < stop``; t is counted from the first stamp of each record.
 
     Returns
     -------
     Diagnosis
-        All errors in it are free-run and held out.
+        Diagnosis of each axis, with free-run errors, and the extended model.
 
     Raises
     ------
     UsageError
-        If records and model are not of one stage, or share no axis.
+        If records and model belong to different stages or share no axis, or a record is given twice.
     RecordError, IdentificationError
-        If the records say too little.
+        If the records contain too little data.
     """
     records = [record] if isinstance(record, Record) else list(record)
     common_stage(records, model.hardware_id)
@@ -98,7 +98,7 @@ def diagnose(
 
 
 def _require_different(records: Sequence[Record]) -> None:
-    """Raise UsageError if a record is there twice: it would confirm itself."""
+    """Raise UsageError if a record is given twice: held out, it would be predicted from its copy."""
     for number, record in enumerate(records):
         for earlier in records[:number]:
             if np.array_equal(record.time_ns, earlier.time_ns) and all(
@@ -114,37 +114,37 @@ def _diagnose_axis(
     report_progress(f"axis {axis}: fitting the hysteresis")
     evidence = evidence_of(records, axis, model, start, stop)
     same = len(records) == 1 and model.quality.source == records[0].source
-    # What belongs to one record says nothing of another.
+    # Effects that belong to one record (drift, hum) do not apply to another.
     shared = [effect for effect in model.effects if same or effect.removable != "record"]
     base = Explanation(evidence, shared)
     known = [effect for effect in shared if in_phase(effect, base)]
     if len(known) < len(shared):
         base = Explanation(evidence, known)
-    if model.kind in REFITTED:
-        selection = _selected(base, evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None)
-        before = base.held_out.rms_of_records
-    else:
-        # Such a kind is not fitted anew here: the loop family shows what it gets wrong.
-        selection, before = select(base, None), _given_rms(model, evidence)
-        if before > WRONG_KIND * base.held_out.rms:
-            selection = replace(selection, structures=(BIAS, *selection.structures))
-    given = _given(model, selection)
+    # Other kinds are not refitted; a comparison with the loop family shows whether they are suitable.
+    fitted = model.kind in REFITTED
+    family = evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None
+    selection = _selected(base, family) if fitted else select(base, None)
+    runs = [_free_run(model, part) for part in selection.now.evidence.parts]
+    before = base.held_out.rms_of_records if fitted else _rms(runs)
+    if not fitted and before > WRONG_KIND * base.held_out.rms:
+        selection = replace(selection, structures=(BIAS, *selection.structures))
+    given = _given(model, runs, selection)
     floor = _floor(selection.now)
     left_out = _ambiguous(selection)
-    # Beside what stays open, nothing that was fitted together with it can be trusted elsewhere.
+    # If effects remain ambiguous, parameters that were fitted together with them are not reliable on other records.
     refitted = given.changed or BIAS in selection.structures or bool(selection.named and not left_out)
     final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
     extended = _extended(model, final, floor, ", ".join(part.source for part in evidence.parts)) if refitted else model
-    outcomes = _outcomes(model, selection.now, final if refitted else None)
+    outcomes = _outcomes(runs, selection.now, final if refitted else None)
     missing = left_out if refitted else [named.name for named in selection.named]
     found = judged(selection, floor, before, given, outcomes, missing, driven_alike(records, axis))
     return found, extended
 
 
 def _ambiguous(selection: Selection) -> list[str]:
-    """Return the effects that may be something else, which would do otherwise on other records.
+    """Return the effects that cannot be distinguished from others whose predictions on other records differ.
 
-    What every record confirms of the others is told to them by either name.
+    Held-out records can resolve this, except for the effects `DYNAMIC` at a single drive frequency.
     """
     alone = one_speed(selection.now.evidence)
     return [
@@ -160,7 +160,7 @@ def _ambiguous(selection: Selection) -> list[str]:
 
 
 def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
-    """Return the outcome of the competition, beside the loop family where that does better than the kind of `base`."""
+    """Return the selection of effects, with the loop family as hysteresis if clearly better than the kind of `base`."""
     if of_family is None:
         return select(base, None)
     family = Explanation(of_family, base.effects)
@@ -172,7 +172,7 @@ def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
 
 
 def _floor(now: Explanation) -> Floor:
-    """Return the floor of the record that repeats itself worst; no less than what rounding adds."""
+    """Return the largest noise floor of the records, at least the rounding error and at most the held-out error."""
     floors = []
     for part, rows in zip(now.evidence.parts, now.evidence.slices, strict=True):
         residual = np.where(part.used, now.residual[rows], np.nan)
@@ -183,16 +183,16 @@ def _floor(now: Explanation) -> Floor:
 
 @dataclass(frozen=True)
 class _FreeRun:
-    """A model along a record, from the initial history that suits it best.
+    """Free-run simulation of a model on a record, from the initial history with the lowest error.
 
     Parameters
     ----------
     errors : ndarray, shape (N,), metres
         Measured - model.
     rms : float, metres
-        Without their constant.
+        Rms of the errors without their mean.
     offsets : (float, float), metres
-        Least and largest constant by initial histories that explain the record as well.
+        Smallest and largest offset (median error) over all possible initial histories.
     """
 
     errors: FloatArray
@@ -201,17 +201,17 @@ class _FreeRun:
 
     @property
     def offset(self) -> float:
-        """The constant nearest to none, metres."""
+        """Offset with the smallest magnitude, metres."""
         return min(self.offsets, key=abs)
 
     @property
     def moved(self) -> float:
-        """By how much (m) the zero has moved, whatever went before the record; 0 where that may be all of it."""
+        """Shift of the zero (m) that remains for every possible initial history; 0 if a history can explain it."""
         return 0.0 if self.offsets[0] <= 0.0 <= self.offsets[1] else self.offset
 
 
 def _free_run(model: AxisModel, part: Part) -> _FreeRun:
-    """Let a model run along a record from every initial history that may have been."""
+    """Simulate a model on a record from all candidate initial histories and return the best free run."""
     errors = [part.y - replace(model, start=start).simulate(part.t, part.v) for start in _starts(model, part)]
     chosen = _known(part)
     rms = np.array([np.std(each[part.used]) for each in errors])
@@ -222,19 +222,19 @@ def _free_run(model: AxisModel, part: Part) -> _FreeRun:
 
 
 def _known(part: Part) -> NDArray[np.bool_]:
-    """Return which samples do not depend on the initial history, but for a constant; all used where these are few."""
+    """Return the mask of used samples to which the initial history only adds a constant; all used ones if too few."""
     known = part.used & part.wiped
     return known if np.count_nonzero(known) >= FEWEST else part.used
 
 
 def _starts(model: AxisModel, part: Part) -> list[Start]:
-    """Return starts for several initial histories, each where the model says that it leads."""
+    """Return the initial states for all candidate histories, with the displacement that the model predicts for each."""
     if not model.causal:
         return [model.start]
     v0, (low, high) = float(part.v[0]), model.voltage_range
     ends = np.array([min(low, v0), max(high, v0)])
     whole = Samples(np.append(v0, ends), np.zeros(3), np.ones(3, dtype=bool))
-    # Whatever went before, a sweep over the whole range ends at one displacement.
+    # A sweep over the whole range ends at the same displacement for every history.
     swept = model.memory("start").forward_array(ends)[-1]
     found = [model.start] if model.start.voltage == v0 else []
     for history in dict.fromkeys((part.history, model.start.history, *histories(whole))):
@@ -243,30 +243,29 @@ def _starts(model: AxisModel, part: Part) -> list[Start]:
     return found
 
 
-def _given_rms(model: AxisModel, evidence: Evidence) -> float:
-    """Return the error (m) of the given model, without the constant of each record."""
-    return float(np.sqrt(np.mean([_free_run(model, part).rms ** 2 for part in evidence.parts])))
+def _rms(runs: Sequence[_FreeRun]) -> float:
+    """Return the rms (m) of the errors of several free runs, each without its mean."""
+    return float(np.sqrt(np.mean([run.rms**2 for run in runs])))
 
 
-def _given(model: AxisModel, selection: Selection) -> Given:
-    """Compare the given model with the records, and refuse one that has nothing to do with them."""
+def _given(model: AxisModel, runs: Sequence[_FreeRun], selection: Selection) -> Given:
+    """Compare the given model with the records; raise IdentificationError if it belongs to another stage."""
     evidence = selection.now.evidence
     motion = float(np.ptp(evidence.y[evidence.used]))
     sources = model.quality.source.split(", ")
     own = np.array([part.source in sources for part in evidence.parts])
-    runs = [_free_run(model, part) for part in evidence.parts]
-    rms = float(np.sqrt(np.mean([run.rms**2 for run in runs])))
+    rms = _rms(runs)
     if own.any() and not own.all():
-        # A gain that drifts within each record would explain one that has changed in between.
+        # A gain drift within each record would also explain a gain that has changed between records.
         steady = selection.now.without(GainDrift.name)
         compared = [_since(own, one) for one in (selection.base, steady)]
     else:
         compared = [_compared(replace(model, effects=()), one) for one in (selection.base, selection.now)]
-    # Records of the same names may be others, whose error tells.
+    # Records of the same name may be different ones; then the error differs from the stored one.
     own_rms = model.quality.rms if own.all() and len(sources) == own.size else 0.0
     compared = [replace(one, rms=rms, motion=motion, own_rms=own_rms) for one in compared]
-    # Effects change what a fit to the records makes of the hysteresis: a stage that has changed shows it without them
-    # and beside them.
+    # Effects alter the fitted hysteresis, so the stage has changed only if both comparisons, without effects and with
+    # them, show it.
     best = min(compared, key=lambda one: (one.changed, one.hysteresis_rms))
     if model.kind in REFITTED and not own.any():
         span = max(motion, float(np.ptp(model.displacement_range)))
@@ -277,9 +276,9 @@ def _given(model: AxisModel, selection: Selection) -> Given:
 
 
 def _compared(bare: AxisModel, one: Explanation) -> Given:
-    """Compare the hysteresis of the given model with what effects leave for one to explain."""
+    """Compare the given hysteresis with the measured displacement minus the effects of the joint fit `one`."""
     errors, refitted, gains, deviations = [], [], [], []
-    # Like the given one, the other hysteresis has branches that rise.
+    # Like the given hysteresis, the refitted one has monotone branches.
     hysteresis, begins = one.hysteresis()
     for part, rows, begin in zip(one.evidence.parts, one.evidence.slices, begins, strict=True):
         chosen = _known(part)
@@ -307,10 +306,10 @@ def _compared(bare: AxisModel, one: Explanation) -> Given:
 
 
 def _since(own: NDArray[np.bool_], one: Explanation) -> Given:
-    """Compare records with those that the given model was identified from, `own`, shape (records,).
+    """Compare new records with those from which the given model was identified, the mask `own`, shape (records,).
 
-    The given model holds what effects did to its own records, and others show them in another way: what one explanation
-    of all records leaves tells whether the stage has changed in between.
+    The given model has absorbed the effects in its own records, which act differently in others. Therefore the
+    residuals of one joint fit to all records show whether the stage has changed in between.
     """
     found = []
     for part, rows in zip(one.evidence.parts, one.evidence.slices, strict=True):
@@ -335,7 +334,7 @@ def _since(own: NDArray[np.bool_], one: Explanation) -> Given:
 
 
 def _weighted(values: FloatArray, deviations: FloatArray) -> tuple[float, float]:
-    """Return the mean of values, weighted by their standard deviations, and its variance; 0 where none is known."""
+    """Return the mean of values weighted by inverse variance, and its variance; (0, inf) if all deviations are inf."""
     weights = 1.0 / np.maximum(np.square(deviations), 1e-300)
     if not weights.sum():
         return 0.0, np.inf
@@ -343,7 +342,7 @@ def _weighted(values: FloatArray, deviations: FloatArray) -> tuple[float, float]
 
 
 def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:
-    """Return by which share a displacement moves more than `h` (m), and its standard deviation, from stretches."""
+    """Return the gain of `target` relative to `h` (m) minus 1, and its standard deviation from `STRETCHES` parts."""
     moved, missed = h - h.mean(), target - h
     whole = float(moved @ missed / max(float(moved @ moved), 1e-300))
     left = missed - missed.mean() - whole * moved
@@ -353,19 +352,18 @@ def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:
     return whole, float(np.sqrt(np.sum(np.square(parts))) / max(float(moved @ moved), 1e-300))
 
 
-def _outcomes(model: AxisModel, now: Explanation, final: Explanation | None) -> tuple[RecordOutcome, ...]:
-    """Return what became of each record; without `final` the model stays as it is."""
+def _outcomes(runs: Sequence[_FreeRun], now: Explanation, final: Explanation | None) -> tuple[RecordOutcome, ...]:
+    """Return the errors of each record before and after the diagnosis; without `final` the model is unchanged."""
     left_out = [error if np.isfinite(error) else None for error in np.sqrt(now.held_out.records).tolist()] or [None]
     outcomes = []
-    for part, rows, other in zip(now.evidence.parts, now.evidence.slices, left_out, strict=True):
-        run = _free_run(model, part)
+    for part, rows, run, other in zip(now.evidence.parts, now.evidence.slices, runs, left_out, strict=True):
         after = float(np.std(final.residual[rows][part.used])) if final else run.rms
         outcomes.append(RecordOutcome(part.source, run.offset, run.rms, after, other))
     return tuple(outcomes)
 
 
 def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> AxisModel:
-    """Return the model with the effects found, its hysteresis fitted together with them, as the first record starts."""
+    """Return the model with jointly fitted hysteresis and effects, in the initial state of the first record."""
     evidence, first = now.evidence, now.evidence.parts[0]
     hysteresis, starts = now.hysteresis()
     y, errors = evidence.y[evidence.used], now.residual[evidence.used]
@@ -394,7 +392,7 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
 
 
 def _creeping_on(effect: Effect, now: Explanation) -> Effect:
-    """Return a creep that goes on from a move before the record, where all of several records say the same of it."""
+    """Return the effect; a creep includes the move before the records (`initial`) if several records agree on it."""
     records = len(now.evidence.parts)
     if not isinstance(effect, Creep) or records == 1 or now.began.size != records or not effect.gains[0]:
         return effect

@@ -1,4 +1,4 @@
-"""The parameters of an effect that a fit may change, as one vector."""
+"""Free parameters of effects as vectors, with their bounds, step sizes and uncertainties."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from slpi_ros.effects.rate_dependence import RateDependence
 
 FloatArray = NDArray[np.float64]
 
-# The others (times of a drift, the form of a rate dependence) are chosen, not fitted.
+# Fitted parameters of each effect; the others (times of a drift, form of a rate dependence) are chosen, not fitted.
 FREE = {
     "delay": ("seconds",),
     "lag": ("time_constant",),
@@ -28,10 +28,10 @@ FREE = {
     "sensor_periodic": ("period", "amplitude", "phase"),
     "hum": ("frequency", "amplitude", "phase"),
 }
-# Of a rate dependence without backlash, and of one that is a coercivity.
+# Fitted parameters of a rate dependence without backlash, and of one in coercivity form.
 WIDENING = ("widening", "exponent")
 COERCIVE = ("coercivity", "exponent", "onset", "settling", "reversible")
-# Least values; what is not named may have either sign.
+# Lower bounds; other parameters may be negative, except those of `NOT_NEGATIVE`.
 LEAST = {
     "time_constant": 1e-6,
     "time_constants": FASTEST,
@@ -46,8 +46,8 @@ LEAST = {
     "onset": 0.1,
     "reversible": -np.inf,
 }
-# Greatest values, of any effect or of one. What is damped more does not ring; what grows as the rate itself is a shift
-# in time.
+# Upper bounds by parameter, or by effect or side and parameter. With more damping there is no resonance; a rate
+# dependence proportional to the rate is a time shift.
 MOST = {
     "damping": 0.4,
     "displacement.exponent": 0.6,
@@ -55,11 +55,11 @@ MOST = {
     "settling": 0.05,
     "cross_coupling.gains": 0.4,
 }
-# Effects none of whose other parameters may be negative.
+# Effects whose parameters have the lower bound 0 if `LEAST` states no other.
 NOT_NEGATIVE = ("creep", "rate_dependence")
-# Parameters that the displacement is linear in, or nearly so at any size.
+# Parameters in which the displacement is linear, or nearly so; their steps are not limited.
 LINEAR = ("gains", "values", "origin", "widening", "backlash", "seconds", "reversible")
-# At most so many times its own size may a parameter change in one step.
+# Largest change of a parameter in one step, relative to its magnitude.
 LARGEST_STEP = 0.7
 
 
@@ -74,12 +74,12 @@ def _free_fields(effect: Effect) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class EachRecord:
-    """An effect that every record has of its own, such as drift or hum.
+    """An effect with separate parameters in each record, such as drift or hum.
 
     Parameters
     ----------
     parts : tuple of Effect
-        One for each record.
+        The effect in each record.
     """
 
     parts: tuple[Effect, ...]
@@ -93,40 +93,40 @@ class EachRecord:
 
     @property
     def uncertainty(self) -> Mapping[str, float]:
-        """That of the first record's."""
+        """Standard deviations of the parameters in the first record, by name."""
         return self.parts[0].uncertainty
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return what becomes of a signal, shape (N,), metres, of all records."""
+        """Return the output for the concatenated signals of all records, shape (N,), metres."""
         records = zip(self.parts, around.split(signal), around.records, strict=True)
         return np.concatenate([part.apply(own, record) for part, own, record in records])
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the signal, shape (N,), metres, that becomes the given one."""
+        """Return the input signal, shape (N,), metres, for an output signal of all records."""
         records = zip(self.parts, around.split(signal), around.records, strict=True)
         return np.concatenate([part.invert(own, record) for part, own, record in records])
 
     def describe(self) -> str:
-        """Say what it is in each record."""
+        """Describe the effect in each record."""
         return "; ".join(f"record {k}: {part.describe()}" for k, part in enumerate(self.parts, 1))
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate | Effect]:
-        """Yield nothing: its parts look for themselves."""
+        """Yield nothing: candidates come from the effect of each record."""
         yield from ()
 
     def streaming(self) -> None:
-        """Return None: it belongs to the records' clocks."""
+        """Return None: the effect depends on the time in its record and cannot be compensated sample by sample."""
         return
 
 
 def _is_law(effect: Effect) -> bool:
-    """Return whether it is a creep by the logarithmic law: all its relaxations have one gain."""
+    """Return whether an effect is logarithmic creep: several relaxations with equal gains."""
     return isinstance(effect, Creep) and len(effect.gains) >= LAW_FEWEST and len(set(effect.gains)) == 1
 
 
 def _items(effect: Effect) -> list[tuple[str, float]]:
-    """Return name and value of each free parameter: that of the field, with place or axis where there are several."""
+    """Return name and value of each free parameter; elements of a field have names such as ``gains.0``."""
     if isinstance(effect, EachRecord):
         return [(f"{name}", value) for part in effect.parts for name, value in _items(part)]
     if isinstance(effect, Creep) and _is_law(effect):
@@ -144,17 +144,17 @@ def _items(effect: Effect) -> list[tuple[str, float]]:
 
 
 def names(effect: Effect) -> list[str]:
-    """Return a name for each free parameter."""
+    """Return the names of the free parameters."""
     return [name for name, _ in _items(effect)]
 
 
 def free(effect: Effect) -> FloatArray:
-    """Return the free parameters, shape (k,), SI."""
+    """Return the values of the free parameters, shape (k,), SI."""
     return np.array([value for _, value in _items(effect)], dtype=np.float64)
 
 
 def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect:
-    """Return the effect with other free parameters, kept where they make sense; `longest`: of time constants, s."""
+    """Return the effect with new free parameters, clipped to their bounds; `longest`: largest time constant (s)."""
     if isinstance(effect, EachRecord):
         own = np.split(values, np.cumsum([free(part).size for part in effect.parts[:-1]]))
         return EachRecord(tuple(moved(part, some, longest) for part, some in zip(effect.parts, own, strict=True)))
@@ -182,7 +182,7 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
 
 
 def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
-    """Return a small step of each free parameter, shape (k,), SI, for derivatives."""
+    """Return the step of each free parameter for numerical derivatives, shape (k,), SI."""
     if isinstance(effect, EachRecord):
         return np.concatenate([steps(part, t, v) for part in effect.parts])
     dt = usual_step(t)
@@ -208,7 +208,7 @@ def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def bounded(effect: Effect, change: FloatArray) -> FloatArray:
-    """Return a change of the free parameters, shortened where it is larger than a linear fit can be trusted."""
+    """Return a change of the free parameters, limited to the range in which the linearised fit is valid."""
     limit = LARGEST_STEP * np.abs(free(effect))
     for k, name in enumerate(names(effect)):
         if name.partition(".")[0] in LINEAR:
@@ -219,7 +219,7 @@ def bounded(effect: Effect, change: FloatArray) -> FloatArray:
 
 
 def certain(effect: Effect, spread: Sequence[float]) -> Effect:
-    """Return the effect with the standard deviations of its free parameters, in their order."""
+    """Return the effect with `spread`, the standard deviations of its free parameters in order, as its uncertainty."""
     left = list(spread)
     if isinstance(effect, EachRecord):
         return EachRecord(tuple(certain(part, [left.pop(0) for _ in free(part)]) for part in effect.parts))

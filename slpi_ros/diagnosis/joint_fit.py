@@ -1,11 +1,11 @@
-"""The hysteresis of one axis with effects around it, fitted to records together and scored on what is left out.
+"""Joint fit of the hysteresis and the effects of one axis to records, and its cross-validation.
 
-The hysteresis is linear in its parameters ``x``, and so is an effect in its gains ``g``, or in a small change of its
-parameters: ``y = A x + J g``. With the hysteresis eliminated once for every fold (Frisch-Waugh), trying other columns
-``J`` takes a few products with sparse matrices; so hundreds of them can compete.
+The displacement is linear in the hysteresis parameters ``x`` and in the gains ``g`` of effects or small changes of
+their parameters: ``y = A x + J g``. The hysteresis is eliminated once per fold (Frisch-Waugh theorem); then other
+columns ``J`` need only a few sparse matrix products, so that hundreds of candidates can be compared.
 
-Left out are blocks of every record, and where there are several, each record in turn: the hysteresis is fitted to the
-others, and of that one nothing is estimated but how it began and its constant.
+Blocks of every record are held out and, if there are several, each record in turn: the hysteresis is fitted to the
+other records, and only offset and initial relaxation are estimated from the held-out record itself.
 """
 
 import operator
@@ -35,45 +35,47 @@ from slpi_ros.identification.samples import Samples
 FloatArray = NDArray[np.float64]
 Factor = tuple[FloatArray, bool]
 
-# What effects add is found in turns with the hysteresis, until a turn changes it by less than this share of the error.
+# Effects and hysteresis are updated in turn: largest number of iterations, and change (share of the error) below which
+# they stop.
 MOST_TURNS, SETTLED = 15, 0.001
-# Voltages at which the middle of the largest loop is found.
+# Number of voltages at which the mid-line of the largest loop is computed.
 LEVELS = 60
-# Steps towards the best parameters end when they gain less than this share of the error.
+# Gauss-Newton steps end when one lowers the objective by less than this share.
 ENOUGH = 1e-3
-# Time constants are no longer than so many times the longest record.
+# Upper bound of time constants, as a multiple of the duration of the longest record.
 SLOWEST = 10.0
-# Of a step, where all of it is too much.
+# Shares of a Gauss-Newton step, tried in this order until one lowers the objective.
 SHARES = (1.0, 0.4, 0.1)
-# Keeps the gains definite where columns are alike, relative to the columns' own size.
+# Regularisation that keeps the gains unique for collinear columns, relative to the size of the columns.
 ALIKE = 1e-9
-# Share of the record that is its beginning.
+# Initial share of a record, which is never held out.
 BEGINNING = 0.08
-# Of more samples every so manieth is fitted and judged, from all that effects and memory do to every one of them.
+# Largest number of samples that are fitted and held out. Longer records are thinned for this, but hysteresis
+# and effects are simulated at every sample.
 MOST_ROWS = 20_000
-# Others cover a parameter of the hysteresis that weighs so much in them (sum of squares), and can predict a sample of
-# which less than this share depends on parameters that they do not cover. A record is judged by so many samples.
+# The other records cover a hysteresis parameter with at least this sum of squares in them, and can predict a sample if
+# it depends on other parameters by less than this weight. Fewest samples for the held-out error of a record.
 SEEN, UNSEEN, FEWEST_JUDGED = 0.1, 0.02, 200
-# Nor can they predict a sample where the variance of the prediction is so many times the usual one; it is found at so
-# many samples of a record.
+# They cannot predict a sample with more than this multiple of the median prediction variance; approximate number of
+# samples of a record at which the variance is computed.
 UNCERTAIN, LOOKED_AT = 10.0, 1000
-# Blocks of a fold are told apart when scores are compared.
+# Number of blocks of held-out samples for the comparison of two scores.
 BLOCKS = 40
 
 
 @dataclass(frozen=True)
 class Score:
-    """How well columns and hysteresis together predict what is left out of the fit.
+    """Held-out errors of a joint fit of hysteresis and columns.
 
     Parameters
     ----------
     losses : ndarray, shape (blocks,), m^2
-        Mean square of the errors of each block.
+        Mean square held-out error of each block.
     gains : ndarray, shape (k,)
-        Of the columns, fitted to all blocks.
+        Gains of the columns, fitted to all samples.
     records : ndarray, shape (records,), m^2
-        Mean square of the errors of each record, its constant apart, by a fit to the others; NaN where these cover too
-        little of it, empty for one record.
+        Mean square error of each record without its offset, from a fit to the other records; NaN if these cover too
+        little of it, empty if there is only one record.
     """
 
     losses: FloatArray
@@ -82,25 +84,25 @@ class Score:
 
     @property
     def rms(self) -> float:
-        """Held-out error on blocks, metres."""
+        """Rms error of held-out blocks, metres."""
         return float(np.sqrt(np.mean(self.losses)))
 
     @property
     def rms_of_records(self) -> float:
-        """Held-out error on records, metres; on blocks where there is one record."""
+        """Rms error of held-out records, metres; of held-out blocks if there are none."""
         return float(np.sqrt(np.nanmean(self.records))) if np.isfinite(self.records).any() else self.rms
 
 
 class Joint:
-    """The normal equations of one axis's hysteresis, ready for columns to be put beside it.
+    """Normal equations of the hysteresis of one axis, to which columns of effects can be added.
 
     Parameters
     ----------
     evidence : Evidence
     u : ndarray, shape (N,), volts
-        What drives the hysteresis.
+        Voltage that drives the hysteresis.
     like : Joint, optional
-        Of the same records; they are judged by the same samples.
+        Equations of the same records, from which the mask `predictable` is reused.
     """
 
     def __init__(self, evidence: Evidence, u: FloatArray, like: "Joint | None" = None) -> None:
@@ -110,14 +112,14 @@ class Joint:
         self._groups = _groups(self.problem, evidence)
         self.everything = self.problem.design.rows(np.concatenate(self._groups))
         self._ends = np.cumsum([0, *(rows.size for rows in self._groups)]).tolist()
-        # Of each row of the problem, and of each that is fitted.
+        # Sample of each row of the problem, and of each fitted row in the order of the groups.
         self._sample = np.empty(self.problem.y.size, dtype=np.int64)
         self._sample[evidence.rows] = np.arange(evidence.rows.size)
         self._samples = self._sample[np.concatenate(self._groups)]
 
     @cached_property
     def factor(self) -> Factor:
-        """Factor of the hysteresis's equations, all samples."""
+        """Cholesky factor of the normal equations of the hysteresis for all samples."""
         return self._factored(self.everything.gram(), self._ends[-1])
 
     def _factored(self, gram: FloatArray, count: int) -> Factor:
@@ -125,12 +127,12 @@ class Joint:
 
     @cached_property
     def rows(self) -> list[Rows]:
-        """Equations of each group."""
+        """Rows of the design matrix by group of samples."""
         return [self.problem.design.rows(rows) for rows in self._groups]
 
     @cached_property
     def held_out(self) -> tuple[list["_HeldOut"], list["_HeldOut"]]:
-        """The folds, and the records where there are several."""
+        """Held-out folds, and held-out records if there are several."""
         grams = [rows.gram() for rows in self.rows]
         everything, whole = range(len(grams)), _sum(grams)
 
@@ -149,7 +151,7 @@ class Joint:
 
     @cached_property
     def predictable(self) -> NDArray[np.bool_]:
-        """Samples, shape (N,), that the other records can predict, whatever their record's initial history."""
+        """Mask of the samples, shape (N,), that the other records can predict for any initial history."""
         whole = self.everything.gram()
         found = np.zeros(self.evidence.t.size, dtype=bool)
         for k, samples in enumerate(self.evidence.slices):
@@ -159,20 +161,20 @@ class Joint:
             factor = self._factored(rest, self._ends[-1] - rows.size)
             every = -(-rows.size // LOOKED_AT)
             predicted = _predicted(own, _judged(self.problem)[rows], rest, factor, self.evidence.basis.size, every)
-            # A sample that is not fitted counts like the fitted one before it.
+            # A sample that is not fitted is treated like the preceding fitted one.
             place = np.searchsorted(self._sample[rows], np.arange(samples.start, samples.stop), side="right") - 1
             found[samples] = predicted[np.maximum(place, 0)]
         return found
 
     @cached_property
     def blocks(self) -> list[NDArray[np.int64]]:
-        """Rows of the blocks that are left out, in the order of time."""
+        """Row indices of each held-out block, in time order."""
         left_out = [self._groups[group] for fold in self.held_out[0] for group in fold.left]
         return np.array_split(np.sort(np.concatenate(left_out)), BLOCKS)
 
     @cached_property
     def largest_loops(self) -> list[tuple[FloatArray, Design]]:
-        """Of each record voltages (V), and the hysteresis from the record's first sample up, down and up over them."""
+        """For each record, voltages (V) and the design matrix of a rise, fall and rise over these voltages."""
         levels, loops = np.linspace(float(self.u.min()), float(self.u.max()), LEVELS), []
         for part, rows in zip(self.evidence.parts, self.evidence.slices, strict=True):
             path = np.concatenate([self.u[rows.start : rows.start + 1], levels, levels[::-1], levels])
@@ -181,40 +183,40 @@ class Joint:
         return loops
 
     def padded(self, signal: FloatArray) -> FloatArray:
-        """Return a signal, shape (N,), metres, on the rows of the problem, in units of its scale."""
+        """Return a signal, shape (N,), metres, at the rows of the problem, in units of its scale; 0 at others."""
         whole = np.zeros(self.problem.y.size)
         whole[self.evidence.rows] = signal / self.problem.scale
         return whole
 
     def sampled(self, signals: FloatArray) -> FloatArray:
-        """Return signals, shape (N, ..), metres, at the rows of the equations, in units of the problem's scale."""
+        """Return signals, shape (N, ..), metres, at the fitted samples, group by group, in units of the scale."""
         chosen: FloatArray = signals[self._samples] / self.problem.scale
         return chosen
 
     def grouped(self, signals: FloatArray) -> list[FloatArray]:
-        """Return signals at the rows of the equations as those of each group."""
+        """Split the result of `sampled` into its groups."""
         return [signals[first:end] for first, end in pairwise(self._ends)]
 
     def predict(self, x: FloatArray) -> FloatArray:
-        """Return what the hysteresis gives for parameters `x`, shape (N,), metres."""
+        """Return the displacement of the hysteresis, shape (N,), metres, for parameters `x`, shape (p,)."""
         return self.problem.design.predict(x)[self.evidence.rows] * self.problem.scale
 
     def columns(self, *signals: FloatArray) -> "Columns":
-        """Return the equations of signals, shape (N,) or (N, k) each, metres, beside the hysteresis."""
+        """Return signals, shape (N,) or (N, k) each, metres, as columns of a joint fit with the hysteresis."""
         return Columns(self, self.sampled(np.column_stack(signals)))
 
     def score(self, signals: Sequence["Columns"], *, positive: int = 0, starting: Sequence[int] = ()) -> Score:
-        """Score hysteresis and columns on what is left out.
+        """Return the held-out errors of a joint fit of hysteresis and columns.
 
         Parameters
         ----------
         signals : sequence of Columns
-            The very first column is what the others are to explain, with the hysteresis.
+            The very first column is the target, to which hysteresis and all other columns are fitted.
         positive : int
-            Number of the last columns whose gains may not be negative.
+            Number of trailing columns whose gains must be non-negative.
         starting : sequence of int
-            Columns, the first one not counted, that tell how a record began: with its constant they are fitted to a
-            record that is left out.
+            Indices of the columns, without counting the target, that describe the state before a record. Together with
+            an offset, they are fitted to a held-out record itself.
         """
         at = self.grouped(np.column_stack([one.at for one in signals]))
         projected = [np.column_stack(parts) for parts in zip(*(one.projected for one in signals), strict=True)]
@@ -223,7 +225,7 @@ class Joint:
         errors, (folds, records) = np.full(self.problem.y.size, np.nan), self.held_out
         for k, fold in enumerate(folds):
             solved = np.column_stack([one.solved_of_folds[k] for one in signals])
-            # Sums, not differences: a column that is zero in the others is exactly zero.
+            # Sums instead of differences, so that a column that is zero in all other groups stays exactly zero.
             rest, inner = (_sum([own[group] for group in fold.rest]) for own in (projected, products))
             of_rest = _gains(rest, inner, solved, positive)
             x = solved @ _missed(of_rest)
@@ -232,7 +234,7 @@ class Joint:
         losses = np.array([float(np.mean(errors[rows] ** 2)) for rows in self.blocks])
         left_out = []
         for record in records:
-            # The gains of the columns are those of all records: one record at one speed does not tell them.
+            # The gains are fitted to all records, because the remaining ones, if at one speed, may not determine them.
             rest = _sum([projected[group] for group in record.rest])
             x = _solved(record.factor, rest @ _missed(gains))
             missed = [self.rows[group].predict(x) - at[group] @ _missed(gains) for group in record.left]
@@ -243,9 +245,9 @@ class Joint:
 
 
 def _without_start(missed: FloatArray, began: FloatArray) -> float:
-    """Return the mean square of errors, shape (n,), without their constant and what columns, shape (n, k), explain.
+    """Return the mean square of errors, shape (n,), after a fit of a constant and of columns, shape (n, k), to them.
 
-    NaN where there are too few to judge by.
+    NaN for fewer than `FEWEST_JUDGED` errors.
     """
     if missed.size < FEWEST_JUDGED:
         return np.nan
@@ -255,7 +257,7 @@ def _without_start(missed: FloatArray, began: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """Groups that are left out, the others, the factor of their equations, and which rows of a record they predict."""
+    """Held-out groups, the other groups, the Cholesky factor of these, and the mask of the rows they can predict."""
 
     left: Sequence[int]
     rest: Sequence[int]
@@ -265,13 +267,13 @@ class _HeldOut:
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns beside the hysteresis.
+    """Columns of a joint fit with the hysteresis.
 
     Parameters
     ----------
     joint : Joint
     at : ndarray, shape (n, k)
-        The columns at the rows of the equations.
+        Columns at the fitted samples, as returned by `Joint.sampled`.
     """
 
     joint: Joint
@@ -279,23 +281,23 @@ class Columns:
 
     @cached_property
     def projected(self) -> list[FloatArray]:
-        """``A'J`` of each group, shape (p, k)."""
+        """Product ``A'J`` of each group, shape (p, k)."""
         joint = self.joint
         return [rows.project(own) for rows, own in zip(joint.rows, joint.grouped(self.at), strict=True)]
 
     @cached_property
     def whole(self) -> FloatArray:
-        """``A'J``, shape (p, k)."""
+        """Product ``A'J`` of all groups, shape (p, k)."""
         return self.joint.everything.project(self.at)
 
     @cached_property
     def solved(self) -> FloatArray:
-        """Parameters of the hysteresis that explains each column best, shape (p, k)."""
+        """Hysteresis parameters, shape (p, k), of the best fit to each column."""
         return _solved(self.joint.factor, self.whole)
 
     @cached_property
     def solved_of_folds(self) -> list[FloatArray]:
-        """The same without each fold."""
+        """Hysteresis parameters, shape (p, k), of the best fit to each column without the samples of each fold."""
         return [
             _solved(fold.factor, _sum([self.projected[group] for group in fold.rest]))
             for fold in self.joint.held_out[0]
@@ -313,7 +315,7 @@ class Columns:
         Returns
         -------
         x : ndarray, shape (p,)
-            Of the hysteresis, in units of the problem's scale; branches may fall a little.
+            Hysteresis parameters in units of the problem's scale, without the constraint of monotone branches.
         gains : ndarray, shape (k,)
         """
         own = self.joint.columns(y)
@@ -324,21 +326,21 @@ class Columns:
 
 
 def _missed(gains: FloatArray) -> FloatArray:
-    """Return the weights, shape (1 + k,), of a signal and the columns that explain it with some gains, shape (k,)."""
+    """Return the weights ``[1, -gains]``, shape (1 + k,), with which target and columns add up to the residual."""
     return np.concatenate([[1.0], -gains])
 
 
 def _gains(projected: FloatArray, products: FloatArray, solved: FloatArray, positive: int = 0) -> FloatArray:
-    """Return the gains, shape (k,), of columns that explain the first one together with the hysteresis.
+    """Return the gains, shape (k,), of the columns in a joint fit with the hysteresis to the first column.
 
     Parameters
     ----------
     projected, solved : ndarray, shape (p, 1 + k)
-        ``A'J`` and the hysteresis that explains each column.
+        ``A'J``, and the hysteresis parameters of the best fit to each column.
     products : ndarray, shape (1 + k, 1 + k)
         ``J'J``.
     positive : int
-        Number of the last columns whose gains may not be negative.
+        Number of trailing columns whose gains must be non-negative.
     """
     if products.shape[0] == 1:
         return np.empty(0)
@@ -363,9 +365,9 @@ def _solved(factor: Factor, of: FloatArray) -> FloatArray:
 
 
 def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
-    """Return of each record the rows that are always fitted, then those of each fold.
+    """Return, for each record, the rows that are in every fit, followed by the rows of each fold.
 
-    The beginning is never left out: what settles there from before the record shows nowhere else.
+    The beginning of a record is never held out, because relaxation from before the record is visible only there.
     """
     judged, groups = _judged(problem), []
     for rows in evidence.slices:
@@ -381,33 +383,33 @@ def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
 
 
 def _judged(problem: Problem) -> NDArray[np.bool_]:
-    """Return which rows other parts of a record, or other records, can predict, shape (N,)."""
+    """Return the mask of the rows, shape (N,), that other parts of the record or other records can predict."""
     walk = problem.design.walk
-    # While it has not moved yet the memory does not matter: what shows there comes from outside.
+    # Before the first motion the hysteresis state does not matter; the signal there is not due to hysteresis.
     return np.asarray((problem.judged & ~walk.first_rise) | (walk.direction == 0))
 
 
 def _predicted(
     own: Rows, known: NDArray[np.bool_], rest: FloatArray, factor: Factor, size: int, every: int
 ) -> NDArray[np.bool_]:
-    """Return which rows of a record, shape (n,), the others can predict.
+    """Return the mask of the rows of a record, shape (n,), that the other records can predict.
 
     Parameters
     ----------
     own : Rows
-        Of the record.
+        Rows of the record.
     known : ndarray of bool, shape (n,)
-        Rows that do not depend on the initial history but for a constant.
+        Rows to which the initial history only adds a constant.
     rest, factor : ndarray, shape (p, p), and its factor with the penalty
-        Equations of the other records.
+        Normal equations of the other records.
     size : int
-        Number of parameters of the hysteresis; those behind it are displacements at rest.
+        Number of hysteresis parameters; the remaining parameters are the displacements at rest.
     every : int
-        The variance is found for one of so many rows.
+        Step between the rows at which the prediction variance is computed.
     """
     if not known.any():
         return known
-    # What only the way before these samples depends on is a constant for them.
+    # Parameters on which only the preceding path depends add a constant to these samples.
     depends = abs(own.local[known]).sum(axis=0) > 0.0
     unseen = np.where(depends & (np.diag(rest) < SEEN), 1.0, 0.0)
     unseen[size:] = 0.0
@@ -436,27 +438,27 @@ def _sum(parts: Sequence[FloatArray]) -> FloatArray:
 
 
 class Explanation:
-    """Effects in the order of the signal chain, and the hysteresis that goes with them.
+    """Joint fit of the hysteresis and of effects, which are in the order of the signal chain.
 
     Parameters
     ----------
     evidence : Evidence
     effects : sequence of Effect
     like : Explanation, optional
-        Of the same evidence; its equations serve again where the same voltage drives the hysteresis.
+        Fit to the same evidence, whose equations are reused if the same voltage drives the hysteresis.
 
     Attributes
     ----------
     u : ndarray, shape (N,), volts
-        What drives the hysteresis.
+        Voltage that drives the hysteresis.
     h : ndarray, shape (N,), metres
-        What the hysteresis gives.
+        Displacement of the hysteresis.
     added : ndarray, shape (N,), metres
-        What the effects add behind the hysteresis, or lead round it.
+        Contribution of the effects on the displacement, and of the reversible path parallel to the hysteresis.
     settling : ndarray, shape (N,), metres
-        What still goes on at the start of the record from moves before it.
+        Relaxation in each record from moves before it, and the additional columns `beside` of the evidence.
     began : ndarray, shape (k,), metres
-        How much of it, of each record one behind the other.
+        Amplitudes of that relaxation, record by record.
     """
 
     joint: Joint
@@ -514,32 +516,32 @@ class Explanation:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Samples that count, shape (N,)."""
+        """Mask of the samples used in the fit, shape (N,)."""
         return self.evidence.used
 
     @property
     def others(self) -> Mapping[str, FloatArray]:
-        """Motion of the other axes from their start, shape (N,), metres."""
+        """Displacement of the other axes relative to their start, shape (N,), metres."""
         return self.evidence.others
 
     @property
     def target(self) -> FloatArray:
-        """What the hysteresis is to explain, shape (N,), metres."""
+        """Measured displacement minus the contribution of the effects, shape (N,), metres."""
         return self.evidence.y - self.added
 
     @property
     def predicted(self) -> FloatArray:
-        """What hysteresis and effects give, shape (N,), metres."""
+        """Predicted displacement, shape (N,), metres."""
         return self.h + self.added + self.settling
 
     @property
     def residual(self) -> FloatArray:
-        """What they leave of the measured displacement, shape (N,), metres."""
+        """Residual, measured - predicted, shape (N,), metres."""
         return self.evidence.y - self.predicted
 
     @property
     def around(self) -> EffectContext:
-        """What effects may look at."""
+        """Context passed to the effects."""
         return self._around(self.u)
 
     def _around(self, u: FloatArray) -> EffectContext:
@@ -551,13 +553,13 @@ class Explanation:
         return replace(around, u=u, middle=self._middles[0], records=records)
 
     def of_record(self, k: int) -> "RecordLeft":
-        """Return what is left of one record."""
+        """Return the signals and the residual of record `k`."""
         rows, around = self.evidence.slices[k], self.around.records[k]
         t, u, h, y, residual = (x[rows] for x in (self.t, self.u, self.h, self.y, self.residual))
         return RecordLeft(t, u, h, y, self.used[rows], residual, around)
 
     def _behind(self, effects: Sequence[Effect], h: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the displacement, shape (N,), metres, that effects make of what the hysteresis gives, `h`."""
+        """Return the displacement, shape (N,), metres, after effects have been applied to the hysteresis output `h`."""
         around = self._around(u)
         for effect in effects:
             if effect.side == "displacement":
@@ -565,13 +567,13 @@ class Explanation:
         return h
 
     def _middle(self, k: int) -> Callable[[FloatArray], FloatArray]:
-        """Return what gives the displacement (m) of a record half-way between the branches of the largest loop.
+        """Return the function that maps voltage (V) to the mid-line of the largest loop (m) of record `k`.
 
-        It is a function of voltages (V).
+        The mid-line is the mean of the rising and the falling branch.
         """
         x, first = self._x[: self.evidence.basis.size + 1], float(self.h[self.evidence.slices[k].start])
         levels, whole = self.joint.largest_loops[k]
-        # The function must not hold this object: others keep it, and a fit takes much room.
+        # The function must not refer to this object, which takes much memory and would be kept alive by it.
         scale = self.joint.problem.scale
 
         @cache
@@ -584,13 +586,13 @@ class Explanation:
         return lambda u: np.asarray(np.interp(u, levels, middle()), dtype=np.float64)
 
     def respond(self, u: FloatArray) -> FloatArray:
-        """Return what the hysteresis gives (m) for another voltage `u`, shape (N,), volts."""
+        """Return the displacement of the hysteresis, shape (N,), metres, for another voltage `u`, shape (N,), volts."""
         response = self.evidence.design(self.evidence.samples(u)).predict(self._x)[self.evidence.rows]
         return response * self.joint.problem.scale
 
     @cached_property
     def tangents(self) -> FloatArray:
-        """How the prediction changes with each free parameter of the effects, shape (N, k), metres."""
+        """Derivative of the prediction by each free parameter of the effects, shape (N, k), metres per unit."""
         columns = []
         for place, effect in enumerate(self.effects):
             values = free(effect)
@@ -608,11 +610,11 @@ class Explanation:
         return self.settling + self._behind(effects, h + reversible_bypass, u)
 
     def prediction_without(self, name: str) -> FloatArray:
-        """Return what it would give, shape (N,), metres, if one of its effects were not there and all else as it is."""
+        """Return the prediction, shape (N,), metres, without one of the effects and with everything else unchanged."""
         return self._whole([effect for effect in self.effects if effect.name != name])
 
     def score(self, candidate: Candidate) -> Score:
-        """Score it with a candidate beside it, all effects refitted."""
+        """Return the held-out errors with a candidate added and all effects refitted to first order."""
         first = self._before.shape[1] + self.tangents.shape[1]
         starting = [*self._starting, *range(first, first + candidate.starting)]
         signals = self._signals, self.joint.columns(candidate.columns)
@@ -620,23 +622,23 @@ class Explanation:
 
     @cached_property
     def _signals(self) -> Columns:
-        """The target and what stands beside the hysteresis."""
+        """Columns of the joint fit: target, initial relaxation, additional columns, and tangents of the effects."""
         return self.joint.columns(self.target, self._before, self.tangents)
 
     @cached_property
     def held_out(self) -> Score:
-        """Its own score."""
+        """Held-out errors of this fit."""
         return self.joint.score([self._signals], starting=self._starting)
 
     @property
     def objective(self) -> float:
-        """Mean square (m^2) of what is left, and what its roughness costs the hysteresis."""
+        """Mean square of the residual plus the roughness penalty of the hysteresis, m^2."""
         used, problem = self.used, self.joint.problem
         rough = float(self._x @ problem.penalty(self.evidence.smoothness, problem.count) @ self._x) / problem.count
         return float(np.mean(self.residual[used] ** 2)) + rough * problem.scale**2
 
     def refined(self, times: int) -> "Explanation":
-        """Return it with the parameters of all effects fitted together with the hysteresis (Gauss-Newton)."""
+        """Return the fit after up to `times` Gauss-Newton steps of hysteresis and all effect parameters."""
         best = self
         for _ in range(times if self.effects else 0):
             better = best._step()
@@ -647,13 +649,13 @@ class Explanation:
         return best
 
     def _step(self) -> "Explanation":
-        """Return it after one step, shortened until it gains; itself where none does."""
+        """Return the fit after one Gauss-Newton step, shortened until the objective falls; else the fit itself."""
         change = self.joint.columns(self._before, self.tangents).fit(self.target)[1][self._before.shape[1] :]
         for share in SHARES:
             try:
                 effects = self._stepped(share * change)
             except ModelError:
-                # Too far: no effect has such parameters.
+                # The step is too long: the effect parameters are invalid.
                 continue
             stepped = Explanation(self.evidence, effects, self)
             if stepped.objective < self.objective:
@@ -671,7 +673,7 @@ class Explanation:
         return effects
 
     def hysteresis(self) -> tuple[Hysteresis, tuple[float, ...]]:
-        """Return the model with every branch rising, and the displacement at the start of each record, metres."""
+        """Return the hysteresis with monotone branches, and its displacement at the start of each record, m."""
         problem = replace(self.joint.problem, y=self.joint.padded(self.target - self.settling))
         x = problem.solve(self.evidence.smoothness)
         h = problem.design.predict(x)[self.evidence.rows] * problem.scale
@@ -681,7 +683,7 @@ class Explanation:
     def with_uncertainty(self) -> list[Effect]:
         """Return the effects with the standard deviations of their free parameters.
 
-        Errors of neighbouring samples are alike, so that there are fewer independent ones than samples.
+        Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
         """
         if not self.effects:
             return []
@@ -696,49 +698,49 @@ class Explanation:
         return effects
 
     def smoothed(self) -> "Explanation":
-        """Return it with the hysteresis as smooth as blocks left out say, now that effects no longer disturb it."""
+        """Return the fit with the smoothness of the hysteresis reselected by cross-validation, given the effects."""
         problem = replace(self.joint.problem, y=self.joint.padded(self.target))
         best = problem.smoothness_near(self.evidence.smoothness, SMOOTHNESS)
         if best == self.evidence.smoothness:
             return self
         smoothed = Explanation(replace(self.evidence, smoothness=best), self.effects).refined(2)
-        # The blocks are one choice of several, and leave the effects as they are.
+        # That choice is based on one division into blocks and on fixed effects; therefore compare after a refit.
         return min(self.refined(2), smoothed, key=lambda one: one.held_out.rms_of_records)
 
     @cached_property
     def zeros(self) -> FloatArray:
-        """Displacement of each record, shape (records,), metres, in the middle of the largest loop."""
+        """Displacement at the centre of the largest loop of each record, shape (records,), metres."""
         voltage = np.array([0.5 * (float(self.u.min()) + float(self.u.max()))])
         return np.array([float(middle(voltage)[0]) for middle in self._middles])
 
     def effect(self, name: str) -> Effect:
-        """Return its effect of this name."""
+        """Return the effect of this name."""
         return next(effect for effect in self.effects if effect.name == name)
 
     def adding(self, effect: Effect) -> "Explanation":
-        """Return it with one more effect."""
+        """Return the fit with one more effect."""
         return Explanation(self.evidence, [*self.effects, effect], self)
 
     def only(self, names: Collection[str]) -> "Explanation":
-        """Return it with those of its effects that are named, fitted anew if others are gone."""
+        """Return the fit with only the named effects, refitted if any effect is removed."""
         kept = [effect for effect in self.effects if effect.name in names]
         return self if len(kept) == len(self.effects) else Explanation(self.evidence, kept, self).refined(2)
 
     def without(self, name: str) -> "Explanation":
-        """Return it without an effect, the others fitted anew."""
+        """Return the fit without one effect, with the others refitted."""
         return self.only([effect.name for effect in self.effects if effect.name != name])
 
     def beside(self, columns: FloatArray) -> "Explanation":
-        """Return it with `columns`, shape (N, k), beside the hysteresis, whatever their gains."""
+        """Return the fit with additional `columns`, shape (N, k), metres, whose gains are free."""
         evidence = replace(self.evidence, beside=np.column_stack([self.evidence.beside, columns]))
         return Explanation(evidence, self.effects, self)
 
     def with_older_moves(self) -> "Explanation":
-        """Return it with creep that goes on from moves long before each record as well."""
+        """Return the fit in which creep may also continue from moves long before each record."""
         return Explanation(replace(self.evidence, older_moves=True), self.effects, self).refined(2)
 
     def bare(self) -> "Explanation":
-        """Return it without anything beside the hysteresis but effects, those fitted anew."""
+        """Return the fit without the additional columns of `beside`, with the effects refitted."""
         if not self.evidence.beside.shape[1]:
             return self
         evidence = replace(self.evidence, beside=self.evidence.beside[:, :0])
@@ -747,7 +749,7 @@ class Explanation:
 
 @dataclass(frozen=True)
 class RecordLeft:
-    """What is left of one record, for effects that belong to it alone; as `slpi_ros.effects.base.ResidualView`."""
+    """Signals and residual of one record as a `slpi_ros.effects.base.ResidualView`, for effects of this record only."""
 
     t: FloatArray
     u: FloatArray
@@ -759,16 +761,16 @@ class RecordLeft:
 
     @property
     def others(self) -> Mapping[str, FloatArray]:
-        """Motion of the other axes from their start, shape (N,), metres."""
+        """Displacement of the other axes relative to their start, shape (N,), metres."""
         return self.around.others
 
     def respond(self, u: FloatArray) -> FloatArray:
-        """Refuse: an effect of one record alone does not act on the voltage."""
+        """Raise NotImplementedError: effects of a single record do not act on the voltage."""
         raise NotImplementedError
 
 
 def alike_in_a_row(errors: FloatArray) -> float:
-    """Return how many errors in a row tell no more than one, from their correlation up to where it first vanishes."""
+    """Return the number of samples per independent error, from the autocorrelation up to its first zero."""
     errors = errors - errors.mean()
     power = np.abs(np.fft.rfft(errors, 2 * errors.size)) ** 2
     correlation = np.fft.irfft(power)[: errors.size]

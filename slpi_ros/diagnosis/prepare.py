@@ -1,4 +1,4 @@
-"""What records say about one axis: what an explanation is fitted to."""
+"""Preparation of the data of one axis for the joint fit."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,36 +27,37 @@ from slpi_ros.model.axis_model import AxisModel
 
 FloatArray = NDArray[np.float64]
 
-# Blocks left out need some samples each, and hysteresis some turns, or nothing is left to judge by.
+# Smallest numbers of samples and of reversals that allow a cross-validation.
 FEWEST_SAMPLES, FEWEST_TURNS = 1000, 4
-# Vertices of a loop family where the model has none that fit the record.
+# Number of vertices of the loop family if those of the model do not cover the record.
 VERTICES = 41
-# Samples from before the memory was wiped are left out where at least this share is left.
+# Samples before the reset of the hysteresis state may be excluded if at least this share of the samples remains.
 ENOUGH_WIPED = 0.5
-# The beginning of a record disagrees with the rest when its error is this many times as large: nobody knows what had
-# moved the stage before.
+# They are excluded if their error exceeds that of the others by this factor, because the motion before the record is
+# unknown.
 DISAGREES = 2.0
-# Axes whose voltages are correlated more than this have a common drive.
+# Axes whose voltages have a larger correlation than this have a common drive.
 ONE_DRIVE = 0.98
-# Smaller reversals, as a share of the voltage range, do not count.
+# Reversals smaller than this share of the voltage range are ignored.
 SMALLEST_TURN = 0.01
-# A record has one drive frequency when this share of its moves from turn to turn takes the same time, up to a factor.
+# A record has a single drive frequency if more than this share of its moves between reversals takes the same time,
+# within this factor.
 MOST_RUNS, ALMOST = 0.8, 1.25
-# The power of the voltage rate up to the highest frequency that a drive excites, as a share of all.
+# Share of the power of the voltage rate below the highest frequency that counts as excited.
 EXCITED = 0.999
-# A sample this many robust standard deviations off, while its neighbours are not half as far, is an outlier.
+# A residual above this many robust standard deviations is an outlier if both neighbours are less than half as large.
 OUTLIER = 10.0
-# Of a longer record so many samples in a row are looked at: effects are told apart by what happens between samples, so
-# that none may be left out.
+# Largest number of samples used, from the start of a record. Records are not thinned here, because the differences
+# between successive samples distinguish the effects.
 MOST_SAMPLES = 200_000
-# A sensor is at its limit where so many readings are one and the same extreme one, and so many times as many as there
-# are of the readings next to it.
+# A sensor is at its limit if the extreme reading occurs at least this often, and this many times as often as each of
+# the readings next to it.
 AT_LIMIT, AT_LIMIT_TIMES = 20, 5
 
 
 @dataclass(frozen=True)
 class Part:
-    """One axis of one record.
+    """Data of one axis from one record.
 
     Parameters
     ----------
@@ -67,20 +68,21 @@ class Part:
         As commanded or read.
     y : ndarray, shape (N,), metres
     used : ndarray of bool, shape (N,)
-        Samples that are explained; the others (outliers, drop-outs, what came before the memory was known) only move
-        the memory.
+        Samples to be fitted. The others (outliers, drop-outs, samples before the hysteresis state is known) only drive
+        the hysteresis state.
     seen : ndarray of bool, shape (N,)
-        Samples whose displacement is known and asked for.
+        Samples with a valid displacement within the selected time.
     wiped : ndarray of bool, shape (N,)
-        Samples from where on the initial history no longer matters but for a constant.
+        Samples after both ends of the voltage range have been visited, which resets the hysteresis state: the initial
+        history only adds a constant to these.
     history : tuple of float, volts
-        As in `slpi_ros.model.stage_model.Start`.
+        Initial history, as in `slpi_ros.model.axis_model.Start`.
     others : mapping of axis name to ndarray, shape (N,), metres
-        How far the other axes of the record have moved since its start.
+        Displacement of the other axes relative to the start of the record.
     digit : float, metres
-        Step between two readings of the sensor; 0 where they are continuous.
+        Resolution of the sensor readings; 0 if they are continuous.
     mixed : float
-        Share of the readings that are early, late or a mixture of two neighbouring values; they are not used.
+        Share of the readings that are early, late or a mixture of two neighbouring values; these are not used.
     """
 
     source: str
@@ -98,19 +100,20 @@ class Part:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What records say about one axis; signals of shape (N,) hold those of all records, one behind the other.
+    """Data of one axis for a joint fit; signals of shape (N,) are concatenated from all records.
 
     Parameters
     ----------
     parts : tuple of Part
-        One for each record.
+        Data of each record.
     basis : Basis
-        Of the hysteresis.
+        Basis of the hysteresis.
     smoothness : float
+        Weight of the roughness penalty of the hysteresis.
     beside : ndarray, shape (N, k), metres
-        Columns that stand beside the hysteresis, whatever their gains.
+        Additional columns of the joint fit, whose gains are free.
     older_moves : bool
-        Whether creep goes on from moves long before a record as well, not only from one just before it.
+        Whether creep may continue from moves long before a record, in addition to one just before it.
     """
 
     parts: tuple[Part, ...]
@@ -120,7 +123,7 @@ class Evidence:
     older_moves: bool = False
 
     def __post_init__(self) -> None:
-        """Give `beside` its rows."""
+        """Give an empty `beside` the shape (N, 0)."""
         if not self.beside.size:
             object.__setattr__(self, "beside", np.empty((self.t.size, 0)))
 
@@ -141,12 +144,12 @@ class Evidence:
 
     @cached_property
     def used(self) -> NDArray[np.bool_]:
-        """Samples that are explained, shape (N,)."""
+        """Mask of the samples to be fitted, shape (N,)."""
         return np.concatenate([part.used for part in self.parts])
 
     @cached_property
     def others(self) -> Mapping[str, FloatArray]:
-        """Motions of the axes that all records hold, shape (N,), metres."""
+        """Displacements of the other axes that all records contain, relative to their start, shape (N,), metres."""
         common = set.intersection(*(set(part.others) for part in self.parts))
         return {
             name: np.concatenate([part.others[name] for part in self.parts])
@@ -156,20 +159,20 @@ class Evidence:
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
-        """Where each record's samples stand."""
+        """Slice of the samples of each record."""
         ends = np.cumsum([0, *(part.t.size for part in self.parts)]).tolist()
         return tuple(slice(*pair) for pair in zip(ends[:-1], ends[1:], strict=True))
 
     @cached_property
     def rows(self) -> NDArray[np.int64]:
-        """Rows of the problem that are samples, not those of an initial history, shape (N,)."""
+        """Indices of the rows of the problem that are samples, without those of initial histories, shape (N,)."""
         leads = np.cumsum([len(part.history) for part in self.parts])
         rows: NDArray[np.int64] = np.arange(self.t.size) + np.repeat(leads, [part.t.size for part in self.parts])
         return rows
 
     @cached_property
     def around(self) -> EffectContext:
-        """Time and the other axes, as effects look at them."""
+        """Context of the effects: time and the other axes."""
         return EffectContext(
             self.t,
             others=self.others,
@@ -178,11 +181,11 @@ class Evidence:
 
     @cached_property
     def rounding(self) -> float:
-        """What rounding to the digits of the sensors adds at least, metres rms."""
+        """Rms rounding error of the finest sensor resolution among the records, metres."""
         return float(min(part.digit for part in self.parts) / np.sqrt(12.0))
 
     def each(self, columns: Sequence[FloatArray]) -> FloatArray:
-        """Return columns of each record, shape (N_k, m_k) each, as columns that are zero on the other records."""
+        """Return the columns of each record, shape (N_k, m_k) each, extended by zeros in the other records."""
         whole = np.zeros((self.t.size, sum(own.shape[1] for own in columns)))
         first = 0
         for rows, own in zip(self.slices, columns, strict=True):
@@ -191,7 +194,7 @@ class Evidence:
         return whole
 
     def samples(self, u: FloatArray) -> list[Samples]:
-        """Return the samples of each record after its initial history, driven by `u`, shape (N,), volts."""
+        """Return the samples of each record, after its initial history, for the voltage `u`, shape (N,), volts."""
         low, high = self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf)
         return [
             Samples(np.clip(u[rows], low, high), part.y, part.used).after(part.history)
@@ -199,7 +202,7 @@ class Evidence:
         ]
 
     def problem(self, u: FloatArray) -> Problem:
-        """Pose the problem of the hysteresis driven by `u`, shape (N,), volts."""
+        """Pose the problem of fitting the hysteresis, driven by the voltage `u`, shape (N,), volts."""
         return Problem.pose(self.samples(u), self.basis)
 
     def design(self, samples: Sequence[Samples]) -> Design:
@@ -209,11 +212,11 @@ class Evidence:
         return Design.of(walk, self.basis.branch_part(walk))
 
     def of_record(self, k: int) -> "Evidence":
-        """Return what one of the records says by itself."""
+        """Return the data of record `k` only."""
         return Evidence((self.parts[k],), self.basis, self.smoothness)
 
     def without_record(self, k: int) -> "Evidence":
-        """Return what the other records say."""
+        """Return the data of all records but record `k`."""
         return Evidence((*self.parts[:k], *self.parts[k + 1 :]), self.basis, self.smoothness)
 
 
@@ -224,12 +227,12 @@ def evidence_of(
     start: float | None = None,
     stop: float | None = None,
 ) -> Evidence:
-    """Return what records say about one axis, to be explained by a hysteresis like that of `model`, or a loop family.
+    """Return the data of one axis from records, with the hysteresis basis of `model` or, by default, of a loop family.
 
     Raises
     ------
     RecordError, IdentificationError
-        If they say too little.
+        If the records contain too little data.
     """
     read = [_readings(record, axis, start, stop) for record in records]
     _require_enough(read)
@@ -265,7 +268,7 @@ def evidence_of(
 def _readings(
     record: Record, axis: str, start: float | None, stop: float | None
 ) -> tuple[FloatArray, Samples, dict[str, FloatArray]]:
-    """Return time (s), samples, and the motions of other axes (m) of one record."""
+    """Return times (s), samples, and displacements of the other axes (m) from one record."""
     samples = select_samples(record, axis, start, stop)
     t, others = _clock_and_others(record, axis)
     kept = np.diff(t[: samples.v.size], prepend=-np.inf) > 0.0
@@ -274,7 +277,7 @@ def _readings(
             f"{record.source}: most stamps are equal, so that nothing can be said of time; record the stamps of the "
             "sensor"
         )
-    # Of readings with one stamp the first counts: what depends on time cannot say anything of the others.
+    # Of readings with equal stamps only the first is used: effects that depend on time cannot explain the others.
     chosen = np.flatnonzero(kept)[:MOST_SAMPLES]
     v, y, fitted, mixed = samples.v[chosen], samples.y[chosen], samples.fitted[chosen], samples.mixed * chosen.size
     samples = replace(samples, v=v, y=y, fitted=fitted, mixed=mixed // samples.v.size)
@@ -282,7 +285,7 @@ def _readings(
 
 
 def _trusted(part: Part, residual: FloatArray, samples: Samples, *, only_wiped: bool) -> Part:
-    """Return a record without the samples that what a hysteresis alone leaves of them, shape (N,), shows to be bad."""
+    """Return the data of a record without bad samples, as seen in the residual, shape (N,), of hysteresis alone."""
     samples = samples.without_mixed(part.y - residual)
     used = part.used & samples.fitted
     used = used & ~_outliers(residual, used)
@@ -293,7 +296,7 @@ def _trusted(part: Part, residual: FloatArray, samples: Samples, *, only_wiped: 
 
 
 def _residual(evidence: Evidence) -> FloatArray:
-    """Return what a hysteresis alone leaves, shape (N,), metres."""
+    """Return the residual of a fit of hysteresis without effects, shape (N,), metres."""
     problem = evidence.problem(evidence.v).reweighted()
     matrix, vector = problem.design.normal_equations(problem.y, problem.weights)
     x = solve_free(matrix + problem.penalty(evidence.smoothness, problem.count), vector)
@@ -301,7 +304,7 @@ def _residual(evidence: Evidence) -> FloatArray:
 
 
 def _at_limit(samples: Samples) -> NDArray[np.bool_]:
-    """Return which samples, shape (N,), the sensor read at the end of its range."""
+    """Return the mask of the samples, shape (N,), at which the sensor is at an end of its range."""
     y, limited = samples.y, np.zeros(samples.y.size, dtype=bool)
     levels, count = np.unique(y[samples.fitted], return_counts=True)
     for end, near in ((0, count[1:4]), (-1, count[-4:-1])):
@@ -311,7 +314,7 @@ def _at_limit(samples: Samples) -> NDArray[np.bool_]:
 
 
 def _beginning_disagrees(residual: FloatArray, used: NDArray[np.bool_], wiped: NDArray[np.bool_]) -> bool:
-    """Return whether what came before the memory was wiped is explained much worse than what came after it."""
+    """Return whether residuals before the reset of the hysteresis state are much larger than those after it."""
     before, after = residual[used & ~wiped], residual[used & wiped]
     if not before.size or after.size < ENOUGH_WIPED * (before.size + after.size):
         return False
@@ -319,7 +322,7 @@ def _beginning_disagrees(residual: FloatArray, used: NDArray[np.bool_], wiped: N
 
 
 def _clock_and_others(record: Record, axis: str) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return time (s) where the axis was driven, and how far other axes with a drive of their own have moved (m)."""
+    """Return the times (s) at which the axis has a voltage, and the motion (m) of axes with a different drive."""
     own = record.voltage[axis]
     driven = np.isfinite(own)
     t, others = record.t, {}
@@ -333,7 +336,7 @@ def _clock_and_others(record: Record, axis: str) -> tuple[FloatArray, dict[str, 
 
 
 def driven_alike(records: Sequence[Record], axis: str) -> tuple[str, ...]:
-    """Return the other axes whose drive no record tells from that of an axis: nor can their motions be told apart."""
+    """Return the other axes with the same drive as `axis` in every record; their coupling cannot be identified."""
     others = [name for name in records[0].axes if name != axis]
     return tuple(
         name
@@ -343,7 +346,7 @@ def driven_alike(records: Sequence[Record], axis: str) -> tuple[str, ...]:
 
 
 def _common(own: FloatArray, other: FloatArray) -> bool:
-    """Return whether two axes have one drive, or the other none: then nothing tells their motions apart."""
+    """Return whether two axes have a common drive, so that their motions cannot be distinguished."""
     both = np.isfinite(own) & np.isfinite(other)
     if np.count_nonzero(both) < 2 or not np.ptp(other[both]) > 0.0 or not np.ptp(own[both]) > 0.0:
         return False
@@ -365,7 +368,7 @@ def _require_enough(read: Sequence[tuple[FloatArray, Samples, dict[str, FloatArr
 
 
 def _basis(model: AxisModel | None, samples: Sequence[Samples]) -> Basis:
-    """Return the basis of the model's hysteresis, made to hold the voltages of all records."""
+    """Return the basis of the model's hysteresis, or of a loop family if that does not cover the voltages."""
     low, high = float(min(part.v.min() for part in samples)), float(max(part.v.max() for part in samples))
     if model is not None and isinstance(model.hysteresis, PrandtlIshlinskii | LoopFamily):
         basis, _ = basis_of(model)
@@ -383,7 +386,7 @@ def _smoothness(samples: Sequence[Samples], basis: Basis) -> float:
 
 
 def _outliers(residual: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which samples stand alone, shape (N,)."""
+    """Return the mask of single-sample outliers, shape (N,)."""
     size = np.where(used, np.abs(residual), 0.0)
     beside = np.maximum(np.append(size[1:], 0.0), np.insert(size[:-1], 0, 0.0))
     spread = 1.4826 * float(np.median(size[used]))
@@ -392,12 +395,12 @@ def _outliers(residual: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_
 
 
 def one_speed(evidence: Evidence) -> bool:
-    """Return whether all records were driven at one and the same frequency."""
+    """Return whether all records have the same single drive frequency."""
     return drive_frequency(evidence) > 0.0
 
 
 def drive_frequency(evidence: Evidence) -> float:
-    """Return the one frequency (Hz) of the drive of all records; 0 where there are several."""
+    """Return the single drive frequency (Hz) of all records; 0 if there are several."""
     found = []
     for part in evidence.parts:
         # The first move and the last one may be cut off.
@@ -410,7 +413,7 @@ def drive_frequency(evidence: Evidence) -> float:
 
 
 def excited_frequency(evidence: Evidence) -> float:
-    """Return the frequency (Hz) below which the fastest record has `EXCITED` of the power of its voltage rate."""
+    """Return the highest frequency (Hz) that any record excites; see `EXCITED`."""
     found = []
     for part in evidence.parts:
         grid = np.arange(part.t[0], part.t[-1], usual_step(part.t))
@@ -421,5 +424,5 @@ def excited_frequency(evidence: Evidence) -> float:
 
 
 def _dead_band(v: FloatArray) -> float:
-    """Return the reversals (V) of a voltage, shape (N,), that are noise or too small to matter."""
+    """Return the size (V) up to which reversals of a voltage, shape (N,), are ignored as noise or as too small."""
     return max(voltage_dead_band(v), SMALLEST_TURN * float(np.ptp(v)))

@@ -1,4 +1,4 @@
-"""What a diagnosis says: figures and sentences, for the page and for the document."""
+"""Results of a diagnosis: figures and sentences for the report and the JSON document."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
-# Which drive separates effects that a record leaves open: the first pair that is among them decides.
+# Drive that separates each pair of effects; the first pair contained in the ambiguous effects is used.
 SEPARATES = (
     ({"lag", "delay"}, "lag"),
     ({"lag", "rate_dependence"}, "rate_dependence"),
@@ -50,16 +50,16 @@ ANOTHER_HYSTERESIS = {
     BIAS: "The shape of the loops depends on the bias voltage, which the kind of the given "
     "model cannot follow: identify this record with kind 'slpi'; no new one is needed.",
 }
-# The given model is out of date when its error is so many times that of one fitted to the record.
+# The given model is out of date if its error exceeds that of a refitted one by this factor.
 STALE = 1.5
-# It is not where its error is that on its own records, within this factor.
+# It is not out of date if its error equals that at its identification, within this factor.
 AS_BEFORE = 1.1
-# Below this share of its motion (excess rms), or of its gain, a stage has not changed; its gain is told apart from none
-# at so many standard deviations, and its zero when it moved by so many times the error.
+# Thresholds for a changed stage: excess rms error as a share of the motion; relative change of gain; change of gain in
+# standard deviations.
 CHANGED, LEAST_CHANGE, CERTAIN = 1e-3, 3e-3, 5.0
-# What is left is more than the floor when it is this many times as much.
+# An error up to this multiple of the noise floor counts as noise.
 ABOVE_FLOOR = 1.5
-# No hysteresis model resolves better than this share of the displacement range, even where there is no noise.
+# Best accuracy of a hysteresis model without noise, as a share of the displacement range.
 RESOLUTION = 2e-4
 
 SCHEMA = "slpi_ros/diagnosis/1"
@@ -68,22 +68,22 @@ NAMED, AMBIGUOUS, UNEXPLAINED, NOTHING_FOUND = "named", "ambiguous", "unexplaine
 
 @dataclass(frozen=True)
 class NamedEffect:
-    """An effect that explains part of the error.
+    """Effect that explains part of the error.
 
     Parameters
     ----------
     effect : Effect
-        With its parameters, and their standard deviations.
+        Effect with its parameters and their standard deviations.
     gain_percent : float
-        By how much it lowers the held-out rms error, added to the effects before it.
+        Reduction of the held-out rms error when the effect is added to the preceding ones, per cent.
     share_of_residual : float
-        Share of the mean square error before any effect, held out, that it explains, 0..1.
+        Share of the mean square held-out error without effects that the effect explains, 0..1.
     p_value : float
-        How often chance would gain as much.
+        Probability that chance reduces the error as much.
     alternatives : tuple of str
-        Effects that would do in its place: the record does not tell them apart.
+        Effects that explain the error equally well, so that the records do not distinguish them.
     evidence : str
-        One sentence with numbers.
+        Evidence for the effect, one sentence with numbers.
     """
 
     effect: Effect
@@ -101,7 +101,7 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class Traces:
-    """One axis over the record, for plots.
+    """Signals of one axis for charts.
 
     Parameters
     ----------
@@ -109,9 +109,9 @@ class Traces:
         From the first stamp.
     voltage : ndarray, shape (N,), volts
     measured, before, after : ndarray, shape (N,), metres
-        Measured displacement; that of the hysteresis alone (`before`), and with effects (`after`).
+        Measured displacement, and that of the hysteresis without effects (`before`) and with effects (`after`).
     contributions : mapping of effect name to ndarray, shape (N,), metres
-        What each effect does to the displacement.
+        Contribution of each effect to the displacement.
     """
 
     t: FloatArray
@@ -124,18 +124,18 @@ class Traces:
 
 @dataclass(frozen=True)
 class RecordOutcome:
-    """What became of one record.
+    """Errors of one record before and after the diagnosis.
 
     Parameters
     ----------
     source : str
     offset : float, metres
-        By how much the zero has moved against the given model.
+        Shift of the zero relative to the given model.
     before_rms, after_rms : float, metres
-        Error of the given model and of the extended one, free-run, each without its constant.
+        Free-run rms error of the given model and of the extended one, each without its mean.
     left_out_rms : float or None, metres
-        Error of hysteresis and effects that were fitted to the other records; None where there is no other, or where
-        these cover too little of it.
+        Held-out rms error, with the hysteresis fitted to the other records; None if there are no others, or if these
+        cover too little of this record.
     """
 
     source: str
@@ -157,35 +157,35 @@ class RecordOutcome:
 
 @dataclass(frozen=True)
 class AxisDiagnosis:
-    """What one axis's model gets wrong, and why.
+    """Diagnosis of the model of one axis.
 
     Parameters
     ----------
     verdict : str
         `NAMED`, `AMBIGUOUS`, `UNEXPLAINED` or `NOTHING_FOUND`.
     summary : str
-        The same in a sentence or two.
+        Result in a few sentences.
     floor_rms : float, metres
-        What no model can explain.
+        Noise floor, which no model can explain.
     floor_source : str
-        Where that was seen.
+        Data from which the floor was estimated.
     given_rms : float, metres
-        Error of the given model as it is, free-run, without the constant of each record.
+        Free-run rms error of the given model as it is, without the offset of each record.
     before_rms, after_rms : float, metres
-        Held-out error, free-run: of the hysteresis fitted to the records, and of hysteresis and effects; on blocks left
-        out, and where there are several records, on records left out.
+        Held-out, free-run rms error of the refitted hysteresis without effects, and with effects; on held-out blocks
+        or, if there are several records, on held-out records.
     effects : tuple of NamedEffect
-        In the order of gain.
+        Identified effects, the largest gain first.
     next_experiment : str or None
-        What to record, or to do, next.
+        Recommended next recording or other action.
     traces : Traces
-        Of the first record.
+        Signals of the first record.
     records : tuple of RecordOutcome
-        One for each record.
+        Errors of each record.
     dropped : tuple of str
-        Effects that were found on some records and make others worse.
+        Effects that were found on some records but do not carry over to others.
     given : Given or None
-        How well the given model does as it is.
+        Comparison of the given model with the records.
     """
 
     verdict: str
@@ -231,15 +231,15 @@ class AxisDiagnosis:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a model gets wrong on a record.
+    """Diagnosis of the model of a stage.
 
     Parameters
     ----------
     axes : mapping of axis name to AxisDiagnosis
     extended : StageModel
-        The model with the effects found, hysteresis and effects fitted together.
+        Model with the identified effects; hysteresis and effects are fitted jointly.
     source : str
-        The record.
+        Names of the records.
     """
 
     axes: Mapping[str, AxisDiagnosis]
@@ -257,24 +257,23 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Given:
-    """How well the given model does as it is.
+    """Comparison of the given model with the records.
 
     Parameters
     ----------
     rms : float, metres
-        Its error, free-run, without the constant of each record.
+        Free-run rms error of the model as it is, without the offset of each record.
     hysteresis_rms, refitted_rms : float, metres
-        The same of its hysteresis, once the initial history no longer matters, with the effects that were found if
-        that is less; and of a hysteresis fitted to the same samples.
+        Rms error of the model's hysteresis and of a refitted one, on samples to which the initial history only adds a
+        constant; with the identified effects if the error is then lower.
     gain, gain_deviation : float
-        By which share the stage moves more than its hysteresis says, and its standard deviation.
+        Relative change of the gain of the stage with respect to the model, and its standard deviation.
     zero_moved : float or None, metres
-        By how much the zero has moved, in the record where that is most; None where the records do not tell it from the
-        initial history.
+        Largest shift of the zero among the records; None if it is small or the initial history can explain it.
     motion : float, metres
-        How far the stage moved.
+        Range of the measured displacement.
     own_rms : float, metres
-        Error on the records that it was identified from, if these are the ones diagnosed; else 0.
+        Rms error at the identification of the model, if the diagnosed records are those of the identification; else 0.
     """
 
     rms: float
@@ -288,7 +287,7 @@ class Given:
 
     @property
     def changed(self) -> bool:
-        """Whether its loops are wrong where those of one fitted to the records are not, and were not from the start."""
+        """Whether the stage has changed: loops or gain of the model are wrong, unlike at its identification."""
         if self.own_rms <= AS_BEFORE * self.rms and self.rms <= AS_BEFORE * self.own_rms:
             return False
         excess = np.sqrt(max(self.hysteresis_rms**2 - self.refitted_rms**2, 0.0))
@@ -305,22 +304,22 @@ def judged(
     left_out_of_model: Sequence[str],
     driven_alike: Sequence[str],
 ) -> AxisDiagnosis:
-    """Return what is to be said of one axis.
+    """Return the diagnosis of one axis.
 
     Parameters
     ----------
     selection : Selection
     floor : Floor
-        Of the records.
+        Noise floor of the records.
     before_rms : float, metres
-        Error before any effect, held out.
+        Held-out rms error without effects.
     given : Given
-        Of the given model.
+        Comparison of the given model with the records.
     records : tuple of RecordOutcome
     left_out_of_model : sequence of str
-        Effects that were found and are not in the extended model.
+        Identified effects that the extended model does not contain.
     driven_alike : sequence of str
-        Axes that have the drive of this one.
+        Other axes with the same drive as this one.
     """
     base, now = selection.base, selection.now
     effects = _named_effects(selection)
@@ -384,13 +383,13 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) ->
 
 
 def _resolved(selection: Selection) -> float:
-    """Return the error (m) below which no hysteresis model comes."""
+    """Return the lowest error (m) that a hysteresis model can reach."""
     evidence = selection.now.evidence
     return RESOLUTION * float(np.ptp(evidence.y[evidence.used]))
 
 
 def _left(selection: Selection, floor: Floor) -> bool:
-    """Return whether more is left than noise and the model's resolution."""
+    """Return whether the held-out error exceeds the noise and the accuracy of a hysteresis model."""
     return selection.now.held_out.rms > max(ABOVE_FLOOR * floor.rms, _resolved(selection))
 
 
@@ -402,7 +401,7 @@ def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floo
 
 
 def _stale(given: Given, selection: Selection) -> bool:
-    """Return whether the given model is wrong where one of its kind, fitted to the records, is not."""
+    """Return whether the given model is out of date, so that a refit of the same kind corrects it."""
     return BIAS not in selection.structures and given.changed
 
 
@@ -485,12 +484,12 @@ def _traces(base: Explanation, now: Explanation) -> Traces:
 
 
 def _more_loops(evidence: Evidence) -> str:
-    """Return the record that shows most, in a sentence."""
+    """Return a sentence that recommends the most informative record."""
     return f"Record `{_command(evidence)}`, which visits loops of every size at several speeds, and diagnose that."
 
 
 def _separating(names: Sequence[str], evidence: Evidence) -> str:
-    """Return the experiment that separates effects, the likeliest first, in sentences."""
+    """Return sentences that recommend an experiment to separate the effects `names`, the most likely one first."""
     chosen = next((drive for pair, drive in SEPARATES if pair <= set(names)), names[0])
     axes = " --axis OTHER THIS" if chosen == "cross_coupling" else ""
     other = OTHER_FREQUENCIES if one_speed(evidence) else ""
@@ -503,5 +502,5 @@ def _command(evidence: Evidence) -> str:
 
 
 def _of_structure(structure: str) -> str:
-    """Return what to do where the hysteresis itself is wrong, in a sentence."""
+    """Return the recommendation for a defect of the hysteresis model, in a sentence."""
     return ANOTHER_HYSTERESIS[structure]

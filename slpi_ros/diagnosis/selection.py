@@ -1,4 +1,4 @@
-"""The competition: every effect tries to explain what is left, and the best one stays, if its gain is beyond chance."""
+"""Forward selection of effects: the one that best explains the residual is added if its gain is significant."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,71 +27,71 @@ from slpi_ros.identification.progress import report_progress
 
 FloatArray = NDArray[np.float64]
 
-# What a kind of model gets wrong that the loop family gets right.
+# Defect of other kinds of hysteresis model than the loop family.
 BIAS = "loops that depend on bias"
-# What the loop family gets wrong.
+# Defects of the loop family.
 NOT_CLOSING, LEVEL = "loops that do not close", "loops that depend on level"
-# Ways (share of the voltage range) over which a material without return-point memory may forget.
+# Memory lengths (voltage travel, share of the voltage range) for hysteresis without return-point memory.
 FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
-# An effect must lower the held-out error by this share of it.
+# Smallest relative reduction of the held-out error by an effect.
 LEAST_GAIN = 0.05
-# A fit from another start is taken when it lowers the error by this share of it.
+# A fit from other initial parameters, or with another effect, is preferred if it lowers the error by this share.
 BETTER = 0.01
-# No more effects than this: a record does not carry more.
+# Largest number of effects that are selected; records cannot determine more.
 MOST_EFFECTS = 4
-# A gain counts when chance gives as much less often than this; two effects differ when chance does so less often.
+# Largest p-value for a gain to be significant, and for two effects to differ; number of random sign patterns.
 CHANCE, ALIKE = 0.01, 0.05
 SURROGATES = 1999
-# Keeps losses of no noise positive (m^2).
+# Lower bound of losses, for records without noise (m^2).
 TINY = 1e-30
-# What screening finds less for than this share of the best gain, and of the error, is not tried in full.
+# Screening: effects are fitted if their gain exceeds these shares of the best gain and of the error.
 WORTH_TRYING, LEAST_SCREENED = 0.3, 0.01
-# After one step towards its best parameters an effect is given up that explains less than this share of what the best
-# one does.
+# After one Gauss-Newton step, effects are refined further if they explain at least this share of what the best one
+# explains.
 WORTH_REFINING = 0.3
-# Another effect that explains less than this share of what the best one does is no alternative to it.
+# An alternative to the best effect explains at least this share of what the best one explains.
 ALTERNATIVE = 0.7
-# The same at one drive frequency, where a better fit says little.
+# The same for a single drive frequency, where a better fit proves little.
 ALTERNATIVE_AT_ONE_SPEED = 0.4
-# What one drive frequency cannot tell apart.
+# Effects that a single drive frequency cannot distinguish.
 DYNAMIC = {"delay", "lag", "rate_dependence", "creep"}
-# What is shared by all records, or each record's own: where a sensor begins to count it may begin its period.
+# Effects that are common to all records or separate in each: a sensor may start each record with another phase.
 MAY_BE_OWN = {"sensor_periodic"}
-# Zeros are alike for a sensor's error when they differ by no more than this share of its period.
+# Largest difference of the zeros of records, as a share of the period, for a common periodic sensor error.
 IN_PHASE = 0.1
-# What does nothing but shift in time.
+# Effects that only shift the displacement in time.
 SHIFTS = {"delay", "lag"}
-# What shifts the displacement against the voltage.
+# Effects that shift the displacement in time, among other things.
 SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
 STEPS = 5
-# Of other records none may be off by more than so many times what it was without an effect.
+# Largest accepted ratio of the error with an effect to that without it, on any held-out record.
 NO_WORSE = 1.05
-# A shift by less than this share of a sample is how commands are held.
+# Time shifts below this share of the sampling period may be due to the hold of commands between samples.
 HELD = 0.6
-# Warmth takes time (s), and moves a stage by no more than this share of its motion in a second.
+# Thermal drift: shortest duration (s), and highest rate (share of the motion per second).
 DRIFT_TAKES, DRIFT_RATE = 10.0, 1e-2
-# What keeps its place while the sensitivity changes is no further outside the record than this share of its range.
+# Largest distance of the origin of a gain drift from the displacement range, as a share of that range.
 ORIGIN = 0.3
-# Multiples of the drive's frequency that may be what is left of hysteresis.
+# Highest harmonic of the drive frequency that may be residual hysteresis.
 MOST_HARMONICS = 15
-# A resonance is seen up to so many times the highest frequency that the drive excites.
+# Highest resonance frequency that can be identified, as a multiple of the highest excited frequency.
 RINGS = 2.0
-# Rounding errors (their rms) repeat with every digit, that is sqrt(12) times as far; what is left of a record is
-# rounding when it is no more than so many times that.
+# Multiples of the rms rounding error: shortest period of a sensor error (rounding repeats with every digit, sqrt(12)
+# times its rms), and largest residual that counts as rounding.
 ROUNDING_PERIOD, ROUNDING_LEFT = 1.3 * 12**0.5, 1.3
-# An error below this share of the displacement range is rounding: no sensor shows more.
+# An error below this share of the displacement range is beyond the resolution of any sensor.
 FINEST = 1e-6
 
 
 @dataclass(frozen=True)
 class Contender:
-    """One more effect, fitted together with all others.
+    """Candidate effect, fitted jointly with the effects selected so far.
 
     Parameters
     ----------
     name : str
     explanation : Explanation
-        With it.
+        Joint fit that includes the candidate.
     """
 
     name: str
@@ -99,53 +99,53 @@ class Contender:
 
     @property
     def effect(self) -> Effect:
-        """The effect itself."""
+        """Candidate effect with its parameters."""
         return self.explanation.effect(self.name)
 
     @property
     def score(self) -> Score:
-        """Held-out score with it."""
+        """Held-out errors of the joint fit."""
         return self.explanation.held_out
 
     @property
     def rms(self) -> float:
-        """Held-out error (m) that it competes with."""
+        """Held-out rms error by which candidates are compared, metres."""
         return held_out_error(self.score, own=is_own(self.effect))
 
     @property
     def parameters(self) -> int:
-        """Number of its parameters that were fitted."""
+        """Number of fitted parameters of the effect."""
         return free(self.effect).size
 
     def refined(self, steps: int = STEPS) -> "Contender":
-        """Return it with its parameters at their best, unless that does worse on what is left out."""
+        """Return the candidate after up to `steps` Gauss-Newton steps, unless these increase the held-out error."""
         better = Contender(self.name, self.explanation.refined(steps))
         return min(self, better, key=lambda one: one.rms)
 
     def counts_beside(self, now: Explanation) -> bool:
-        """Return whether it gains enough over what has been found so far."""
+        """Return whether the candidate significantly improves the joint fit `now`, which does not include it."""
         return counts(now.held_out, self.score, own=is_own(self.effect))
 
 
 def is_own(effect: Effect) -> bool:
-    """Return whether an effect is each record's own."""
+    """Return whether an effect has separate parameters in each record, such as drift or hum."""
     return effect.removable == "record"
 
 
 def held_out_error(score: Score, *, own: bool) -> float:
-    """Return the held-out error (m) that counts for an effect: on other records, if it is not each record's own."""
+    """Return the held-out rms error (m) for an effect: on blocks if it is separate in each record, else on records."""
     return score.rms if own else score.rms_of_records
 
 
 def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[Contender]:
-    """Return the effects, of those with the given names, that explain something of what is left; the best one first.
+    """Return candidates for the named effects that explain part of the residual, the best one first.
 
-    Effects that every record shares come before those that are each record's own, where both count.
+    Of several records, significant effects that are common to all records precede all other candidates.
     """
     taken = {effect.name for effect in now.effects}
     screened = {name: best for name in names if name not in taken and (best := _screened(name, now))}
     error = now.held_out.rms
-    # What is not plausible does not set the mark for others.
+    # Implausible effects do not determine the threshold.
     most = max((error - score.rms for score, effect in screened.values() if plausible(effect, now)), default=0.0)
     least = max(WORTH_TRYING * most, LEAST_SCREENED * error)
     tried = [
@@ -165,29 +165,29 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
 
 
 def _refined(tried: Sequence[Contender], before: Explanation, most: float) -> list[Contender]:
-    """Return contenders with their parameters at their best, where the first step shows that to be worth while.
+    """Refine the candidates that explain enough after the first step, and return all candidates.
 
     Parameters
     ----------
     tried : sequence of Contender
-        After one step.
+        Candidates after one Gauss-Newton step.
     before : Explanation
-        Without them.
+        Joint fit without candidates.
     most : float, m^2
-        By how much the best one lowers the mean square of the held-out error.
+        Reduction of the mean square held-out error by the best candidate.
     """
     square, least = before.held_out.rms**2, WORTH_REFINING * most
     return [one.refined() if square - one.score.rms**2 >= least else one for one in tried]
 
 
 def plausible(effect: Effect, now: Explanation) -> bool:
-    """Return whether an effect is what its name says, and not something else in its shape."""
+    """Return whether the parameters of an effect are plausible, so that it does not imitate another cause."""
     if isinstance(effect, EachRecord):
         return all(plausible(part, now) for part in effect.parts)
     evidence, motion = now.evidence, float(np.ptp(now.y[now.used]))
     match effect:
         case Delay() | Lag():
-            # How a command is held between samples does as much as a shift by less than that.
+            # Smaller shifts may be due to the hold of commands between samples.
             shift = effect.seconds if isinstance(effect, Delay) else effect.time_constant
             others = {other.name for other in now.effects} & SHIFTING - {effect.name}
             return not others or abs(shift) > HELD * usual_step(evidence.t)
@@ -195,7 +195,7 @@ def plausible(effect: Effect, now: Explanation) -> bool:
             pairs = zip(np.diff(effect.values).tolist(), np.diff(effect.times).tolist(), strict=True)
             return effect.times[-1] >= DRIFT_TAKES and all(abs(dy) <= DRIFT_RATE * motion * dt for dy, dt in pairs)
         case GainDrift():
-            # Gains round an origin far away are a thermal drift.
+            # With an origin far away, a gain drift is a thermal drift.
             y = now.y[now.used]
             near = float(y.min()) - ORIGIN * motion <= effect.origin <= float(y.max()) + ORIGIN * motion
             return near and effect.times[-1] >= DRIFT_TAKES
@@ -204,7 +204,7 @@ def plausible(effect: Effect, now: Explanation) -> bool:
         case Hum():
             return not _is_harmonic(effect.frequency, evidence)
         case Resonance():
-            # Far above all that is excited a resonance is a shift, and bends with the frequency as hysteresis does.
+            # Far above the excited frequencies a resonance only shifts in time, and can imitate hysteresis.
             return effect.frequency <= RINGS * excited_frequency(evidence)
         case SensorPeriodic():
             return bool(effect.period > ROUNDING_PERIOD * evidence.rounding)
@@ -212,7 +212,7 @@ def plausible(effect: Effect, now: Explanation) -> bool:
 
 
 def _stands_still(effect: Saturation, now: Explanation) -> bool:
-    """Return whether the stage stands still beyond the limits, where the voltage goes on."""
+    """Return whether the stage stands still while the voltage changes beyond the saturation limits."""
     middle, dv, dy = outward_steps(now.evidence.v, now.y, now.used)
     inside = (middle > effect.lower) & (middle < effect.upper)
     usual = float(dv[inside] @ dy[inside] / max(float(dv[inside] @ dv[inside]), 1e-300))
@@ -223,9 +223,9 @@ def _stands_still(effect: Saturation, now: Explanation) -> bool:
 
 
 def _is_harmonic(frequency: float, evidence: Evidence) -> bool:
-    """Return whether a frequency (Hz) is a low multiple of the only one that drives a record, as far as that can tell.
+    """Return whether a frequency (Hz) is a low harmonic of the single drive frequency of any record, within resolution.
 
-    What is left of hysteresis fades with the order; of high multiples one is near to any frequency.
+    Residual hysteresis decreases with the order. High harmonics are ignored, as any frequency is close to one of them.
     """
     for k, part in enumerate(evidence.parts):
         drive = drive_frequency(evidence.of_record(k))
@@ -238,10 +238,10 @@ def _is_harmonic(frequency: float, evidence: Evidence) -> bool:
 
 
 def _screened(name: str, now: Explanation) -> tuple[Score, Effect] | None:
-    """Return the linear form of an effect that does best, and its score.
+    """Return the held-out errors and the effect for the best form of the effect `name`; None if there is no form.
 
-    A simpler form that does as well, as far as the record can tell, stands for it: what is more than that goes astray
-    where the record ends.
+    Of forms that do not differ significantly from the best, the one with the fewest parameters is returned, because
+    surplus parameters extrapolate poorly.
     """
     tried = [scored for form in _forms(name, now) if (scored := _scored(form, now)) and in_phase(scored[1], now)]
     if not tried:
@@ -256,9 +256,9 @@ def _screened(name: str, now: Explanation) -> tuple[Score, Effect] | None:
 
 
 def in_phase(effect: Effect, now: Explanation) -> bool:
-    """Return whether an effect that depends on the reading is at the same displacements in all records.
+    """Return whether a periodic sensor error has the same phase in all records; True for any other effect.
 
-    Where their zeros differ, those of other records do as well, and nothing tells what the effect is there.
+    If the zeros of the records differ, so may those of other records, and the phase there is unknown.
     """
     if not isinstance(effect, SensorPeriodic) or len(now.evidence.parts) == 1:
         return True
@@ -266,7 +266,7 @@ def in_phase(effect: Effect, now: Explanation) -> bool:
 
 
 def _forms(name: str, now: Explanation) -> Iterator[Candidate | Effect]:
-    """Yield what an effect may be; one of every record where it is each record's own, or may be."""
+    """Yield the forms of an effect: with common parameters, with separate ones in each record, or both."""
     records, own = len(now.evidence.parts), EFFECTS[name].removable == "record"
     if not own or records == 1:
         yield from EFFECTS[name].fit(now)
@@ -290,16 +290,16 @@ def _scored(form: Candidate | Effect, now: Explanation) -> tuple[Score, Effect] 
     try:
         effect = form.effect(score.gains[-(form.positive or form.columns.shape[1]) :])
     except ModelError:
-        # No effect has such parameters.
+        # The effect parameters are invalid.
         return None
     return (score, effect) if effect is not None else None
 
 
 def chance_of_gain(before: Score, after: Score) -> float:
-    """Return how often chance lowers the losses of the blocks by as much: the sign of each gain is drawn anew.
+    """Return the p-value of a reduction of the block losses, by a sign-flip test with random signs of each reduction.
 
-    Gains are taken as they are, and in proportion to the losses, so that a single block of large errors does not hide
-    what all others show; the clearer answer counts.
+    The test is made with absolute and with logarithmic reductions, so that a single block with large errors does not
+    hide the others; the smaller p-value is returned.
     """
     signs = _signs(before.losses.size)
     gains = (before.losses - after.losses, np.log(np.maximum(before.losses, TINY) / np.maximum(after.losses, TINY)))
@@ -308,19 +308,19 @@ def chance_of_gain(before: Score, after: Score) -> float:
 
 @cache
 def _signs(blocks: int) -> FloatArray:
-    """Return the signs of each surrogate, shape (surrogates, blocks): always the same ones."""
+    """Return random sign patterns, shape (surrogates, blocks), the same ones at every call."""
     return np.random.default_rng(0).choice([-1.0, 1.0], (SURROGATES, blocks))
 
 
 def gain(before: Score, after: Score) -> float:
-    """Return the share of the held-out error on blocks that is gone."""
+    """Return the relative reduction of the held-out error on blocks."""
     return 1.0 - after.rms / before.rms
 
 
 def carries_over(before: Score, after: Score) -> bool:
-    """Return whether what was found on some records lowers the error on the others; True for one record.
+    """Return whether a gain carries over to held-out records; True for one record.
 
-    On each of them, or on all together by the share that counts.
+    It does if the error falls on each of them, or as required by `_carries_over_clearly`.
     """
     ratio = _ratio_on_records(before, after)
     lower = ratio.size == 0 or float(ratio.max()) < 1.0
@@ -328,14 +328,14 @@ def carries_over(before: Score, after: Score) -> bool:
 
 
 def _carries_over_clearly(before: Score, after: Score) -> bool:
-    """Return whether the error on records that were left out falls by the share that counts, and grows on none."""
+    """Return whether the error on held-out records falls by `LEAST_GAIN` and rises to `NO_WORSE` times on none."""
     ratio = _ratio_on_records(before, after)
     less = after.rms_of_records <= (1.0 - LEAST_GAIN) * before.rms_of_records
     return ratio.size > 0 and float(ratio.max()) <= NO_WORSE and less
 
 
 def _ratio_on_records(before: Score, after: Score) -> FloatArray:
-    """Return after / before of the errors on the records that were left out and could be judged."""
+    """Return the ratio of the errors, after / before, on each held-out record for which both are known."""
     if not before.records.size:
         return np.empty(0)
     both = np.isfinite(before.records) & np.isfinite(after.records)
@@ -344,22 +344,22 @@ def _ratio_on_records(before: Score, after: Score) -> FloatArray:
 
 
 def counts(before: Score, after: Score, *, own: bool = True) -> bool:
-    """Return whether a gain is large enough, beyond chance, and, but for what is each record's own, carries over."""
+    """Return whether a gain is large, significant and, unless the effect is separate in each record, carries over."""
     if not (gain(before, after) >= LEAST_GAIN and chance_of_gain(before, after) <= CHANCE):
         return False
     return own or carries_over(before, after)
 
 
 def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) -> bool:
-    """Return whether another effect explains as much as the best one, as far as the record can tell.
+    """Return whether the records do not distinguish another effect from the best one.
 
-    At one drive frequency what depends on time and what depends on rate cannot be told apart: a better fit says only
-    which of them bends the loops in a more suitable way. Shifts by less than a sample look the same. Of several records
-    those that are left out decide as well.
+    A single drive frequency cannot distinguish effects that depend on time from those that depend on rate; a better fit
+    then only means a more suitable loop shape. Delay and lag below the sampling period are alike, too. If there are
+    several records, the errors on held-out records also decide.
     """
     explained, by_other = before.rms**2 - best.score.rms**2, before.rms**2 - other.score.rms**2
     if best.name in SHIFTS and other.name == Resonance.name:
-        # It is a shift that rings as well: where it does no better nothing rings.
+        # A resonance is a shift with ringing: if it does not fit better, there is no ringing.
         return False
     if best.score.records.size and other.score.rms_of_records > NO_WORSE * best.score.rms_of_records:
         return False
@@ -371,27 +371,27 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
 
 
 def _shift(effect: Effect) -> float:
-    """Return by how much (s) a delay or lag shifts the displacement."""
+    """Return the time shift (s) of a delay or lag; infinite for other effects."""
     return abs(effect.seconds) if isinstance(effect, Delay) else getattr(effect, "time_constant", np.inf)
 
 
 @dataclass(frozen=True)
 class Named:
-    """An effect that won.
+    """Selected effect.
 
     Parameters
     ----------
     name : str
     before, after : Score
-        Without it and with it.
+        Held-out errors without the effect and with it.
     alternatives : tuple of str
-        Effects that explain as much, as far as the record can tell.
+        Effects that the records do not distinguish from it.
     runner_up : (str, float) or None
-        The next best effect, and the held-out error (m) with it instead.
+        Next best effect, and the held-out rms error (m) with that one instead.
     own : bool
-        Whether it is each record's own.
+        Whether it has separate parameters in each record.
     confirmed : bool
-        Whether each record, left out, says that it belongs to the others' explanation.
+        Whether the errors on held-out records confirm it.
     """
 
     name: str
@@ -405,18 +405,18 @@ class Named:
 
 @dataclass(frozen=True)
 class Selection:
-    """How the competition ended.
+    """Result of the selection.
 
     Parameters
     ----------
     base, now : Explanation
-        Before and after.
+        Joint fit before and after the selection.
     named : tuple of Named
-        Effects in the order of their gain, each added to those before it.
+        Selected effects, the largest gain first; each gain is relative to the preceding effects.
     structures : tuple of str
-        What is wrong with the hysteresis itself, of `STRUCTURES`.
+        Defects of the hysteresis model: `BIAS`, or keys of `STRUCTURES`.
     dropped : tuple of str
-        Effects that explain the records they were found on and make others worse.
+        Effects that were found on some records but do not carry over to others.
     """
 
     base: Explanation
@@ -427,19 +427,19 @@ class Selection:
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
-    """Add effects as long as one of them counts; drop those that later ones make needless.
+    """Add effects as long as one has a significant gain, and remove those that later ones make unnecessary.
 
     Parameters
     ----------
     base : Explanation
-        Without any.
+        Joint fit to start from.
     family : Explanation, optional
-        The same by the loop family, where that does better than the kind of `base`: then effects stand beside it.
+        The same with the loop family as hysteresis, if it is better than the kind of `base`; it is then used instead.
     """
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
-    # Their effects alone: a fit takes much room.
+    # Only effects are stored, because a joint fit takes much memory.
     rivals: dict[str, list[Effect]] = {}
     dropped: set[str] = set()
     exchanged = False
@@ -455,7 +455,7 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
         if not found or not found[0].counts_beside(now):
             names = {effect.name for effect in now.effects}
             if not exchanged and len(now.effects) > 1:
-                # Rivals come with their best parameters.
+                # The parameters of the rivals have been refined before, too.
                 now, exchanged = _exchanged(now.refined(STEPS), rivals), True
             if {effect.name for effect in now.effects} == names:
                 break
@@ -466,7 +466,7 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
         if {Creep.name, ThermalDrift.name} <= {effect.name for effect in now.effects} and not now.evidence.older_moves:
             # Creep from long before a record looks like a thermal drift.
             now = _without_needless(now.with_older_moves(), {ThermalDrift.name})
-    # Effects that were exchanged, and structures that no longer stand beside them, may make others needless.
+    # Exchanged effects and removed structures may have made other effects unnecessary.
     with_structures, now = now, now.bare()
     now = _without_needless(now, set(rivals), restart=now is not with_structures)
     named = _named(start, now, rivals)
@@ -474,7 +474,7 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
 
 
 def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
-    """Return the effect with the fewest parameters of those that explain as much as the best one."""
+    """Return the candidate with the fewest parameters among those that the records do not distinguish from the best."""
     alone = one_speed(now.evidence)
     equal = [
         other
@@ -485,15 +485,15 @@ def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
 
 
 def _without_needless(now: Explanation, names: Collection[str], *, restart: bool = True) -> Explanation:
-    """Return it without those of the named effects that the others make needless.
+    """Return the fit without those of the named effects that the others make unnecessary.
 
-    One that is not needed as it is, with `restart` (default) each one, is tried from a new start: an effect that was
-    found while another one was missing may have settled at parameters that make up for that.
+    An unnecessary effect, with `restart` (default) any effect, is first refitted from new initial parameters: its
+    parameters may compensate for another effect that was missing when it was found.
     """
     for name in [effect.name for effect in now.effects if effect.name in names]:
         without = now.without(name)
         needed = counts(without.held_out, now.held_out, own=is_own(now.effect(name)))
-        # The others may have come to their best only without it.
+        # The others may reach their best parameters only without it.
         anew = contenders(without, [name]) if without.effects and (restart or not needed) else []
         for one in anew:
             if one.counts_beside(without) and (not needed or gain(now.held_out, one.score) > BETTER):
@@ -504,9 +504,9 @@ def _without_needless(now: Explanation, names: Collection[str], *, restart: bool
 
 
 def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
-    """Return it with a rival in the place of an effect that it beats, or that it equals with fewer parameters.
+    """Return the fit in which rivals replace effects that are worse, or equivalent with more parameters.
 
-    Which effect came first depends on what else was missing then.
+    An effect may have been selected before its rival only because a third one was missing at that time.
     """
     alone = one_speed(now.evidence)
     for name in [effect.name for effect in now.effects if effect.name in rivals]:
@@ -528,7 +528,7 @@ def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation
 
 
 def _tried(name: str, now: Explanation, rest: Explanation, rivals: Sequence[Effect]) -> list[Contender]:
-    """Return rivals in the place of an effect, fitted beside the `rest`, the best one first."""
+    """Return the rivals of an effect as candidates added to `rest`, the fit without the effect, the best one first."""
     present = {effect.name for effect in now.effects}
     tried = [Contender(rival.name, rest.adding(rival).refined(1)) for rival in rivals if rival.name not in present]
     refined = _refined(tried, rest, rest.held_out.rms**2 - now.held_out.rms**2)
@@ -536,7 +536,7 @@ def _tried(name: str, now: Explanation, rest: Explanation, rivals: Sequence[Effe
 
 
 def _best_structure(now: Explanation, taken: tuple[str, ...]) -> tuple[str | None, Explanation]:
-    """Return what is wrong with the hysteresis itself, if that counts, and the explanation that allows for it."""
+    """Return the main defect of the hysteresis model, None if not significant, and the fit that allows for it."""
     best: tuple[str | None, Explanation] = (None, now)
     for name, columns in STRUCTURES.items():
         if name not in taken:
@@ -552,7 +552,7 @@ def _beats(one: Score, other: Score) -> bool:
 
 
 def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[Effect]]) -> tuple[Named, ...]:
-    """Return the effects, each added to those before it, the one that gains most first."""
+    """Return the selected effects, each with its gain when added to the preceding ones, the largest gain first."""
     left = [effect.name for effect in now.effects if effect.name in rivals]
     taken, before, ordered = [effect.name for effect in start.effects], start.held_out, []
     while left:
@@ -569,23 +569,23 @@ def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[E
 def _in_its_place(
     name: str, now: Explanation, rivals: Sequence[Effect]
 ) -> tuple[tuple[str, ...], tuple[str, float] | None, bool]:
-    """Return which rivals would do as well in the place of an effect, the best of them, and whether it is confirmed."""
+    """Return the alternatives to an effect, its best rival with the error, and whether held-out records confirm it."""
     rest, best = now.without(name), Contender(name, now)
     tried = _tried(name, now, rest, rivals)
     alone = one_speed(now.evidence)
     alternatives = [other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone)]
     inseparable = [other.name for other in tried if {name, other.name} <= DYNAMIC]
     if alone and name in DYNAMIC and not alternatives:
-        # A better fit at one frequency says only which of them bends the loops in a more suitable way.
+        # At a single frequency a better fit only means a more suitable loop shape.
         alternatives = inseparable[:1] or [one for one in ("rate_dependence", "creep") if one != name][:1]
     confirmed = _carries_over_clearly(rest.held_out, now.held_out)
     return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None, confirmed
 
 
 def _do_not_close(now: Explanation) -> FloatArray:
-    """Return what forgets with the way, not at turning points: Duhem operators, such as Bouc and Wen's.
+    """Return columns, shape (N, k), metres, for loops that do not close: Duhem operators, as in the Bouc-Wen model.
 
-    Each follows ``dz = dv - z |dv| / w`` for a way ``w``; at whatever speed.
+    Each follows ``dz = dv - z |dv| / w`` with a memory length ``w`` (V), independent of the rate.
     """
     span = float(np.ptp(now.evidence.v))
     columns = [
@@ -605,7 +605,7 @@ def _duhem(v: FloatArray, way: float) -> FloatArray:
 
 
 def _bent(now: Explanation) -> FloatArray:
-    """Return what bends the displacement: then loops between the same turns differ with the level they hang on."""
+    """Return columns, shape (N, 2), metres, for loops that depend on level: square and cube of the displacement."""
     x = now.h - now.h.mean()
     x = x / np.abs(x).max()
     return np.column_stack([x**2, x**3]) * float(np.ptp(now.h))

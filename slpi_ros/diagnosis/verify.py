@@ -1,7 +1,7 @@
-"""The model against records that it has not seen, and what is left of a compensated path's error.
+"""Verification of a model on records not used for its identification, and causes of the error of compensated paths.
 
-What happened before a record began is unknown: an initial history and a constant offset are estimated for each record,
-and nothing else. Judged is what comes when the initial history adds nothing but a constant, if that ever comes.
+The motion before a record is unknown: an initial history and a constant offset are estimated for each record, and
+nothing else. The samples to which the initial history only adds a constant are evaluated, or all if these are too few.
 """
 
 import warnings
@@ -35,17 +35,17 @@ IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 SCHEMA = "slpi_ros/verification/1"
-# Without a tolerance an error passes up to so many times the noise floor.
+# Default tolerance as a multiple of the noise floor.
 TIMES_THE_FLOOR = 3.0
-# A shift in time must make the model agree with the desired displacement better by this factor.
+# A delay is accepted if it reduces the difference between model and desired displacement by this factor.
 BETTER = 1.1
-# A change of gain is all that there is when it leaves less than this share of the error.
+# A change of gain contributes to the offset if the error after fitting it is below this share of the error before.
 MOSTLY = 0.5
-# Tables are made from about so many samples.
+# Approximate number of samples from which tables are computed.
 TABLE_SAMPLES = 40_000
-# A voltage is at a limit when it stays at the record's own extreme for so many samples.
+# A voltage is at a limit if it stays at the extreme of the record for at least this many samples.
 FEWEST_AT_LIMIT = 3
-# The longest shift between desired displacement and model that is looked for, seconds and share of the record.
+# Longest delay that is searched for, in seconds and as a share of the record, and number of steps of the search.
 LONGEST_DELAY, DELAY_SHARE, DELAY_STEPS = 0.5, 0.05, 200
 
 CAUSES = {
@@ -62,7 +62,7 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class ErrorPart:
-    """Errors of a part of the samples: how many they are, and their rms and maximum, metres."""
+    """Number of samples, and their rms and maximum error (m), for a part of the samples."""
 
     name: str
     samples: int
@@ -81,22 +81,22 @@ class ErrorPart:
 
 @dataclass(frozen=True)
 class Tracking:
-    """How well a compensator followed a desired path, and where its error comes from.
+    """Tracking error of a compensated path, and its causes.
 
     Parameters
     ----------
     error : ErrorPart
         Measured - desired displacement.
     shares : mapping of cause to float
-        Parts of the mean square error, of `CAUSES`; they add up to 1, and one that counteracts others is negative.
+        Share of each of `CAUSES` in the mean square error. Their sum is 1; a cause that counteracts others is negative.
     delay : float, seconds
-        By how much the displacement follows later.
+        Delay of the displacement behind the desired one.
     effects : tuple of str
-        What a diagnosis of the record named.
+        Effects that a diagnosis of the record identified.
     t, desired : ndarray, shape (N,), seconds and metres
-        For the charts.
+        Time and desired displacement, for charts.
     parts : mapping of cause to ndarray, shape (N,), metres
-        The error, cause by cause; "model" holds noise and effects too.
+        Contribution of each cause to the error; "model" includes noise and effects.
     """
 
     error: ErrorPart
@@ -127,38 +127,39 @@ class Tracking:
 
 @dataclass(frozen=True)
 class RecordVerification:
-    """One axis of one record.
+    """Verification of one axis on one record.
 
     Parameters
     ----------
     error : ErrorPart
-        Of measured - model over the samples judged, without the offset; its name is that of the record.
+        Error, measured - model, of the evaluated samples without the offset, named after the record.
     limit : float, metres
-        The largest rms error that passes.
+        Largest rms error that passes.
     floor_rms : float, metres
-        How well the record repeats itself.
+        Noise floor (repeatability) of the record.
     floor_source : str
-        Where that was seen.
+        Data from which the floor was estimated.
     known_from : float or None, seconds
-        From when on the initial history adds nothing but a constant: judged from there. None: never; everything is
-        judged, from the estimated history.
+        Time from which the initial history only adds a constant; evaluation starts there. None if there is no such
+        time: all samples are evaluated, from the estimated history.
     history : tuple of float, volts
-        The initial history that best explains the record, as in `slpi_ros.model.stage_model.Start`.
+        Initial history that best explains the record, as in `slpi_ros.model.axis_model.Start`.
     offset : float, metres
-        By how much the zero has moved.
+        Shift of the zero.
     offset_uncertainty : float, metres
-        What an unknown initial history can hide, and chance.
+        Uncertainty of the offset, due to the unknown initial history and to random errors.
     zero_moved : bool
-        Whether the offset is more than that.
+        Whether the offset exceeds its uncertainty.
     gain, width : float
-        By which share the outermost loop is higher and wider than that of the model.
+        Relative change of the height of the loops from those of the model, and additional change of their width.
     outside : int
-        Samples whose voltage lies outside of what the model was identified on.
+        Number of samples with a voltage outside the range of the identification.
     t, v, measured, model : ndarray, shape (N,), seconds, volts and metres
-        The record, and the model with the offset.
+        Time, voltage and displacement of the record, and displacement of the model including the offset.
     judged : ndarray of bool, shape (N,)
+        Mask of the evaluated samples.
     tracking : Tracking or None
-        Where the desired displacement is known.
+        Tracking error; None if the desired displacement is not known.
     """
 
     error: ErrorPart
@@ -187,7 +188,7 @@ class RecordVerification:
 
     @property
     def left(self) -> FloatArray:
-        """Measured - model of the samples judged, shape (M,), metres."""
+        """Measured - model of the evaluated samples, shape (M,), metres."""
         return (self.measured - self.model)[self.judged]
 
     def to_document(self) -> dict[str, Any]:
@@ -215,16 +216,17 @@ class RecordVerification:
 
 @dataclass(frozen=True)
 class AxisVerification:
-    """One axis over all records.
+    """Verification of one axis on all records.
 
     Parameters
     ----------
     overall : ErrorPart
+        Error of all evaluated samples.
     resolution : float, metres
-        The error that the model had on data held out when it was identified.
+        Held-out error of the model at its identification.
     records : tuple of RecordVerification
     by_level, by_speed, by_region : tuple of ErrorPart
-        By how deep the loop lies in others, by the size of dv/dt, and by voltage.
+        Errors by nesting depth of the loop, by magnitude of dv/dt, and by voltage.
     """
 
     overall: ErrorPart
@@ -241,7 +243,7 @@ class AxisVerification:
 
     @property
     def worst(self) -> RecordVerification:
-        """The record whose error is largest against its limit."""
+        """Record with the largest ratio of error to limit."""
         return max(self.records, key=lambda record: record.error.rms / record.limit if record.limit else np.inf)
 
     def to_document(self) -> dict[str, Any]:
@@ -261,7 +263,7 @@ class AxisVerification:
 
 @dataclass(frozen=True)
 class Verification:
-    """The model of a stage against records that it has not seen.
+    """Verification of the model of a stage on records not used for its identification.
 
     Parameters
     ----------
@@ -269,7 +271,7 @@ class Verification:
     tolerance : float or None, metres
         As given.
     hardware_id : str
-        The stage.
+        Hardware id of the stage.
     """
 
     axes: Mapping[str, AxisVerification]
@@ -300,21 +302,21 @@ def verify(
     axes: Sequence[str] | None = None,
     desired: Sequence[Mapping[str, FloatArray] | None] | None = None,
 ) -> Verification:
-    """Validate a model on records that it has not seen, by free-run simulation.
+    """Verify a model by free-run simulation of records not used for its identification.
 
     Parameters
     ----------
     records : Record or sequence of Record
     model : StageModel
-        Of the same stage.
+        Model of the same stage.
     tolerance : float, metres, optional
-        The largest rms error that passes; by default three times the record's noise floor, but at least the fraction
+        Largest rms error that passes; by default three times the record's noise floor, but at least the fraction
         `RESOLUTION` of the stroke, the best accuracy that a hysteresis model attains.
     axes : sequence of str, optional
-        All that records and model share by default.
+        Axes to be verified; by default all that the model and every record contain.
     desired : sequence of mapping of axis name to ndarray, shape (N,), metres, or None, optional
-        For each record the desired displacement at its samples, NaN where there was none; adds how well a compensator
-        followed it.
+        Desired displacement of each record at its samples, NaN where there was none. If given, the tracking error of
+        the compensator is evaluated as well.
 
     Returns
     -------
@@ -323,7 +325,7 @@ def verify(
     Raises
     ------
     UsageError
-        If records and model are not of one stage or share no axis, or the tolerance is not positive.
+        If records and model belong to different stages or share no axis, or the tolerance is not positive.
     RecordError
         If a record contains too little data.
     """
@@ -355,10 +357,10 @@ def verify(
 
 @dataclass(frozen=True)
 class _Run:
-    """One axis of a record, and the model free-run along it from the initial history that explains the record best.
+    """Free-run simulation of one axis on a record, from the initial history that best explains the record.
 
-    `constant` (m) is what no initial history explains: `offset` and what a change of gain adds. `assumed` is the model
-    from each memory that a compensator may have assumed.
+    `constant` (m) is the part of the offset due to a change of gain, plus `offset` if that is significant. `assumed`
+    holds a simulation from each initial state that a compensator may have assumed.
     """
 
     t: FloatArray
@@ -372,7 +374,7 @@ class _Run:
 
 
 def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[str, _Run]:
-    """Choose the initial history of each axis that best explains the record, and simulate all axes from there."""
+    """Simulate the axes on a record, each from the initial history that best explains it, with cross coupling."""
     moving = [name for name in model.axes if name in record.axes and np.isfinite(record.voltage[name]).any()]
     runs, motions = {}, {}
     for name in dict.fromkeys((*names, *moving)):
@@ -382,11 +384,11 @@ def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[s
         except SlpiError:
             if name in names:
                 raise
-            # An axis that rests moves no other one.
+            # An axis at rest does not couple into others.
             continue
         t = record.t[np.isfinite(record.voltage[name])]
         with warnings.catch_warnings():
-            # The figures say what comes of loops that were never identified.
+            # The effect of loops that were never identified is visible in the errors.
             warnings.simplefilter("ignore", UnidentifiedLoopWarning)
             runs[name] = _run(axis, t, samples)
             start = runs[name].found.start
@@ -408,14 +410,14 @@ def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[s
 
 
 def _run(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
-    """Simulate an axis along a record from the initial history that explains it best."""
-    # What belongs to one record is not expected of another one.
+    """Simulate an axis on a record from the initial history that best explains it."""
+    # Effects that belong to one record (drift, hum) do not apply to another.
     axis = replace(axis, effects=tuple(effect for effect in axis.effects if effect.removable != "record"))
     found = match(axis, samples, t)
     simulated = replace(axis, start=found.start).simulate(t, samples.v)
     after = samples.fitted & (np.arange(t.size) >= found.known_from)
     judged = after if np.count_nonzero(after) >= FEWEST else samples.fitted
-    # Of a stage that moves more, the place where the model starts stays.
+    # A change of gain leaves the start displacement of the model unchanged.
     by_gain = 0.0
     if found.gain_changed and found.rms_explained < MOSTLY * found.rms:
         by_gain = found.gain_change * float(simulated[judged].mean() - axis.start.displacement)
@@ -435,7 +437,7 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
 
 
 def _default_limit(axis: AxisModel, floor: float) -> float:
-    """Return the largest rms error (m) that passes over a noise floor (m)."""
+    """Return the default limit of the rms error (m) for a noise floor (m)."""
     low, high = axis.displacement_range
     return max(TIMES_THE_FLOOR * floor, RESOLUTION * (high - low))
 
@@ -493,7 +495,7 @@ def _summary(records: Sequence[RecordVerification], resolution: float) -> AxisVe
 
 
 def _thinned(record: RecordVerification, most: int) -> IntArray:
-    """Return about `most` of the samples judged."""
+    """Return the indices of about `most` evaluated samples."""
     at = np.flatnonzero(record.judged)
     return at[:: max(1, round(at.size / most))]
 
@@ -501,10 +503,10 @@ def _thinned(record: RecordVerification, most: int) -> IntArray:
 def _tracking(
     one: RecordVerification, run: _Run, path: FloatArray, record: Record, model: StageModel, name: str
 ) -> Tracking:
-    """Take the error measured - desired apart.
+    """Decompose the tracking error, measured - desired, by cause.
 
-    With the model ``m`` from the initial history that explains the record, ``a`` from the memory that the
-    compensator seems to have assumed, and the desired ``d`` (``d'``: as late as the stage follows)::
+    ``m`` is the model from the initial history that explains the record, ``a`` the model from the initial state that
+    the compensator seems to have assumed, and ``d`` the desired displacement (``d'``: delayed as the stage is)::
 
         y - d = (y - offset - m) + offset + (m - a) + (a - d') + (d' - d)
                  model, noise      zero     memory    command    delay
@@ -549,7 +551,7 @@ def _tracking(
 
 
 def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
-    """Return by how much the model follows later than desired, seconds; 0 where no shift does better."""
+    """Return the delay (s) of the model behind the desired displacement; 0 if no delay is clearly better."""
     longest = min(LONGEST_DELAY, DELAY_SHARE * float(t[-1] - t[0]))
     shifts = np.linspace(0.0, longest, DELAY_STEPS + 1)
     misses = [_rms(model - np.interp(t - shift, t, desired)) for shift in shifts.tolist()]
@@ -558,7 +560,7 @@ def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
 
 
 def _at_limit(v: FloatArray, command: FloatArray) -> Mask:
-    """Return where a voltage stays at the record's extreme and a displacement (m) beyond it was desired, shape (N,)."""
+    """Return the mask of samples, shape (N,), with the voltage at a limit and a desired displacement beyond it."""
     margin = 1e-6 * float(np.ptp(v))
     limited = np.zeros(v.size, dtype=bool)
     for extreme, missing in ((v.max(), command < 0.0), (v.min(), command > 0.0)):
@@ -571,13 +573,13 @@ def _at_limit(v: FloatArray, command: FloatArray) -> Mask:
 
 
 def _effects(one: RecordVerification, record: Record, model: StageModel, name: str) -> tuple[tuple[str, ...], float]:
-    """Diagnose a record that the model does not describe: return what is named, and its share of the residual."""
+    """Return the effects that a diagnosis identifies, and their share of the residual; none if the error is small."""
     if one.error.rms <= _default_limit(model.axis(name), one.floor_rms):
         return (), 0.0
     try:
         found = diagnose(record, model, axes=[name]).axes[name].effects
     except SlpiError:
-        # A record that says too little for a diagnosis still tells how large the model's part is.
+        # With too little data for a diagnosis, the contribution of the model is still known.
         return (), 0.0
     return tuple(effect.name for effect in found), min(sum(max(one.share_of_residual, 0.0) for one in found), 1.0)
 

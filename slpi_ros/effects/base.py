@@ -36,9 +36,9 @@ class EffectContext:
     others : mapping of axis name to ndarray, shape (N,), metres
         Displacement of the other axes relative to their start, before coupling.
     records : tuple of EffectContext
-        One context per record where the signals are several concatenated records; empty for a single record.
+        One context per record if the signals are concatenated from several records; empty for a single record.
     grid : Uniform, optional
-        That of `t`, where it is known already.
+        Uniform grid that covers `t`, if already computed.
     """
 
     t: FloatArray
@@ -88,7 +88,7 @@ class StreamingEffect(Protocol):
         """Advance the state by `dt` (s) to the input `x` and return the output."""
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the input for the output `wanted` after `dt` (s), or the nearest stable one; state unchanged."""
+        """Return the input, or a stable approximation, for the output `wanted` after `dt` (s); keep the state."""
 
     def snapshot(self) -> Any:
         """Return the complete state as JSON-compatible numbers and tuples of numbers."""
@@ -151,7 +151,7 @@ class Candidate:
     positive : int
         Number of trailing columns whose gains must be non-negative; if not 0, `effect` receives only these gains.
     starting : int
-        Number of leading columns that describe the state before a record; they have separate gains in every record.
+        Number of leading columns that describe the initial state of the records; each belongs to one record.
     """
 
     columns: FloatArray
@@ -215,14 +215,14 @@ def wave(phase: FloatArray) -> FloatArray:
 
 
 def amplitude_and_phase(gains: FloatArray) -> tuple[float, float]:
-    """Return amplitude and phase (rad) of the sinusoid with two gains for the columns of `wave`."""
+    """Return amplitude and phase (rad) of a sinusoid from its two gains for the columns of `wave`."""
     return float(np.hypot(gains[0], gains[1])), float(np.arctan2(gains[1], gains[0]))
 
 
 def strongest_lines(
     power: FloatArray, at: NDArray[np.floating[Any]], count: int, width: int = LINE_WIDTH
 ) -> list[float]:
-    """Return the frequencies of the highest peaks of a spectrum, shape (n,), in their unit, strongest first."""
+    """Return the frequencies of the highest peaks of a spectrum, shape (n,), in the unit of `at`, strongest first."""
     power, found = power.copy(), []
     for _ in range(count):
         k = int(np.argmax(power))

@@ -53,13 +53,13 @@ class Chain:
 
     @property
     def rate_dependence(self) -> RateDependence | None:
-        """The rate dependence that requires the voltage of the hysteresis, or None if there is none."""
+        """The rate dependence that acts on the displacement and requires the voltage of the hysteresis, or None."""
         first = self.own[0] if self.own else None
         return first if isinstance(first, RateDependence) else None
 
     @property
     def coercivity(self) -> RateDependence | None:
-        """The rate dependence of coercivity form, which acts on the voltage, or None if there is none."""
+        """The rate dependence in its coercivity form, which acts on the voltage, or None if there is none."""
         last = self.before[-1] if self.before else None
         return last if isinstance(last, RateDependence) else None
 
@@ -82,7 +82,7 @@ class Chain:
     def hysteresis_for(
         self, own: FloatArray, around: EffectContext, inverse: Callable[[FloatArray], FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return displacement (m) and voltage (V) of the hysteresis, shape (N,) each, for the axis's own displacement.
+        """Return displacement (m) and voltage (V) of the hysteresis, shape (N,) each, for a displacement of the axis.
 
         Parameters
         ----------
@@ -113,7 +113,7 @@ class Chain:
 
 
 def reaching(effects: Sequence[Effect], v: FloatArray, around: EffectContext) -> tuple[FloatArray, FloatArray]:
-    """Return hysteresis voltage and parallel reversible displacement, shape (N,) each, volts and metres."""
+    """Return the voltage (V) of the hysteresis and the reversible displacement (m) parallel to it, shape (N,) each."""
     u, reversible_bypass = v, np.zeros_like(v)
     for effect in effects:
         if effect.side == "voltage":

@@ -46,9 +46,9 @@ class Creep:
     ----------
     time_constants : tuple of float, length K >= 1, seconds, ``tau_k``
     gains : tuple of float, length K
-        Shares ``g_k`` of the motion ``h - h_0`` that follow with a time constant.
+        Share ``g_k`` of the motion ``h - h_0`` that follows with each time constant.
     initial : float, metres
-        Displacement step just before the record, default 0. Only `apply` continues the creep of this step; streaming
+        Displacement step just before the record, default 0. Only `apply` includes the creep after this step; streaming
         starts at equilibrium.
     uncertainty : mapping of parameter name to standard deviation, optional
         Standard deviations; those of single elements have keys such as ``gains.0``.
@@ -189,7 +189,7 @@ class StreamingCreep:
     def resume(self, other: "StreamingCreep", x: float) -> None:
         """Take over the state of another model's creep at the input displacement `x` (m).
 
-        Relaxations whose time constant `other` has as well continue from there; all others start settled.
+        Relaxations with a time constant that `other` also has continue from its state; all others start in equilibrium.
         """
         moved = other._input
         known = dict(zip(other._creep.time_constants, other._states, strict=True))
@@ -197,7 +197,7 @@ class StreamingCreep:
         self._states = [known.get(tau, moved) for tau in self._creep.time_constants]
 
     def snapshot(self) -> tuple[float, ...]:
-        """Return origin, motion, and the relaxations."""
+        """Return origin, last motion from the origin, and states of the relaxations (m)."""
         return self._origin, self._input, *self._states
 
     def restore(self, state: tuple[float, ...]) -> None:
@@ -229,10 +229,10 @@ def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[
 def settling(
     time_constants: Sequence[float], around: EffectContext, used: NDArray[np.bool_], *, older: bool = False
 ) -> FloatArray:
-    """Return the decay in each record of creep from before it, shape (N, k), one column per identifiable relaxation.
+    """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation.
 
-    For the logarithmic law there is a single column, as for one move just before the record; with `older` another one,
-    as for a move that was as long before it as the record lasts: of that only the slow part still goes on.
+    The logarithmic law has a single column, for a move just before the record. With `older` there is a second one, for
+    a move one record duration before the record, of which only the slow part remains.
     """
     whole = []
     for own in range(max(len(around.records), 1)):

@@ -50,7 +50,7 @@ class CrossCoupling:
         return signal - self.part(signal, around)
 
     def part(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the coupled motion, shape (N,), metres."""
+        """Return the displacement caused by the other axes, shape (N,), metres."""
         known = (gain * around.others[axis] for axis, gain in self.gains.items() if axis in around.others)
         return sum(known, np.zeros_like(signal))
 
@@ -78,7 +78,7 @@ Motion = TypeVar("Motion", float, FloatArray)
 
 
 class Coupling:
-    """Linear coupling of all axes of a stage: the observed motions are ``(I + G) m``, with ``m`` the own motions.
+    """Linear coupling of all axes: the observed motions are ``(I + G) m``, with ``m`` the motions without coupling.
 
     Parameters
     ----------
@@ -100,11 +100,11 @@ class Coupling:
         self._solutions: dict[tuple[str, ...], list[list[float]]] = {}
 
     def part(self, name: str, motions: Mapping[str, Motion]) -> Motion | float:
-        """Return the displacement (m) caused by the own motions of the others; absent ones are stationary."""
+        """Return the displacement (m) of axis `name` caused by the own motions of the others, 0 for missing axes."""
         return sum((gain * motions[other] for other, gain in self._gains[name].items() if other in motions), 0.0)
 
     def decouple(self, seen: Mapping[str, Motion], resting: Mapping[str, Motion]) -> dict[str, Motion]:
-        """Return the own motions (m) that produce the observed motions.
+        """Return the own motions (m), those without coupling, that produce the observed motions.
 
         Parameters
         ----------

@@ -53,7 +53,7 @@ class Delay:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield delays of both signs, from a fraction of a sampling interval to several."""
+        """Yield delays of both signs, from a fraction of a sampling interval to several intervals."""
         dt = usual_step(left.t)
         for seconds in (-4.0 * dt, 0.5 * dt, 2.0 * dt, 8.0 * dt):
             column = left.respond(cls(seconds).apply(left.u, left.around)) - left.h

@@ -18,7 +18,7 @@ FINEST = 4
 
 
 class Hold(NamedTuple):
-    """Coefficients of one step ``z1 = now u1 + before u0 + kept z0``, with sum 1."""
+    """Coefficients of one step of a first-order lag, ``z1 = now u1 + before u0 + kept z0``, with sum 1."""
 
     now: float
     before: float
@@ -34,8 +34,8 @@ def hold(dt: float, time_constant: float) -> Hold:
 
 
 def filtered(numerator: ArrayLike, denominator: ArrayLike, signal: FloatArray) -> FloatArray:
-    """Return a signal, shape (N,), after a discrete transfer function, from rest."""
-    # A node filters sample by sample and does without the import, which takes a second.
+    """Filter a signal, shape (N,), with a discrete transfer function, from a zero state."""
+    # Imported here because it takes a second and nodes, which filter sample by sample, do not need it.
     from scipy.signal import lfilter
 
     return np.asarray(lfilter(numerator, denominator, signal), dtype=np.float64)
@@ -108,7 +108,7 @@ class Uniform:
 
     @classmethod
     def over(cls, t: FloatArray) -> "Uniform":
-        """Return the grid for stamps `t`, shape (N,), seconds, with their median interval where that is fine enough."""
+        """Return the grid for stamps `t`, shape (N,), s: their median interval, at most `FINEST` points per sample."""
         span = float(t[-1] - t[0]) if t.size else 0.0
         if span <= 0.0:
             return cls(t, t, 0.0)

@@ -9,8 +9,8 @@ import numpy as np
 
 from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
 
-# Numbers of uniform knots of the candidates. Within the first piece there are others at equal factors of time, so many
-# to a decade, as piezo ageing goes with the logarithm of time; the first one comes after a loop and so many readings.
+# Numbers of uniform knots of the candidates. The first interval has more knots, spaced logarithmically (number per
+# decade), as piezo ageing is logarithmic in time; the first lies after one loop and at least this many readings.
 UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
 
 
@@ -21,8 +21,8 @@ class GainDrift:
     ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. `apply` and `invert` use
     the record's clock; `streaming` uses the value at the end of the record.
 
-    The change acts after hysteresis, creep and resonance, which it scales alike, and before the coupling, through which
-    other axes receive the scaled motion.
+    The factor acts after hysteresis, creep and resonance, and scales all three. It acts before the cross coupling, so
+    that other axes receive the scaled motion.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class GainDrift:
     gains : tuple of float, length K
         Relative change of sensitivity ``g`` at the knots.
     origin : float, metres
-        Displacement that is independent of the sensitivity.
+        Displacement that does not change with the sensitivity.
     uncertainty : mapping of parameter name to standard deviation, optional
         Standard deviations; those of single elements have keys such as ``gains.0``.
     """
@@ -71,9 +71,9 @@ class GainDrift:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield a line, and curves with uniform knots and more of them at the beginning.
+        """Yield a straight line, and piecewise linear curves with uniform knots and additional early knots.
 
-        Beside the gains stand shifts at the same knots: both together tell the origin.
+        Displacement shifts at the same knots are fitted with the gains; their ratio gives the origin.
         """
         t, end = left.t - left.t[0], float(left.t[-1] - left.t[0])
         travel = np.cumsum(np.abs(np.diff(left.u, prepend=left.u[0])) * left.used)
@@ -91,9 +91,9 @@ class GainDrift:
 
     @classmethod
     def _through(cls, times: FloatArray, low: float, high: float, found: FloatArray) -> "GainDrift":
-        """Return that of gains and shifts; its origin is within the record's displacements from `low` to `high`."""
+        """Return the gain drift for fitted gains and shifts; its origin is limited to the range `low` to `high` (m)."""
         gains, shifts = np.split(found, 2)
-        # A knot tells as much as it has samples.
+        # The weight of a knot is the duration that it represents.
         weighted = gains * np.gradient(np.append(0.0, times))[1:]
         share = -float(weighted @ shifts) / max(float(weighted @ gains), 1e-300)
         origin = low + min(max(share, 0.0), 1.0) * (high - low)

@@ -83,5 +83,5 @@ class Hum:
         return f"the measured displacement contains hum of {self.amplitude * 1e9:.3g} nm at {self.frequency:.4g} Hz"
 
     def streaming(self) -> None:
-        """Return None: the phase refers to the record's clock, so that hum cannot be predicted in operation."""
+        """Return None: the phase is known only for the clock of the record, so hum cannot be predicted in operation."""
         return

@@ -66,7 +66,7 @@ class Lag:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield lags from a fraction of a sampling interval to many."""
+        """Yield lags from a fraction of a sampling interval to many intervals."""
         for samples in (0.5, 2.0, 8.0, 32.0):
             tau = samples * usual_step(left.t)
             column = left.respond(cls(tau).apply(left.u, left.around)) - left.h

@@ -12,7 +12,7 @@ FloatArray = NDArray[np.float64]
 
 @compiled
 def settled_rate(t: FloatArray, v: FloatArray, settling: float) -> FloatArray:
-    """Return the low-pass filtered rate (V/s) of a path, shape (N,), volts, from rest, at times `t`, shape (N,), s."""
+    """Return the rate (V/s) of `v` (V) at times `t` (s), shape (N,) each, low-pass filtered over `settling` (s)."""
     settled, now, last = np.empty_like(v), 0.0, v.size - 1
     for k in range(v.size):
         # The rate before the present sample; the streaming version has no access to the present one.
@@ -36,7 +36,7 @@ def play(v: FloatArray, half_width: FloatArray) -> FloatArray:
 
 @compiled
 def direction(u: FloatArray, transition: float) -> FloatArray:
-    """Return the direction of a path, shape (N,), volts, from -1 to 1, which changes over a `transition` (V)."""
+    """Return the direction of a path, shape (N,), volts, from -1 to 1, smoothed over a voltage `transition` (V)."""
     directions, now = np.empty_like(u), 0.0
     for k in range(u.size):
         moved = u[k] - u[max(k - 1, 0)]
@@ -51,7 +51,7 @@ def direction(u: FloatArray, transition: float) -> FloatArray:
 def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArray:
     """Return the sum of first-order relaxations of a displacement, shape (N,), metres.
 
-    For gains, shape (K,), and coefficients of the first-order hold, shape (K, 3), as `slpi_ros.effects.filters.Hold`.
+    `gains` has shape (K,); `holds`, shape (K, 3), are coefficients as in `slpi_ros.effects.filters.Hold`.
     """
     crept, before, states = np.empty_like(moved), 0.0, np.zeros(gains.size)
     for k in range(moved.size):
@@ -67,7 +67,7 @@ def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArr
 def smoothed_slope(x: FloatArray) -> FloatArray:
     """Return the change per sample of a signal, shape (N >= 7,), by quadratic fits over seven samples (Savitzky-Golay).
 
-    At the ends it is that of the first and the last fit.
+    The first and the last three values are taken from the first and the last fit.
     """
     slope, last = np.empty_like(x), x.size - 4
     for k in range(x.size):

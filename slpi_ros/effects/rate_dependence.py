@@ -1,7 +1,7 @@
 """Rate dependence: loops that widen with the rate by more than a linear filter explains.
 
-There are two forms: a loss on the displacement (wider loops and a backlash), and growing thresholds, for which the
-hysteresis receives the voltage through a play operator (see `coercivity`).
+There are two forms: wider loops with a backlash, which act on the displacement, and a rate-dependent coercivity, which
+acts on the voltage as a play operator before the hysteresis.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,9 +27,9 @@ from slpi_ros.errors import ModelError
 
 CoercivityState = tuple[float, float, float, float]
 
-# Number of secant steps for inverting the reversible part, which is nearly linear over a coercivity.
+# Number of secant steps for inverting the reversible part, which is nearly linear within the play.
 CHORDS = 8
-# Tolerance for a command at the end of the play, for rounding.
+# Rounding tolerance for a command at the end of the play.
 INSIDE = 1 - 1e-9
 
 
@@ -78,11 +78,11 @@ class StreamingCoercivity:
         return self.ahead(wanted, copysign(1.0, way)) if way else self._v
 
     def ahead(self, u: float, direction: float) -> float:
-        """Return the command (V) at which the hysteresis moves on from `u` (V) in `direction`, -1 or 1."""
+        """Return the command (V) at which the hysteresis starts to move from `u` (V) in `direction`, -1 or 1."""
         return u + direction * self._half_width(self._rate_out)
 
     def within(self, reversible_bypass: float) -> tuple[float | None, float]:
-        """Return the command (V) for a reversible displacement (m), hysteresis at rest; None if beyond the play.
+        """Return the command (V) for a reversible displacement (m) with the hysteresis at rest; None beyond the play.
 
         The second value is the direction of the command from the middle of the play, -1 or 1.
         """
@@ -101,7 +101,7 @@ class StreamingCoercivity:
         return self.between(self._v, self._u)
 
     def between(self, v: float, u: float) -> float:
-        """Return the reversible displacement (m) at a command `v` (V) if the hysteresis is at `u` (V)."""
+        """Return the reversible displacement (m) at a command `v` (V) and a voltage `u` (V) of the hysteresis."""
         return sum(gain * (v**power - u**power) for power, gain in enumerate(self._reversible, start=1))
 
     def snapshot(self) -> CoercivityState:
@@ -177,7 +177,7 @@ class StreamingRateDependence:
         return x + self._speed(self._rate) * (self._widening * (x - self._middle(self._u)) - behind)
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the displacement (m) of the quasi-static loops for one of the widened loops, `wanted` (m)."""
+        """Return the displacement (m) of the quasi-static loops for a displacement `wanted` (m) of the wider loops."""
         self._asked = wanted
         if self._u is None or self._desired is None or dt <= 0.0:
             return wanted
@@ -219,7 +219,7 @@ class StreamingRateDependence:
         self._metres = kept * self._metres + abs(went)
 
     def _volts_per_metre(self) -> float:
-        """Return the voltage per metre of displacement, from the middle of the loop and from recent samples."""
+        """Return the voltage per metre of displacement, from the slope of the mid-line and from recent samples."""
         u = self._u or 0.0
         slope = 1 / max((self._middle(u + 1.0) - self._middle(u - 1.0)) / 2, 1e-15)
         seen = self._volts / self._metres if self._metres > 0.0 else slope
@@ -229,40 +229,41 @@ class StreamingRateDependence:
 # Exponents, and transition lengths as shares of the voltage range, of the candidates.
 EXPONENTS, TRANSITIONS = (0.1, 0.3, 0.6), (0.01, 0.04, 0.12)
 
-# Coercivities (share of the voltage range) at which the search for growing thresholds starts.
+# Candidates of the coercivity form: exponent, onset (share of the reference rate), settling (s), and coercivities
+# (shares of the voltage range).
 COERCIVE_EXPONENT, COERCIVE_ONSET, SETTLING, COERCIVITIES = 0.3, 0.1, 2e-3, (0.003, 0.02, 0.06)
 # Number of gains of the reversible part.
 POWERS, MOST_POWERS = 3, 6
 
-# Least number of samples of which batch evaluation takes a rate.
+# Fewest samples from which batch evaluation computes a rate.
 WINDOW = 7
 
 
 @dataclass(frozen=True)
 class RateDependence:
-    """Either ``y = h + (|du/dt| / r)^e (widening (h - m(u)) - backlash z)``, or a coercivity ``c (|dv/dt| / r)^e``.
+    """Rate dependence of the loops in one of two forms: wider loops with a backlash, or a coercivity.
 
-    In the first form ``m`` is the mid-line of the largest loop, and ``z`` the direction of ``u``, from -1 to 1, with
-    ``dz = (sign(du) - z) |du| / transition``. In the second form the voltage of the hysteresis is ``u = play(v)`` with
-    half-width ``c (s / r)^e``, where ``s`` is the low-pass filtered ``|dv/dt|``; the reversible part ``R(v) - R(u)``,
-    ``R(v) = g1 v + g2 v^2 + ..``, acts in parallel. An instance has one form.
+    First form: ``y = h + (|du/dt| / r)^e (widening (h - m(u)) - backlash z)``, where ``m`` is the mid-line of the
+    largest loop, and ``z`` the direction of ``u``, from -1 to 1, with ``dz = (sign(du) - z) |du| / transition``. Second
+    form: the voltage of the hysteresis is ``u = play(v)`` with half-width ``c (s / r)^e``, where ``s`` is the low-pass
+    filtered ``|dv/dt|``; the reversible part ``R(v) - R(u)``, ``R(v) = g1 v + g2 v^2 + ..``, acts in parallel.
 
     Parameters
     ----------
     widening : float
         Relative widening of the loops at the reference rate.
     backlash : float, metres
-        Displacement lost behind the direction of motion at the reference rate.
+        Displacement by which the stage lags in its direction of motion, at the reference rate.
     exponent : float
         Exponent ``e`` of the rate.
     reference_rate : float, V/s
         Reference rate ``r``.
     transition : float, volts
-        Voltage change after a reversal in which the direction changes, to 1/e; first form only.
+        Voltage change after a reversal over which the direction ``z`` changes, to 1/e; first form only.
     coercivity : float, volts
         Coercivity ``c`` at the reference rate; 0 selects the first form.
     onset : float, V/s
-        Rate above which the coercivity follows ``(1 + s / onset)^e - 1``, nearly logarithmic; 0 selects ``s^e``.
+        If not 0, the coercivity is proportional to ``(1 + s / onset)^e - 1``, nearly logarithmic, instead of ``s^e``.
     settling : float, seconds
         Time constant of the rate filter for the coercivity.
     reversible : tuple of float, m/V, m/V^2, ..
@@ -302,12 +303,12 @@ class RateDependence:
 
     @property
     def side(self) -> Side:
-        """Signal on which the effect acts: the voltage for growing thresholds, else the displacement."""
+        """Signal on which the effect acts: the voltage in the coercivity form, else the displacement."""
         return "voltage" if self.coercivity else "displacement"
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement of the widened loops, shape (N,), metres, or the voltage at the hysteresis, volts."""
+        """Return the displacement of the wider loops, shape (N,), metres, or in the coercivity form the voltage (V)."""
         if self.coercivity:
             from slpi_ros.effects.paths import play, settled_rate
 
@@ -335,7 +336,7 @@ class RateDependence:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield candidates with several exponents: losses with short and long transitions, and coercivities."""
+        """Yield candidates of both forms: wider loops (several exponents and transitions) and several coercivities."""
         reference = float(np.sqrt(np.mean(np.gradient(left.u, left.t) ** 2)))
         yield from cls._losing(left, reference)
         yield from cls._coercive(left, reference)

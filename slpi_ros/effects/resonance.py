@@ -23,9 +23,9 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.filters import Mode, filtered
 
-# Smallest tap spacing, times 1 / w; smaller spacings give larger taps without benefit.
+# Smallest tap spacing, in units of 1 / w; smaller spacings give larger taps without benefit.
 SPACING = 0.5
-# Largest tap spacing, times 1 / w; larger spacings cannot cancel the oscillation.
+# Largest tap spacing, in units of 1 / w; larger spacings cannot cancel the oscillation.
 WIDEST = 3.0
 
 
@@ -36,7 +36,7 @@ class Unringing:
     Parameters
     ----------
     taps : tuple of float
-        Taps with sum 1: zeros at the poles of the mode, and one more that compensates the remaining delay.
+        Taps with sum 1: their zeros are at the poles of the mode, and one more zero compensates the remaining delay.
     spacing : float, seconds
     """
 
@@ -129,7 +129,7 @@ class StreamingResonance:
         self._asked = None
 
     def _remember(self, dt: float) -> None:
-        """Store the last desired displacement, or the position if none was given, as long as a tap requires it."""
+        """Store the last desired displacement (the position if none was given) and drop those older than all taps."""
         self._now += dt
         desired = self._desired
         if dt <= 0.0:

@@ -51,7 +51,7 @@ class Saturation:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator["Saturation"]:
-        """Yield limits at which the displacement remains constant while the voltage changes."""
+        """Yield limits beyond which the displacement remains constant while the voltage changes."""
         low, width = float(left.u.min()), float(np.ptp(left.u)) / BINS
         middle, dv, dy = outward_steps(left.u, left.y, left.used)
         place = np.clip(((middle - low) / width).astype(np.int64), 0, BINS - 1)
@@ -72,12 +72,12 @@ class Saturation:
         return f"the amplifier clips {' and '.join(where) or 'nowhere'}"
 
     def streaming(self) -> "StreamingSaturation":
-        """Return the streaming limits."""
+        """Return the limits as a streaming effect."""
         return StreamingSaturation(self.lower, self.upper)
 
 
 def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the steps away from the middle of the voltage range; with a clipped amplifier these have no displacement.
+    """Return the steps away from the middle of the voltage range, which give no displacement beyond a clipping limit.
 
     Returns
     -------

@@ -81,8 +81,8 @@ class SensorPeriodic:
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield the strongest lines of the spectrum of the residual over the displacement."""
-        # What the sensor sees: other effects move it as well.
+        """Yield the strongest spectral lines of the residual as a function of the displacement."""
+        # Displacement seen by the sensor, which includes the other effects.
         seen = left.y - left.residual
         width = float(np.ptp(seen)) / BINS
         place = ((seen[left.used] - float(seen.min())) / width).astype(np.int64)

@@ -71,5 +71,5 @@ class ThermalDrift:
         return f"whatever the voltage, the stage drifts by {way * 1e6:.3g} um within {span:.3g} s of this record"
 
     def streaming(self) -> None:
-        """Return None: drift refers to the record's clock, so that it cannot be predicted in operation."""
+        """Return None: drift is known only for the time of the record and cannot be predicted in operation."""
         return

@@ -16,7 +16,7 @@ FAST, SLOW = 1.8, 0.6
 SHORTEST = 0.05
 # Duration of each hold as a share of the total duration.
 HOLD = 0.025
-# Number of reversal curves from each end and of loops in each nest: usual, smallest, largest. If time is short, moves
+# Number of reversal curves from each end and of loops in each nest: smallest, usual, largest. If time is short, moves
 # become faster, then their number is reduced; if time remains beyond the largest number, moves become slower.
 FEWEST_LEVELS, USUAL_LEVELS, MOST_LEVELS = 2, 4, 100
 # Centres of the nested loops, shares of the range.
@@ -26,9 +26,9 @@ NESTS = (0.3, 0.7)
 def calibration(spec: DriveSpec, rng: np.random.Generator) -> Path:
     """Cover the Preisach plane uniformly, at several speeds and with holds.
 
-    A sweep over the whole range comes first, to set a known memory. Reversal curves follow in random order, rising from
-    minima and falling from maxima over the whole range, so that drift is not correlated with voltage; then nested
-    loops. A longer duration gives more of each.
+    A sweep over the whole range comes first, to set a known hysteresis state. Reversal curves follow in random order,
+    rising from minima and falling from maxima over the whole range, so that drift is not correlated with voltage; then
+    nested loops. A longer duration gives more of each.
 
     Parameters
     ----------

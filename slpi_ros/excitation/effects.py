@@ -10,7 +10,7 @@ from slpi_ros.errors import UsageError
 from slpi_ros.excitation.calibration import MEAN_SPEED
 from slpi_ros.excitation.legs import FEWEST_STEPS, STEEPEST, DriveSpec, Path
 
-# Shares of the duration for the initial hold and for the full loop that wipes the memory.
+# Share of the duration for the initial hold and the full loop that resets the hysteresis state.
 WIPED = 0.15
 # Largest speed in ranges per second at the steepest point, even without a slew limit.
 FASTEST = 5.0
@@ -25,9 +25,9 @@ class EffectDrive:
     effect : str
         Name of the effect.
     why : str
-        One sentence: the motion, and why it separates the effect from others.
+        One sentence on the motion, and on why it separates the effect from others.
     draw : callable
-        Appends the legs of the drive to an empty path for a spec; see `path`.
+        Function that appends the legs of the drive to a path, after the initial full loop of `path`.
     least_axes : int
         Smallest number of axes.
     """
@@ -38,7 +38,7 @@ class EffectDrive:
     least_axes: int = 1
 
     def path(self, spec: DriveSpec) -> Path:
-        """Return the drive, starting and ending at the low end, with an initial full loop that sets a known memory."""
+        """Return the path of the drive from and to the low end; an initial full loop sets a known hysteresis state."""
         path = Path()
         full = max(WIPED * spec.duration / 3, _safe_duration(1.0))
         path.hold(WIPED * spec.duration / 3)
@@ -73,7 +73,7 @@ def _safe_duration(span: float) -> float:
 
 
 def _remaining(spec: DriveSpec) -> float:
-    """Return the time (s) that remains after the memory is wiped."""
+    """Return the time (s) that remains after the initial hold and full loop."""
     return (1.0 - WIPED) * spec.duration
 
 

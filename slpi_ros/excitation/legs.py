@@ -147,7 +147,7 @@ class Path:
     def voltages(self, spec: DriveSpec) -> FloatArray:
         """Return the voltages along all legs, with the duration of the drive.
 
-        A difference to the desired durations is distributed over the legs in proportion to their duration.
+        The time beyond the shortest durations is distributed in proportion to desired minus shortest duration.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The engine for whole paths, compiled by Numba: `turning_points` on arrays, with the same results to the last bit.
+"""Compiled (Numba) version of the engine in `turning_points` for whole paths; its results are bit-identical.
 
 Importing Numba takes about 0.5 s: import this module only where a long path is evaluated.
 """
@@ -21,7 +21,7 @@ def compiled(function: Function) -> Function:
     """Return a function that is compiled by Numba at its first call.
 
     The machine code is cached beside the source, or in ``NUMBA_CACHE_DIR`` or the user's cache folder; if none of these
-    is writable, every process compiles the function. The cache follows changes of the function's own file only:
+    is writable, every process compiles the function. Only changes of the function's own file invalidate the cache:
     compiled functions that call each other must be in one file.
     """
     for kept in (True, False):
@@ -34,7 +34,7 @@ def compiled(function: Function) -> Function:
 
 @compiled
 def composed(operators: FloatArray, amplitude: float, s: float, turn: float, knots: FloatArray) -> int:
-    """Write the knots of the branch of a `MultiSlope` model that starts at `turn` (V); return the last one's index."""
+    """Write the knots of a `MultiSlope` branch that starts at `turn` (V); return the index of the last knot."""
     n, count = operators.shape[1], 0
     starts, change = np.empty(n), np.empty(4 * n)
     # Sorted by insertion: the starts of the operators, and on a fall the three bends of their envelopes.
@@ -75,7 +75,7 @@ def composed(operators: FloatArray, amplitude: float, s: float, turn: float, kno
 
 @compiled
 def interpolated(branches: Branches, s: float, turn: float, knots: FloatArray) -> int:
-    """Write the knots of the branch that starts at `turn` (V), as `Branches.curve`; return the last one's index."""
+    """Write the knots of a branch that starts at `turn` (V), as in `Branches.curve`; return the index of the last."""
     vertices, side, row = branches.vertices, int(s < 0.0), 0
     while row < vertices.shape[1] and vertices[side, row] < s * turn:
         row += 1
@@ -104,7 +104,7 @@ def through(
     branches: Branches,
     walk: NDArray[np.int64],
 ) -> tuple[int, float, int]:
-    """Move a memory through a path, as `Memory.forward` or `Memory.inverse` does at each sample.
+    """Move a memory along a path, as `Memory.forward` or `Memory.inverse` does at each sample.
 
     Parameters
     ----------
@@ -112,15 +112,15 @@ def through(
     coordinate : int
         Coordinate of `x`: 0 voltage, 1 displacement.
     lower, upper : float, volts
-        Limits of the inverse; `point` lies within.
+        Voltage limits of the inverse; `point` must lie within them.
     out : ndarray, shape (N,)
-        Set to the other coordinate.
+        Output: the other coordinate along the path.
     direction : float
         +1 rising, -1 falling, 0 at rest.
     point : ndarray, shape (2,), volts and metres
-        Present point, replaced by the last one.
+        Current point; overwritten with the last point of the path.
     turns : ndarray, shape (2, depth + N), volts and metres
-        Stack of `depth` reversals, modified.
+        Stack of reversals; the first `depth` columns are in use. Modified in place.
     depth : int
     rest : ndarray, shape (2,), volts and metres
     symmetric_rest, branches : bool, Branches
@@ -134,7 +134,7 @@ def through(
     Returns
     -------
     done : int
-        Number of samples evaluated; below N if the model does not reach the next one.
+        Number of samples evaluated; less than N if the model cannot reach the next one.
     direction : float
     depth : int
     """
@@ -199,7 +199,7 @@ def through(
         out[n] = point[other]
         n += 1
         if not still and driven == coordinate:
-            # The following samples between the same knots, without a closure or a limit.
+            # Fast loop for following samples between the same knots: no loop closure, no limit.
             now, v, y = target, begin[coordinate], begin[other]
             end = min(knots[coordinate, i], s * (close[coordinate] - v))
             while n < x.size and s * (x[n] - now) >= 0.0:

@@ -2,8 +2,8 @@
 
 All branches follow from one Everett function ``E(alpha, beta)``, ``beta <= alpha``: the displacement between the
 reversals ``alpha`` and ``beta``. A falling branch from ``alpha`` is ``y_a - E(alpha, v)``, a rising one from ``beta``
-is ``y_a + E(v, beta)``, so every loop closes. At a grid vertex the branch is a classical PI model with thresholds at
-the grid's spacing; between vertices it is interpolated.
+is ``y_a + E(v, beta)``, with ``y_a`` the displacement at the reversal, so every loop closes. At a grid vertex the
+branch is a classical PI model with thresholds at the grid's spacing; between vertices it is interpolated.
 """
 
 from collections.abc import Iterator, Sequence
@@ -75,7 +75,7 @@ class LoopFamily:
         rows, columns = [triangle[i, i::-1] for i in range(n)], [triangle[j:, j] for j in range(n)]
         top = self._edge(self.grid[-1] - self.grid[::-1], rows[-1])
         bottom = self._edge(self.grid - self.grid[0], columns[0])
-        # A fall from far above, which wipes the memory, follows the first rise's slope down to the grid.
+        # A fall from far above, which erases the memory, has the slope of the first rise down to the grid.
         fall = np.column_stack([np.zeros(2), top + FAR / 2 * np.array([[1.0], [self.edge_gain]])])
         far = fall, np.sign(fall) * [[1.0], [self.edge_gain]]
         at_top, at_bottom = ((edge, np.zeros_like(edge)) for edge in (top, bottom))
@@ -91,9 +91,9 @@ class LoopFamily:
     def branch(self, direction: int, v_turn: float) -> Curve:
         """Return the branch that starts at `v_turn` (V): an interpolated row or column of the Everett function.
 
-        Beyond the grid the displacement between two reversals depends only on their distance, as for the classical PI
-        model, with the loops of the grid's end. A fall from far above, which wipes the memory, follows the last of
-        these.
+        Beyond the grid the displacement between two reversals depends only on their distance, as in the classical PI
+        model, and the branches equal those at the end of the grid. A fall from far above, which erases the memory, has
+        the slope `edge_gain` down to the grid, and then follows the branch from the grid's upper end.
         """
         return self.branches.curve(direction, v_turn)
 
@@ -111,7 +111,7 @@ class LoopFamily:
 
 
 def _rows(vertices: FloatArray, lines: Sequence[FloatArray], edge: FloatArray) -> Iterator[Row]:
-    """Yield the rows for the intervals between vertices, whose branches are `lines` on the grid and `edge` beyond."""
+    """Yield the rows of `Branches` between vertices, for branches `lines` on the grid and `edge` beyond it."""
     for k in range(1, vertices.size):
         own, before = vertices[k:] - vertices[k], vertices[k:] - vertices[k - 1]
         # The first column is the reversal itself.

@@ -3,8 +3,8 @@
 `MultiSlope` is a sum of the generalized play operators of the MPI paper, Eq. 2, with one set of weights for one
 amplitude ``V_p``; its branches are shapes on the engine.
 
-`AmplitudeScaled` scales it (MPI paper, 3): ``y = (X_p / X_p120) sum_k w_k f_k``, ``X_p`` being the peak displacement of
-a cycle. For the peak to come out as ``X_p``, the base model must be driven to its own amplitude::
+`AmplitudeScaled` scales it (MPI paper, section 3): ``y = (X_p / X_p120) sum_k w_k f_k``, with ``X_p`` the peak
+displacement of a cycle. For the peak to equal ``X_p``, the base model must be driven to its own amplitude::
 
     y(u) = X_p(V_p) / X_p(V_base) * Y_base(u V_base / V_p)
 
@@ -71,11 +71,11 @@ def falling_envelope(u: ArrayLike, thresholds: ArrayLike, amplitude: float) -> F
 class MultiSlope:
     """A weighted sum of the operators of Eq. 2, ``y = sum_k w_k f_k``.
 
-    The operators start at the low end, as after a fall from far above. A memory without motion describes voltages at or
-    above its rest voltage; a primed one describes all voltages.
+    The operators start at the low end, as after a fall from far above. A memory without previous motion is valid for
+    voltages at or above its rest voltage, a primed one for all voltages.
 
     There is no linear term: a branch is flat from its reversal until the first operator moves, except at the ends of
-    the range. There the inverse is discontinuous: every displacement has a voltage, but not every small step.
+    the range. The inverse exists for every displacement, but its voltage jumps across the flat part.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ class MultiSlope:
         return _curve(starts - turn, self._w)
 
     def _fall_from(self, turn: float) -> Curve:
-        """Return a falling branch: each operator is constant until it meets its falling envelope, then follows that."""
+        """Return a falling branch: each operator is constant until it meets its falling envelope, then follows it."""
         r, w, (low, middle, high) = self._r, self._w, self._bends
         top = rising_envelope(turn, r)
         gentle = (top - AMPLITUDE_SHARE * self.amplitude - THRESHOLD_SHARE * r) / GENTLE
@@ -172,10 +172,10 @@ def _curve(u: FloatArray, changes: FloatArray) -> Curve:
 
 
 def cycles(x: FloatArray, back: float) -> list[tuple[int, int]]:
-    """Divide a path, shape (N,), N >= 1, into cycles that end at the first minimum of each section up to `back`.
+    """Divide a path, shape (N,), N >= 1, into cycles that end at the lowest sample of each section at or below `back`.
 
     Each cycle is given by its first and last sample; the last one is the first sample of the next cycle. The parts
-    before the first and after the last return also count as cycles.
+    before the first and after the last of these samples also count as cycles.
     """
     low = np.concatenate([[False], x <= back, [False]])
     stretches = np.flatnonzero(low[1:] != low[:-1]).reshape(-1, 2)
@@ -220,7 +220,7 @@ class AmplitudeScaled:
             raise ModelError("SMPI: no operator of the base model moves within its amplitude; lower the thresholds")
 
     def peak(self, amplitude: float) -> float:
-        """Return ``X_p`` (m) at an amplitude (V): linear from (0, 0) through the knots and beyond the last."""
+        """Return ``X_p`` (m) at an amplitude (V): piecewise linear from (0, 0), extrapolated beyond the last knot."""
         v, x = np.append(0.0, self.peak_voltages), np.append(0.0, self.peak_displacements)
         beyond = max(0.0, amplitude - float(v[-1]))
         return float(np.interp(amplitude, v, x) + beyond * (x[-1] - x[-2]) / (v[-1] - v[-2]))
@@ -232,11 +232,11 @@ class AmplitudeScaled:
 
 @dataclass(frozen=True)
 class KnownPath:
-    """The SMPI model on completely known paths, as the amplitude of a cycle is known only at its peak.
+    """The SMPI model for paths known in advance: the amplitude of a cycle is known only at its peak.
 
     A cycle starts at the low end, at the end point of the previous cycle. Every call starts from the initial point. A
-    displacement path is divided where it returns to the displacement of the origin, with the same relative tolerance as
-    a voltage path that returns to the origin, so that both divisions agree except close to the tolerance.
+    voltage path is divided into cycles where it returns to the origin, a displacement path where it returns to the
+    displacement at the origin, with the same relative tolerance; both divisions agree except close to the tolerance.
 
     Parameters
     ----------
@@ -297,14 +297,14 @@ class KnownPath:
         return BACK * self.model.base.amplitude
 
     def _displacement_of_origin(self, y: FloatArray) -> float:
-        """Return the displacement (m) of the origin after the peak of `y`: the start value, if that is the low end."""
+        """Return the displacement (m) at the origin after the peak of `y`; the start value if the path starts there."""
         present = (self.start_voltage, self.start_displacement)
         cycle = _Cycle(self.model, self._amplitude_for(float(y.max(initial=present[1])), *present), *present)
         return present[1] + cycle.stroke(present[0]) - cycle.stroke(self.model.base.origin)
 
     def _amplitude_for(self, peak: float, v_start: float, y_start: float) -> float:
         """Return the amplitude (V) of the cycle from a start (V, m) with the peak displacement `peak` (m)."""
-        # Only this kind needs it, and importing it takes longer than all the rest of the package's hysteresis.
+        # Imported here because only this kind needs it, and the import is slow.
         from scipy.optimize import brentq
 
         def missing(amplitude: float) -> float:
@@ -348,5 +348,5 @@ class _Cycle:
         return np.clip(v, lower, upper), self._y_start + self._scale * memory.displacement
 
     def _of_base(self, v: Volts) -> Volts:
-        """Convert voltages of the cycle to voltages of the base model."""
+        """Scale voltages of the cycle to voltages of the base model."""
         return self._base.origin + (v - self._base.origin) * self._stretch

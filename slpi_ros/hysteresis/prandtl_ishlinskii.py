@@ -18,8 +18,8 @@ FloatArray = NDArray[np.float64]
 class PrandtlIshlinskii:
     """A weighted sum of play operators, ``P[v] = sum_i w_i p_i[v]``; the one with threshold 0 is the linear term.
 
-    At rest every operator is in the middle of its play and moves after ``r_i``; in a primed memory it is at the upper
-    end of its play, as after a long fall, and moves up after ``2 r_i``.
+    At rest every operator is in the middle of its play and moves after ``r_i``. In a primed memory it is at the end of
+    its play, as after a long fall, and moves up after ``2 r_i``.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class PrandtlIshlinskii:
     _first: Curve = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Validate the parameters and compute the two shapes of all branches."""
+        """Validate the parameters and compute the shapes of the branches and of the first rise."""
         for name in ("thresholds", "weights"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         r, w = self.thresholds, self.weights
@@ -75,8 +75,8 @@ class PrandtlIshlinskii:
         """Return the analytic inverse, a PI model from displacement (m) to voltage (V).
 
         ``r'_i = sum_{j<=i} w_j (r_i - r_j)``, ``w'_1 = 1 / w_1`` and ``w'_i = -w_i / (W_{i-1} W_i)``, where ``W_i`` is
-        the sum of the first i weights (Eq. 12, the linear weight being that of threshold 0). It serves a virgin memory;
-        for a primed one use `Memory.inverse`.
+        the sum of the first i weights (Eq. 12, the linear weight being that of threshold 0). It is valid for a memory
+        without previous motion; for a primed one use `Memory.inverse`.
 
         Raises
         ------

@@ -23,17 +23,17 @@ def reversals(x: FloatArray, dead_band: float = 0.0) -> IntArray:
     Returns
     -------
     ndarray of int, shape (M,)
-        The reversals in order, and the ends of the signal. Between neighbours `x` changes by more than `dead_band`,
-        alternately up and down. For a flat extremum this is the last sample. Without a dead band the ends are the first
-        and the last sample, otherwise the extrema beside the first and the last large move. Only sample 0 for a
-        constant signal.
+        Reversals in ascending order, between the two ends of the signal. From one to the next, `x` changes by more than
+        `dead_band`, alternately up and down. A flat extremum gives its last sample. Without a dead band the ends are
+        the first and the last sample; with one, the extrema before the first and after the last change larger than the
+        dead band. A constant signal gives only sample 0.
     """
     if not x.size:
         return np.empty(0, dtype=np.int64)
     candidates = np.append(0, _run_ends(x)[1:])
     if not dead_band > 0.0:
         return candidates
-    # Direction of the current large move, and the minimum and the maximum since its start.
+    # Direction of the current change above the dead band, and minimum and maximum since its start.
     direction, low, high = 0, 0, 0
     value = x[candidates].tolist()
     found: list[int] = []

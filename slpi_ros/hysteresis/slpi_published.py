@@ -46,16 +46,16 @@ class Loop:
     vertex : int
         Sample at which the loop starts.
     direction : int
-        Direction of the first move from the vertex: -1 on a rising branch, +1 on a falling one.
+        Direction of the first move from the vertex: +1 rising, -1 falling.
     samples : ndarray of int, shape (m,)
-        Samples of this loop only, in order. A vertex belongs to the loop that contains it, except for the vertex of the
-        outer loop, sample 0.
+        Samples of this loop without its inner loops, in order. The vertex belongs to the loop that contains it, except
+        for the vertex of the outer loop, sample 0.
     sewn : ndarray of int, shape (n,)
-        Those samples that are vertices of separated inner loops.
+        Samples of this loop that are vertices of separated inner loops.
     closed : bool
         Whether the voltage returned to the vertex. The outer loop is open by definition.
     below : int
-        Number of the loop that contains the vertex; 0 for the outer loop.
+        Index of the loop that contains the vertex; 0 for the outer loop.
     """
 
     level: int
@@ -68,7 +68,7 @@ class Loop:
 
     @property
     def path(self) -> IntArray:
-        """Samples of the joined loop, shape (m + 1 or 2,): vertex, samples, and the vertex again."""
+        """Samples of the joined loop, shape (n,): vertex, own samples and, if the loop is closed, the vertex again."""
         own = self.samples[self.samples != self.vertex]
         return np.concatenate([[self.vertex], own, [self.vertex] if self.closed else []]).astype(np.int64)
 
@@ -83,10 +83,10 @@ class Separation:
         Voltage without the reversals within the dead band.
     displacement : ndarray, shape (N,), metres
     phase : ndarray of int, shape (N,)
-        ``tr``: +1 boost (rising), -1 back (falling); a reversal has the phase that starts there.
+        ``tr``: +1 boost (rising), -1 back (falling); a reversal belongs to the phase that it starts.
     level : ndarray of int, shape (N,)
-        ``lv``: the number of suspected vertices at that time. A loop of the outer loop's back phase counts one more
-        than one of its boost phase; `Loop.level` is the depth of nesting instead.
+        ``lv``: the number of suspected vertices at that time. It is one higher for loops in the back phase of the outer
+        loop than in its boost phase; `Loop.level` is the nesting depth instead.
     vertex : ndarray of int, shape (N,)
         ``sp``: 0 none, 1 suspected, 2 true vertex.
     loops : tuple of Loop
@@ -217,14 +217,14 @@ class SingleLoop:
     span : (float, float), volts and metres
         Distance from the vertex to the farthest point of the loop, both positive.
     offset : (float, float), volts and metres
-        Distance of the vertex from the model of the containing loop at the same displacement or voltage: every loop
-        keeps its measured position, so that errors do not propagate to inner loops.
+        Distance of the vertex from the model of the containing loop, in voltage at the same displacement and in
+        displacement at the same voltage: every loop keeps its measured position, so that errors do not propagate.
     model : PrandtlIshlinskii
         Model in coordinates that are zero at the vertex and increase along the loop.
     run_in : float or None, volts
         None: the play operators start at rest, as published; an inner loop then misses its vertex by ``sum w_i r_i``.
-        0: they start primed and move after ``2 r``, as after a reversal; the loop closes. Positive: primed that far
-        below the vertex and driven up to it, for an outer loop that starts with history.
+        0: they start primed and move after ``2 r``, as after a reversal; the loop closes. Positive: they are primed
+        this far below the vertex and driven up to it, for an outer loop with an initial history.
     """
 
     level: int
@@ -301,7 +301,7 @@ class SeparatedLoops:
         Parameters
         ----------
         level, direction : int
-            Level and direction; a different value adds half the outer loop's span each to the distance.
+            Level and direction; each one that differs adds half the outer loop's span to the distance.
         vertex, span : float
             Position of the vertex and span, volts (`coordinate` 0) or metres (`coordinate` 1).
         coordinate : int
@@ -325,13 +325,13 @@ class SeparatedLoops:
 
 
 class KnownPath:
-    """The published SLPI model on completely known paths.
+    """The published SLPI model for paths that are completely known in advance.
 
     Parameters
     ----------
     model : SeparatedLoops
     start : (float, float), volts and metres
-        Rest point before every path.
+        Rest point from which every path starts.
     """
 
     def __init__(self, model: SeparatedLoops, start: tuple[float, float]) -> None:
@@ -359,7 +359,7 @@ class KnownPath:
         return np.clip(self._through(y, 1), lower, upper)
 
     def _through(self, x: FloatArray, coordinate: int) -> FloatArray:
-        """Evaluate one coordinate (0 voltage, 1 displacement) along `x`, from the outer loop to the inner ones."""
+        """Return the other coordinate along `x` (`coordinate` of `x`: 0 voltage, 1 displacement), outer loop first."""
         if not x.size:
             return np.empty_like(x)
         require_finite(x)
@@ -389,7 +389,7 @@ class KnownPath:
 
 
 def _unidentified(loop: Loop, place: tuple[int, int, float, float], count: int, coordinate: int) -> str:
-    """Return a message on the unidentified loops of a path with their number and the first of them."""
+    """Return the message about the unidentified loops of a path: their number and the first of them."""
     unit, factor = ("V", 1.0) if coordinate == 0 else ("um", 1e6)
     level, _, vertex, span = place
     return (

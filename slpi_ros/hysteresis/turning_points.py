@@ -7,8 +7,8 @@ Every rate-independent operator with return-point memory obeys Madelung's laws:
 3. a closed loop removes both its reversals from the memory, and the previous branch continues.
 
 Models differ only in the *shape* of a branch, ``y = y_a + s F(s (v - v_a))`` with ``s = +1`` rising or ``-1`` falling.
-``F`` is continuous, strictly increasing and piecewise linear, ``F(0) = 0``, and therefore invertible: one stack serves
-both directions, exactly and causally.
+``F`` is continuous, strictly increasing and piecewise linear, ``F(0) = 0``, and therefore invertible: one stack of
+reversals gives both displacement from voltage and voltage from displacement, exactly and causally.
 """
 
 import sys
@@ -37,7 +37,7 @@ LOADED_FROM, COMPILED_FROM = 20_000, 200
 
 
 class Curve(NamedTuple):
-    """A branch shape ``F`` as knots (V, m), increasing from ``u[0] = f[0] = 0``, the last at distance `END`.
+    """A branch shape ``F`` as knots (V, m), increasing from ``u[0] = f[0] = 0``; the last lies `END` beyond the others.
 
     The knots are stored as lists for a fast scalar search and as an array, shape (2, k).
     """
@@ -54,7 +54,7 @@ class Curve(NamedTuple):
 
 
 class Branches(NamedTuple):
-    """All branches of a shape as arrays, for the compiled engine; index 0 rising, 1 falling.
+    """All branches of a shape as arrays, for the compiled engine; first index 0 rising, 1 falling.
 
     Voltages of the falling branches are negated. A branch is interpolated between vertices or composed of operators.
 
@@ -63,7 +63,7 @@ class Branches(NamedTuple):
     vertices : ndarray, shape (2, n), volts
         Ascending. Row k of the other arrays is for branches that start above vertex k - 1, up to vertex k.
     knots : ndarray, shape (2, n + 1, 2, m), volts and metres
-        Branch from vertex k.
+        Knots of the branch that starts at vertex k.
     change : ndarray, shape (2, n + 1, 2, m)
         Derivative of the knots with respect to the distance (V) of the start below vertex k.
     last : ndarray of int, shape (2, n + 1)
@@ -83,7 +83,7 @@ class Branches(NamedTuple):
 
     @classmethod
     def interpolated(cls, vertices: FloatArray, rows: Sequence[Sequence[tuple[FloatArray, FloatArray]]]) -> "Branches":
-        """Return the branches whose knots and change, shape (2, k) each, are `rows`, n + 1 for each direction."""
+        """Return the branches for `rows` of knots and change, shape (2, k) each, n + 1 rows for each direction."""
         last = np.array([[knots.shape[1] - 1 for knots, _ in side] for side in rows], dtype=np.int64)
         packed = np.zeros((2, *last.shape, 2, int(last.max()) + 1))
         for side, of_side in enumerate(rows):
@@ -106,9 +106,9 @@ class Shape(Protocol):
 
     @property
     def symmetric_rest(self) -> bool:
-        """Whether rest is the middle of the memory: the first loop then closes at the mirror image of its reversal.
+        """Whether the first loop closes at the mirror image of its reversal about the rest point (symmetric rest).
 
-        If not, rest is the low end of the memory: a fall from rest is an ordinary branch that returns to rest.
+        If not, the rest point is the low end of all loops: a rise after a fall from rest closes at the rest point.
         """
 
     @property
@@ -144,7 +144,7 @@ class Memory:
     rest_displacement : float, metres
         Initial point.
     primed : bool
-        False: no previous motion. True: the initial point was reached by a long fall that wiped the memory.
+        False: no previous motion. True: the initial point was reached by a long fall, which erased the memory.
     """
 
     __slots__ = (
@@ -336,7 +336,7 @@ class Memory:
         return self._through(y, 1, lower, upper)
 
     def _through(self, x: FloatArray, coordinate: int, lower: float, upper: float) -> FloatArray:
-        """Evaluate the model along one coordinate `x` (0 voltage, 1 displacement)."""
+        """Return the other coordinate along `x`; `coordinate` of `x`: 0 voltage, 1 displacement."""
         x = np.require(x, np.float64, ("C", "W"))
         if not x.size:
             return np.empty_like(x)
@@ -380,6 +380,6 @@ class Memory:
 
 
 def worth_compiling(samples: int) -> bool:
-    """Return whether the compiled engine is faster than the loop over that many samples."""
+    """Return whether the compiled engine is faster than the Python loop for this number of samples."""
     loaded = "slpi_ros.hysteresis.compiled" in sys.modules
     return samples >= (COMPILED_FROM if loaded else LOADED_FROM)

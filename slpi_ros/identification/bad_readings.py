@@ -1,4 +1,4 @@
-"""Readings of a sensor that are wrong: repeated values, outliers, stale, early, late and mixed readings.
+"""Detection of wrong sensor readings: repeated values, outliers, and stale, early, late and mixed readings.
 
 All tests take the voltage into account: a displacement may rest or reverse where the voltage does.
 """
@@ -11,7 +11,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
 from scipy.special import ndtri
+from scipy.stats import binomtest
 
+from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.signal_statistics import ENOUGH, FEWEST, digit, median_rms, noise, spread
 
 FloatArray = NDArray[np.float64]
@@ -27,12 +29,12 @@ _BLOCK = 1_000_000
 _EARLIER = 3
 # Least size of an outlier as a share of the range; piecewise excitation signals have smaller kinks.
 LEAST_SPIKE = 0.001
-# A reading is an outlier for sure when it lies so many times farther from the median of so many readings than half of
-# those do that are not the median, and than those beside it; looked for so many times.
+# Large outliers: distance from the running median, as multiples of the median (non-zero) distance in the record and of
+# that in the window; window length of the running median, in readings; number of passes.
 _FAR, _APART, _WINDOW, _PASSES = 15.0, 5.0, 7, 5
-# The error of a model is compared with the median of so many readings.
+# Window length of the running median of a model error, in readings.
 _MODEL_WINDOW = 15
-# Readings beside outliers deviate by less than this share of them.
+# Readings next to an outlier deviate by less than this share of the outlier.
 _SUDDEN = 0.5
 # Largest delay of a displacement reversal, and duration of ringing after a jump, in samples.
 _TURN_REACH, _RINGING = 5, 200
@@ -45,7 +47,7 @@ class Repeats:
     Parameters
     ----------
     first : ndarray of int, shape (M,)
-        First reading of each run.
+        Index of the first reading of each run.
     length : ndarray of int, shape (M,)
         Number of readings in each run, at least 2.
     """
@@ -65,14 +67,14 @@ class Repeats:
         """Return the range of `x`, shape (N,), during each run, shape (M,)."""
         if not self.first.size:
             return np.empty(0)
-        # Every second range of reduceat is one of ours, and what lies between is left out.
+        # Every second range of reduceat is a run; the ranges between runs are discarded.
         bounds = np.column_stack([self.first, self.first + self.length]).ravel()
         padded = np.append(x, x[-1])
         high, low = (extreme.reduceat(padded, bounds)[::2] for extreme in (np.maximum, np.minimum))
         return np.asarray(high - low)
 
     def where(self, chosen: Mask) -> "Repeats":
-        """Return the runs that are `chosen`, a mask of shape (M,)."""
+        """Return the runs selected by the mask `chosen`, shape (M,)."""
         return Repeats(self.first[chosen], self.length[chosen])
 
     @property
@@ -82,9 +84,9 @@ class Repeats:
 
 
 def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: float) -> Repeats:
-    """Return the runs of equal displacement readings that are not due to chance.
+    """Return the runs of equal displacement readings that indicate a frozen sensor.
 
-    Either the voltage changed enough that the displacement had to follow, or so many equal readings are improbable
+    Either the voltage changed so much that the displacement must have moved, or a run of this length is improbable
     given the noise.
 
     Parameters
@@ -124,7 +126,7 @@ def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
 
 
 def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repeats:
-    """Return the repeats of a voltage during which the displacement moves and after which the voltage jumps.
+    """Return the runs of equal voltage readings during which the displacement moves and after which the voltage jumps.
 
     Parameters as for `frozen`. A hold after a voltage jump is excluded: there the displacement still follows the jump.
     """
@@ -138,9 +140,9 @@ def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repe
 
 
 def far_outliers(v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the readings of voltage and displacement that are farther from those beside them than the other explains.
+    """Return the indices of large outliers in voltage and displacement that the other signal does not explain.
 
-    Unlike `lone_outliers` it needs no estimate of noise, which outliers this far would spoil.
+    Unlike `lone_outliers`, this needs no noise estimate, which such large outliers would distort.
 
     Parameters
     ----------
@@ -148,11 +150,11 @@ def far_outliers(v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArr
 
     Returns
     -------
-    tuple of ndarray of int, shape (M,) each
+    tuple of ndarray of int, shapes (M,) and (K,)
     """
     found = np.zeros((2, v.size), dtype=bool)
     for _ in range(_PASSES):
-        # Outliers beside each other hide each other.
+        # Neighbouring outliers mask each other.
         cleaned = [without(x, np.flatnonzero(off)) for x, off in zip((v, y), found, strict=True)]
         more = np.array([_far(*cleaned), _far(*cleaned[::-1])])
         if not more.any():
@@ -167,53 +169,63 @@ def _far(x: FloatArray, other: FloatArray) -> Mask:
     if not off.any():
         return np.zeros(x.size, dtype=bool)
     moved = maximum_filter1d(other, reach) - minimum_filter1d(other, reach)
-    # On the way from one end to the other the median is the reading itself.
+    # During a monotone move the median is the reading itself, at distance 0.
     least = max(_FAR * float(np.median(off[off > 0.0])), LEAST_SPIKE * spread(middle))
     gain = spread(middle) / (spread(other) or np.inf)
     far: Mask = off > least + 2.0 * gain * moved
     if not far.any():
         return far
-    # Ringing takes every reading away from the median, an outlier only itself.
+    # Ringing moves all readings away from the median, an outlier only one.
     return np.asarray(far & (off > _APART * median_filter(off, _WINDOW, mode="nearest")))
 
 
 def outliers_beside(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the readings that are off by a model, where neither the others beside them are nor a reversal explains it.
+    """Return the displacement readings with a sudden deviation from a model that no reversal explains.
 
-    Outliers beside each other and at kinks are among them, which without a model are not told from motion.
+    This includes groups of outliers and outliers at kinks, which cannot be distinguished from motion without a model.
 
     Parameters
     ----------
     path, y, v : ndarray, shape (N,), metres, metres and volts
-        Displacement by the model and as it was read, and voltage.
+        Displacement of the model, measured displacement, and voltage.
     """
     kept = np.arange(y.size)
     for _ in range(_PASSES):
-        # Outliers beside each other hide each other.
+        # Neighbouring outliers mask each other.
         off = _off_path(path[kept], y[kept], v[kept])
         if not off.any():
             break
         kept = kept[~off]
-    return np.setdiff1d(np.arange(y.size), kept)
+    found = np.setdiff1d(np.arange(y.size), kept)
+    if not found.size:
+        return found
+    # Outliers lie anywhere; what is found at reversals more often than elsewhere is an error of the model.
+    near = np.zeros(v.size, dtype=bool)
+    near[reversals(v)] = True
+    near = maximum_filter1d(near, 4 * _MODEL_WINDOW + 1)
+    groups = near[found[np.diff(found, prepend=-_MODEL_WINDOW) >= _MODEL_WINDOW]]
+    share = float(np.mean(near))
+    coincidental = binomtest(int(groups.sum()), groups.size, share, alternative="greater").pvalue > FALSE_ALARMS
+    return found if coincidental else found[~near[found]]
 
 
 def _off_path(path: FloatArray, y: FloatArray, v: FloatArray) -> Mask:
     if y.size < 5:
         return np.zeros(y.size, dtype=bool)
     off = y - path
-    # What the model gets wrong is alike in neighbouring readings.
+    # The error of the model itself is similar in neighbouring readings.
     off = np.abs(off - median_filter(off, _MODEL_WINDOW, mode="mirror"))
     if not off.any():
         return np.zeros(y.size, dtype=bool)
     turned = np.pad(np.abs(_off_neighbours(v)), 2)
     explained = 2.0 * spread(y) / spread(v) * maximum_filter1d(turned, 2 * _TURN_REACH + 1)
-    # A stage that moves is predicted less well than one at rest.
+    # The model error is larger while the stage moves than at rest.
     usual = 1.4826 * median_filter(off, 2 * _MODEL_WINDOW + 1, mode="mirror")
     least = np.maximum(_FAR * np.maximum(usual, median_rms(off[off > 0.0])), LEAST_SPIKE * spread(y))
     far: Mask = off > least + explained
     if not far.any():
         return far
-    # The error of a model grows from reading to reading, an outlier is there at once.
+    # A model error grows gradually, an outlier appears within one reading.
     bounds = np.flatnonzero(np.diff(far, prepend=False, append=False))
     padded = np.concatenate([[0.0], off, [0.0]])
     beside = np.maximum(padded[bounds[::2]], padded[bounds[1::2] + 1])
@@ -223,7 +235,7 @@ def _off_path(path: FloatArray, y: FloatArray, v: FloatArray) -> Mask:
 
 
 def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:
-    """Return readings `x`, shape (N,), with a line between their neighbours in the place of outliers."""
+    """Return readings `x`, shape (N,), with outliers replaced by linear interpolation between their neighbours."""
     if not outliers.size:
         return x
     good = np.setdiff1d(np.arange(x.size), outliers)
@@ -235,16 +247,16 @@ def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:
 def lone_of(
     t: FloatArray, v: FloatArray, y: FloatArray, at_kinks: bool = True
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the lone outliers of a voltage and of a displacement.
+    """Return the isolated outliers of a voltage and of a displacement.
 
-    Outliers of both at once are attributed to the voltage, which the displacement follows.
+    An outlier of both signals at the same sample is attributed to the voltage, which the displacement follows.
 
     Parameters
     ----------
     t, v, y : ndarray, shape (N,), seconds, volts and metres
-        Both signals vary.
+        Time, voltage and displacement; neither signal is constant.
     at_kinks : bool
-        As for `lone_outliers`, of the displacement.
+        As for `lone_outliers`; applies to the displacement.
     """
     gain, noise_v, noise_y = spread(y) / spread(v), noise(v, t), noise(y, v, t)
     off_v = lone_outliers(v, y, 1.0 / gain, max(noise_v, digit(v), LEAST_SPIKE * float(np.ptp(v))), noise_y)
@@ -255,7 +267,7 @@ def lone_of(
 def lone_outliers(
     y: FloatArray, v: FloatArray, gain: float, noise_y: float, noise_v: float, at_kinks: bool = True
 ) -> NDArray[np.int64]:
-    """Return the readings that deviate from a line through their four neighbours where the voltage does not.
+    """Return the readings that deviate from a line through their four neighbours although the voltage does not.
 
     Parameters
     ----------
@@ -263,9 +275,9 @@ def lone_outliers(
         Displacement and voltage.
     gain : float, metres per volt
     noise_y, noise_v : float, metres and volts
-        Their noise.
+        Rms noise of displacement and voltage.
     at_kinks : bool
-        Whether those are returned as well that may be a kink and noise. Default True.
+        Whether to include readings that a kink in the displacement plus noise could explain. Default True.
 
     Returns
     -------
@@ -279,7 +291,7 @@ def lone_outliers(
     jump = 5.0 * np.quantile(np.abs(v[every::every] - v[every - 1 : -1 : every]), 0.9) + 8.0 * noise_v
     found = [np.empty(0, np.int64)]
     for start in range(0, y.size, _BLOCK):
-        # A block sees enough of those beside it.
+        # Blocks overlap their neighbours.
         first, end = max(start - _RINGING, 0), start + _BLOCK + _RINGING
         here = _outliers_of_block(y[first:end], v[first:end], gain, noise_y, (limit, beyond_kink), jump) + first
         found.append(here[(here >= start) & (here < start + _BLOCK)])
@@ -295,13 +307,13 @@ def _outliers_of_block(
     off, turns = _off_neighbours(y), np.abs(_off_neighbours(v))
     explained = 2.0 * gain * maximum_filter1d(turns, 2 * _TURN_REACH + 1)
     found = np.flatnonzero((np.abs(off) > limit + explained) & ~_after_jumps(v, jump)[2:-2])
-    # Kinks and ringing bend the line of the neighbours too.
+    # At kinks and during ringing, the neighbours do not lie on a line either.
     before, after = y[found + 1] - y[found], y[found + 4] - y[found + 3]
     across = y[found + 3] - y[found + 1]
     size = np.abs(off[found])
     straight = np.abs(before - after) < np.maximum(8.0 * noise_y, 0.5 * size)
     straight &= np.abs(across - before - after) < np.maximum(12.0 * noise_y, 0.5 * size)
-    # A kink puts a reading off by 3/4 of its change of slope.
+    # At a kink, a reading deviates from its neighbours by 3/4 of the change of slope.
     straight &= size - 0.75 * np.sign(off[found]) * (before - after) > beyond_kink
     return np.asarray(found[straight] + 2)
 
@@ -319,9 +331,9 @@ def _off_neighbours(x: FloatArray) -> FloatArray:
 
 
 def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArray[np.int64]:
-    """Return the outliers that repeat one of the preceding readings within the noise.
+    """Return the outliers that are equal, within the noise, to one of the preceding readings.
 
-    If outliers match later readings about as often, the matches are due to chance and none is returned.
+    If outliers match later readings almost as often, the matches are coincidental and none is returned.
     """
     near = 3.0 * np.sqrt(2.0) * noise_rms
     reach = np.arange(1, _EARLIER + 1)
@@ -333,15 +345,16 @@ def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArr
     return outliers[:0] if by_chance else outliers[earlier]
 
 
-# A reading is compared with so many on either side.
+# Number of readings on either side with which a reading is compared.
 _BESIDE = 3
-# Readings are found to be mixed with the next or the one before where more than this share of them lie off by more than
-# half of the way to it, so many times as many as on the other side; judged by those whose way noise leaves to be seen.
+# A record has mixed readings if more than this share of the readings deviates by more than half a step towards one
+# neighbour (next or preceding), and this many times as many as towards the other. Readings count only if the ratio of
+# noise to step is below the last value.
 _MIXED_SHARE, _MIXED_TIMES, _MIXED_NOISE = 0.02, 5.0, 0.12
-# One of them lies off by this share of that way at least, by a line through others and by a model, and by so many
+# Least deviation of a mixed reading: as a share of the step, from a line through neighbours and from a model; and in
 # robust standard deviations.
 _MIXED_BY_LINE, _MIXED_BY_MODEL, _MIXED_DEVIATIONS = 0.2, 0.05, 4.0
-# Hardly any lies farther off than the next reading.
+# Largest deviation of a mixed reading, in steps, with a margin for errors.
 _MIXED_MOST = 1.3
 
 
@@ -351,11 +364,11 @@ class Mixed(NamedTuple):
     Parameters
     ----------
     readings : ndarray of int, shape (M,)
-        Those readings.
+        Indices of these readings.
     judged : int
-        Number of readings among which they were found; those beside a turn are not.
+        Number of readings tested; readings next to a reversal are not tested.
     side : int
-        1 where they are mixed with the next one, -1 with the one before, 0 where there are none but by chance.
+        1 if they are mixed with the next reading, -1 if with the preceding one, 0 if no mixed readings were found.
     """
 
     readings: NDArray[np.int64]
@@ -366,8 +379,8 @@ class Mixed(NamedTuple):
 def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
     """Find the readings of a displacement that are early, late or a mixture of two neighbouring values.
 
-    Such a reading lies between its true value and that of a neighbour, as from a link that delivers an old value or
-    parts of two. All deviate to the same side, unlike noise and outliers.
+    Such a reading lies between its true value and that of a neighbour: a data link has delivered an old value or parts
+    of two values. Unlike noise and outliers, all deviate towards the next reading, or all towards the preceding one.
 
     Parameters
     ----------
@@ -394,37 +407,37 @@ def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
 
 
 def mixed_beside(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> NDArray[np.int64]:
-    """Return the `fitted` readings, of a displacement with mixed ones, that are mixed by a model; those at turns too.
+    """Return the mixed readings among the `fitted` ones by comparison with a model, including those near reversals.
 
     Parameters
     ----------
     path, y : ndarray, shape (N,), metres
-        Displacement by the model, and as it was read.
+        Displacement of the model, and measured displacement.
     fitted : ndarray of bool, shape (N,)
     side : int
         As in `Mixed`.
     """
     at = np.flatnonzero(fitted)
     off = (y - path)[at]
-    # What the model gets wrong is alike in neighbouring readings.
+    # The error of the model itself is similar in neighbouring readings.
     off = off - median_filter(off, _MODEL_WINDOW)
     way = np.diff(path, append=path[-1]) if side > 0 else np.diff(path, prepend=path[0])
     return at[_mixed(side * off, way[at], _MIXED_BY_MODEL)]
 
 
 def _mixed(off: FloatArray, way: FloatArray, least: float) -> NDArray[np.int64]:
-    """Return which readings, `off` by so much (m) and a share of their way to the next one, `way` (m), are mixed."""
+    """Return the readings whose deviation `off` (m) exceeds the share `least` of the step `way` (m) to a neighbour."""
     known, ahead = way != 0.0, np.sign(way) * off
     noise_off = _MIXED_DEVIATIONS * median_rms(off[known]) if known.any() else 0.0
     found = ahead > np.maximum(least * np.abs(way), noise_off)
-    # What lies beyond the next reading is something else.
+    # A deviation beyond the neighbouring reading has another cause.
     return np.flatnonzero(known & found & (ahead < _MIXED_MOST * np.abs(way) + noise_off))
 
 
 def _beside_lines(y: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far each reading, shape (N,), metres, lies from a line through others, and the way between two.
+    """Return the deviation of each reading from a line through its neighbours, and its step, both (N,), metres.
 
-    Both are 0 for readings that are not in the middle of a move.
+    The step is the displacement from one reading to the next. Both are 0 where the voltage is not monotone.
     """
     width = 2 * _BESIDE + 1
     off, way = np.zeros(y.size), np.zeros(y.size)
@@ -440,7 +453,7 @@ def _beside_lines(y: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]
     off[at + _BESIDE] = y[at + _BESIDE] - line
     way[at + _BESIDE] = gain * np.median(steps, axis=1)
     known = way != 0.0
-    # A branch bends, so that all readings of a part of it lie beside the line: as many steps, whichever way it goes.
+    # A branch is curved, so that all readings of a section deviate from the line by the same number of steps.
     steps_off = np.divide(off, way, out=np.zeros_like(off), where=known)
     off[known] -= (median_filter(steps_off, 2 * width + 1) * way)[known]
     return np.where(known, off, 0.0), way

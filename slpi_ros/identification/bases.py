@@ -54,7 +54,7 @@ class Basis(Protocol):
 
 @dataclass(frozen=True)
 class SurfaceBasis:
-    """Basis of the loop family on a uniform grid (V): Everett function below the diagonal, then the first rise."""
+    """Basis of the loop family on a uniform grid (V): Everett values below the diagonal, then the first rise."""
 
     grid: FloatArray
     symmetric_rest: bool = False
@@ -79,7 +79,7 @@ class SurfaceBasis:
         return n * (n - 1) // 2 + np.arange(n)
 
     def branch_part(self, walk: Walk) -> sp.csr_array:
-        """Return the signed Everett function between reversal and sample; on the first rise, the rise between both."""
+        """Return rows of the signed Everett function from reversal to sample, or of the first rise up to the sample."""
         v, v_origin, sign = walk.v, walk.v_origin, walk.direction.astype(np.float64)
         rises, falls_long = walk.first_rise, walk.long_fall
         upper, lower = np.maximum(v, v_origin), np.minimum(v, v_origin)
@@ -99,7 +99,7 @@ class SurfaceBasis:
         return cell, x - cell
 
     def _surface_rows(self, upper: FloatArray, lower: FloatArray, factor: FloatArray) -> sp.csr_array:
-        """Return rows of `factor` times the interpolated surface: bilinear, but linear in cells on the diagonal."""
+        """Return rows of `factor` times the Everett function: bilinear, linear in cells on the diagonal."""
         (i, p), (j, q) = self._cell(upper), self._cell(lower)
         row = np.arange(upper.size)
         on_diagonal = i == j
@@ -126,8 +126,8 @@ class SurfaceBasis:
         """Return the rows of the roughness penalty, shape (r, size + 1).
 
         Third differences along branches penalise uneven loops; second differences along the diagonal penalise uneven
-        change of the loops with their vertex (zero for the classical PI model); the first rise is penalised for
-        curvature and for deviation from a rise from the low end.
+        change of the loops from vertex to vertex (zero for the classical PI model); the first rise is penalised for
+        curvature and for deviation from the rise that starts at the low end.
         """
         n, column, rise = self.grid.size, self._column, self._rise_columns
         i, j = np.tril_indices(n, -1)
@@ -148,7 +148,7 @@ class SurfaceBasis:
         return sp.csr_array(sp.hstack([rows, sp.csr_array((rows.shape[0], 1))], format="csr"))
 
     def _differences(self, stencil: list[tuple[NDArray[np.int64], NDArray[np.int64], float]]) -> sp.csr_array:
-        """Return rows of weighted sums over the surface, for stencils that lie on it; the diagonal counts as zero."""
+        """Return rows of weighted sums of Everett values for stencils within the triangle; the diagonal is zero."""
         n = self.grid.size
         fits = np.ones(stencil[0][0].size, dtype=bool)
         for i, j, _ in stencil:
@@ -162,7 +162,7 @@ class SurfaceBasis:
         return sp.csr_array(total)
 
     def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
-        """Return the constraints that branches and the first rise have at least the least gain between vertices."""
+        """Return the constraints that branches and first rise have at least the share `LEAST_GAIN` of the mean gain."""
         n = self.grid.size
         i, j = np.tril_indices(n, -1)
         upward = self._differences([(i, j, 1.0), (i - 1, j, -1.0)])
@@ -187,14 +187,14 @@ class SurfaceBasis:
         return LoopFamily(self.grid, surface, x[self._rise_columns] - x[self._rise_columns[0]], edge_gain)
 
     def covered(self, branch_part: sp.csr_array) -> float:
-        """Return the share of the surface's vertex pairs that the samples of a `branch_part` determine, 0..1."""
+        """Return the share of the Everett values that the samples of a `branch_part` determine, 0..1."""
         pairs = self.size - self.grid.size
         touched = np.unique(branch_part.indices)
         return float(np.count_nonzero(touched < pairs) / pairs)
 
 
 class OperatorWeights:
-    """Common part of bases with one weight for each operator, with `thresholds` (V), shape (size,)."""
+    """Base class of bases with one weight for each operator; `thresholds` (V) has shape (size,)."""
 
     thresholds: FloatArray
 

@@ -76,7 +76,7 @@ class CrossValidationReport:
     axis, kind : str
         Name of the axis and kind of the model.
     floor : Floor
-        Repeatability floor of the record; of several records, the median.
+        Repeatability floor of the record; for several records, the median of their floors.
     overall : Slice
         Errors of all held-out samples.
     by_level : tuple of Slice
@@ -135,7 +135,7 @@ def cross_validate(
     stop: float | None = None,
     loops_at_rest: bool = False,
 ) -> CrossValidationReport:
-    """Cross-validate a kind of model on a thinned record: fit all blocks but one fold, evaluate on that fold.
+    """Cross-validate a kind of model on a thinned record: fit all folds but one, evaluate the error on that fold.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def loop_levels(t: FloatArray, v: FloatArray) -> IntArray:
 
 
 def speeds(t: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the magnitude of dv/dt (V/s), shape (N,), by differences over a few samples."""
+    """Return the magnitude of dv/dt (V/s), shape (N,), from central differences over a few samples."""
     at = np.arange(v.size)
     before, after = np.maximum(at - _SPEED_REACH, 0), np.minimum(at + _SPEED_REACH, v.size - 1)
     seconds = t[after] - t[before]

@@ -2,7 +2,7 @@
 
 Displacement is linear in a model's parameters: the displacement of a sample is that of the reversal at which its
 branch started, plus the increment along the branch. With the increments ``A_local``, the matrix ``P`` that selects
-each sample's reversal and the predictions ``T`` at reversals, the record is ``(A_local + P T) x``;
+each sample's reversal and the predictions ``T`` at reversals, the displacements are ``(A_local + P T) x``;
 the product is never formed.
 """
 
@@ -110,7 +110,7 @@ class Design:
 
     @cached_property
     def _before(self) -> list[tuple[int, int]]:
-        """Each reversal and the one at which its own branch started, where there is one, in ascending order."""
+        """Pairs of a reversal and the reversal at which its branch started, as indices into `turns`, ascending."""
         before = self._branch[self.turns]
         rows = np.flatnonzero(before >= 0)
         return list(zip(rows.tolist(), before[rows].tolist(), strict=True))
@@ -133,7 +133,7 @@ class Design:
 
     @classmethod
     def of(cls, walk: Walk, branch_part: sp.csr_array) -> "Design":
-        """Append the columns of the displacements at rest to the `branch_part`, shape (N, size), of a basis."""
+        """Return the design matrix of a `branch_part`, shape (N, size), with a column for each displacement at rest."""
         rows = np.flatnonzero(walk.origin < 0)
         starts, record = np.unique(walk.first, return_inverse=True)
         no_turn = sp.csr_array((np.ones(rows.size), (rows, record[rows])), shape=(walk.v.size, starts.size))
@@ -162,7 +162,7 @@ class Design:
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows ``A = local + pick at_turns`` of a design matrix, of n samples.
+    """Rows ``A = local + pick at_turns`` of a design matrix for n samples.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ class Rows:
         return result
 
     def weight(self, parameters: FloatArray) -> FloatArray:
-        """Return by how much each row, shape (n,), depends on parameters of some weight, shape (p,)."""
+        """Return the sum of the absolute coefficients of each row, shape (n,), weighted by `parameters`, shape (p,)."""
         result: FloatArray = abs(self.local) @ parameters + self.pick @ (abs(self.at_turns) @ parameters)
         return result
 

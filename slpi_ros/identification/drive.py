@@ -11,9 +11,9 @@ from slpi_ros.hysteresis.reversals import reversals
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Cells per dimension of the map of reversal voltage and present voltage.
+# Cells per dimension of the grid of last reversal voltage and present voltage.
 _CELLS = 10
-# Swings within this factor count as equal, and so do speeds within this factor.
+# Voltage changes, and speeds, that differ by less than these factors count as equal.
 _SWING_FACTOR = 1.6
 SPEED_FACTOR = 1.5
 # Shortest hold, seconds; creep becomes visible after this time.
@@ -53,7 +53,10 @@ class Runs:
 
     @property
     def speeds(self) -> tuple[float, ...]:
-        """Distinct speeds (V/s), ascending, of swings of one size: the size with the largest number of speeds."""
+        """Distinct speeds (V/s) of runs with similar voltage change, in ascending order.
+
+        Of all voltage changes, the one with the largest number of distinct speeds is used.
+        """
         timed = (self.duration > 0.0) & (self.swing != 0.0)
         swing, speed = np.abs(self.swing[timed]), np.abs(self.swing[timed]) / self.duration[timed]
         best: tuple[float, ...] = ()
@@ -84,7 +87,7 @@ def _distinct(speeds: FloatArray) -> tuple[float, ...]:
 
 
 def covered(v: FloatArray, runs: Runs) -> float:
-    """Return the share, 0..1, of all pairs of reversal voltage and present voltage that a record visits."""
+    """Return the share, 0..1, of all pairs of last reversal voltage and present voltage that a record visits."""
     low, high = float(v.min()), float(v.max())
     cell = np.minimum((v - low) * (_CELLS / (high - low)), _CELLS - 1).astype(np.int8)
     origin = np.repeat(cell[runs.ends[:-1]], np.diff(runs.ends))
@@ -95,18 +98,18 @@ def covered(v: FloatArray, runs: Runs) -> float:
 
 
 def smallest_turn(v: FloatArray, noise: float) -> float:
-    """Return the dead band (V) for reversals of the voltage `v`, shape (N,), volts, with `noise` (V rms)."""
+    """Return the dead band (V) that excludes reversals due to `noise` (V rms) in the voltage `v`, shape (N,), volts."""
     span = float(np.ptp(v))
     return float(np.clip(8.0 * noise, _SMALLEST_TURN * span, _LARGEST_DEAD_BAND * span))
 
 
 def hold_band(v: FloatArray, noise: float, digit: float) -> float:
-    """Return the tolerance band (V) of a hold, for noise (V rms) and resolution `digit` (V) of the voltage."""
+    """Return the largest voltage range (V) within a hold, given `noise` (V rms) and resolution `digit` (V)."""
     return max(1e-4 * float(np.ptp(v)), 6.0 * noise, 1.5 * digit)
 
 
 def resting(t: FloatArray, v: FloatArray, band: float) -> tuple[IntArray, IntArray]:
-    """Find the holds, where the voltage `v`, shape (N,), at times `t` (s) stays within `band` (V).
+    """Find the holds: 0.5 s or more in which the voltage `v`, shape (N,), at times `t` (s) varies by up to `band` (V).
 
     Returns
     -------
@@ -126,6 +129,6 @@ def resting(t: FloatArray, v: FloatArray, band: float) -> tuple[IntArray, IntArr
 
 
 def holds(t: FloatArray, v: FloatArray, band: float) -> FloatArray:
-    """Return the duration of each hold, shape (H,), seconds; a hold stays within `band` (V)."""
+    """Return the duration of each hold found by `resting`, shape (H,), seconds."""
     starts, stops = resting(t, v, band)
     return np.asarray(t[stops - 1] - t[starts])

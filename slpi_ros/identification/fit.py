@@ -54,8 +54,8 @@ def identify(
         ``slpi`` (the loop family), ``slpi-published`` (a classical PI model for each separated loop), ``pi`` (classical
         Prandtl-Ishlinskii), ``mpi`` (multi-slope PI) or ``smpi`` (multi-slope PI scaled with the amplitude).
     loops_at_rest : bool
-        For ``slpi-published`` only: the play operators of every loop start at rest, as in the paper, instead of
-        primed. Default False.
+        For ``slpi-published`` only: the play operators of every loop start at rest, as in the paper, instead of in
+        their state after a reversal. Default False.
     start, stop : float, seconds, optional
         Fit only samples with ``start <= t < stop``, where t counts from the first stamp; by default all samples.
     axes : sequence of str, optional
@@ -103,7 +103,7 @@ def identify(
 
 
 def _without_bad(samples: Sequence[Samples], model: AxisModel, starts: Sequence[Start]) -> list[Samples]:
-    """Return the samples of each record without the readings that a first model shows to be bad."""
+    """Return the samples of each record without the mixed readings and outliers found with a first model."""
     good = []
     for part, start in zip(samples, starts, strict=True):
         path = replace(model, start=start).memory("start").forward_array(part.v)

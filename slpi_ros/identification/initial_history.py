@@ -35,7 +35,7 @@ class InitialHistoryWarning(UserWarning):
 
 
 class Fit(Protocol):
-    """Fit of the samples from which it was made."""
+    """Fit to samples, as returned by the function `pose` of `choose_start`."""
 
     def reweighted(self) -> "Fit":
         """Return the fit with reduced weights of outliers."""
@@ -47,7 +47,7 @@ class Fit(Protocol):
 def histories(samples: Samples) -> list[tuple[float, ...]]:
     """Return the candidate initial histories: none (rest), a long fall, a long rise, a decaying oscillation.
 
-    Each is a tuple of voltages (V) as in `slpi_ros.model.stage_model.Start`.
+    Each is a tuple of voltages (V) as in `slpi_ros.model.axis_model.Start`.
     """
     v0, low, high = float(samples.v[0]), float(samples.v.min()), float(samples.v.max())
     shrink = 1.0 - np.arange(1, MIDDLE_LOOPS) / MIDDLE_LOOPS
@@ -63,7 +63,7 @@ class InitialHistory:
     Parameters
     ----------
     history : tuple of float, volts
-        As in `slpi_ros.model.stage_model.Start`.
+        As in `slpi_ros.model.axis_model.Start`.
     only_wiped : bool
         Whether samples before the reset of the hysteresis state are excluded, because no history explains them.
     """
@@ -147,7 +147,7 @@ def _residual(fit: Fit, samples: Samples) -> FloatArray:
 
 # In `match`: candidate start voltages of the last move before a record, as shares of the distance to either end.
 LAST_MOVES = np.linspace(0.0, 1.0, 9)
-# Fewest samples of a stretch between two new extremes of the voltage that are compared with each other.
+# Fewest samples of a stretch (between two new extremes of the voltage) that is used in the comparison.
 FEWEST_OF_STRETCH = 20
 # Number of parts of the record for the jackknife uncertainty of `match`.
 PARTS = 10
@@ -164,11 +164,11 @@ class Match:
     Parameters
     ----------
     start : Start
-        Initial state with the lowest error, at the first voltage of the hysteresis, with the displacement relative to
-        the zero of the record.
+        Initial state with the lowest error, at the first voltage of the hysteresis; its displacement includes the
+        offset of the record.
     offset, offset_uncertainty : float, metres
-        Zero of the record minus zero of the model, and its uncertainty: the range due to the unknown initial history
-        plus `BEYOND_CHANCE` standard deviations.
+        Zero of the record minus zero of the model, and its uncertainty: half the range due to the unknown initial
+        history plus `BEYOND_CHANCE` standard deviations.
     gain_change, gain_uncertainty : float
         Relative change of the loop height, and its standard deviation.
     width_change, width_uncertainty : float
@@ -180,7 +180,8 @@ class Match:
     known_from : int
         First sample after which the initial history affects only the offset; N if there is none.
     known : ndarray of bool, shape (N,)
-        Samples that can be compared with others of the same stretch between two new extremes of the voltage.
+        Fitted samples, without outliers, of stretches between two new extremes of the voltage that are long enough for
+        a comparison; see `match`.
     residual : ndarray, shape (N,), metres
         Model minus measured, free-run from `start`; NaN where not fitted.
     """
@@ -217,8 +218,9 @@ class Match:
 def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Match:
     """Compare a model with a record of unknown initial history.
 
-    Between two new extremes of the voltage the initial history adds only a constant, so the samples of such a stretch
-    can be compared with each other. After both ends of the model's range were visited, the zero is known as well.
+    While the voltage stays within the range visited so far, the unknown initial history adds only a constant, so the
+    samples of such a stretch can be compared with each other. Once both ends of the model's voltage range have been
+    visited, the offset is known as well.
 
     Parameters
     ----------
@@ -273,7 +275,7 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Mat
 
 
 def lasting_effects(axis: AxisModel) -> tuple[Effect, ...]:
-    """Return the effects of an axis that persist in other records: no drift or hum; of a gain drift the final gain."""
+    """Return the effects of an axis that hold for other records: no drift or hum; a gain drift keeps its final gain."""
     lasting: list[Effect] = []
     for effect in axis.effects:
         if isinstance(effect, GainDrift):
@@ -302,7 +304,7 @@ def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
 
 
 def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> NDArray[np.int64]:
-    """Return the stretch number of each sample, shape (N,); within a stretch the initial history adds a constant.
+    """Return the stretch number of each sample, shape (N,); in a stretch the initial history adds only a constant.
 
     Parameters
     ----------
@@ -324,7 +326,7 @@ def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> NDArray[np
 
 
 def _inliers(residual: FloatArray, stretch: NDArray[np.int64], counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask, shape (N,), of the counted samples whose residual (m) lies near that of their neighbours."""
+    """Return the mask, shape (N,), of the counted samples whose residual (m) is close to that of their neighbours."""
     inside = np.zeros(residual.size, dtype=bool)
     at = np.flatnonzero(counted)
     if at.size < FEWEST:
@@ -346,7 +348,7 @@ def _changes(
     stretch: NDArray[np.int64],
     known: NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray, float, float]:
-    """Return the changes of gain and width, their standard deviations, and the rms errors without and with them (m)."""
+    """Return changes of gain and width, their standard deviations, and the rms errors (m) before and after the fit."""
     if np.count_nonzero(known) < FEWEST:
         return np.zeros(2), np.full(2, np.inf), axis.quality.held_out_rms, axis.quality.held_out_rms
     bare = replace(axis, effects=())
@@ -385,7 +387,7 @@ def _changes(
 
 
 def _solved(matrices: FloatArray, vectors: FloatArray, own_error: float, count: int) -> tuple[FloatArray, FloatArray]:
-    """Solve normal equations given as sums over parts; return the solution and its standard deviations (jackknife).
+    """Solve the sum of the normal equations of all parts; return the solution and its standard deviations (jackknife).
 
     Parameters
     ----------

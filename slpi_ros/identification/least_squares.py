@@ -40,7 +40,7 @@ class Fitted:
     held_out : ndarray, shape (N,), metres
         Held-out error of every sample, model minus measured, free-run; NaN for samples that are in every fit.
     covered : float
-        Share of the model that the samples determine, 0..1.
+        Share of the model's parameters or loops that the samples determine, 0..1.
     """
 
     hysteresis: Hysteresis
@@ -136,7 +136,7 @@ RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class Problem:
-    """Least-squares problem of one basis on one record or several.
+    """Least-squares problem of the fit of one basis to one or several records.
 
     `y` is in units of `scale` (m), shape (N,); `weights` are zero for samples that are not fitted; `judged` marks the
     samples that can be held out; `rough` is the roughness matrix, shape (p, p); `gain` is the mean gain (m/V).
@@ -222,7 +222,7 @@ class Problem:
     def folds(self) -> list[NDArray[np.int64]]:
         """Return the sample indices of each fold.
 
-        The first rise is in every fit: it occurs once in a record, so no other part can predict it.
+        The first rise is part of every fit: it occurs only once in a record, so no other part can predict it.
         """
         return blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise)
 
@@ -242,9 +242,9 @@ class Problem:
         return np.array([self._score(each) for each in smoothness])
 
     def smoothness_near(self, present: float, among: Sequence[float]) -> float:
-        """Return that of the ascending values `among` from which no neighbour lowers the held-out error.
+        """Return a local minimum of the held-out error over the roughness weights `among`, in ascending order.
 
-        The search starts from the `present` one.
+        The search starts at the value `present`.
         """
         score = cache(lambda k: self._score(among[k]))
         best, k = among.index(present), -1
@@ -255,7 +255,7 @@ class Problem:
 
     @cached_property
     def _folds(self) -> list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]]:
-        """Number of samples of each fold, normal equations of the others, and its own."""
+        """For each fold: number of its samples, normal equations of all other samples, normal equations of the fold."""
         matrix, vector = self.design.normal_equations(self.y, self.weights)
         equations = []
         for chosen in self.folds():
@@ -276,7 +276,7 @@ class Problem:
 
 
 def blocked_folds(allowed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Return the sample indices of each fold, among those `allowed`; a fold consists of blocks across the record."""
+    """Return the sample indices of each fold, from the mask `allowed`; a fold is a set of blocks across the record."""
     blocks = np.array_split(np.flatnonzero(allowed), FOLDS * BLOCKS_OF_FOLD)
     return [np.concatenate(blocks[fold::FOLDS]) for fold in range(FOLDS)]
 

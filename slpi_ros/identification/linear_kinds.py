@@ -23,7 +23,7 @@ PLAY_OPERATORS = 30
 # Numbers of samples to which a long record is thinned: for the choice of initial history, grid and smoothness, and for
 # the final fit. More samples cost time and memory without changing the result.
 SELECTION_SAMPLES, FIT_SAMPLES = 100_000, 1_000_000
-# Share of these numbers for play operators: every sample moves every operator, and the parameters are few.
+# Factor on these numbers for play operators: every sample moves every operator, and there are few parameters.
 PLAYS_SHARE = 0.2
 
 

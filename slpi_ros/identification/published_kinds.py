@@ -51,7 +51,7 @@ LARGEST_DEAD_BAND = 0.02
 
 
 def fit_primed(samples: Sequence[Samples]) -> Fitted:
-    """Fit the loops of one record with primed play operators, so that loops of level 1 and above close."""
+    """Fit the loops of one record with play operators that start as after a reversal, so that inner loops close."""
     return _fit(only_one(samples, "slpi-published"), at_rest=False)
 
 
@@ -126,7 +126,7 @@ def fit_loops(
     fitted : ndarray of bool, shape (N,)
         Samples whose displacement is fitted.
     at_rest : bool
-        Whether play operators start at rest, as published, instead of primed.
+        Whether play operators start at rest, as published, instead of in their state after a reversal.
     thresholds : ndarray, shape (n,), volts, optional
         Thresholds of every loop; by default those of `default_thresholds`.
 
@@ -269,7 +269,7 @@ class _SingleLoopFit:
         )
 
     def loop(self, solution: Plays, below: SingleLoop | None) -> SingleLoop:
-        """Return the loop with the fitted weights, relative to the loop `below`; None for the outer loop."""
+        """Return the loop with the fitted weights; `below` is the loop that contains it, None for the outer loop."""
         loop = self._loop
         vertex = self._vertex[0], self._vertex[1] + loop.direction * solution.start
         return SingleLoop(
@@ -301,7 +301,7 @@ SAME_AMPLITUDE = 0.02
 
 @dataclass(frozen=True)
 class MultiSlopeBasis(OperatorWeights):
-    """Basis of the MPI model with one weight for each operator; `origin`, `amplitude`, `thresholds` as `MultiSlope`."""
+    """Basis of the MPI model, one weight for each operator; `origin`, `amplitude`, `thresholds` as in `MultiSlope`."""
 
     origin: float
     amplitude: float
@@ -335,8 +335,8 @@ class MultiSlopeBasis(OperatorWeights):
 def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the amplitude and the peak displacement of each cycle of a record, in chronological order.
 
-    A cycle starts at a voltage less than 1 % of the range above the lowest, and rises above that band. It is omitted if
-    its displacement is unknown at the start, or within 1 % of its highest voltage.
+    A cycle starts at a voltage within 1 % of the range above the lowest voltage, and rises above that band. It is
+    omitted if its displacement is unknown at its start, or at all voltages within 1 % of the range below its peak.
 
     Parameters
     ----------
@@ -366,7 +366,7 @@ def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the knots of ``X_p`` over amplitude for the SMPI model; cycles of nearly equal amplitude are averaged.
+    """Return peak displacement ``X_p`` against amplitude for the SMPI model, averaged over cycles of similar amplitude.
 
     Parameters
     ----------
@@ -507,7 +507,7 @@ def _ends(samples: Samples) -> tuple[float, float]:
 
 
 def _fit_scaled(samples: Samples, kept: NDArray[np.bool_], largest: NDArray[np.bool_]) -> tuple[AmplitudeScaled, float]:
-    """Return the model fitted to the samples `kept`, and the displacement at the start (m)."""
+    """Return the model fitted to the samples `kept`, and the initial displacement (m)."""
     part = replace(samples, fitted=kept & largest)
     problem = Problem.pose([part], MultiSlopeBasis.over(*_ends(samples)))
     x = problem.solve(FIRST_SMOOTHNESS) * problem.scale

@@ -31,7 +31,7 @@ class ClockQuality:
     samples : int
         Number of samples.
     duration, period : float, seconds
-        Time from the first to the last sample, and median sample period.
+        Time from the first to the last sample, and median sampling period.
     jitter : float, seconds
         Standard deviation of the time steps, without those at missing samples.
     lost : int
@@ -41,7 +41,7 @@ class ClockQuality:
     longest_gap : float, seconds
         Longest step.
     duplicates : int
-        Number of repeated stamps.
+        Number of samples with the same stamp as the preceding sample.
     unseen : int
         Number of gaps within which the voltage moved, so that reversals may be missing.
     """
@@ -82,10 +82,10 @@ class SignalQuality:
     spikes : int
         Number of other single outliers.
     mixed, mixed_share : int, float
-        Number of readings that are early, late or a mixture of two neighbouring values, and their share of those that
-        can be judged.
+        Number of readings that are early, late or a mixture of two neighbouring values, and their share of the
+        readings tested, which are those not next to a reversal.
     mixed_size : float
-        Typical error of these readings.
+        Typical largest error of these readings: half of the change between their neighbours.
     """
 
     low: float
@@ -121,15 +121,15 @@ class DriveQuality:
     samples_per_run : float
         Median number of samples between reversals.
     speeds : tuple of float, V/s
-        Distinct speeds of swings of one size.
+        Distinct speeds of runs with about equal voltage change, as in `slpi_ros.identification.drive.Runs`.
     speed_range : (float, float), V/s
-        Slowest and fastest run between reversals, of any size.
+        Speeds of the slowest and the fastest run between reversals.
     holds : tuple of float, seconds
         Duration of each hold.
     begins_at_end : bool
         Whether the record begins at an end of its voltage range, so that the initial history is known.
     wiped : float or None, seconds
-        Time at which both ends have been visited, which resets the hysteresis state; None if never.
+        Time by which both ends of the range have been visited, which resets the hysteresis state; None if never.
     """
 
     turns: int
@@ -157,7 +157,7 @@ class Quality:
     drive : DriveQuality
         Excitation voltage.
     notes : tuple of str
-        Notes of the record.
+        Remarks on how the record was made.
     """
 
     axis: str
@@ -178,7 +178,7 @@ def assess(record: Record, axis: str, *, start: float | None = None, stop: float
     axis : str
         Name of one of its axes.
     start, stop : float, seconds, optional
-        Part to be fitted, as for `identify`; the voltage before `start` counts for the excitation.
+        Part to be fitted, as for `identify`; the assessment of the excitation includes the voltage before `start`.
 
     Returns
     -------
@@ -232,9 +232,9 @@ def _clock(t: FloatArray, v: FloatArray, still: float) -> ClockQuality:
 
 
 def _missing(steps: FloatArray) -> int:
-    """Return the number of missing samples, from the steps between stamps in periods, shape (N - 1,).
+    """Return the number of missing samples, from the steps between stamps in sampling periods, shape (N - 1,).
 
-    Only a lasting delay counts: after a late stamp the next steps are short, and no sample is missing.
+    Only a lasting delay counts: if a late stamp is followed by shorter steps, no sample is missing.
     """
     behind = np.cumsum(np.maximum(steps, 0.0) - 1.0)
     stays = minimum_filter1d(behind, _CATCHES_UP, origin=-((_CATCHES_UP - 1) // 2), mode="nearest")

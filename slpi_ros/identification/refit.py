@@ -2,7 +2,7 @@
 
 The old parameters ``x_old`` are the prior of a convex fit. A stage changes with time mostly in gain, so that
 ``x = (1 + s) x_old + e``, where ``s`` is a few per cent and ``e`` is small and smooth. The gain ``s`` is fitted only
-if the error of the old model exceeds its known error, so that a record of small loops that agrees with the old model
+if the record deviates significantly from the old model, so that a record of small loops that agrees with the old model
 does not change the large loops.
 """
 
@@ -30,16 +30,16 @@ from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
-# Standard deviations of the prior: of the gain (relative) and of each parameter, which follows its neighbours (relative
-# to the displacement range), where the stage has changed; and where the old model is as good as it ever was.
+# Standard deviations of the prior, for the gain (relative) and for the smooth deviation of each parameter (share of the
+# displacement range): if the stage has changed, and if the old model still agrees with the record.
 CHANGED = (0.1, 1e-3)
 UNCHANGED = (0.0, 1e-4)
-# How much the deviation from the old shape may bend, against how large it may be.
+# Weight of the roughness of the deviation from the old shape, relative to the weight of its size.
 SMOOTH = 30.0
-# The stage has changed when the old model's error on the new record is this many times the one it was identified with.
+# The stage has changed if the error of the old model on the new record exceeds this multiple of its held-out error.
 BEYOND_REPEATABILITY = 2.0
-# A model is of another stage when its error is more than this share of the displacement range, and this many times
-# that of one fitted to the record.
+# A model belongs to another stage if its error exceeds this share of the displacement range, and this multiple of the
+# error of a model fitted to the record.
 FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
 
 
@@ -50,13 +50,13 @@ class AxisChange:
     Parameters
     ----------
     error_before, error_after : float, metres
-        Rms error on the new record, free-run, of the old and of the new model, each from its best initial history and
-        relative to the zero of the record.
+        Rms error on the new record, free-run, of the old and of the new model, each with the best-fitting initial
+        history and without the constant offset from the record.
     repeatability : float, metres
         Held-out error of the old model, or the noise of the sensor if larger.
     drifted : bool
-        Whether gain, width or shape of the loops has changed, so that initial history, zero, lag and slow drift do
-        not explain the error of the old model.
+        Whether gain, width or shape of the loops has changed: whether initial history, offset, lag and slow drift
+        cannot explain the error of the old model.
     gain : float
         Relative change of the height of the outermost loop.
     largest : float, metres
@@ -80,9 +80,9 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
     Parameters
     ----------
     model : StageModel
-        Model with axes of kind ``slpi`` or ``pi``. Effects are kept; the hysteresis is fitted to the remainder.
+        Model with axes of kind ``slpi`` or ``pi``. Its effects are kept, and subtracted from the record before the fit.
     record : Record
-        Record within the voltage range of the model. Axes of the model that the record lacks are kept.
+        Record within the voltage range of the model. Axes that are not in the record are kept unchanged.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
     UsageError
         If the record is of another stage, or the model's kind cannot be updated.
     RecordError, IdentificationError
-        If the record does not allow it.
+        If the record does not allow an update.
     """
     common_stage([record], model.hardware_id)
     shared = [axis for axis in model.axes if axis in record.axes]
@@ -136,7 +136,7 @@ def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -
 
 
 def _held(v: FloatArray) -> FloatArray:
-    """Return a voltage, shape (N,), volts, with unknown samples replaced by the last known one."""
+    """Return a voltage, shape (N,), volts, with NaN replaced by the last finite value."""
     known = np.flatnonzero(np.isfinite(v))
     if not known.size:
         raise IdentificationError("the voltage is never known; record it")
@@ -213,7 +213,7 @@ def require_own(error: float, fitted_anew: float, span: float) -> None:
     Parameters
     ----------
     error, fitted_anew : float, metres
-        Rms errors of the model, and of a model fitted to the record.
+        Rms errors on the record, of the model and of a model fitted to this record.
     span : float, metres
         Displacement range.
     """

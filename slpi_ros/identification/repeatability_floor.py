@@ -1,4 +1,4 @@
-"""The repeatability floor of a record: how far repetitions of the same motion differ."""
+"""The repeatability floor (noise floor) of a record: how much repetitions of the same motion differ."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ from slpi_ros.identification.signal_statistics import FEWEST, digit, noise
 FloatArray = NDArray[np.float64]
 
 _FEWEST_READINGS = 5
-# Enough moves and holds of a long record, taken evenly from all of it, and how far back a move is looked for.
+# Largest number of moves and of holds used, evenly spread over the record; number of earlier moves searched.
 _ENOUGH_PIECES, _LOOK_BACK = 1000, 1000
-# Turns this close to each other (share of the voltage range) are the same; so are voltages along a move, in rms.
+# Largest difference of equal reversals, and rms difference of voltages along equal moves (shares of the voltage range).
 _SAME_TURN, _SAME_VOLTAGE = 0.005, 0.003
 _FEWEST_OF_MOVE, _FEWEST_OF_HOLD = 10, 20
-# A longer hold is cut, so that what is slow in it is nearly a parabola.
+# Length (s) of the pieces into which a hold is cut, so that creep within a piece is nearly a parabola.
 _LONGEST_PIECE = 2.0
-# What lies farther out, in standard deviations, is an outlier; the rms of a Gaussian cut off there; how often to cut.
+# Limit for outliers, in standard deviations; rms of a Gaussian truncated there; number of truncations.
 _OUTLIER, _CUT_GAUSSIAN, _CUTS = 2.5, 0.95460, 5
 _ROBUST_FITS = 3
-# Smaller than this share of the range it is the rounding of numbers.
+# Noise below this share of the range is due to rounding.
 NO_NOISE = 1e-9
 
 
@@ -46,7 +46,7 @@ class Floor:
 
 
 def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray | None = None) -> Floor:
-    """Estimate the repeatability floor of a record: the noise, and whatever else differs when a motion is repeated.
+    """Estimate the repeatability floor of a record: noise and all other differences between repetitions of a motion.
 
     Estimated from repeated moves between the same reversals if there are enough; else from holds; else from the
     sample-to-sample noise. Slow and smooth differences (drift, creep) do not count.
@@ -56,7 +56,7 @@ def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray |
     t, v : ndarray, shape (N,), seconds and volts
         Time and voltage.
     y : ndarray, shape (N,), metres
-        Displacement; NaN where there is none.
+        Displacement; NaN where unknown.
     residual : ndarray, shape (N,), metres, optional
         Residual of a model. It replaces `y` in the estimate, so that drift and hum described by the model do not
         count.
@@ -64,7 +64,7 @@ def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray |
     Returns
     -------
     Floor
-        Rms in metres per reading, outliers left out, and what it was estimated from.
+        Rms per reading (m), without outliers, and the data from which it was estimated.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def _repeats(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[Float
     """
     span = float(np.ptp(v))
     ends = reversals(v, smallest_turn(v, noise(v, t)))
-    # Each move: the turn before it, its own, and where it goes.
+    # For each move: voltage of the reversal before its start, of its start and of its end.
     turns = np.column_stack([v[ends[:-2]], v[ends[1:-1]], v[ends[2:]]])
     for move in range(1, len(turns), max(1, len(turns) // _ENOUGH_PIECES)):
         earliest = max(0, move - _LOOK_BACK)
@@ -133,7 +133,7 @@ def _repeats(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[Float
 
 
 class Move(NamedTuple):
-    """Time (s) since the turn, voltage (V) and signal (m) from one turn to the next."""
+    """Move from one reversal to the next: time since its start (s), voltage (V) and signal (m)."""
 
     t: FloatArray
     v: FloatArray
@@ -141,7 +141,7 @@ class Move(NamedTuple):
 
 
 def _difference(own: Move, other: Move, within: NDArray[np.bool_], same: float) -> FloatArray:
-    """Return how `own` differs from `other` where it is `within`; empty where their voltages are not the `same` (V)."""
+    """Return the difference (m) of two moves at samples `within`; empty if their voltages differ by over `same` (V)."""
     t, v, signal = (x[within] for x in own)
     if min(t.size, other.t.size) < _FEWEST_OF_MOVE:
         return np.empty(0)
@@ -157,15 +157,15 @@ def _difference(own: Move, other: Move, within: NDArray[np.bool_], same: float) 
     v_other, signal_other = ((1.0 - share) * x[before] + share * x[after] for x in (other.v, other.signal))
     if np.sqrt(np.mean((v - v_other) ** 2)) > same:
         return np.empty(0)
-    # A reading between two others is less noisy than they are.
+    # A value interpolated between two readings is less noisy than these.
     weight = 1.0 / np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
-    # Where the voltages differ a little, the displacements do by a gain, which changes along the move.
+    # A small voltage difference causes a displacement difference, with a gain that changes along the move.
     beside = v - v_other
     return _without(weight * (signal - signal_other), *(weight * x for x in (np.ones_like(t), t, beside, beside * t)))
 
 
 def _shift(t: FloatArray, v: FloatArray, t_other: FloatArray, v_other: FloatArray) -> float:
-    """Return the delay (s) of the other move at equal voltages."""
+    """Return the delay (s) of the other move for the best match of the voltages."""
     rate = np.gradient(v, np.maximum.accumulate(t) + 1e-12 * np.arange(t.size))
     shift = 0.0
     for _ in range(3):
@@ -179,7 +179,7 @@ def _holds(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatAr
     starts, stops = resting(t, v, hold_band(v, noise(v, t), digit(v)))
     every = max(1, starts.size // _ENOUGH_PIECES)
     for start, stop in zip(starts[::every].tolist(), stops[::every].tolist(), strict=True):
-        # At first the stage still follows the move before.
+        # In its first half the stage still creeps after the preceding move.
         first = (start + stop) // 2
         pieces = max(1, round((t[stop - 1] - t[first]) / _LONGEST_PIECE))
         for piece in np.array_split(np.arange(first, stop), pieces):

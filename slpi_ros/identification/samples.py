@@ -35,7 +35,7 @@ NEAR_END = 0.02
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples of one axis, in time order, without gaps in the voltage.
+    """Samples of one axis, in time order, with a finite voltage.
 
     Parameters
     ----------
@@ -46,11 +46,11 @@ class Samples:
     fitted : ndarray of bool, shape (N,)
         Samples whose displacement is to be fitted.
     history : int
-        Number of leading samples that form the initial history, which begins with a long fall to the first sample.
-        Default 0: the axis starts at rest.
+        Number of leading samples that form an assumed initial history. The first of them is reached by a long fall,
+        which erases the hysteresis memory. Default 0: the axis starts at rest.
     mixed, side : int
-        Number of samples that are not fitted because their displacement is late or mixed with that of a neighbour, and
-        which one, as in `slpi_ros.identification.bad_readings.Mixed`. Default 0: none.
+        Number of samples that are not fitted because their displacement is early, late or mixed with that of a
+        neighbour, and the side of that neighbour, as in `slpi_ros.identification.bad_readings.Mixed`. Default 0: none.
     """
 
     v: FloatArray
@@ -62,7 +62,7 @@ class Samples:
 
     @property
     def primed(self) -> bool:
-        """Whether the samples begin with an initial history, so with a long fall to the first voltage."""
+        """Whether the samples begin with an assumed initial history, and so with a long fall to the first voltage."""
         return self.history > 0
 
     def after(self, history: tuple[float, ...]) -> "Samples":
@@ -77,13 +77,13 @@ class Samples:
         )
 
     def only(self, chosen: NDArray[np.bool_]) -> "Samples":
-        """Return the samples, fitting only those that are `chosen`, a mask of shape (N,)."""
+        """Return all samples, with the fit restricted to the mask `chosen`, shape (N,)."""
         return replace(self, fitted=self.fitted & chosen)
 
     def without_mixed(self, path: FloatArray) -> "Samples":
-        """Return the samples without those that are mixed by the displacement of a model, `path`, shape (N,), metres.
+        """Exclude mixed readings from the fit, using the displacement of a model, `path`, shape (N,), metres.
 
-        Without a model, `select_samples` cannot judge the readings beside a turn.
+        This includes readings next to a reversal, which `select_samples` cannot test without a model.
         """
         if not self.side:
             return self
@@ -92,9 +92,9 @@ class Samples:
         return replace(self, fitted=fitted, mixed=self.mixed + mixed.size)
 
     def without_outliers(self, path: FloatArray) -> "Samples":
-        """Return the samples without the outliers by the displacement of a model, `path`, shape (N,), metres.
+        """Exclude outliers from the fit, using the displacement of a model, `path`, shape (N,), metres.
 
-        None are told from mixed readings, which `without_mixed` leaves out.
+        Samples with mixed readings are returned unchanged: outliers cannot be distinguished from mixed readings.
         """
         if self.side:
             return self
@@ -118,7 +118,7 @@ class Samples:
         return kept
 
     def at(self, kept: NDArray[np.bool_]) -> "Samples":
-        """Return the samples that are `kept`, a mask of shape (N,)."""
+        """Return only the samples selected by the mask `kept`, shape (N,)."""
         history = int(np.count_nonzero(kept[: self.history]))
         return replace(self, v=self.v[kept], y=self.y[kept], fitted=self.fitted[kept], history=history)
 
@@ -130,13 +130,13 @@ class Samples:
 
     @property
     def spread(self) -> tuple[float, float]:
-        """Ranges of voltage (V) and displacement (m) of the fitted samples, without outliers."""
+        """Ranges of voltage (V) and displacement (m) of the fitted samples, from the 1st to the 99th percentile."""
         v, y = (np.percentile(x[self.fitted], (1, 99)) for x in (self.v, self.y))
         return float(v[1] - v[0]), float(y[1] - y[0])
 
     @property
     def wiped(self) -> NDArray[np.bool_]:
-        """Mask of the samples after both ends of the voltage range have been visited, shape (N,)."""
+        """Mask of the samples after visits to both ends of the voltage range, which reset the state, shape (N,)."""
         low, high = self.v.min(), self.v.max()
         margin = NEAR_END * (high - low)
         own = self.v[self.history :]
@@ -146,7 +146,7 @@ class Samples:
 
     @property
     def mostly_wiped(self) -> bool:
-        """Whether at least half of the fitted voltage travel comes after the reset of the hysteresis state."""
+        """Whether at least half of the voltage travel of the fitted samples follows the hysteresis reset (`wiped`)."""
         own = self.v[self.history :]
         way = np.abs(np.diff(own, prepend=own[0])) * self.fitted[self.history :]
         return bool(way @ self.wiped[self.history :] >= 0.5 * way.sum())
@@ -155,20 +155,21 @@ class Samples:
     def judged(self) -> NDArray[np.bool_]:
         """Mask of the samples that can be held out, shape (N,).
 
-        Samples before the reset of the hysteresis state depend on the initial history and cannot be predicted.
+        Samples before the reset of the hysteresis state depend on the initial history and cannot be predicted; they are
+        excluded if `mostly_wiped`.
         """
         return self.fitted & self.wiped if self.mostly_wiped else self.fitted
 
 
 def select_samples(record: Record, axis: str, start: float | None, stop: float | None) -> Samples:
-    """Select the samples of one axis with ``start <= t < stop`` (s), including all earlier voltages.
+    """Select the samples of one axis for a fit, ``start <= t < stop`` (s), preceded by all earlier voltages.
 
     Raises
     ------
     UsageError
         If the record has no such axis.
     RecordError
-        If the samples are too few or unordered, or one signal does not vary.
+        If the samples are too few or unordered, or a signal is constant, implausibly large or of the wrong sign.
     IdentificationError
         If the voltage has no reversal.
     """
@@ -196,7 +197,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
         raise RecordError(f"{where}: {count} usable samples of {len(record)}{part}; at least {FEWEST} are needed")
     if count < fitted.size:
         y = np.where(fitted, y, 0.0)
-    # An outlier of the voltage is no reversal, and no range.
+    # Outliers of the voltage must not count as reversals or extend the range.
     when = t if driven.all() else t[driven]
     far_v, far_y = far_outliers(v, without(y, np.flatnonzero(~fitted)))
     v = without(v, far_v)
@@ -208,7 +209,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
     known = np.flatnonzero(fitted)
     mixed = mixed_readings(y[known], v[known])
     off_v, off_y = lone_of(when[known], v[known], y[known], at_kinks=False)
-    # Where a link mixes readings, those are what is off.
+    # If the record has mixed readings, only these are excluded: they look like outliers, too.
     fitted[known[mixed.readings if mixed.side else off_y]] = False
     smooth = without_noise(when, without(v, known[off_v]))
     return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side)
@@ -223,7 +224,7 @@ def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int
 
 
 def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> None:
-    """Raise RecordError unless both signals vary, plausibly and together; IdentificationError without a reversal."""
+    """Raise RecordError for constant, implausible or opposing signals, IdentificationError if there is no reversal."""
     turns = bool((v[1:] > v[:-1]).any() and (v[1:] < v[:-1]).any())
     if not fitted.all():
         v, y = v[fitted], y[fitted]
@@ -243,7 +244,7 @@ def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], whe
 
 
 def only_one(records: Sequence[Samples], kind: str) -> Samples:
-    """Return the samples of the only record, thinned; UsageError for several, which `kind` cannot be fitted to."""
+    """Return the thinned samples of a single record; UsageError for several, as `kind` cannot be fitted to them."""
     if len(records) != 1:
         raise UsageError(f"{len(records)} records given, but kind '{kind}' is fitted to one; choose one or 'slpi'")
     return records[0].thinned(ENOUGH)

@@ -1,4 +1,4 @@
-"""Statistics of sensor readings: error metrics, resolution and noise, and a voltage without its noise."""
+"""Statistics of sensor readings: error metrics, resolution and noise; noise removal for a voltage."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,10 @@ from slpi_ros.hysteresis.reversals import without_small_reversals
 class ErrorMetrics:
     """Error metrics of a model against a measurement, or of a measurement against a setpoint.
 
-    The MPI paper's "mean square error" is `root_mean_square` in all places: Tables 2 and 4, 0.1201 µm (feedforward) and
-    0.2949 µm (feedforward and PID). Its unit is µm, and it exceeds the mean absolute error as a root must. A mean
-    square cannot exceed the product of maximum and mean absolute error; Table 2 from 20 to 100 V, Table 4 at 20 and
-    40 V and the 0.1201 do. Of the others, R² of 0.9996 at 120 V (Table 3) goes with the root only.
+    The "mean square error" of the MPI paper is `root_mean_square` throughout: Tables 2 and 4, 0.1201 µm (feedforward)
+    and 0.2949 µm (feedforward and PID). Its unit is µm, and it exceeds the mean absolute error, as an rms must. A mean
+    square cannot exceed the product of maximum and mean absolute error, but the values in Table 2 from 20 to 100 V, in
+    Table 4 at 20 and 40 V, and 0.1201 do. The value at 120 V matches R² = 0.9996 (Table 3) only as an rms.
 
     Parameters
     ----------
@@ -26,9 +26,9 @@ class ErrorMetrics:
     mean : float, metres
         Mean absolute error.
     root_mean_square : float, metres
-        What the paper calls mean square error.
+        Root mean square error; the paper calls it mean square error.
     mean_square : float, square metres
-        Mean square error proper.
+        Mean square error.
     r_squared : float
         ``R² = 1 - SSE / SST``, MPI paper, Eq. 3.
     """
@@ -79,14 +79,14 @@ Mask = NDArray[np.bool_]
 
 # Number of readings from which noise and resolution are estimated.
 ENOUGH = 100_000
-# Fewer differences than this do not tell their rms to 10 %.
+# Fewest differences that determine their rms to 10 %.
 FEWEST = 100
 
 
 def digit(x: FloatArray) -> float:
     """Return the resolution of readings `x`, shape (N,), in their unit; 0 if they are continuous.
 
-    The largest step of which (nearly) all small differences between sorted readings are multiples.
+    The resolution is the largest step of which (nearly) all small differences between sorted readings are multiples.
     """
     differences = np.diff(np.unique(x[:: max(1, x.size // ENOUGH)]))
     if differences.size < 5:
@@ -106,16 +106,16 @@ def spread(x: FloatArray) -> float:
 
 
 def median_rms(deviation: FloatArray) -> float:
-    """Return the standard deviation, outliers apart; 0 where most do not deviate at all."""
+    """Return a robust standard deviation, from the median absolute value of `deviation`; 0 if most values are 0."""
     return float(1.4826 * np.median(np.abs(deviation)))
 
 
 def noise(x: FloatArray, *drivers: FloatArray) -> float:
     """Return the robust rms of the noise from reading to reading.
 
-    The least of several estimates: deviations from a line or a cubic through the neighbours, and from a line in a
-    driver, which is insensitive to an uneven rate. The curvature of the signal increases each estimate; medians reduce
-    this effect. Noise correlated over several samples is not detected.
+    The smallest of several estimates: deviations from a line or a cubic through the neighbours, and from a line over
+    each of the `drivers`, which allows for uneven sampling. Curvature of the signal increases each estimate; medians
+    reduce this effect. Noise correlated over several samples is not detected.
 
     Parameters
     ----------
@@ -141,13 +141,13 @@ def noise(x: FloatArray, *drivers: FloatArray) -> float:
     return float(min(estimates))
 
 
-# A commanded voltage has less noise than the first share of its range; what looks like more than the other one is none.
+# Range of plausible noise of a measured voltage, as shares of its range: a commanded voltage has less, motion more.
 LEAST_NOISE, MOST_NOISE = 1e-4, 5e-3
-# Orders of the differences in which noise is all that is left.
+# Orders of the differences that leave only noise.
 _ORDERS = (3, 4, 5, 6)
-# Samples over which a parabola may take the place of the readings: as many as it fits.
+# Window lengths (samples) of the parabolas that replace readings; the largest window that fits is used.
 _WINDOWS = (5, 9, 17, 33, 65, 129)
-# Reversals up to so many standard deviations are still noise.
+# Dead band for reversals, in standard deviations of the noise.
 _DEAD_BAND = 2.0
 
 
@@ -161,7 +161,7 @@ def voltage_noise(t: FloatArray, v: FloatArray) -> float:
     part = v[:ENOUGH]
     estimates = [noise(v, t)]
     for order in _ORDERS:
-        # The squares of the binomial coefficients of a difference add up to another one.
+        # The squares of the binomial coefficients of a difference add up to the central binomial coefficient.
         size = np.sqrt(_central_binomial(order))
         estimates.append(float(1.4826 * np.median(np.abs(np.diff(part, order)))) / size)
     level = min(estimates)
@@ -180,7 +180,7 @@ def without_noise(t: FloatArray, v: FloatArray) -> FloatArray:
     Each reading is replaced by a parabola over the largest window that fits within the noise. Remaining reversals
     within the noise are flattened.
     """
-    # SciPy's signal package takes a second to load, and most commands do without.
+    # SciPy's signal package takes a second to load, and most commands do not need it.
     from scipy.signal import savgol_filter
 
     noise = voltage_noise(t, v)
@@ -192,13 +192,13 @@ def without_noise(t: FloatArray, v: FloatArray) -> FloatArray:
             break
         parabola = savgol_filter(v, window, 2)
         off = uniform_filter1d((v - parabola) ** 2, window, mode="nearest")
-        # Of so few readings the parabola takes three, and chance some.
+        # The parabola takes part of the noise, and the mean square of few readings scatters.
         explained = noise**2 * (1.0 - _weight_of_own(window)) * (1.0 + np.sqrt(2.0 / window)) ** 2
         smooth = np.where(off < explained, parabola, smooth)
     return without_small_reversals(smooth, _DEAD_BAND * noise)
 
 
 def _weight_of_own(window: int) -> float:
-    """Return the weight of the middle reading in the parabola's value there."""
+    """Return the weight of the middle reading of a window in the value of the fitted parabola at that reading."""
     n = window // 2
     return 3.0 * (3.0 * n * (n + 1) - 1.0) / ((2 * n + 3) * (2 * n + 1) * (2 * n - 1))

@@ -1,7 +1,7 @@
 """Uncertainty of a model's curves by a wild block bootstrap.
 
-Whole blocks of errors keep or change their sign at random, since neighbouring errors are correlated; parts that occur
-once in the record stay in every resample. The errors are held-out errors, which no fit has reduced.
+Each resample changes the sign of whole blocks of errors at random, since neighbouring errors are correlated, and keeps
+all samples, as some parts occur only once in a record. The errors are held-out errors: those of a fit are too small.
 """
 
 from collections.abc import Sequence
@@ -22,10 +22,10 @@ FloatArray = NDArray[np.float64]
 
 RESAMPLES = 50
 BLOCKS = 80
-# More samples cost time; so many determine the curves, less surely.
+# Number of samples to which a record is thinned; more samples cost time and give a smaller uncertainty.
 SAMPLES = 20_000
 _KINDS = {"slpi": (surfaces, SMOOTHNESS), "pi": (plays, SMOOTHNESS[:1])}
-# Voltages of the outermost loop at which the uncertainty is given.
+# Number of voltages of the outermost loop at which the uncertainty is given.
 _CURVE_POINTS = 101
 
 
@@ -33,8 +33,8 @@ _CURVE_POINTS = 101
 class CurveUncertainty:
     """Uncertainty of a model's curves due to the errors of the record.
 
-    Computed on a thinned record, so an upper bound for long records. Regions that no sample visits, which the
-    roughness penalty determines, are not included.
+    Computed from a thinned record, and therefore an upper bound for long records. The uncertainty of regions that no
+    sample visits is not included: there the roughness penalty determines the curves.
 
     Parameters
     ----------
@@ -45,11 +45,11 @@ class CurveUncertainty:
     v : ndarray, shape (n,), volts
         Voltages of the branches.
     rising, falling : ndarray, shape (n,), metres
-        Branches of the outermost loop, from the displacement at its low end.
+        Branches of the outermost loop, relative to the displacement at its low end.
     rising_std, falling_std : ndarray, shape (n,), metres
-        Their standard deviations.
+        Standard deviations of these branches.
     rms, maximum : float, metres
-        Standard deviation of the displacement predicted for the record's samples.
+        Rms and maximum standard deviation of the displacement predicted for the record's samples.
     """
 
     axis: str
@@ -161,13 +161,13 @@ def _solutions(problem: Problem, smoothness: float, resamples: int) -> list[Floa
 
 
 def _outermost(problem: Problem, v: FloatArray) -> Problem:
-    """Pose the problem of the outermost loop: up and down again, after a long fall to its low end."""
+    """Pose the problem of the outermost loop: a rise and a fall, after a long fall to the low end."""
     path = np.concatenate([v[:1], v, v[-2::-1]])
     return Problem.pose([Samples(path, path, np.ones(path.size, dtype=bool), history=1)], problem.basis)
 
 
 def _branches(loop: Problem, x: FloatArray, problem: Problem) -> FloatArray:
-    """Return the rising and the falling branch, shape (2, n), metres, from the low end."""
+    """Return the rising and the falling branch, shape (2, n), metres, relative to the low end."""
     y = loop.design.predict(x[: problem.basis.size + 1])[1:] * problem.scale
     n = (y.size + 1) // 2
     return np.asarray([y[:n], y[n - 1 :][::-1]] - y[0])

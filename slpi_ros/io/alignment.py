@@ -14,7 +14,7 @@ from slpi_ros.io.record import FloatArray, Record
 
 TimeArray = NDArray[np.int64]
 
-# Gap length, in periods, within which values are not interpolated.
+# Longest gap, in median periods, across which values are interpolated.
 _GAP = 10.0
 # Axis names for columns without names.
 _AXES = ("x", "y", "z")
@@ -29,14 +29,14 @@ class Signals:
     logged : ndarray of int64, shape (N,), nanoseconds
         Times of recording, in ascending order.
     stamp : ndarray of int64, shape (N,), nanoseconds, or None
-        Header stamps; None where no message is stamped.
+        Header stamps; None if no message is stamped.
     frame_id : str
-        The first one that is not empty.
+        First frame id that is not empty.
     fields : mapping of field to mapping of name to ndarray, shape (N,)
-        ``position``, ``effort``, ``data`` or ``vector``, in it ``x`` or what the messages name. NaN where a message
-        does not hold it. Names are in the order in which the messages first give them.
+        Columns by name, for each field: ``position``, ``effort``, ``data`` or ``vector``. NaN where a message does not
+        contain the column. Names are in the order of their first occurrence.
     named : bool
-        Whether the messages give names; else they are ``0``, ``1``, ...
+        Whether the message type gives names to the columns; otherwise they are ``0``, ``1``, ...
     """
 
     logged: NDArray[np.int64]
@@ -55,26 +55,26 @@ class Signals:
 class SeparateTopics:
     """Names and interpretation of separate topics for voltage and displacement, instead of ``stage_state``.
 
-    Either may be of type ``sensor_msgs/JointState``, ``std_msgs/Float64``, ``std_msgs/Float64MultiArray`` or
-    ``geometry_msgs/Vector3Stamped``, in volts and metres. Of a JointState, displacement is ``position``, and voltage
-    is ``effort`` unless that is empty or zero: then ``position`` too. Axes are matched by name where both topics name
-    them; columns without names are taken in the order of the axes, and a single voltage drives all axes.
+    Each topic may be of type ``sensor_msgs/JointState``, ``std_msgs/Float64``, ``std_msgs/Float64MultiArray`` or
+    ``geometry_msgs/Vector3Stamped``, in volts and metres. In a JointState, the displacement is ``position``; the
+    voltage is ``effort``, or ``position`` if ``effort`` is empty or zero. Axes are matched by name if both topics name
+    them; columns without names are assigned in the order of the axes, and a single voltage drives all axes.
 
-    Time is that of the header stamps where both topics have them and they overlap, else of recording, for both.
-    Outside the time that both topics cover there are no samples.
+    Times are the header stamps if both topics have them and they overlap, otherwise the recording times of both
+    topics. Samples exist only in the time interval that both topics cover.
 
     Parameters
     ----------
     voltage, displacement : str
-        Names, as for a single topic.
+        Topic names; the leading slash and the namespace may be omitted if the name is unambiguous.
     clock : {"displacement", "voltage"}
-        Signal whose messages become samples. With "displacement", the voltage is resampled at the displacement's
-        times; a voltage reversal between two displacements becomes an additional sample with displacement NaN. With
-        "voltage", displacement is interpolated linearly.
+        Signal whose messages become samples. With "displacement", the voltage is resampled at the times of the
+        displacement; a voltage reversal between two displacements becomes an additional sample with displacement NaN.
+        With "voltage", the displacement is interpolated linearly.
     held : bool
-        A commanded voltage stays as it is until the next message. With the clock "voltage", a sample then lies in the
-        middle between its message and the next. False for a measured voltage, which is interpolated linearly.
-        Nothing is interpolated across gaps of more than ten periods: NaN is what is known there.
+        True for a commanded voltage, which is held until the next message; with the clock "voltage", each sample then
+        lies midway between its message and the next one. False for a measured voltage, which is interpolated linearly.
+        There is no interpolation across gaps of more than ten periods; the values there are NaN.
     """
 
     voltage: str
@@ -103,7 +103,7 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
     axes : sequence of str
         Axes to read, by name, or in the order of columns without names; empty for all.
     path : Path
-        The bag, for messages.
+        Path of the bag, for messages.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
     Raises
     ------
     RecordError
-        If they hold no signal, do not overlap, or their axes do not match.
+        If a topic has no signal, the topics do not overlap in time, or their axes do not match.
     """
     where = f"{path}: voltage on '{topics.voltage}', displacement on '{topics.displacement}'"
     v_columns = _filled(voltage, ("effort", "position", "data", "vector"), where)
@@ -141,20 +141,20 @@ def held_at(desired: Signals, record: Record, where: str) -> dict[str, FloatArra
     Parameters
     ----------
     desired : Signals
-        Of a topic of desired displacements.
+        Decoded messages of a topic with desired displacements.
     record : Record
     where : str
-        For messages.
+        Bag and topic, for messages.
 
     Returns
     -------
     dict of axis name to ndarray, shape (N,), metres
-        Of the record's axes; NaN before the first message.
+        Axes of the record that the messages contain; NaN before the first message.
 
     Raises
     ------
     RecordError
-        If their times do not overlap, or the columns are not those of the record's axes.
+        If topic and record do not overlap in time, or the columns do not match the axes of the record.
     """
     time = desired.logged if desired.stamp is None else desired.stamp
     if not _overlap(time, record.time_ns):
@@ -166,7 +166,7 @@ def held_at(desired: Signals, record: Record, where: str) -> dict[str, FloatArra
     last = np.searchsorted(time[order], record.time_ns, side="right") - 1
     held = {}
     for axis, column in _assign(columns, desired.named, axes, where, alone=False).items():
-        # An axis that a message does not name stays where it was.
+        # An axis that a message does not name keeps its last value.
         known = np.maximum.accumulate(np.where(np.isfinite(column[order]), np.arange(order.size), -1))
         at = np.where(last >= 0, known[last], -1)
         held[axis] = np.where(at >= 0, column[order][at], np.nan)
@@ -193,7 +193,7 @@ def _common_axes(voltage: Signals, displacement: Signals) -> tuple[str, ...]:
 def _assign(
     columns: Mapping[str, FloatArray], named: bool, axes: Sequence[str], what: str, *, alone: bool
 ) -> dict[str, FloatArray]:
-    """Return one column for each axis; a single one may serve all if that makes sense for it `alone`."""
+    """Return one column for each axis; if `alone`, a single column may be used for all axes."""
     if named and all(axis in columns for axis in axes):
         return {axis: columns[axis] for axis in axes}
     if len(columns) == 1 and (alone or (len(axes) == 1 and not named)):
@@ -213,7 +213,7 @@ def _naming(signals: Signals, topic: str, axes: Sequence[str]) -> list[str]:
 def _times(
     voltage: Signals, displacement: Signals, topics: SeparateTopics, where: str
 ) -> tuple[TimeArray, TimeArray, list[str]]:
-    """Return the times of both topics on one clock, and what to note about it."""
+    """Return the times of both topics on the same clock, and notes for the record."""
     if voltage.stamp is not None and displacement.stamp is not None:
         if _overlap(voltage.stamp, displacement.stamp):
             for topic, stamp in ((topics.voltage, voltage.stamp), (topics.displacement, displacement.stamp)):
@@ -256,7 +256,7 @@ def _on_displacement(voltage: _Series, displacement: _Series, held: bool) -> _Al
         return time, {axis: _between(time, voltage.time, column) for axis, column in voltage.columns.items()}, y
     current = np.searchsorted(voltage.time, time, side="right") - 1
     unseen = _unseen_turns(voltage, current)
-    # The displacement that follows a command in time stands behind it.
+    # Each missing reversal is inserted before the first displacement that is not earlier.
     places = np.searchsorted(time, voltage.time[unseen], side="left")
     current = np.insert(current, places, unseen)
     return (
@@ -267,14 +267,14 @@ def _on_displacement(voltage: _Series, displacement: _Series, held: bool) -> _Al
 
 
 def _unseen_turns(voltage: _Series, current: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the messages at which a voltage turns and which are `current` at no displacement."""
+    """Return the indices of voltage reversals that are not in `current`, the last message at each displacement."""
     unseen = np.zeros(voltage.time.size, dtype=bool)
     unseen[current.min(initial=voltage.time.size) : current.max(initial=0)] = True
     unseen[current] = False
     turn = np.zeros(voltage.time.size, dtype=bool)
     for column in voltage.columns.values():
         step = np.sign(np.diff(column))
-        # A level stretch goes on as the last move before it.
+        # While the voltage is constant, the direction of its last change is kept.
         step = step[np.maximum.accumulate(np.where(step != 0.0, np.arange(step.size), 0))]
         turn[1:-1] |= step[:-1] * step[1:] < 0
     return np.flatnonzero(unseen & turn)
@@ -296,7 +296,7 @@ def _on_voltage(voltage: _Series, displacement: _Series, held: bool) -> _Aligned
 
 
 def _between(time: TimeArray, known_at: TimeArray, values: FloatArray) -> FloatArray:
-    """Interpolate linearly; NaN within gaps."""
+    """Interpolate linearly; the result is NaN within long gaps."""
     start = known_at[0]
     result = np.interp((time - start).astype(np.float64), (known_at - start).astype(np.float64), values)
     steps = np.diff(known_at)

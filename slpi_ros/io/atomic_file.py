@@ -23,7 +23,7 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
     Yields
     ------
     file
-        UTF-8.
+        Text file with UTF-8 encoding.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
             yield file
         os.replace(draft, target)
     except (OSError, ValueError) as error:
-        # A name that no file can have, such as one with a NUL, is a ValueError.
+        # A name that no file can have, such as one with a NUL character, raises ValueError.
         reason = error.strerror if isinstance(error, OSError) else error
         raise failure(f"{path}: cannot be written: {reason}; choose another place") from None
     finally:
@@ -48,17 +48,17 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
 
 
 def is_replaceable(path: Path) -> bool:
-    """Return whether there is nothing in the place of a file that it must not replace: a device, a pipe, a socket."""
+    """Return False if `path` is something that a file must not replace: a device, a pipe or a socket."""
     try:
         return path.is_file() or path.is_dir() or not os.path.lexists(path)
     except (OSError, ValueError):
-        # What is wrong with the name is told when it is opened.
+        # The error message for an invalid name comes from opening the file.
         return True
 
 
 @contextmanager
 def output_folder(path: str | os.PathLike[str], *names: str) -> Iterator[Path]:
-    """Make a folder for files, see `make_folder`; those made are removed if the ``with`` block ends with an error."""
+    """Create an output folder, see `make_folder`; new folders are removed if the ``with`` block raises an error."""
     if not str(path):
         raise SlpiError("'': no folder to write into; name one")
     missing = [place for place in (Path(path), *Path(path).parents) if not os.path.lexists(place)]
@@ -67,7 +67,7 @@ def output_folder(path: str | os.PathLike[str], *names: str) -> Iterator[Path]:
         yield Path(path)
     except BaseException:
         with suppress(OSError):
-            # What others wrote there meanwhile stays.
+            # A folder that contains files by now is kept.
             for place in missing:
                 place.rmdir()
         raise
@@ -85,7 +85,7 @@ def make_folder(path: str | os.PathLike[str], *names: str) -> None:
     Raises
     ------
     SlpiError
-        If it cannot be made or written to, or holds a folder of one of these names.
+        If the folder cannot be created or written to, or contains a folder with one of these names.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)

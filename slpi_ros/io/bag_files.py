@@ -20,12 +20,12 @@ _PART = re.compile(r"(.*)_(\d+)(\.(?:mcap|db3)(?:\.zstd)?)")
 _WANTED = "give a rosbag2 folder or an .mcap or .db3 file"
 # The last bytes of a complete mcap file.
 _MCAP_END = b"\x89MCAP0\r\n"
-# Seconds. The writer of a slow record fills a whole chunk before its file grows.
+# Seconds without growth until a recording counts as abandoned: a writer fills a whole chunk before its file grows.
 PATIENCE = 120.0
 
 
 def partial_path(path: str | os.PathLike[str]) -> Path:
-    """Return the folder that holds the bag of this path until it is complete."""
+    """Return the folder that contains the bag of this path until it is complete."""
     path = Path(path)
     return path.with_name(f".{path.name}.partial")
 
@@ -36,7 +36,7 @@ def locate(path: Path) -> list[Path]:
     Raises
     ------
     RecordError
-        If there is none at this path.
+        If there is no bag at this path.
     """
     if not path.exists():
         hint = _WANTED
@@ -61,7 +61,7 @@ def locate(path: Path) -> list[Path]:
 
 
 def _parts(files: list[Path], folder: Path) -> list[Path]:
-    """Return the files of a split bag in order; only of such a one, as there may be several bags in a folder."""
+    """Return the files of a split bag in order; RecordError if they are not the parts of a single bag."""
     names = [_PART.fullmatch(file.name) for file in files]
     order = sorted(int(name[2]) if name else -1 for name in names)
     if order != list(range(len(files))) or len({(name[1], name[3]) for name in names if name}) > 1:
@@ -100,13 +100,13 @@ def translated(source: Path) -> Iterator[None]:
     except Exception as error:
         if getattr(error, "errno", None) == errno.ENOSPC:
             raise RecordError(f"{source}: no room to unpack it; free some, or set TMPDIR to another place") from error
-        # struct, zstd, yaml, sqlite, unicode...: a damaged file fails in any way
+        # A damaged file can raise any exception: of struct, zstd, yaml, sqlite, unicode...
         reason = one_line(error)
         raise RecordError(f"{source}: damaged or unfinished ({reason}); {_remedy(source)}") from error
 
 
 def _require_whole(source: Path) -> None:
-    """Raise EOFError for an SQLite file that lacks its end: SQLite itself would read zeros there."""
+    """Raise EOFError if an SQLite file is truncated (SQLite would read zeros) or its write-ahead log is not empty."""
     files = sorted(source.iterdir()) if source.is_dir() else [source]
     for file in (file for file in files if file.suffix == ".db3"):
         journal = file.with_name(f"{file.name}-wal")
@@ -145,18 +145,18 @@ def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str]
     Parameters
     ----------
     topics : mapping of str to str
-        Full name to type of what the bag holds.
+        Full name and type of each topic in the bag.
     topic : str
-        Full name, or its last parts where they leave no doubt.
+        Full name, or its last parts if they are unambiguous.
     msgtypes : collection of str
-        The types it may have.
+        Accepted message types.
     source : Path
-        The bag, for messages.
+        Path of the bag, for messages.
 
     Raises
     ------
     RecordError
-        If there is none, more than one, or it is of another type.
+        If no topic or several topics match, or the type is not accepted.
     """
     contents = ", ".join(f"{name} ({topics[name]})" for name in sorted(topics)) or "no topics"
     wanted = absolute_name(topic)
@@ -181,25 +181,25 @@ def absolute_name(topic: str) -> str:
 class BagWatch:
     """Watch a folder for newly completed bags; bags still being written are ignored.
 
-    A rosbag2 folder is complete once it holds ``metadata.yaml``, which its writer adds last; a lone mcap file once it
-    ends as such files do. Lone sqlite3 files do not tell, and are left out.
+    A rosbag2 folder is complete when it contains ``metadata.yaml``, which its writer adds last; a single mcap file when
+    it ends with the magic bytes of a complete file. Single sqlite3 files are ignored, as they have no such mark.
 
     Parameters
     ----------
     folder : path
-        Bags that are complete there already count as seen, but for the newest one.
+        Folder to watch. Bags that are complete from the beginning are not reported, except the newest one.
     patience : float, seconds
-        A bag that is not complete and has not grown for so long counts as abandoned.
+        An incomplete bag that has not grown for this time counts as abandoned.
 
     Attributes
     ----------
     abandoned : tuple of Path
-        Abandoned bags at the last `poll`, by name; they stay watched.
+        Bags found to be abandoned at the last `poll`, sorted by name; they are still watched.
 
     Raises
     ------
     UsageError
-        If there is no such folder.
+        If the folder does not exist.
     """
 
     def __init__(self, folder: str | os.PathLike[str], patience: float = PATIENCE) -> None:
@@ -210,7 +210,7 @@ class BagWatch:
         self._seen = set(self._dated(_finished)[:-1])
 
     def poll(self) -> list[Path]:
-        """Return the bags completed since the last call, oldest first; none if the folder has gone."""
+        """Return the bags completed since the last call, oldest first; none if the folder no longer exists."""
         new = [bag for bag in self._dated(_finished) if bag not in self._seen]
         self._seen.update(new)
         last = time.time_ns() - int(self.patience * 1e9)
@@ -218,13 +218,13 @@ class BagWatch:
         return [path for path, _ in new]
 
     def _dated(self, date: Callable[[Path], int | None]) -> list[tuple[Path, int]]:
-        """Return what has a date (ns), oldest first."""
+        """Return the entries of the folder for which `date` returns a time (ns), oldest first, with this time."""
         found = []
         for path in self._entries():
             try:
                 when = date(path)
             except OSError:
-                # Deleted in between.
+                # The entry has been deleted in the meantime.
                 continue
             if when is not None:
                 found.append((path, when))
@@ -238,7 +238,7 @@ class BagWatch:
 
 
 def _finished(path: Path) -> int | None:
-    """Return when a bag was finished (ns), or None if it is none or still being written."""
+    """Return the time (ns) at which a bag was completed; None if `path` is no bag or is still being written."""
     if path.name.startswith("."):
         return None
     metadata = path / "metadata.yaml"
@@ -252,14 +252,14 @@ def _finished(path: Path) -> int | None:
 
 
 def _grown(path: Path) -> int | None:
-    """Return when a bag that is not finished last grew (ns), or None if it is finished or none."""
+    """Return the time (ns) at which an incomplete bag last grew; None if `path` is no bag or is complete."""
     if _finished(path) is not None:
         return None
     if not path.is_dir():
         return path.stat().st_mtime_ns if path.suffix == ".mcap" and not path.name.startswith(".") else None
     folder = path
     if path.name.startswith("."):
-        # Where this package's own recorder keeps what is not complete.
+        # The recorder of this package keeps an incomplete bag in such a folder.
         folder = path / path.name[1:].removesuffix(".partial")
         if path != partial_path(path.with_name(folder.name)) or not folder.is_dir():
             return None

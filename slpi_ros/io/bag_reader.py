@@ -33,23 +33,23 @@ def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: 
     Parameters
     ----------
     path : path
-        A rosbag2 folder, or a lone ``.mcap`` or ``.db3`` file; compressed or not.
+        A rosbag2 folder, or a single ``.mcap`` or ``.db3`` file; compressed or not.
     topic : str or SeparateTopics
-        Name with or without the leading slash; it also finds ``/ns/stage_state`` when that is the only one.
-        Of type ``sensor_msgs/JointState``: ``position`` in metres, ``effort`` in volts. Or two topics.
+        Topic of type ``sensor_msgs/JointState`` (``position`` in metres, ``effort`` in volts), or separate topics for
+        voltage and displacement. The leading slash and the namespace may be omitted if the name is unambiguous.
     axes : sequence of str, optional
-        The axes to read, in this order; all that the messages name when not given or empty.
+        The axes to read, in this order; default: all axes that the messages name.
 
     Returns
     -------
     Record
-        Time is the header stamp, or the time of recording where no header is stamped, which `notes` tell. NaN where a
-        message does not hold an axis.
+        Times are the header stamps; if no message is stamped, the recording times, which is stated in `notes`. Values
+        are NaN where a message does not contain the axis.
 
     Raises
     ------
     RecordError
-        If there is no such bag, topic or axis, or the bag cannot be read; the message says what to do.
+        If there is no such bag, topic or axis, or the bag cannot be read; the message names the remedy.
     """
     path = Path(path)
     sources = locate(path)
@@ -90,9 +90,9 @@ def read_bags(
     Raises
     ------
     UsageError
-        If there is no path, or one of them comes twice.
+        If there is no path, or one is given twice.
     RecordError
-        As from `read_bag`; also if the bags are of different stages.
+        As for `read_bag`; also if the bags are of different stages.
     """
     places = [Path(path) for path in paths]
     if not places:
@@ -106,7 +106,7 @@ def read_bags(
 
 
 def require_one_stage(records: Sequence[Record]) -> None:
-    """Raise RecordError unless all records have one hardware id; beside one that has, a bag without may be of any."""
+    """Raise RecordError unless all records have the same hardware id; a missing id differs from every given id."""
     for record in records[1:]:
         if record.hardware_id != records[0].hardware_id:
             raise RecordError(
@@ -116,26 +116,26 @@ def require_one_stage(records: Sequence[Record]) -> None:
 
 
 def read_desired(path: _Path, record: Record, topic: str | None = None) -> dict[str, NDArray[np.float64]] | None:
-    """Read the desired displacement beside a record of the same bag.
+    """Read the desired displacement that belongs to a record of the same bag.
 
     Parameters
     ----------
     path : path
-        The bag that `record` comes from.
+        The bag that `record` was read from.
     record : Record
     topic : str, optional
-        Of any type that the compensator takes; ``desired_displacement`` by default.
+        Topic of one of the `MESSAGE_TYPES`; default ``desired_displacement``.
 
     Returns
     -------
     dict of axis name to ndarray, shape (N,), metres, or None
-        At the record's samples: each message holds until the next one; NaN before the first. None where the bag has no
-        message on the default topic.
+        Values at the samples of the record: each message is held until the next one; NaN before the first one. None if
+        `topic` is not given and the bag has no message on the default topic.
 
     Raises
     ------
     RecordError
-        If the bag cannot be read, or the topic's clock is not that of the record.
+        If the bag cannot be read, or the times or axes of the topic do not match those of the record.
     """
     path = Path(path)
     with _Bag(locate(path), path) as bag:
@@ -157,7 +157,7 @@ class _Bag:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        """Find the files and the topics."""
+        """Open the files and list their topics."""
         with ExitStack() as stack:
             for source in self._sources:
                 with translated(source):
@@ -166,7 +166,7 @@ class _Bag:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Remove what was unpacked."""
+        """Close the files and remove those that were decompressed."""
         self._stack.close()
 
     def _open(self, source: Path, stack: ExitStack) -> None:
@@ -174,17 +174,17 @@ class _Bag:
         for connection in reader.connections:
             self._topics[connection.topic] = connection.msgtype
             self._counts[connection.topic] += connection.msgcount
-        # A folder has a storage for each of its files, unpacked where it was compressed; a lone file is one.
+        # The reader of a folder has one storage for each file, decompressed if necessary; that of a file is itself one.
         storages = getattr(reader.storage, "storages", [reader.storage])
         self._storages += [(storage, source) for storage in storages]
 
     def holds(self, topic: str) -> bool:
-        """Return whether there is a message on a topic, named in full or by its last parts."""
+        """Return whether there is a message on a topic, given by its full name or by its last parts."""
         wanted = absolute_name(topic)
         return any(name.endswith(wanted) and self._counts[name] for name in self._topics)
 
     def read(self, topic: str, msgtypes: Iterable[str]) -> Signals:
-        """Return what the messages of a topic hold, which is of one of the types."""
+        """Return the decoded messages of a topic, which must have one of the message types."""
         name = match_topic(self._topics, topic, tuple(msgtypes), self._path)
         with translated(self._path):
             signals = decode_signals(self._blocks(name), self._topics[name], self._counts[name])
@@ -200,7 +200,7 @@ class _Bag:
 
 
 def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tuple[str, ...]:
-    """Return the wanted axes, by default all, once it is sure that each has both signals."""
+    """Return the wanted axes, default: all; RecordError if an axis lacks one of the two signals."""
     names = ", ".join(state.names)
     if not names:
         raise RecordError(f"{where}: the messages name no axis; name[] must hold the axes")
@@ -227,12 +227,12 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
     msgtype : str
         One of `MESSAGE_TYPES`.
     expected : int
-        About how many messages there are in all.
+        Approximate total number of messages.
 
     Returns
     -------
     Signals or None
-        None where there is no message.
+        None if there is no message.
     """
     columns, frame_id = _Columns(expected), ""
     for block in blocks:
@@ -255,7 +255,7 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
     return Signals(logged, stamp if stamp.any() else None, frame_id, fields, kind.named)
 
 
-# Columns are found by field and name; the times have no field.
+# Key of a column: field and name; for times the field is empty.
 _Key = tuple[str, str]
 _Part = tuple[str, dict[_Key, NDArray[Any]]]
 _LOGGED, _STAMP = ("", "logged"), ("", "stamp")
@@ -295,7 +295,7 @@ def _decode(block: MessageBlock, msgtype: str) -> _Part:
 
 
 def _alike(block: MessageBlock, first: Message, rows: NDArray[np.void]) -> _Part:
-    """Take the columns out of messages that all have the layout of the first one."""
+    """Return frame id and columns of a block of messages that all have the layout of the first one."""
     stamp = np.zeros(rows.size, np.int64)
     if "sec" in first.layout.fields:
         stamp = rows["sec"].astype(np.int64) * SECOND_NS + rows["nanosec"]
@@ -306,14 +306,14 @@ def _alike(block: MessageBlock, first: Message, rows: NDArray[np.void]) -> _Part
 
 
 def _each(block: MessageBlock, msgtype: str, messages: Sequence[Message]) -> _Part:
-    """Match every message's numbers to their columns by name."""
+    """Return frame id and columns of messages of different layouts, whose numbers are assigned by name."""
     stamp = np.array([message.stamp_ns for message in messages], np.int64)
     columns: dict[_Key, NDArray[Any]] = {_LOGGED: block.logged, _STAMP: stamp}
     for name in dict.fromkeys(name for message in messages for name in message.names):
         columns |= {(field, name): np.full(len(messages), np.nan) for field in MESSAGE_TYPES[msgtype].fields}
     for row, message in enumerate(messages):
         for field, numbers in message.values.items():
-            # zip ends with the shorter one: what is behind the end of an array has no value
+            # zip stops at the shorter sequence: names beyond the end of an array have no value.
             for name, number in zip(message.names, numbers, strict=False):
                 columns[field, name][row] = number
     return next((message.frame_id for message in messages if message.frame_id), ""), columns

@@ -1,8 +1,9 @@
 """Reading of the raw messages of one topic from an MCAP or SQLite file, in blocks.
 
-MCAP files are read a chunk at a time, without touching single messages: ten times as fast as by rosbags. Format:
-https://mcap.dev/spec. A file is a sequence of records; most are chunks, which hold records in turn, and behind each
-chunk stand indexes of its messages. Chunks without the wanted topic are skipped. SQLite files are read by rosbags.
+MCAP files are read chunk by chunk, without a loop over the messages: ten times as fast as with rosbags. Format:
+https://mcap.dev/spec. A file is a sequence of records. Most of them are chunks, which contain further records; each
+chunk is followed by indexes of its messages. Chunks without the wanted topic are skipped. SQLite files are read with
+rosbags.
 """
 
 import struct
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.io.cdr import ByteArray
 
-# Messages taken together where the file does not group them itself.
+# Number of messages per block where the file itself has no chunks.
 BLOCK = 4_000
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -32,9 +33,9 @@ class MessageBlock:
     Parameters
     ----------
     logged : ndarray of int64, shape (n,), nanoseconds
-        When each was recorded.
+        Recording time of each message.
     messages : ndarray of uint8, shape (n, L), or list of bytes, length n
-        The former where all have the same length L.
+        An array if all messages have the same length L, else a list.
     """
 
     logged: NDArray[np.int64]
@@ -42,7 +43,7 @@ class MessageBlock:
 
     @classmethod
     def of(cls, logged: Sequence[int], messages: Sequence[bytes]) -> "MessageBlock":
-        """Make a block of single messages, decompressed where the recorder compressed each of them."""
+        """Return a block of the given messages, decompressed if the recorder compressed each message."""
         times = np.array(logged, np.int64)
         if len(set(map(len, messages))) == 1 and messages[0]:
             rows = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
@@ -53,7 +54,7 @@ class MessageBlock:
         return cls(times, list(messages))
 
     def each(self) -> list[bytes]:
-        """Return the single messages."""
+        """Return the messages as a list."""
         if isinstance(self.messages, list):
             return self.messages
         return [row.tobytes() for row in self.messages]
@@ -70,12 +71,12 @@ def _unpacked(message: bytes) -> bytes:
 
 
 def decompressed(data: bytes, compression: str) -> bytes:
-    """Decompress data compressed by one of the methods of MCAP and rosbag2: "", "zstd" or "lz4".
+    """Decompress data of an MCAP or rosbag2 file; `compression` is "" (none), "zstd" or "lz4".
 
     Raises
     ------
     ValueError
-        If there is no such compression.
+        If `compression` has another value.
     """
     match compression:
         case "":
@@ -83,7 +84,7 @@ def decompressed(data: bytes, compression: str) -> bytes:
         case "zstd":
             return bytes(zstd().decompress(data))
         case "lz4":
-            # Rarely needed; rosbags brings it, as it does zstd.
+            # Rarely needed; lz4 is installed with rosbags, as is zstd.
             from lz4.frame import decompress  # type: ignore[import-untyped]
 
             return bytes(decompress(data))
@@ -91,7 +92,7 @@ def decompressed(data: bytes, compression: str) -> bytes:
 
 
 def zstd() -> Any:
-    """Return the module for zstd, which is part of Python from 3.14 on."""
+    """Return the module for zstd, which is part of Python since version 3.14."""
     if sys.version_info >= (3, 14):
         from compression import zstd as module
     else:
@@ -105,11 +106,11 @@ _RECORD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _INDEX_HEAD = struct.Struct("<HI")
 
-# What comes before the data of a message.
+# Header of a message record, which precedes the data of the message.
 _MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
-# Of a message's length, what is not data.
+# Bytes of the length of a message record that are not data.
 _HEAD_IN_LENGTH = _MESSAGE_HEAD.itemsize - _RECORD.size
 
 
@@ -119,21 +120,21 @@ def read_mcap(path: Path, topic: str) -> Iterator[MessageBlock]:
     Parameters
     ----------
     path : Path
-        A complete file.
+        Complete MCAP file.
     topic : str
-        Full name.
+        Full name of the topic.
 
     Raises
     ------
     Exception
-        Of any kind where the file is damaged.
+        Of any type if the file is damaged.
     """
     with path.open("rb") as file:
         yield from _McapFile(file, topic).blocks()
 
 
 class _McapFile:
-    """One pass through the records of a file."""
+    """Reader of the messages of one topic in an MCAP file."""
 
     def __init__(self, file: BinaryIO, topic: str) -> None:
         self._file = file
@@ -175,7 +176,7 @@ class _McapFile:
         raise EOFError("no end of the data section")
 
     def _records(self, position: int) -> Iterator[tuple[int, int, int]]:
-        """Yield type, place and length of the records from `position` on, to the footer."""
+        """Yield type, offset and length of the records from `position` to the footer."""
         while position < self._end:
             op, length = _RECORD.unpack(self._read(position, _RECORD.size))
             position += _RECORD.size
@@ -192,13 +193,13 @@ class _McapFile:
         return data
 
     def _learn(self, channel: bytes) -> None:
-        """Remember a channel if it is one of the topic's."""
+        """Store the id of a channel if it belongs to the topic."""
         size = int.from_bytes(channel[4:8], "little")
         if channel[8 : 8 + size] == self._topic:
             self._channels.add(int.from_bytes(channel[:2], "little"))
 
     def _chunk(self, start: int, length: int, indexes: list[bytes]) -> Iterator[MessageBlock]:
-        """Yield the messages of a chunk, if it holds any."""
+        """Yield the messages of the topic in a chunk as one block, if there are any."""
         if indexes and self._all_known:
             offsets = _indexed(indexes, self._channels)
             if not offsets.size:
@@ -211,7 +212,7 @@ class _McapFile:
             yield _gather(np.frombuffer(records, np.uint8), offsets, self._channels)
 
     def _walk(self, records: bytes) -> NDArray[np.int64]:
-        """Return where the wanted messages of a chunk without index are."""
+        """Return the offsets of the wanted messages in a chunk without index."""
         offsets, position = [], 0
         while position < len(records):
             op, length = _RECORD.unpack_from(records, position)
@@ -225,7 +226,7 @@ class _McapFile:
 
 
 def _indexed(indexes: list[bytes], channels: set[int]) -> NDArray[np.int64]:
-    """Return the offsets of the wanted messages, in ascending order."""
+    """Return the offsets of the wanted messages according to the indexes of a chunk, in ascending order."""
     offsets = [np.empty(0, np.int64)]
     for index in indexes:
         channel, size = _INDEX_HEAD.unpack_from(index)
@@ -236,7 +237,7 @@ def _indexed(indexes: list[bytes], channels: set[int]) -> NDArray[np.int64]:
 
 
 def _records_of_chunk(chunk: bytes) -> bytes:
-    """Return the records in a chunk, decompressed and checked."""
+    """Return the records in a chunk, decompressed, after a check of size and checksum."""
     _, _, size, checksum, name = _CHUNK_HEAD.unpack_from(chunk)
     start = _CHUNK_HEAD.size + name
     compression = chunk[_CHUNK_HEAD.size : start].decode()
@@ -250,7 +251,7 @@ def _records_of_chunk(chunk: bytes) -> bytes:
 
 
 def _gather(records: ByteArray, offsets: NDArray[np.int64], channels: set[int]) -> MessageBlock:
-    """Cut the messages at the `offsets`, shape (n,), out of a chunk's records."""
+    """Return the messages at the `offsets`, shape (n,), in the records of a chunk."""
     heads = _rows(records, offsets, _MESSAGE_HEAD.itemsize).view(_MESSAGE_HEAD)[:, 0]
     if (heads["op"] != _MESSAGE).any() or not np.isin(heads["channel"], list(channels)).all():
         raise ValueError("an index of messages points elsewhere")
@@ -270,7 +271,7 @@ def _gather(records: ByteArray, offsets: NDArray[np.int64], channels: set[int]) 
 
 
 def _rows(data: ByteArray, starts: NDArray[np.int64], length: int) -> ByteArray:
-    """Return the `length` bytes from each of the ascending `starts` on, shape (n, length)."""
+    """Return `length` bytes from each of the ascending offsets `starts`, shape (n, length)."""
     if starts[0] < 0 or starts[-1] + length > data.size:
         raise EOFError("a message reaches beyond its chunk")
     steps = np.diff(starts)
@@ -282,19 +283,19 @@ def _rows(data: ByteArray, starts: NDArray[np.int64], length: int) -> ByteArray:
 
 
 def read_sqlite(storage: Any, topic: str) -> Iterator[MessageBlock]:
-    """Yield the messages of a topic in the order of their recording.
+    """Yield the messages of a topic in the order in which they were recorded.
 
     Parameters
     ----------
     storage : rosbags.rosbag2.storage_sqlite3.Sqlite3Reader
-        Open.
+        Reader of the open file.
     topic : str
-        Full name.
+        Full name of the topic.
 
     Raises
     ------
     Exception
-        Of any kind where the file is damaged.
+        Of any type if the file is damaged.
     """
     connections = [connection for connection in storage.connections if connection.topic == topic]
     messages = storage.messages(connections) if connections else iter(())

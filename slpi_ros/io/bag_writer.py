@@ -36,28 +36,28 @@ class BagWriter:
     Parameters
     ----------
     path : path
-        The rosbag2 folder to make; parent folders are made too.
+        The rosbag2 folder to create, with its parent folders if missing.
     storage : {"mcap", "sqlite3"}
         File format.
     topic : str, optional
-        Topic of type ``sensor_msgs/JointState`` that ``write`` goes to; None to announce
-        all topics by ``add_topic``.
+        Topic of type ``sensor_msgs/JointState`` to which ``write`` writes by default; None if all topics
+        are added with ``add_topic``.
 
     Attributes
     ----------
     path : Path
-        Where the bag will be.
+        Final path of the bag.
     partial : Path
-        Where it is until then.
+        Folder that contains the bag until it is complete.
     message_count : int
-        Messages written so far.
+        Number of messages written so far.
 
     Raises
     ------
     RecordError
-        If the path or an unfinished bag of that name exists, or cannot be written.
+        If the path or an unfinished bag of the same name exists, or the bag cannot be written.
     UsageError
-        If there is no such storage.
+        If `storage` is not one of these formats.
     """
 
     def __init__(
@@ -91,19 +91,19 @@ class BagWriter:
             self.add_topic(topic)
 
     def add_topic(self, topic: str, msgtype: str = JOINT_STATE) -> None:
-        """Announce a topic.
+        """Add a topic to the bag.
 
         Parameters
         ----------
         topic : str
-            Name; a missing leading slash is added.
+            Name of the topic; a missing leading slash is added.
         msgtype : str
-            As in ``sensor_msgs/msg/JointState``; any type of ROS 2 Jazzy's own packages.
+            Message type, written like ``sensor_msgs/msg/JointState``, from a package that is part of ROS 2 Jazzy.
 
         Raises
         ------
         RecordError
-            If the definition of the type is not known here.
+            If the definition of the type is not known, or the bag cannot be written.
         """
         name = absolute_name(topic)
         try:
@@ -116,16 +116,16 @@ class BagWriter:
             raise self._failure(error) from error
 
     def write(self, stamp_ns: int, message: bytes, topic: str | None = None) -> None:
-        """Write a message that is serialised already.
+        """Write a serialised message.
 
         Parameters
         ----------
         stamp_ns : int, nanoseconds
-            Time of the log.
+            Log time of the message.
         message : bytes
-            CDR with its encapsulation header.
+            CDR data with encapsulation header.
         topic : str, optional
-            One that was announced; by default the writer's own.
+            A topic of the bag; default: the topic given to the constructor.
         """
         name = absolute_name(topic or self._topic or "")
         if name not in self._connections:
@@ -189,9 +189,9 @@ def write_bag(
     Parameters
     ----------
     path : path
-        The folder to make.
+        The folder to create.
     record : Record
-        What to write; its hardware id becomes the messages' ``frame_id``.
+        Record to write; its hardware id becomes the ``frame_id`` of the messages.
     storage : {"mcap", "sqlite3"}
         File format.
     topic : str
@@ -200,12 +200,12 @@ def write_bag(
     Raises
     ------
     RecordError
-        If the path exists, or cannot be written.
+        If the path exists, or the bag cannot be written.
     """
     displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
     voltage = np.column_stack([record.voltage[axis] for axis in record.axes])
     messages = encode_joint_states(record.time_ns, displacement, voltage, record.axes, record.hardware_id)
-    # readers sort by log time: where stamps run backwards, the order of the record must survive
+    # Readers sort by log time, which must not decrease: so the order of the record is kept where its stamps decrease.
     logged = np.maximum.accumulate(record.time_ns)
     with BagWriter(path, storage=storage, topic=topic) as bag:
         for stamp, message in zip(logged.tolist(), messages, strict=True):

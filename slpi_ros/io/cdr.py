@@ -1,10 +1,10 @@
 """CDR, the serialisation of ROS 2: single messages, and many messages of one layout as one structured array.
 
-Messages whose strings and array lengths are the same differ only in their numbers, which stay at fixed offsets, so a
-whole recording is decoded by one comparison and one view.
+Messages with the same strings and array lengths differ only in their numbers, which are at fixed offsets. A block of
+such messages is decoded by one comparison of the constant bytes and one NumPy view of the numbers.
 
 Reference: OMG, Common Data Representation (DDS-XTypes 1.3, section 7.4). A value of n bytes is aligned to n bytes,
-counted from behind the encapsulation of four bytes.
+counted from the end of the encapsulation header of four bytes.
 """
 
 import struct
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 ByteArray = NDArray[np.uint8]
 
 ENCAPSULATION = 4
-# Plain CDR, which every DDS of ROS 2 sends; the second byte tells the byte order. Two bytes of options follow.
+# Plain CDR, which every DDS of ROS 2 sends; the second byte is the byte order. Two bytes of options follow.
 BYTE_ORDERS = {b"\0\0": ">", b"\0\1": "<"}
 _DTYPES = {"i": "i4", "I": "u4"}
 
@@ -31,11 +31,12 @@ class CdrLayout:
     Parameters
     ----------
     template : ndarray of uint8, shape (M,)
-        One such message.
+        One message of this layout.
     fixed : ndarray of bool, shape (M,)
-        The bytes that are the same in every such message: no numbers, and no padding, which is undefined.
+        True for bytes that are the same in all messages of this layout; False for numbers, and for padding bytes,
+        which are undefined.
     fields : mapping of str to (dtype, int)
-        NumPy type and offset of the named numbers.
+        NumPy type and offset of each named field.
     """
 
     template: ByteArray
@@ -43,12 +44,12 @@ class CdrLayout:
     fields: Mapping[str, tuple[Any, int]]
 
     def decode(self, rows: ByteArray) -> NDArray[np.void] | None:
-        """Return the fields of all messages, or None when one of them has another layout.
+        """Return the fields of all messages, or None if one of them has another layout.
 
         Parameters
         ----------
         rows : ndarray of uint8, shape (N, L)
-            Serialised messages; bytes behind the message proper are ignored, as some writers append garbage.
+            Serialised messages; bytes after the end of the message are ignored, as some writers append undefined bytes.
 
         Returns
         -------
@@ -61,7 +62,7 @@ class CdrLayout:
 
     def _alike(self, rows: ByteArray) -> bool:
         """Return whether all messages have the fixed bytes of the template."""
-        # Fixed bytes in a row are compared as one value each: several times faster than byte by byte.
+        # Adjacent fixed bytes are compared as integers of up to 8 bytes: several times faster than byte by byte.
         ends = np.flatnonzero(np.diff(self.fixed, prepend=False, append=False)).tolist()
         words = {
             f"at {at}": (f"u{size}", at)
@@ -85,7 +86,7 @@ class CdrLayout:
 
 
 def _words(begin: int, end: int) -> Iterator[tuple[int, int]]:
-    """Yield offset and size of the words, of 8, 4, 2 or 1 bytes, that bytes consist of."""
+    """Yield offset and size of words of 8, 4, 2 or 1 bytes that together cover the bytes from `begin` to `end`."""
     while begin < end:
         size = next(size for size in (8, 4, 2, 1) if size <= end - begin)
         yield begin, size
@@ -93,24 +94,24 @@ def _words(begin: int, end: int) -> Iterator[tuple[int, int]]:
 
 
 class CdrReader:
-    """Reads a serialised message value by value and records its layout.
+    """Reader of one serialised message, value by value, which also determines its layout.
 
     Parameters
     ----------
     data : bytes
-        With its encapsulation.
+        Serialised message with encapsulation header.
 
     Attributes
     ----------
     order : str
-        Byte order, as the module ``struct`` writes it.
+        Byte order, as a format character of the module ``struct``.
     at : int
-        Offset behind what has been read, bytes.
+        Offset of the next byte to read.
 
     Raises
     ------
     struct.error
-        If it is not plain CDR, or, by any method, where it is cut off.
+        If the data are not plain CDR. Methods raise it if the message is truncated.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -123,11 +124,11 @@ class CdrReader:
         self._fields: dict[str, tuple[Any, int]] = {}
 
     def struct(self) -> struct.Struct:
-        """Return what unpacks all that has been read: the encapsulation's kind, then every value in order."""
+        """Return a Struct that unpacks all values read so far, in order, after the two encapsulation bytes."""
         return struct.Struct("".join(self._format))
 
     def layout(self, start: int = 0) -> CdrLayout:
-        """Return the layout of what has been read from offset `start` on; values without a name are fixed."""
+        """Return the layout of the data read from offset `start` on; values read without a name are fixed."""
         fixed = np.zeros(self.at, bool)
         for begin, end in self._fixed:
             fixed[begin:end] = True
@@ -135,7 +136,7 @@ class CdrReader:
         return CdrLayout(np.frombuffer(self.data, np.uint8, self.at - start, start), fixed[start:], fields)
 
     def integer(self, kind: str = "I", name: str = "") -> int:
-        """Read an integer of 32 bits, signed (``i``) or not (``I``)."""
+        """Read a 32-bit integer, signed (``i``) or unsigned (``I``)."""
         self._align(4)
         (value,) = struct.unpack_from(self.order + kind, self.data, self.at)
         self._pass(4, kind, name, self.order + _DTYPES[kind])
@@ -155,7 +156,7 @@ class CdrReader:
         return tuple(self.string() for _ in range(self.integer()))
 
     def doubles(self, name: str = "", count: int | None = None) -> tuple[int, int]:
-        """Skip `count` doubles, or a sequence that tells its own length; return how many, and their offset."""
+        """Skip `count` doubles, default: a sequence preceded by its length; return their number and offset."""
         number = self.integer() if count is None else count
         if number:
             self._align(8)
@@ -166,7 +167,7 @@ class CdrReader:
         return number, begin
 
     def array(self, name: str) -> NDArray[np.float64]:
-        """Return the doubles that were read under this name, shape (n,)."""
+        """Return the doubles that were read with the field name `name`, shape (n,)."""
         (dtype, (count,)), offset = self._fields[name]
         return np.frombuffer(self.data, dtype, count, offset).astype(np.float64)
 
@@ -185,7 +186,7 @@ class CdrReader:
 
 
 def serialise(*values: int | str | Sequence[float]) -> bytes:
-    """Return a little-endian message: integers as 32 bits without sign, strings, and sequences of doubles."""
+    """Return a little-endian message that contains 32-bit unsigned integers, strings and sequences of doubles."""
     data = bytearray(b"\0\1\0\0")
     for value in values:
         if isinstance(value, str):
@@ -203,5 +204,5 @@ def serialise(*values: int | str | Sequence[float]) -> bytes:
 
 def multiarray_header(count: int) -> bytes:
     """Return the CDR header of a Float64MultiArray with `count` doubles, in this machine's byte order."""
-    # No dimensions, no offset; then the doubles begin at a multiple of eight.
+    # No dimensions and data offset 0; the doubles then start at a multiple of eight bytes.
     return struct.pack("=2B2x3I4x", 0, sys.byteorder == "little", 0, 0, count)

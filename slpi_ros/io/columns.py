@@ -15,15 +15,15 @@ class Quantity:
     Parameters
     ----------
     name : str
-        For messages; the name of its option.
+        Name in messages, and name of the option that selects its columns.
     default : str
-        Unit where nothing says it.
+        Unit if neither the column name nor an option gives one.
     units : mapping of str to float
-        Known units and their size in SI.
+        Known units and their values in SI units.
     prefixes : tuple of str
-        How names of its columns begin, in lower case.
+        Beginnings of the names of its columns, in lower case.
     others : frozenset of str
-        Name endings that are units of other quantities, in lower case.
+        Units that are recognized in a column name but are not valid for this quantity, in lower case.
     """
 
     name: str
@@ -33,24 +33,24 @@ class Quantity:
     others: frozenset[str]
 
     def unit(self, text: str) -> str:
-        """Return the known unit that a text means; "" if none. Case counts only where it decides."""
+        """Return the known unit that a text denotes, or ""; case matters only where it changes the meaning."""
         plain = text.strip().replace("µ", "u").replace("μ", "u")
         if plain in self.units:
             return plain
         if plain.casefold() in _SPELLED:
             spelled = _SPELLED[plain.casefold()]
             return spelled if spelled in self.units else ""
-        # Nm is no length; and MV may be meant as either
+        # Nm (newton metre) is not a length, and MV may mean megavolt or millivolt.
         one_case = plain in (plain.lower(), plain.upper()) and plain != "MV"
         return next((unit for unit in self.units if one_case and unit.casefold() == plain.casefold()), "")
 
     def is_other_unit(self, text: str) -> bool:
-        """Return whether a text that is no unit of this quantity must be one of another."""
+        """Return whether a text is a unit, but not one of this quantity."""
         if self.unit(text):
             return False
         folded = text.strip().casefold()
         almost = any(unit.casefold() == folded for unit in self.units)
-        # names such as voltage_s and displacement_h rather end in the name of an axis
+        # In names such as voltage_s and displacement_h, the last letter is more likely the name of an axis.
         foreign = any(q.unit(text) == text and (len(text) > 1 or text == "V") for q in QUANTITIES)
         return almost or foreign or folded in self.others
 
@@ -103,13 +103,13 @@ class Column:
     Parameters
     ----------
     name : str
-        As in the table.
+        Name in the table.
     axis : str
-        What its name holds besides the quantity and the unit; ``x`` if nothing.
+        Part of the name that is neither quantity nor unit; ``x`` if there is none.
     unit : str
         Unit of its values.
     scale : float
-        Size of the unit in SI.
+        Value of the unit in SI units.
     assumed : bool
         Whether neither the name nor an option gives the unit.
     """
@@ -129,18 +129,18 @@ def parse_column(name: str, quantity: Quantity, *, given_unit: str | None = None
     name : str
         Name of the column.
     quantity : Quantity
-        What it holds.
+        Quantity of the column.
     given_unit : str, optional
-        Unit by option, for a name without one.
+        Unit given by an option, for a name without a unit.
     source : str
-        The table, for messages.
+        Name of the table, for messages.
 
     Raises
     ------
     RecordError
-        If the name says a unit that is not known.
+        If the name contains an unknown unit.
     UsageError
-        If it says another unit than the option.
+        If the units of the name and the option differ.
     """
     stem, written = _split(name, quantity)
     unit = quantity.unit(written)
@@ -160,17 +160,17 @@ def parse_column(name: str, quantity: Quantity, *, given_unit: str | None = None
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit of anything, also of what is not known here."""
+    """Return whether a text is a unit of any quantity, including units that are recognized but not supported."""
     return any(quantity.unit(text) or quantity.is_other_unit(text) for quantity in QUANTITIES)
 
 
 def unit_in(name: str, quantity: Quantity) -> str:
-    """Return the known unit that a name says; "" if none."""
+    """Return the known unit in the name of a column; "" if there is none."""
     return quantity.unit(_split(name, quantity)[1])
 
 
 def axis_of(name: str, quantity: Quantity) -> str:
-    """Return what a name holds beside quantity and unit."""
+    """Return the part of a column name that is neither quantity nor unit; ``x`` if there is none."""
     return _axis(_split(name, quantity)[0])
 
 
@@ -180,7 +180,7 @@ def begins(name: str, quantity: Quantity) -> bool:
 
 
 def _split(name: str, quantity: Quantity) -> tuple[str, str]:
-    """Return the rest of a name and the unit it says, as written; "" if it says none."""
+    """Return a column name without its unit, and the unit as written, or "" if there is none."""
     index = _INDEX_OF_A_MATRIX.search(name)
     body, index_text = (name[: index.start()], index.group()) if index else (name, "")
     for start, end, written in _written_units(body, quantity):
@@ -190,7 +190,7 @@ def _split(name: str, quantity: Quantity) -> tuple[str, str]:
 
 
 def _written_units(name: str, quantity: Quantity) -> Iterator[tuple[int, int, str]]:
-    """Yield begin, end and text of what may be the unit in a name, the surest first."""
+    """Yield begin, end and text of each possible unit in a name, the most likely one first."""
 
     def is_any(text: str) -> bool:
         return bool(quantity.unit(text)) or quantity.is_other_unit(text)
@@ -203,7 +203,7 @@ def _written_units(name: str, quantity: Quantity) -> Iterator[tuple[int, int, st
     parts = [(*found.span(), found.group()) for found in _PARTS.finditer(name)]
     for number in range(len(parts) - 1, 0, -1):
         begin, end, text = parts[number]
-        # inside a name, as in displacement_nm_x, a single letter is no unit
+        # Inside a name, a unit has at least two letters, as in displacement_nm_x.
         if is_any(text) and (number == len(parts) - 1 or len(text) > 1):
             yield begin, end, text
 
@@ -214,32 +214,32 @@ def _axis(stem: str) -> str:
             stem = stem.lstrip()[len(word) :]
             break
     axis = stem.strip(" \t_.-,/")
-    # what is left may stand in brackets
+    # The rest may be enclosed in brackets.
     if re.fullmatch(r"[(\[][^()\[\]]*[)\]]", axis) and not _INDEX_OF_A_MATRIX.search(axis):
         axis = axis[1:-1]
     return " ".join(axis.split()) or "x"
 
 
 def match_column(name: str, columns: Sequence[str]) -> str:
-    """Return the name of the only column that matches but for case, unless the name itself is a column."""
+    """Return the only column that equals `name` except for case; else, or if `name` is a column, `name` itself."""
     alike = [column for column in columns if column.casefold() == name.casefold()]
     return alike[0] if len(alike) == 1 and name not in columns else name
 
 
 def joined(names: Sequence[str]) -> str:
-    """Return names for a message: at most 200 printable characters."""
+    """Return the names joined for a message, limited to 200 printable characters."""
     text = ", ".join(names)
     return printable(text[:200]) + ("..." if len(text) > 200 else "")
 
 
 def printable(text: str) -> str:
-    """Replace control characters, which would spoil a terminal."""
+    """Replace control characters, which could disturb a terminal, by question marks."""
     return "".join(c if c.isprintable() or c == "\N{NO-BREAK SPACE}" else "?" for c in text)
 
 
 @dataclass(frozen=True)
 class ColumnOptions:
-    """The options of `slpi_ros.io.tables.import_table`; all may be left out."""
+    """The options of `slpi_ros.io.tables.import_table`, all with default values."""
 
     time: str | None = None
     voltage: tuple[str, ...] = ()
@@ -255,9 +255,9 @@ class ColumnChoice:
     Parameters
     ----------
     time : Column
-        Time.
+        Time column.
     voltage, displacement : mapping of axis name to Column
-        Of the same axes.
+        Columns of each axis; both mappings have the same axes.
     """
 
     time: Column
@@ -277,16 +277,16 @@ def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) ->
     names : sequence of str
         All columns of the table.
     options : ColumnOptions
-        The caller's choice.
+        Options given by the caller.
     source : str
-        The table, for messages.
+        Name of the table, for messages.
 
     Raises
     ------
     RecordError
-        If there is none, their number does not match, or a name says a unit that is not known.
+        If a column is missing, the numbers of columns do not match, or a name contains an unknown unit.
     UsageError
-        If an option is wrong, contradicts a name, or gives one column two roles.
+        If an option is invalid, contradicts a name, or gives one column two roles.
     """
     given_unit = options.displacement_unit
     if given_unit is not None and not DISPLACEMENT.unit(given_unit):
@@ -326,7 +326,7 @@ def _displacement_columns(names: Sequence[str], source: str) -> list[str]:
 
 
 def _voltage_columns(names: Sequence[str], time: Column, moved: Sequence[Column], source: str) -> list[str]:
-    """Return the columns of voltage: where names tell one for each axis, these; else all."""
+    """Return the voltage columns: one for each axis if the names match the axes one to one, else all."""
     taken = {time.name, *(column.name for column in moved)}
     found = [n for n in names if n not in taken and (begins(n, VOLTAGE) or unit_in(n, VOLTAGE))]
     if not found:
@@ -355,7 +355,7 @@ def _one_for_each(moved: Sequence[Column], driven: Sequence[Column], source: str
 
 
 def _axis_names(moved: Sequence[Column], axes: Sequence[str], source: str) -> tuple[str, ...]:
-    """Return one name for each displacement column, no two alike."""
+    """Return one axis name for each displacement column; all must be different."""
     names = tuple(axes) or tuple(column.axis for column in moved)
     if len(names) != len(moved):
         raise UsageError(f"{source}: {len(names)} axes for the displacement columns {_column_names(moved)}")

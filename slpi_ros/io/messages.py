@@ -46,18 +46,18 @@ def _read_vector(reader: CdrReader) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class MessageType:
-    """How one type of message is read.
+    """Rules for decoding one message type.
 
     Parameters
     ----------
     stamped : bool
-        Whether it begins with a header.
+        Whether the message begins with a header.
     named : bool
-        Whether it names what its numbers belong to; else they are numbered.
+        Whether the columns have names, such as joint names; otherwise they are numbered.
     fields : tuple of str
-        Those that hold its numbers.
+        Fields that contain the numbers.
     read : callable
-        Reads all behind the header and returns one name for each column.
+        Reads everything after the header and returns the name of each column.
     """
 
     stamped: bool
@@ -76,20 +76,20 @@ MESSAGE_TYPES = {
 
 @dataclass(frozen=True)
 class Message:
-    """One message, decoded.
+    """Decoded message.
 
     Parameters
     ----------
     stamp_ns : int, nanoseconds
-        Header stamp; 0 where there is no header.
+        Header stamp; 0 if there is no header.
     frame_id : str
-        As in the header.
+        Frame id of the header; "" if there is no header.
     names : tuple of str, length K
-        One for each column.
+        Names of the columns.
     values : mapping of field to ndarray, shape (n,)
-        ``position`` (m), ``effort`` (V), ``data`` or ``vector``; without the last columns where shorter than `names`.
+        ``position`` (m), ``effort`` (V), ``data`` or ``vector``; an array with n < K lacks the last columns.
     layout : CdrLayout
-        Of all messages with the same strings and lengths.
+        Layout of all messages with the same strings and array lengths.
     """
 
     stamp_ns: int
@@ -99,7 +99,7 @@ class Message:
     layout: CdrLayout
 
     def is_regular(self) -> bool:
-        """Return whether every name occurs once and every field has a number for each."""
+        """Return whether there are names, all different, and every field has one number for each name."""
         count = len(set(self.names))
         return count > 0 and all(len(self.names) == count == values.size for values in self.values.values())
 
@@ -110,7 +110,7 @@ def read_message(data: bytes, msgtype: str) -> Message:
     Raises
     ------
     struct.error, UnicodeDecodeError
-        If it is not one.
+        If the data are not a valid message of this type.
     """
     kind, reader = MESSAGE_TYPES[msgtype], CdrReader(data)
     stamp_ns, frame_id = 0, ""
@@ -136,16 +136,16 @@ def encode_joint_states(
         Header stamps.
     position : ndarray, shape (N, K), metres
     effort : ndarray, shape (N, K), volts
-        The stage's drivers put the applied voltage here.
+        Applied voltages.
     names : tuple of str, length K
         Joint names.
     frame_id : str
-        As in the header.
+        Frame id of the header.
 
     Raises
     ------
     RecordError
-        If there is no name, or a stamp does not fit into a header: before 1970 or after 2038.
+        If there is no name, or a stamp does not fit into a header (before 1970 or after 2038).
     """
     if not names:
         raise RecordError("a stage_state message needs at least one axis name")
@@ -165,12 +165,12 @@ def encode_joint_states(
     return [stream[start : start + len(template)] for start in range(0, len(stream), len(template))]
 
 
-# Encapsulation, seconds, nanoseconds: the values before the names.
+# Number of values before the strings: encapsulation, seconds, nanoseconds.
 FIRST = 3
 
 
 class JointStates:
-    """Reads the JointStates of one topic; a message with the layout of the one before takes one ``unpack``."""
+    """Decoder of the JointState messages of one topic; one ``unpack`` per message as long as the layout is the same."""
 
     def __init__(self) -> None:
         self._struct = struct.Struct("2s2x")
@@ -180,7 +180,7 @@ class JointStates:
         self._names: tuple[str, ...] = ()
 
     def read(self, data: bytes) -> tuple[int, tuple[str, ...], Sequence[float]] | None:
-        """Return stamp (ns), names and positions of a serialised message; None where they cannot be read."""
+        """Return stamp (ns), names and positions of a serialised message; None if it cannot be decoded."""
         try:
             values = self._struct.unpack_from(data)
             known = values[FIRST : self._fixed_end] == self._fixed and values[0] == self._kind
@@ -194,7 +194,7 @@ class JointStates:
         return values[1] * SECOND_NS + values[2], self._names, values[self._fixed_end :]
 
     def _learn(self, data: bytes) -> tuple[Any, ...]:
-        """Read a message value by value and keep its layout, up to the positions."""
+        """Read a message value by value and store its layout up to the positions; return the values."""
         reader = CdrReader(data)
         reader.integer("i")
         reader.integer()
@@ -209,7 +209,7 @@ class JointStates:
         return values
 
 
-# Bytes of a point without any numbers.
+# Size of a trajectory point with empty arrays, bytes.
 SMALLEST_POINT = 24
 
 
@@ -265,7 +265,7 @@ def _decode(data: bytes) -> TrajectoryArrays | None:
         reader.integer("i", "sec")
         reader.integer("I", "nanosec")
         size = reader.at - begin
-        # The first point alone may begin at another remainder of eight bytes than those behind it.
+        # Only the first point may have another alignment (offset modulo eight) than the points after it.
         alike = 1 if done == 0 else points - done
         block = np.frombuffer(data, np.uint8, alike * size, begin).reshape(alike, size)
         rows = reader.layout(begin).decode(block)

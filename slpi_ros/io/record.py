@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Record:
-    """Voltage and displacement of the axes of one stage, on one clock.
+    """Voltage and displacement of the axes of one stage, with common time stamps.
 
     Parameters
     ----------
@@ -72,24 +72,24 @@ class Record:
         return int(self.time_ns.size)
 
     def require_axis(self, axis: str) -> None:
-        """Raise UsageError when the record has no such axis."""
+        """Raise UsageError if the record has no such axis."""
         if axis not in self.axes:
             raise UsageError(f"{self.source}: no axis '{axis}'; it holds {', '.join(self.axes)}")
 
 
 def common_stage(records: Sequence[Record], hardware_id: str = "") -> str:
-    """Return the hardware id of the stage that all records, and a model, belong to.
+    """Return the hardware id of the stage that all records, and optionally a model, belong to; "" if unknown.
 
     Parameters
     ----------
     records : sequence of Record
     hardware_id : str
-        Of the model; "" (default) if unknown. What has none may belong to any stage.
+        Hardware id of the model; "" (default) if unknown. Records and models without an id may belong to any stage.
 
     Raises
     ------
     UsageError
-        If there is no record, or they are of several stages.
+        If there is no record, or there are several hardware ids.
     """
     if not records:
         raise UsageError("no record given; give at least one")

@@ -1,4 +1,4 @@
-"""JSON Schemas of all documents on topics or on disk, and validation against them."""
+"""JSON Schemas of all documents that are published or stored in files, and validation against them."""
 
 import json
 import textwrap
@@ -20,7 +20,7 @@ def load_schema(name: str) -> dict[str, Any]:
     Parameters
     ----------
     name : str
-        What the document is, for example ``"model"``.
+        Kind of document, for example ``"model"``.
 
     Returns
     -------
@@ -32,7 +32,7 @@ def load_schema(name: str) -> dict[str, Any]:
     UsageError
         If there is no schema of that name.
     """
-    # Here slpi_ros/msg_schemas is a link to the top-level folder, in an installation a copy of it.
+    # In the source tree slpi_ros/msg_schemas is a link to the top-level folder, in an installation a copy of it.
     folder = files("slpi_ros") / "msg_schemas"
     try:
         text = (folder / f"{name}.schema.json").read_text(encoding="utf-8")
@@ -50,16 +50,16 @@ def validate(document: object, name: str, source: str) -> None:
     Parameters
     ----------
     document : object
-        What ``json.loads`` returned.
+        Parsed document, as returned by ``json.loads``.
     name : str
-        The schema's name, for example ``"model"``.
+        Name of the schema, for example ``"model"``.
     source : str
-        Where the document came from, for the message.
+        Origin of the document, for error messages.
 
     Raises
     ------
     ModelError
-        If the document does not follow the schema; the message names the place and the value.
+        If the document does not conform to the schema; the message names the location and the reason.
     """
     error = best_match(_validator(name).iter_errors(document))
     if error is not None:
@@ -74,7 +74,7 @@ def format_document(document: Mapping[str, Any], name: str) -> str:
     Raises
     ------
     ModelError
-        If the document does not follow its schema.
+        If the document does not conform to its schema.
     ValueError
         If a value is not finite.
     """
@@ -88,7 +88,7 @@ def _validator(name: str) -> Any:
 
 
 def _items(validator: Any, schema: Any, values: Any, parent: Any) -> Iterator[Any]:
-    """Check the items of an array; of an array of floats, check only the minimum and the maximum first."""
+    """Check the items of an array; for an array of floats, check all only if the minimum or maximum is invalid."""
     check = Draft202012Validator.VALIDATORS["items"]
     floats = isinstance(values, list) and len(values) > 2 and all(type(value) is float for value in values)
     if not floats or any(True for _ in check(validator, schema, [min(values), max(values)], parent)):

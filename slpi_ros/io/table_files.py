@@ -17,7 +17,7 @@ from slpi_ros.errors import RecordError
 from slpi_ros.io.columns import is_unit, joined, printable
 from slpi_ros.io.record import FloatArray
 
-# the comma last: in tables with another separator it may be the decimal mark
+# The comma is last: in tables with another separator it may be the decimal mark.
 _SEPARATORS = (";", "\t", ",")
 _LINES_TO_SEARCH = 100
 _UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -27,20 +27,20 @@ _ENOUGH = 10_000
 
 @dataclass(frozen=True)
 class CsvTable:
-    """The text of a table.
+    """Table in a text file.
 
     Parameters
     ----------
     path : Path
-        Where it came from, for messages.
+        Path of the file, for messages.
     columns : tuple of str
-        Their names.
+        Names of the columns.
     body : str
-        The lines below the names.
+        Text below the line of column names.
     separator : str
-        What stands between cells. Where it is no comma, numbers may have a decimal comma.
+        Separator of the cells. If it is not a comma, numbers may have a decimal comma.
     header_line : int
-        Number of the line of names.
+        Number of the line of column names.
     """
 
     path: Path
@@ -59,7 +59,7 @@ class CsvTable:
         Raises
         ------
         RecordError
-            If there is no such column, a cell holds something else, or there are fewer than two rows.
+            If a column is missing or not unique, a cell is not a number, or there are fewer than two rows.
         """
         for column in wanted:
             if self.columns.count(column) != 1:
@@ -74,7 +74,7 @@ class CsvTable:
         return dict(zip(wanted, rows.T.copy(), strict=True))
 
     def _read_fast(self, places: Sequence[int]) -> FloatArray | None:
-        """Let NumPy read a table of nothing but numbers; None where it is not one."""
+        """Read a purely numeric table with NumPy; return None if the table contains anything else."""
         if not self.body.strip():
             return np.empty((0, len(places)))
         body = self.body
@@ -86,11 +86,11 @@ class CsvTable:
             rows = np.loadtxt(io.StringIO(body), delimiter=self.separator, quotechar='"', comments=None, ndmin=2)
         except ValueError:
             return None
-        # a decimal comma makes a regular table too, but one that is wider than its header
+        # Decimal commas in a comma-separated table give regular rows too, but more cells than the header has.
         return rows[:, places] if rows.shape[1] == len(self.columns) else None
 
     def _read_carefully(self, places: Sequence[int]) -> FloatArray:
-        """Read cell by cell: finds empty cells, and the line that is wrong."""
+        """Read the table cell by cell; slower, but allows empty cells and names the line of an error."""
         rows = []
         marks = set[str]()
         for line, cells in self._lines():
@@ -119,7 +119,7 @@ class CsvTable:
             ) from None
 
     def _lines(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield number in the file and cells of every line that is not blank."""
+        """Yield the line number and the cells of every line that is not blank."""
         reader = csv.reader(io.StringIO(self.body), delimiter=self.separator)
         try:
             for cells in reader:
@@ -136,13 +136,13 @@ class CsvTable:
         Parameters
         ----------
         good : ndarray of bool, shape (N,)
-            What holds of the values.
+            Whether each value is valid.
         column : str
-            Their column.
+            Name of the column, for the message.
         values : ndarray, shape (N,)
-            The values, one for each row.
+            Values of the column, one for each row.
         rule : str
-            What the message says that must hold.
+            Requirement for the values, for the message.
         """
         if not good.all():
             row = int(np.argmin(good))
@@ -151,12 +151,12 @@ class CsvTable:
 
 
 def load_csv(path: Path) -> CsvTable:
-    """Read the text and the names of the columns; encoding, separator and the line of names show in the file.
+    """Read the text and the column names of a table; encoding, separator and header line are detected.
 
     Raises
     ------
     RecordError
-        If the file cannot be read, or is not a table with names of columns above its numbers.
+        If the file cannot be read, or is not a table with column names above its numbers.
     """
     text = _text(path)
     lines = _first_lines(text)
@@ -175,7 +175,7 @@ def load_csv(path: Path) -> CsvTable:
 
 @dataclass(frozen=True)
 class _Line:
-    """A line that is not blank: its number, its text, and where in the whole text it ends."""
+    """A line that is not blank: its number, its text, and the offset of its end in the whole text."""
 
     number: int
     text: str
@@ -191,7 +191,7 @@ class _Header:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a file, with lines that end in a line feed."""
+    """Return the text of a file, with line feeds as line ends."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -208,7 +208,7 @@ def _text(path: Path) -> str:
 
 
 def _first_lines(text: str) -> list[_Line]:
-    """Return the lines among which the names of the columns are looked for."""
+    """Return the first lines that are not blank, to be searched for the column names."""
     lines: list[_Line] = []
     end = 0
     for number in range(1, _LINES_TO_SEARCH + 1):
@@ -219,7 +219,10 @@ def _first_lines(text: str) -> list[_Line]:
 
 
 def _header(lines: Sequence[_Line], separator: str) -> _Header | None:
-    """Return the names that stand above as many numbers: of such lines the first of the widest."""
+    """Return the header: the line of names directly above a line of as many numbers; if several, the widest one.
+
+    If that line contains units only, the names are in the line above it. None if there is no such line.
+    """
     rows = [_cells(line.text, separator) for line in lines]
     tops = [at for at in range(len(rows) - 1) if _are_names(rows[at]) and _are_numbers(rows[at + 1], rows[at])]
     if not tops:
@@ -233,7 +236,7 @@ def _header(lines: Sequence[_Line], separator: str) -> _Header | None:
 
 
 def _first_line(lines: Sequence[_Line], path: Path) -> _Header:
-    """Return the first line as names, where none stands above numbers."""
+    """Return the first line as the header, for a text without a line of names above numbers."""
     if not lines:
         raise RecordError(f"{path}: no names in the first line; begin with a line such as time_s,x_V")
     columns, separator = max(((_cells(lines[0].text, s), s) for s in _SEPARATORS), key=lambda split: len(split[0]))
@@ -241,7 +244,7 @@ def _first_line(lines: Sequence[_Line], path: Path) -> _Header:
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    """Return the cells of a line without the space around them; none if it is no line of a table."""
+    """Return the cells of a line, stripped of white space; an empty list if the line is not part of a table."""
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
     except csv.Error:
@@ -253,7 +256,7 @@ def _are_names(cells: Sequence[str]) -> bool:
 
 
 def _are_numbers(cells: Sequence[str], names: Sequence[str]) -> bool:
-    """Return whether cells below names are numbers, or at least two of them are."""
+    """Return whether the cells below `names` are a row of data: all non-empty cells, or at least two, are numbers."""
     numbers = sum(map(_is_number, cells))
     return len(cells) == len(names) and (numbers > 1 or numbers == sum(map(bool, cells)) > 0)
 
@@ -271,14 +274,15 @@ _NUMERIC = {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("",
 
 @dataclass(frozen=True)
 class MatTable:
-    """The vectors of a MATLAB file; of a matrix, those along its longer side.
+    """Vectors in a MATLAB file; a matrix is split into vectors along its longer side.
 
     Parameters
     ----------
     path : Path
-        Where it came from.
+        Path of the file, for messages.
     columns : tuple of str
-        ``name`` of a vector; ``name(:,1)``, ``name(:,2)``, ... or ``name(1,:)``, ... of a matrix.
+        Names of the columns: ``name`` for a vector; ``name(:,1)``, ``name(:,2)``, ... or ``name(1,:)``, ... for a
+        matrix.
     """
 
     path: Path
@@ -294,7 +298,7 @@ class MatTable:
         Raises
         ------
         RecordError
-            If there is no such column, they differ in length, have fewer than two values, or are complex.
+            If a column is missing, the columns differ in length, have fewer than two values, or are complex.
         """
         for column in wanted:
             if column not in self.columns:
@@ -320,7 +324,7 @@ class MatTable:
 
 
 def load_mat(path: Path) -> MatTable:
-    """Find the numeric vectors and matrices in a file.
+    """Find the numeric vectors and matrices in a MATLAB file.
 
     Raises
     ------
@@ -343,7 +347,7 @@ def load_mat(path: Path) -> MatTable:
 
 
 def _joined(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
-    """Return name, shape and class of the variables."""
+    """Return name, shape and class of the variables in a file."""
     try:
         with path.open("rb") as file:
             return list(whosmat(file))
@@ -352,7 +356,7 @@ def _joined(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
     except NotImplementedError:
         raise RecordError(f"{path}: a MATLAB file of version 7.3; save it anew with `save(..., '-v7')`") from None
     except Exception as error:
-        # scipy tells in any way that a file is no MATLAB file, or a damaged one
+        # SciPy raises exceptions of many types for files that are damaged or not MATLAB files.
         raise _unreadable(path, error) from error
 
 
@@ -370,7 +374,7 @@ def _unreadable(path: Path, error: Exception) -> RecordError:
 
 
 def _vector(array: NDArray[np.generic], column: str) -> NDArray[np.generic]:
-    """Return the vector that the name of a column means."""
+    """Return the vector of an array that the name of a column selects."""
     _, _, indices = column.rstrip(")").partition("(")
     if not indices:
         return array.ravel()

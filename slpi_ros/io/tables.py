@@ -1,4 +1,4 @@
-"""Import of measured data from tables; reading and writing of the command line's tables."""
+"""Import of measured data from tables; reading and writing of the tables of the command line."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,41 +28,41 @@ def import_table(
 ) -> Record:
     """Import measured data from a table, identifying columns and units by name or option.
 
-    A unit in a name is honoured, as in ``time_ms``, ``Voltage (mV)``, ``x [nm]`` or ``displacement in nm``; case
-    counts only where it decides. Without one, values are seconds, volts and micrometres.
+    A column name may contain a unit, as in ``time_ms``, ``Voltage (mV)``, ``x [nm]`` or ``displacement in nm``; upper
+    and lower case matter only where they change the meaning. Default units are seconds, volts and micrometres.
 
     Parameters
     ----------
     path : path
-        A text file of columns separated by comma, semicolon or tab, the latter two also with decimal commas, whose
-        names stand above the numbers; or a MATLAB file of numeric arrays, up to version 7, whose name ends in
-        ``.mat``: its vectors are the columns.
+        Text file with a line of column names above the numbers, separated by comma, semicolon or tab; with semicolon
+        or tab, decimal commas are allowed. Or a MATLAB file (``.mat``, up to version 7), whose numeric vectors are the
+        columns.
     time : str, optional
-        Column of time; by default ``time_s``, else the first that begins with "time" (or is ``t``) and says its
-        unit, else the first that begins so.
+        Time column; by default ``time_s``, else the first column with a unit whose name begins with "time" or is
+        ``t``, else the first column whose name begins with "time".
     voltage : sequence of str
-        Columns of voltage, one for all axes or one for each displacement; by default those that begin with
-        "voltage" or say a unit of voltage.
+        Voltage columns, one for all axes or one for each displacement column; by default those whose names begin with
+        "voltage" or contain a unit of voltage.
     displacement : sequence of str
-        Columns of displacement, one for each axis; by default those that begin with "displacement", else with
-        "position", else ``<axis>_m`` (or another unit) where there is ``<axis>_V``, else x, y and z with a unit.
+        Displacement columns, one for each axis; by default those whose names begin with "displacement", else with
+        "position", else ``<axis>_m`` (or another unit) if there is ``<axis>_V``, else x, y and z with a unit.
     displacement_unit : {"um", "m", "mm", "nm", "pm"}, optional
-        Unit of displacement columns whose names do not say one; by default "um".
+        Unit of displacement columns whose names contain none; by default "um".
     axes : sequence of str
-        Names of the axes; by default those in the displacement columns' names, and ``x`` where there is none.
+        Names of the axes; by default taken from the names of the displacement columns, ``x`` if they contain none.
 
     Returns
     -------
     Record
-        In volts and metres. Empty cells and ``nan`` become NaN. A time axis that begins before zero is
-        shifted to begin there.
+        Record in volts and metres. Empty cells and ``nan`` become NaN. If the first time is negative, all times are
+        shifted such that the record begins at 0.
 
     Raises
     ------
     RecordError
         If the file, a column, its unit or a value is invalid.
     UsageError
-        If an option is wrong, contradicts the name of a column, or gives one column two roles.
+        If an option is invalid, contradicts the name of a column, or gives one column two roles.
     """
     options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
     return import_with_summary(path, options)[0]
@@ -74,16 +74,16 @@ def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) ->
     Parameters
     ----------
     path : path
-        As of `import_table`.
+        As for `import_table`.
     options : ColumnOptions
         The other parameters of `import_table`.
 
     Returns
     -------
     record : Record
-        In volts and metres.
+        Record in volts and metres.
     lines : tuple of str
-        Columns, units and ranges, a line for each axis; before them one about time if its unit was assumed.
+        One line for each axis with columns, units and ranges; preceded by a line on time if its unit was assumed.
     """
     path = Path(path)
     table = load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
@@ -122,26 +122,26 @@ def _column_summary(column: Column, values: FloatArray, unit: str) -> str:
 
 
 def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Read a command table, in which every value must be finite.
+    """Read a table of the command line, in which every value must be finite.
 
     Parameters
     ----------
     path : path
-        Columns ``time_s`` and ``<axis>_<suffix>`` in any order; others are ignored.
+        Table with the columns ``time_s`` and ``<axis>_<suffix>`` in any order; other columns are ignored.
     suffix : {"V", "m"}
         Unit of the wanted columns.
 
     Returns
     -------
     t : ndarray, shape (N,), seconds
-        Never decreasing.
+        Non-decreasing times.
     values : dict of axis name to ndarray, shape (N,), volts or metres
         In the order of the columns.
 
     Raises
     ------
     RecordError
-        If a value is missing or not finite, or time runs backwards; with line, column and value.
+        If a value is missing or not finite, or time runs backwards; the message names line, column and value.
     """
     table = load_csv(Path(path))
     ending = _ending(suffix)
@@ -159,12 +159,12 @@ def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, d
 def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[str, FloatArray], suffix: str) -> None:
     """Write a table that ``read_table`` reads back: time to the nanosecond, values to the last bit.
 
-    The file appears complete or not at all; one of the same name is replaced.
+    The file is written atomically; an existing file is replaced.
 
     Parameters
     ----------
     path : path
-        Where to write.
+        File to write.
     t : ndarray, shape (N,), seconds
         Time.
     columns : mapping of axis name to ndarray, shape (N,), volts or metres
@@ -194,7 +194,7 @@ def _ending(suffix: str) -> str:
 
 
 def _nanoseconds(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> NDArray[np.int64]:
-    """Return stamps; times before zero move all stamps up, as messages cannot hold them."""
+    """Return time stamps (ns); if the first time is negative, all are shifted to start at 0, as messages require."""
     table.require(np.isfinite(seconds), column, seconds, "every row needs a time")
     table.require(np.abs(seconds) < _TIME_END, column, seconds, "more than 2^31 s; is the unit right?")
     _require_order(seconds, column, table)

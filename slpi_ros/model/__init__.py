@@ -1,1 +1,1 @@
-"""The model of a stage: hysteresis and effects of each axis, simulated, inverted, streamed and written down."""
+"""The model of a stage: hysteresis and effects of each axis; simulation, inversion, streaming and file format."""

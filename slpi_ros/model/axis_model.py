@@ -42,10 +42,10 @@ class Start:
     voltage : float, volts
     displacement : float, metres
     history : tuple of float, volts
-        Earlier reversal voltages, oldest first. Empty (default): the stage has never been moved.
+        Earlier reversal voltages, oldest first. Empty (default): the stage has never moved.
     from_rest : bool
-        True: the stage was never moved before it left the first voltage of `history`. False (default): a long descent
-        to that voltage erased the memory.
+        True: the stage had never moved before it left the first voltage of `history`. False (default): that voltage was
+        reached by a long fall, which erased the memory.
     """
 
     voltage: float
@@ -71,7 +71,7 @@ class FitQuality:
     covered : float
         Share of the cells of the Everett function that the record visited, 0..1.
     source : str
-        The record.
+        Name of the record or records.
     """
 
     rms: float
@@ -85,7 +85,7 @@ class FitQuality:
 
 @dataclass(frozen=True)
 class AxisModel:
-    """Model of one axis: hysteresis and effects, simulated, inverted or streamed.
+    """Model of one axis: hysteresis and effects, for simulation, inversion and streaming.
 
     Parameters
     ----------
@@ -96,13 +96,13 @@ class AxisModel:
         Initial history of the record.
     voltage_range : (float, float), volts
     displacement_range : (float, float), metres
-        Ranges covered by the record. `compensate` gives no voltage outside.
+        Ranges covered by the record. `compensate` returns only voltages within the voltage range.
     quality : FitQuality
     effects : tuple of Effect
         Effects besides the hysteresis, in the order in which the effects act; default: none.
     end : Start, optional
-        Memory at the end of the (last) record. None (default): unknown, as in older documents and for kinds that are
-        not causal.
+        State of the hysteresis at the end of the (last) record. None (default): unknown, as in older documents and for
+        kinds that are not causal.
 
     Raises
     ------
@@ -134,13 +134,14 @@ class AxisModel:
         Parameters
         ----------
         start_memory : str
-            ``end`` of the record (its start where the end is not known), ``start`` of it, or ``wiped``: after a
-            decaying oscillation over the identified voltages to 0 V, or to the nearest identified voltage.
+            ``end``: state at the end of the record, or at its start if the end is unknown; ``start``: state at the
+            start of the record; ``wiped``: state after a decaying oscillation over the identified voltage range to 0 V,
+            or to the nearest voltage in that range.
 
         Raises
         ------
         UsageError
-            If `start_memory` is none of these, or ``wiped`` is asked of a model that is not causal.
+            If `start_memory` is none of these, or it is ``wiped`` and the model is not causal.
         """
         match start_memory:
             case "start":
@@ -153,7 +154,7 @@ class AxisModel:
         raise UsageError(f"start_memory is '{start_memory}'; give one of {', '.join(START_MEMORIES)}")
 
     def memory(self, start_memory: StartMemory = "end") -> Memory:
-        """Return a new memory in the initial history `start_memory`, see `initial`.
+        """Return a new memory with the initial history `start_memory`, see `initial`.
 
         Raises
         ------
@@ -169,7 +170,7 @@ class AxisModel:
         if not start.history:
             return Memory(self.hysteresis, start.voltage, start.displacement)
         first, *turns = (*start.history, start.voltage)
-        # The displacement is known at the end of the history: simulate it once for that at its start.
+        # The displacement is given for the end of the history: one simulation yields the displacement at its start.
         primed = not start.from_rest
         way = Memory(self.hysteresis, first, 0.0, primed=primed).forward_array(np.array([first, *turns]))[-1]
         memory = Memory(self.hysteresis, first, start.displacement - float(way), primed=primed)
@@ -214,11 +215,11 @@ class AxisModel:
         return Start(state.voltage, state.displacement, turns or (state.voltage,), from_rest)
 
     def stream(self, limits: Limits | None = None, start_memory: StartMemory = "end") -> StreamingInverse:
-        """Return a streaming inverse within `limits` and the identified voltages, from `initial(start_memory)`."""
+        """Return a streaming inverse within `limits` and the identified voltage range, from `initial(start_memory)`."""
         return self.stream_from(self.memory(start_memory), self._allowed(limits))
 
     def stream_from(self, memory: Memory, allowed: Limits) -> StreamingInverse:
-        """Return a streaming inverse that continues from a memory of this axis; the effects start at rest."""
+        """Return a streaming inverse that continues from a memory of this axis; the effects start in equilibrium."""
         middle = self._middle if self.chain.rate_dependence else None
         return StreamingInverse(memory, self.displacement_range, allowed, self.effects, middle)
 
@@ -266,14 +267,14 @@ class AxisModel:
         Raises
         ------
         UnreachableError
-            If a displacement lies far outside the identified ones.
+            If a displacement lies far outside the identified range.
         UsageError
             If a displacement is not finite.
         """
         return self.command(t, self.remove_sensor_effects(t, y), limits, start_memory)
 
     def remove_sensor_effects(self, t: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the own displacement, shape (N,), metres, for a desired one, shape (N,), metres; other axes at rest.
+        """Return the displacement without sensor effects, shape (N,), metres, for a desired one; other axes at rest.
 
         Raises
         ------
@@ -291,7 +292,7 @@ class AxisModel:
     def command(
         self, t: FloatArray, own: FloatArray, limits: Limits | None = None, start_memory: StartMemory = "end"
     ) -> tuple[FloatArray, Mask]:
-        """Return the voltage for an own displacement, shape (N,), metres, and where it is held at a limit."""
+        """Return the voltage for a displacement without sensor effects (m), (N,), and where it is held at a limit."""
         if start_memory != "start":
             return replace(self, start=self.initial(start_memory)).command(t, own, limits, "start")
         allowed = self._allowed(limits)
@@ -309,7 +310,7 @@ class AxisModel:
     def _through_play(
         self, around: EffectContext, own: FloatArray, allowed: Limits, between: Limits
     ) -> tuple[FloatArray, Mask]:
-        """Return the result of `command` for a play before the hysteresis, computed sample by sample."""
+        """Return the result of `command` for a play operator before the hysteresis, computed sample by sample."""
         chain = self.chain
         h = backward(chain.own, own, around)
         stream = StreamingInverse(self.memory("start"), self.displacement_range, between, chain.before[-1:])
@@ -332,7 +333,7 @@ class AxisModel:
 
     @cached_property
     def _middle(self) -> Middle:
-        """The middle of the largest loop (m), at voltages (V)."""
+        """Function from voltage (V) to the mid-line of the largest loop (m)."""
         voltages, middle = loop_middle(self._forward_array, *self.voltage_range)
         return lambda u: np.interp(u, voltages, middle)
 
@@ -359,7 +360,7 @@ class AxisModel:
         return u, self._missed(h, u, allowed)
 
     def _missed(self, h: FloatArray, u: FloatArray, allowed: Limits) -> Mask:
-        """Return where a voltage at a limit does not give the desired displacement."""
+        """Return the mask of samples at which a voltage at a limit does not give the desired displacement."""
         held = (u <= allowed.lower) | (u >= allowed.upper)
         if held.any():
             # A desired displacement may be reached exactly at a limit.

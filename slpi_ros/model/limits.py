@@ -33,7 +33,7 @@ class Limits:
     acceleration: float = inf
 
     def __post_init__(self) -> None:
-        """Refuse an empty voltage range and non-positive rates."""
+        """Validate the limits."""
         if not self.lower <= self.upper or not self.slew > 0 or not self.acceleration > 0:
             raise UsageError(
                 f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s and acceleration "
@@ -41,7 +41,7 @@ class Limits:
             )
 
     def within(self, voltage_range: tuple[float, float]) -> "Limits":
-        """Return these limits, restricted to the identified voltages (V) of a model; UsageError if none is left."""
+        """Return these limits, restricted to the voltage range (V) of a model; UsageError if they do not overlap."""
         lower, upper = max(self.lower, voltage_range[0]), min(self.upper, voltage_range[1])
         if lower > upper:
             raise UsageError(
@@ -58,8 +58,8 @@ class Limits:
 class RateLimiter:
     """Limit the voltage change from one sample to the next by slew rate and acceleration.
 
-    With an acceleration limit every step leaves enough distance to brake before the voltage limits, and also before the
-    goal unless the goal itself reverses faster than the acceleration limit allows.
+    With an acceleration limit every step leaves enough distance to stop at the voltage limits, and at the goal unless
+    the goal itself reverses faster than the acceleration limit allows.
 
     Parameters
     ----------
@@ -80,11 +80,11 @@ class RateLimiter:
 
     @property
     def in_motion(self) -> bool:
-        """Whether the acceleration limit does not allow the voltage to stop at the next sample."""
+        """Whether the acceleration limit prevents the voltage from stopping at the next sample."""
         return abs(self.rate) > self.limits.acceleration * self._dt
 
     def clamp_dt(self, elapsed: float) -> float:
-        """Return the elapsed time (s) limited to 0..`MAX_DT`; after a longer pause the voltage starts from rest."""
+        """Return the elapsed time (s) limited to 0..`MAX_DT`; after a longer pause, reset the rate to zero."""
         if elapsed > MAX_DT:
             self.rest()
             return MAX_DT
@@ -107,7 +107,7 @@ class RateLimiter:
         return lowest, min(highest, max(upper, lowest))
 
     def toward(self, present: float, goal: float, goal_before: float, dt: float) -> tuple[float, float]:
-        """Return the interval of `reach`, restricted so that the voltage can stop at a goal of constant velocity.
+        """Return the interval of `reach`, restricted so that the voltage need not overshoot a goal of constant rate.
 
         Parameters
         ----------
@@ -131,7 +131,7 @@ class RateLimiter:
         return v
 
     def moved(self, way: float, dt: float) -> None:
-        """Store the rate of the last step: `way` (V) in `dt` (s)."""
+        """Store the rate of the last step: a change of `way` (V) in `dt` (s)."""
         if dt > 0.0:
             self.rate, self._dt = way / dt, dt
 
@@ -144,7 +144,7 @@ class RateLimiter:
         self.rate, self._dt = before.rate, before._dt
 
     def _ways(self, present: float, dt: float) -> tuple[float, float]:
-        """Return the largest steps (V) down and up that slew, acceleration and braking distance allow."""
+        """Return the largest steps (V) down and up that slew rate, acceleration and stopping distance allow."""
         limits = self.limits
         change, fastest = limits.acceleration * dt, limits.slew
         down = max(self.rate - change, -fastest) * dt
@@ -168,7 +168,7 @@ def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:
     """Return the reversal voltages (V) of a decaying oscillation, followed by the final voltage.
 
     The first cycle reaches both limits and so erases every loop between the limits. The amplitude then decreases
-    linearly over the cycles, on each side of the final voltage in proportion to the distance from the limit.
+    linearly over the cycles; on each side it is proportional to the distance from the final voltage to the limit.
 
     Parameters
     ----------

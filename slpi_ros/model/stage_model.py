@@ -91,13 +91,13 @@ class StageModel:
         Returns
         -------
         ndarray, shape (N,), or dict of axis name to ndarray, shape (N,), volts
-            In the form of `y`, within the identified voltages. For displacements slightly out of reach the voltage is
-            held at the limit, with a `HeldAtLimitWarning`.
+            In the form of `y`, within the identified voltage range. For displacements slightly outside the reachable
+            range the voltage is held at the limit, with a `HeldAtLimitWarning`.
 
         Raises
         ------
         UnreachableError
-            If a displacement lies far outside the identified ones.
+            If a displacement lies far outside the identified range.
         SlpiError
             If axes, lengths or values are not consistent.
         """
@@ -111,14 +111,14 @@ class StageModel:
     def command(
         self, t: ArrayLike, y: Signal, limits: Limits | None = None, start_memory: StartMemory = "end"
     ) -> dict[str, tuple[FloatArray, Mask]]:
-        """Return the voltage for a desired displacement, and where the voltage is held at a limit.
+        """Return the voltage for a desired displacement, and a mask of the samples at which it is held at a limit.
 
         Parameters
         ----------
         t, y, start_memory
             As in `compensate`.
         limits : Limits, optional
-            Limits of every axis, within the identified voltages; default: the identified voltages.
+            Limits of every axis, within the identified voltage range; default: that range.
 
         Returns
         -------
@@ -169,7 +169,7 @@ class StageModel:
 
     @property
     def origins(self) -> dict[str, float]:
-        """Initial displacement (m) of each axis, from which its motion is counted for cross-coupling."""
+        """Initial displacement (m) of each axis, from which its motion is measured for cross-coupling."""
         return {name: axis.start.displacement for name, axis in self.axes.items()}
 
     def _signals(self, t: ArrayLike, signal: Signal, what: str) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -195,7 +195,7 @@ class StageModel:
 
 @contextmanager
 def _naming(axis: str, what: str) -> Iterator[None]:
-    """Add axis and signal name to errors."""
+    """Add the names of axis and signal to error messages."""
     try:
         yield
     except SlpiError as error:

@@ -25,7 +25,7 @@ StreamingEffects = dict[str, StreamingEffect]
 # A desired displacement outside the identified range by more than this share of its span is refused as an error (wrong
 # unit, another stage); one closer to the range is held at the voltage limit.
 TOLERATED_SHARE = 0.2
-# Rounding, as a share of the displacement range, or of the voltage.
+# Tolerance for rounding errors, as a share of the displacement range, or of the voltage.
 ROUNDING = 1e-9
 # Fixed-point iterations: the coercivity depends weakly on the resulting voltage.
 TRIALS = 4
@@ -65,7 +65,7 @@ class StreamingInverse:
     Parameters
     ----------
     memory : Memory
-        Hysteresis memory in its initial state, modified in place. The effects start at rest.
+        Hysteresis memory in its initial state, modified in place. The effects start in equilibrium.
     displacement_range : (float, float), metres
         Smallest and largest displacement of the identified range.
     limits : Limits
@@ -73,7 +73,7 @@ class StreamingInverse:
     effects : tuple of Effect
         Effects besides the hysteresis; default: none.
     middle : callable, optional
-        Returns the middle of the largest loop (m) for voltages (V), shape (N,); for rate dependence. Default None.
+        Returns the mid-line of the largest loop (m) for voltages (V), shape (N,); for rate dependence. Default None.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ class StreamingInverse:
 
     @property
     def missed(self) -> bool:
-        """Whether any limit prevented the last desired displacement."""
+        """Whether any limit prevented the model from reaching the last desired displacement."""
         if self._streaming:
             return self._missing != 0.0
         return abs(self.desired - self.memory.displacement) > self._rounding
@@ -171,7 +171,7 @@ class StreamingInverse:
         if self._streaming:
             missing, short = self._missing, self._short
         limits, v = self.pace.limits, self.voltage
-        # Effects reach a limit only within rounding, and their inverse may overshoot.
+        # With effects, a limit is reached only up to rounding errors, and their inverse may overshoot.
         if min(missing, short) > 0.0:
             return v >= limits.upper - ROUNDING * (1.0 + abs(limits.upper))
         return max(missing, short) < 0.0 and v <= limits.lower + ROUNDING * (1.0 + abs(limits.lower))
@@ -190,7 +190,7 @@ class StreamingInverse:
         UsageError
             If `t` (s) or `y` (m) is not finite, or time runs backwards.
         UnreachableError
-            If `y` lies far outside the identified displacements.
+            If `y` lies far outside the identified displacement range.
         """
         if not (isfinite(t) and isfinite(y)):
             raise UsageError(f"sample t = {t} s, displacement = {y} m is not finite; omit the sample")
@@ -221,12 +221,12 @@ class StreamingInverse:
     __call__ = step
 
     def move(self, dt: float, y: float) -> float:
-        """Return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last one, without checks.
+        """Return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last sample, without checks.
 
         Raises
         ------
         UsageError
-            If the model has no voltage for `y`; without effects the state is unchanged.
+            If the model cannot reach `y`; without effects the state is unchanged.
         """
         if not self._streaming:
             h = y - self.coupled
@@ -248,7 +248,7 @@ class StreamingInverse:
         return v
 
     def drive(self, voltage: float, dt: float = 0.0) -> float:
-        """Apply a voltage (V), `dt` (s) after the last one, without a setpoint; return the displacement (m)."""
+        """Apply a voltage (V), `dt` (s) after the last sample, without a setpoint; return the displacement (m)."""
         self._command = self._goal = voltage
         self.memory.forward(self._reaching(dt, voltage))
         self.desired, self._missing = self.memory.displacement, 0.0
@@ -336,7 +336,7 @@ class StreamingInverse:
         return v
 
     def _played(self, h: float) -> tuple[float, float]:
-        """Move the memory to a displacement (m); return the voltage (V) before the play, and the bypass (m)."""
+        """Move the memory to `h` (m); return the voltage (V) before the play operator and the reversible bypass (m)."""
         memory, limits, play = self.memory, self.pace.limits, self._play
         if not play:
             return memory.inverse(h, limits.lower, limits.upper), 0.0
@@ -355,12 +355,12 @@ class StreamingInverse:
         return v, play.between(v, u)
 
     def _beyond_rounding(self, h: float) -> float:
-        """Return setpoint `h` - displacement of the hysteresis model (m); 0 if not larger than rounding errors."""
+        """Return the setpoint `h` minus the displacement of the hysteresis (m); 0 if it is only a rounding error."""
         missing = h - self.memory.displacement
         return missing if abs(missing) > self._rounding else 0.0
 
     def _reaching(self, dt: float, v: float) -> float:
-        """Return the voltage (V) that reaches the hysteresis, a command (V) through the effects that precede it."""
+        """Return the voltage (V) of the hysteresis for a command `v` (V), after the effects that precede it."""
         for streaming in self._before.values():
             v = streaming.forward(dt, v)
         return v
@@ -376,7 +376,7 @@ class StreamingInverse:
 
 
 def _streaming(effects: Iterable[Effect]) -> StreamingEffects:
-    """Return the streaming effects by name, without effects that have none."""
+    """Return the streaming forms of the effects by name; effects without a streaming form are omitted."""
     return {effect.name: streaming for effect in effects if (streaming := effect.streaming())}
 
 
@@ -405,7 +405,7 @@ class StageStream:
         Streaming inverse of each axis, modified in place.
     coupling : Coupling
     origins : mapping of axis name to float, metres
-        Displacement of each axis from which its motion is counted for cross-coupling.
+        Displacement of each axis from which its motion is measured for cross-coupling.
 
     Attributes
     ----------
@@ -419,7 +419,7 @@ class StageStream:
         self._coupling, self._origins = coupling, origins
 
     def step(self, t: float, y: Mapping[str, float]) -> dict[str, float]:
-        """Return the voltages (V) for desired displacements `y` (m) at time `t` (s); other axes hold theirs.
+        """Return the voltages (V) for desired displacements `y` (m) at time `t` (s); other axes hold their voltage.
 
         Raises
         ------

@@ -35,7 +35,7 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 # Sensor data: only the newest message is relevant.
 MEASUREMENTS = qos_profile_sensor_data
 DIAGNOSTICS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-# Freed memory that a process keeps: several times that of a trajectory of a million points. Options as in malloc.h.
+# Freed memory that a process keeps: several times the size of a trajectory of a million points. Options of malloc.h.
 KEPT_BYTES, _M_TRIM_THRESHOLD, _M_MMAP_MAX = 2**29, -1, -4
 
 
@@ -227,12 +227,12 @@ _stop = _Stop()
 def request_stop(failure: SlpiError | None = None) -> None:
     """Stop the node that ``run`` is spinning; for use in callbacks.
 
-    An exception that leaves a callback makes the events executor print a traceback; this does not.
+    An exception raised out of a callback would make the events executor print a traceback.
 
     Parameters
     ----------
     failure : SlpiError, optional
-        Reason of a failure: ``run`` prints its message and returns its exit code.
+        Error that causes the stop: ``run`` prints its message and returns its exit code.
     """
     _stop.requested = True
     _stop.failure = _stop.failure or failure
@@ -244,17 +244,17 @@ def make_executor(kind: str) -> Executor:
     Parameters
     ----------
     kind : {"events", "default"}
-        The events executor takes a fraction of the processor time; where rclpy does not have it, it is the default.
+        The events executor needs much less processor time; if rclpy lacks it, the default executor is returned.
 
     Returns
     -------
     rclpy.executors.Executor
-        To be driven by ``spin_once`` with a timeout only: its ``spin`` may miss SIGINT and SIGTERM.
+        Call only its ``spin_once``, with a timeout: its ``spin`` may miss SIGINT and SIGTERM.
 
     Raises
     ------
     UsageError
-        If the kind is neither.
+        If `kind` has another value.
     """
     if kind not in ("events", "default"):
         raise UsageError(f"no executor '{kind}'; choose events or default")
@@ -267,22 +267,22 @@ def make_executor(kind: str) -> Executor:
 
 
 def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
-    """Create a node, spin it until a signal or ``request_stop``, and shut it down in order.
+    """Create a node, spin it until a signal or ``request_stop``, and shut it down cleanly.
 
-    The ROS context stays valid until the node's ``destroy_node`` has returned, so a node may still publish
-    there.
+    The ROS context stays valid until the node's ``destroy_node`` has returned, so that the node may still publish in
+    that method.
 
     Parameters
     ----------
     make_node : callable
-        Creates the node; a SlpiError raised in it ends the process with that error's line and exit code.
+        Creates the node; if it raises a SlpiError, the message is printed and the exit code of the error returned.
     executor : {"events", "default"}
-        Which executor spins the node, unless the node's own `executor_kind` says so.
+        Executor that spins the node; a node with an attribute `executor_kind` chooses its executor itself.
 
     Returns
     -------
     int
-        Exit code of the process: 0 after a signal, a shutdown of ROS or a stop without failure.
+        Exit code of the process: 0 after a signal, a shutdown of ROS or a stop without an error.
     """
     global _stop
     _stop = _Stop()
@@ -300,7 +300,7 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
 
 
 def _live(make_node: Callable[[], Node], kind: str) -> None:
-    """Create, spin and destroy the node; raise the error that stopped it, a UsageError for what ROS refuses."""
+    """Create, spin and destroy the node; raise the error that stopped it, or UsageError if ROS cannot start it."""
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
@@ -331,7 +331,7 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
 
 @contextmanager
 def _signals_to(handler: Callable[..., None]) -> Iterator[None]:
-    """Install a handler for SIGINT and SIGTERM in this block."""
+    """Install a handler for SIGINT and SIGTERM for the duration of the ``with`` block."""
     # Python allows signal handlers in the main thread only; in other threads none is set.
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     previous = {number: signal.signal(number, handler) for number in numbers}

@@ -64,9 +64,9 @@ PATIENCE = Duration(seconds=1.0)
 class Compensator(LifecycleNode):
     """Lifecycle node that publishes the voltages of all axes for every message with desired displacements.
 
-    Subscribes ``desired_displacement``, ``desired_trajectory``, ``measured_displacement`` and ``stage_model``,
-    publishes ``voltage_command`` and ``/diagnostics``, serves ``~/reset_memory``; types, units and quality of service
-    are in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
+    Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement`` and ``stage_model``,
+    publishes ``voltage_command`` and ``/diagnostics``, provides the service ``~/reset_memory``. Message types, units
+    and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
 
     Raises
     ------
@@ -168,7 +168,7 @@ class Compensator(LifecycleNode):
         return self.create_subscription(kind, topic, callback, qos, qos_overriding_options=OVERRIDABLE, raw=raw)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to process messages, from the present voltages."""
+        """Start processing messages, from the present voltages."""
         self._save_memory(complete=False)
         self._controller.activate(time.monotonic_ns())
         result = super().on_activate(state)
@@ -177,7 +177,7 @@ class Compensator(LifecycleNode):
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Hold the present voltages, or first ramp to the safe voltages."""
+        """Stop processing messages; hold the present voltages, or ramp to the safe voltages first if configured."""
         self._end_activity()
         self._report()
         return super().on_deactivate(state)
@@ -191,7 +191,7 @@ class Compensator(LifecycleNode):
         return result
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Hold the present voltages, or first ramp to the safe voltages, and finalize."""
+        """Deactivate as `on_deactivate` does, destroy publisher and subscriptions, and finalize."""
         self._end_activity()
         result = super().on_shutdown(state)
         if self._controller.mode is not Mode.UNCONFIGURED:
@@ -201,7 +201,7 @@ class Compensator(LifecycleNode):
         return result
 
     def destroy_node(self) -> None:
-        """Deactivate in order, then destroy the node."""
+        """Deactivate as `on_deactivate` does, then destroy the node."""
         self._stop_reading()
         self._end_activity()
         super().destroy_node()
@@ -287,7 +287,7 @@ class Compensator(LifecycleNode):
         self._report()
 
     def _reject(self, what: str, error: RejectedError) -> None:
-        """Log and report the rejection of a message, already counted by the controller."""
+        """Log and report the rejection of a message, which the controller has counted already."""
         self._reporter.last_rejection = str(error)
         self.get_logger().warning(f"{what}rejected: {error}", throttle_duration_sec=LOG_PERIOD)
         self._report_at_least(WARN)
@@ -316,7 +316,7 @@ class Compensator(LifecycleNode):
     # Motion without messages
 
     def _clocks(self) -> tuple[int, int]:
-        """Return the times on the monotonic clock and on the clock of trajectories, nanoseconds."""
+        """Return the times on the monotonic clock and on the trajectory clock, nanoseconds."""
         now_ns = time.monotonic_ns()
         return now_ns, self.get_clock().now().nanoseconds if self._simulated else now_ns
 
@@ -371,7 +371,7 @@ class Compensator(LifecycleNode):
         self._reporter.report(self._settings)
 
     def _report_at_least(self, level: bytes) -> None:
-        """Report now if the level of the last report was lower than `level`."""
+        """Publish the diagnostics now if the level of the last report was lower than `level`."""
         if self._reporter.level < level:
             self._report()
 
@@ -380,8 +380,8 @@ class Compensator(LifecycleNode):
     def _on_model(self, message: String) -> None:
         """Load the model of a message in the background; the previous model is used until then.
 
-        The validation of a document takes as long as many commands, so it runs in another thread. It is canceled when a
-        newer document arrives.
+        Validating a document takes as long as processing many commands, so it runs in another thread. The validation is
+        canceled when a newer document arrives.
         """
         self._stop_reading()
         try:
@@ -397,7 +397,7 @@ class Compensator(LifecycleNode):
             self._reading = None
 
     def _on_model_read(self, coming: Future[Read | None]) -> None:
-        """Continue in the thread of the executor."""
+        """Schedule `_take_model` in the thread of the executor."""
         if self.executor:
             self.executor.create_task(self._take_model, coming)
 
@@ -443,7 +443,7 @@ class Compensator(LifecycleNode):
     # The memory
 
     def _begin_memory(self) -> None:
-        """Warn once about an assumed memory, or reset the memory if `reset_on_start`; only when active with a model."""
+        """Warn once about an assumed memory, or start a reset if `reset_on_start`; only when active with a model."""
         controller = self._controller
         unsure = [axis for axis in controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
         if controller.model is None or controller.mode is not Mode.STREAMING or not unsure:
@@ -460,7 +460,7 @@ class Compensator(LifecycleNode):
             )
 
     def _assumed(self, axis: Axis) -> str:
-        """Return a text for the assumed memory of an axis."""
+        """Return a text that describes the assumed memory of an axis."""
         if axis.confidence.doubt or not axis.start_memory:
             return axis.confidence.doubt or "as before activation"
         where = {"end": "at the end of the record", "start": "at the start of the record", "wiped": "as after a reset"}
@@ -488,7 +488,7 @@ class Compensator(LifecycleNode):
         return ""
 
     def _answer_reset(self) -> None:
-        """Answer the service with the result of the reset."""
+        """Send the response of the service ``~/reset_memory`` with the result of the reset."""
         axes, voltages = self._controller.axes, ", ".join(f"{v:.6g}" for v in self._controller.voltages)
         doubts = [f"axis '{axis.name}': {axis.confidence.doubt}" for axis in axes if axis.confidence.state != KNOWN]
         if any(axis.confidence.doubt == INTERRUPTED for axis in axes):
@@ -504,7 +504,7 @@ class Compensator(LifecycleNode):
         self._reset_service.answer(not doubts, said)
 
     def _save_memory(self, complete: bool) -> None:
-        """Save the memory, or log the error; `complete`: no further voltage is output before shutdown."""
+        """Save the memory, or log the error; `complete` means that no further voltage is output afterwards."""
         controller = self._controller
         if not self._keeps_memory or controller.model is None:
             return
@@ -521,7 +521,7 @@ class Compensator(LifecycleNode):
 def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayLike]:
     """Return stamp (ns), names, times (ns) and positions of a serialized JointTrajectory.
 
-    An unreadable message yields no names, positions of different lengths are kept: the controller rejects both.
+    An unreadable message gives no names; positions of different lengths are returned as such. Both are then rejected.
     """
     if arrays := decode_trajectory(data):
         return arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.positions

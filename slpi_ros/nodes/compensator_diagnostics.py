@@ -157,7 +157,7 @@ class Reporter:
         }
 
     def _problems(self, settings: CompensatorSettings) -> Iterator[Problem]:
-        """Yield the problems present or counted since the last periodic report."""
+        """Yield every possible problem, with whether it is present or was counted since the last periodic report."""
         counts, window = self._controller.counts, self._window
         ready, active = self._controller.model is not None, self._controller.active
         yield self.model_error != "", WARN if ready else ERROR, f"model refused: {self.model_error}"

@@ -1,4 +1,4 @@
-"""Parameters of the compensator: one table for declaration, validation and the table in the README."""
+"""Parameters of the compensator: one table for their declaration, validation and documentation in the README."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ HOLD_OR_SAFE = ("hold", "safe")
 
 
 def each_axis(name: str, default: float, description: str, between: tuple[float, float]) -> Declaration:
-    """Declare a number that may be given for each axis."""
+    """Declare a numeric parameter that may have one value for each axis."""
     text = f"{description} One value, or one for each axis."
     return Declaration(name, default, text, between=between, number=True, each_axis=True)
 
@@ -31,12 +31,12 @@ def each_axis(name: str, default: float, description: str, between: tuple[float,
 def scalar(
     name: str, default: float, description: str, between: tuple[float, float], read_only: bool = False
 ) -> Declaration:
-    """Declare a number."""
+    """Declare a numeric parameter with a single value."""
     return Declaration(name, default, description, read_only, between, number=True)
 
 
 def text(name: str, default: str, description: str, *choices: str, read_only: bool = False) -> Declaration:
-    """Declare a string, limited to `choices` if any are given."""
+    """Declare a string parameter, limited to `choices` if any are given."""
     return Declaration(name, default, description, read_only, choices=choices)
 
 
@@ -79,7 +79,7 @@ DECLARATIONS = (
         "Watchdog, seconds without an accepted command until on_timeout applies and /diagnostics warns. 0: disabled.",
         TIMEOUT,
     ),
-    # Safe ends
+    # Safe voltages
     text(
         "on_timeout", "hold", "At command_timeout: hold the voltage, or ramp to safe_voltage (hold or safe).",
         *HOLD_OR_SAFE,
@@ -148,7 +148,7 @@ class CompensatorSettings:
     Parameters
     ----------
     values : mapping of str to object
-        All parameters by name, each validated; tuples with one value per axis where each axis may have its own.
+        All parameters by name, validated; a parameter that may differ between axes is a tuple, one value per axis.
     limits : tuple of Limits
         One for each axis.
     time : TimestampRules
@@ -165,7 +165,7 @@ class CompensatorSettings:
 
     @classmethod
     def of(cls, given: Values) -> "CompensatorSettings":
-        """Return the settings for all parameters by name.
+        """Return the settings from a mapping of parameter names to values.
 
         Raises
         ------

@@ -23,7 +23,7 @@ from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes.common import COMMANDS, LATCHED, request_stop, run
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 
-# A read-back voltage outside the limits by at most this share of the range counts as at the limit.
+# A reported voltage outside the limits by at most this fraction of the range counts as at the limit.
 READ_BACK = 0.01
 
 VOLTAGE = (-10_000.0, 10_000.0)
@@ -90,12 +90,12 @@ class ExciterSettings:
 
     @classmethod
     def of(cls, given: Values) -> "ExciterSettings":
-        """Return the settings for all parameters by name.
+        """Return the settings from a mapping of parameter names to values.
 
         Raises
         ------
         UsageError
-            If a value is not valid, or no excitation drive exists for the values.
+            If a value is not valid, or the values do not allow an excitation.
         """
         values, axes = validated(DECLARATIONS, given), given["axes"]
         low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
@@ -108,12 +108,12 @@ class ExciterSettings:
         return settings
 
     def drawn(self, heard: Sequence[float] | None) -> Drive:
-        """Return the excitation drive from the reported voltages `heard` (V, one per axis), or None if unknown.
+        """Return the excitation, starting at the reported voltages `heard` (V, one per axis; None if unknown).
 
         Raises
         ------
         UsageError
-            If no excitation drive exists for the settings.
+            If the settings do not allow an excitation.
         SlpiError
             If a reported voltage is outside the limits.
         """
@@ -143,9 +143,9 @@ SLUGGISH = 1.02
 class Exciter(Node):
     """Excite a stage within its limits, and return it to its initial voltage when the excitation ends or is stopped.
 
-    Publishes ``voltage_command`` with one sample per period of a monotonic clock: after a stall excitation continues
-    later with the next sample, without a step. With the parameter ``output`` "trajectory" all samples are published in
-    one message on ``voltage_trajectory``: volts in ``effort``, as in ``stage_state``, without positions. Subscribes
+    Publishes ``voltage_command`` with one sample per period of a monotonic clock: after a stall of the process the
+    excitation continues with the next sample, without a voltage step. With the parameter ``output`` "trajectory" all
+    samples are published in one message on ``voltage_trajectory``, volts in ``effort``, no positions. Subscribes to
     ``stage_state`` for the initial voltages. The node waits for a subscriber before it starts.
     Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
 
@@ -209,7 +209,7 @@ class Exciter(Node):
         self._waiting.reset()
 
     def _poll_subscribers(self) -> None:
-        """Start once no subscriber has joined for the settling time, so that no subscriber misses the first samples."""
+        """Start once the number of subscribers has not changed for the time `settle`, so that none misses samples."""
         listeners = self._publisher.get_subscription_count()
         if not listeners:
             self.get_logger().info(
@@ -293,7 +293,7 @@ class Exciter(Node):
 
 
 def trajectory_of(playback: Playback) -> JointTrajectory:
-    """Return the remaining samples as a trajectory: volts in ``effort``, no positions, times from now."""
+    """Return the remaining samples as a trajectory that starts now: volts in ``effort``, no positions."""
     rate = playback.drive.rate
     points = [
         JointTrajectoryPoint(effort=array("d", voltages), time_from_start=_duration(number / rate))

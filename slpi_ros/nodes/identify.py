@@ -89,7 +89,7 @@ class IdentifySettings:
 
     @classmethod
     def of(cls, values: Values) -> "IdentifySettings":
-        """Return the settings for all parameters by name.
+        """Return the settings from a mapping of parameter names to values.
 
         Raises
         ------
@@ -130,15 +130,15 @@ NO_MODEL = "nothing to diagnose: no bag has been identified yet"
 
 
 class DiagnosisService:
-    """Service ``~/diagnose``: diagnoses the model errors on the bags of the fit, and responds when complete.
+    """Service ``~/diagnose``: find the causes of the model errors on the bags of the fit; respond when complete.
 
-    The diagnosis writes files only; it does not change the published model.
+    The diagnosis only writes files; it does not change the published model.
 
     Parameters
     ----------
     node : Node
     identified : callable
-        Returns the model in use, or None.
+        Returns the request for the published model and its bags; None if there is no model.
     folder : callable
         Returns the output folder; "" for a temporary folder.
     report : callable
@@ -169,7 +169,7 @@ class DiagnosisService:
 
     @property
     def activity(self) -> str:
-        """Text for the running diagnosis; "" if none."""
+        """Text that describes the running diagnosis; "" if none."""
         return f"diagnosing {self._job.request.source} for {time.monotonic() - self._began:.0f} s" if self._job else ""
 
     @property
@@ -185,7 +185,7 @@ class DiagnosisService:
         }
 
     def forget(self) -> None:
-        """Discard the last result because another model is in use."""
+        """Discard the last result because another model has been published."""
         if not self._job:
             self._last, self._outcome = None, DiagnosisOutcome()
 
@@ -247,10 +247,10 @@ NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
 class Identify(Node):
     """Identify the model of a stage from bags and publish it, latched, on ``stage_model``.
 
-    Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`; the service ``~/identify``
-    (``std_srvs/Trigger``) starts anew, ``~/diagnose`` says what the published model gets wrong on its bags. A bag that
-    cannot be identified is reported and skipped, and the last good model stays published; so is a bag of the watched
-    folder that is of another stage than that model.
+    Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`. The service ``~/identify``
+    (``std_srvs/Trigger``) repeats the identification, ``~/diagnose`` finds the causes of the errors of the published
+    model on its bags. A bag that cannot be identified, or a bag of the watched folder that was recorded on another
+    stage, is reported and skipped; the last valid model stays published.
 
     Raises
     ------
@@ -307,7 +307,7 @@ class Identify(Node):
             self._begin(settings)
 
     def _begin(self, settings: IdentifySettings) -> None:
-        """Stop the running identification and start that of the parameters."""
+        """Stop the running identification and start the one that the settings request."""
         self._end_job()
         self._error = ""
         self._doubtful = None
@@ -332,7 +332,7 @@ class Identify(Node):
         self._start_next()
 
     def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Publish a withheld model, if any; else repeat the identification of the bags or of the newest watched one."""
+        """Publish a withheld model, if any; else identify again from the given bags or from the newest watched bag."""
         if self._doubtful:
             (asked, document), self._doubtful = self._doubtful, None
             self._take(asked, FitOutcome(document, self._written(asked, document)))
@@ -357,7 +357,7 @@ class Identify(Node):
             self._poll.reset()
 
     def _next_request(self) -> FitRequest | None:
-        """Return the request of the parameters, then one request for each bag of the watched folder."""
+        """Return the request of the settings first, then one for each queued bag of the watched folder, then None."""
         request, self._asked = self._asked, None
         if not request and self._waiting:
             bag = str(self._waiting.popleft())
@@ -452,7 +452,7 @@ class Identify(Node):
 
 
 def abandonment(bags: Sequence[Path]) -> str:
-    """Return a line that names the abandoned bags and the remedy."""
+    """Return a one-line message that names the abandoned bags and the remedy."""
     return (
         f"{', '.join(map(str, bags))}: not complete, and not grown for {PATIENCE:g} s: the recording seems abandoned; "
         "if it is, repair it (`ros2 bag reindex` for a folder, `mcap recover` for a file) or delete it"
@@ -460,7 +460,7 @@ def abandonment(bags: Sequence[Path]) -> str:
 
 
 def described(model: StageModel) -> str:
-    """Return a line with the fit quality of a model."""
+    """Return a one-line message with the fit quality of a model."""
     axes = []
     for name, axis in model.axes.items():
         quality, (low, high) = axis.quality, axis.displacement_range

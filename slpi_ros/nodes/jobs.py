@@ -34,9 +34,9 @@ class WorkerProcess(Generic[Request, Outcome]):
         Module-level function that returns the outcome of a request.
     request : object
     outcome : type
-        Dataclass of plain values; created with `error` only if the process ends without a result.
+        Dataclass of plain values; it is created with only `error` set if the process ends without a result.
     what : str
-        Description of the work for that error.
+        Description of the work for this error message.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class WorkerProcess(Generic[Request, Outcome]):
         return outcome
 
     def end(self) -> None:
-        """Kill the worker process and wait until it has gone."""
+        """Kill the worker process and wait until it has ended."""
         self._process.kill()
         self._process.join()
         self._receiver.close()
@@ -99,7 +99,7 @@ class StageIdentity:
 
     @classmethod
     def of(cls, model: StageModel, before: "StageIdentity | None") -> "StageIdentity":
-        """Return the stage of a model; a missing hardware id is taken from `before`."""
+        """Return the identity of a model's stage; a missing hardware id is taken from `before`."""
         return cls(model.hardware_id or (before.hardware_id if before else ""), tuple(model.axes))
 
     def require(self, record: Record) -> None:
@@ -129,13 +129,13 @@ class FitRequest:
     kind : str
         Kind of hysteresis model.
     start, stop : float or None, seconds
-        Fitted part of the record; None: from the first, or to the last stamp.
+        Start and end of the fitted part of the record; None: first stamp, or last stamp.
     output : str
         File for the model document; "" if none.
     stage : StageIdentity, optional
         Stage that the bags must belong to; default: any.
     published : str
-        Model document to be replaced, compared with the new one; "" (default): no comparison.
+        Published model document, which is compared with the new one; "" (default): no comparison.
     """
 
     bags: tuple[str, ...]
@@ -157,7 +157,7 @@ class FitRequest:
 class FitOutcome:
     """Outcome of an identification: a model document, an error, or both if the file could not be written.
 
-    `doubt` is the reason why the model must not replace the published one automatically; it is not written then.
+    `doubt` is the reason why the model must not replace the published one automatically; no file is written then.
     """
 
     document: str = ""
@@ -167,7 +167,7 @@ class FitOutcome:
 
 def fit(request: FitRequest) -> FitOutcome:
     """Read the bags, identify the model and write it to the output file, if any."""
-    # The compensator reads models by this module, and does without what is slow to load.
+    # Imported here because they load slowly: the compensator uses this module to read models only.
     from slpi_ros.identification.fit import identify
     from slpi_ros.io.bag_reader import read_bag
 
@@ -190,13 +190,13 @@ def fit(request: FitRequest) -> FitOutcome:
     return FitOutcome(document)
 
 
-# A model replaces the published one automatically only if the ratio of the held-out errors is at most this, and the
-# largest loops differ by at most this share of the loop height.
+# Conditions for an automatic replacement of the published model: maximum ratio of the new to the old held-out error,
+# and maximum difference of the largest loops as a fraction of their height.
 MUCH_WORSE, FOREIGN = 3.0, 0.1
 
 
 def doubt_about(model: StageModel, published: StageModel) -> str:
-    """Return why a model should not replace the published one automatically (worse, or another stage), or ""."""
+    """Return the reason not to replace the published model automatically (worse fit, or another stage), or ""."""
     for name, old in published.axes.items():
         new = model.axes[name]
         errors = [axis.quality.held_out_rms * 1e9 for axis in (new, old)]
@@ -254,7 +254,7 @@ class DiagnosisOutcome:
 
 
 def run_diagnosis(request: DiagnosisRequest) -> DiagnosisOutcome:
-    """Read the bags, diagnose the model and write the files."""
+    """Read the bags, diagnose the model and write the output files."""
     from slpi_ros.diagnosis.diagnose import diagnose
     from slpi_ros.io.bag_reader import read_bag
     from slpi_ros.reports.diagnosis import FILES, write_files
@@ -292,7 +292,7 @@ class CheckOutcome:
 
 
 def check(request: tuple[str, str]) -> CheckOutcome:
-    """Validate a model document, given with its source."""
+    """Validate a model document; `request` holds its text, and its name in messages."""
     try:
         return CheckOutcome(fingerprint=model_id(parse_model(*request)))
     except SlpiError as error:

@@ -112,12 +112,12 @@ class Parameters(Generic[Settings]):
     node : Node
     declarations : sequence of Declaration
     make : callable
-        Returns the settings for all values by name; raises SlpiError if they are not valid.
+        Returns the settings from a mapping of names to values; raises SlpiError if they are not valid.
 
     Raises
     ------
     UsageError
-        If the values given at the start are not valid.
+        If the initial values are not valid.
     """
 
     def __init__(self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]) -> None:
@@ -129,7 +129,7 @@ class Parameters(Generic[Settings]):
         self.settings = make(self._values)
 
     def follow(self, apply: Callable[[Settings], None], check: Callable[[Settings], None] | None = None) -> None:
-        """Allow parameter changes that `check` accepts (else it raises SlpiError); call `apply` with new settings."""
+        """Allow parameter changes unless `check` raises SlpiError; call `apply` with the new settings."""
         self._applied, self._checked = apply, check
         self._node.add_on_set_parameters_callback(self._check)
         self._node.add_post_set_parameters_callback(self._apply)
@@ -150,7 +150,7 @@ class Parameters(Generic[Settings]):
             self._applied(self.settings)
 
     def _ours(self, changes: Sequence[Parameter]) -> dict[str, Any]:
-        """Return the changes without parameters of rclpy, such as use_sim_time."""
+        """Return the changes of declared parameters, without those of rclpy such as use_sim_time."""
         return {change.name: change.value for change in changes if change.name in self._values}
 
 
@@ -160,7 +160,7 @@ def number(values: Values, name: str, low: float, high: float) -> float:
     Raises
     ------
     UsageError
-        Unless it is one finite number from `low` to `high`.
+        If it is not one finite number from `low` to `high`.
     """
     return numbers(values, name, ("",), low, high)[0]
 
@@ -171,7 +171,7 @@ def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: fl
     Raises
     ------
     UsageError
-        Unless all are finite numbers from `low` to `high`.
+        If not all are finite numbers from `low` to `high`, or there is not one for each axis.
     """
     given = values[name]
     if isinstance(given, Sequence) and not isinstance(given, str):

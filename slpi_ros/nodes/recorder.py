@@ -37,7 +37,7 @@ DECLARATIONS = (
 class Recorder(Node):
     """Record topics into a bag until stopped.
 
-    Subscribes the topics named by the parameter ``topics``, with the reliability and durability that the
+    Subscribes to the topics named by the parameter ``topics``, with the reliability and durability that their
     publishers offer; messages are not deserialized. An incomplete bag is kept in ``.NAME.partial`` in
     the folder of the output. Parameters in `DECLARATIONS`.
 
@@ -87,7 +87,7 @@ class Recorder(Node):
             super().destroy_node()
 
     def _discover(self) -> None:
-        """Subscribe the topics for which publishers have been discovered."""
+        """Subscribe to the topics for which publishers have been discovered."""
         for name in list(self._awaited):
             if publishers := self.get_publishers_info_by_topic(name):
                 del self._awaited[name]
@@ -106,7 +106,7 @@ class Recorder(Node):
         return str(types.pop())
 
     def _subscribe(self, name: str, msgtype: str, publishers: Sequence[Any]) -> None:
-        """Subscribe a topic with a QoS that all its publishers offer; resubscribe if that QoS has changed."""
+        """Subscribe to a topic with a QoS that all its publishers offer; resubscribe if that QoS has changed."""
         offers = [publisher.qos_profile for publisher in publishers]
         reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
         latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers) and offers
@@ -153,7 +153,7 @@ class Recorder(Node):
                     self._record(name, taken[0])
 
     def _finish(self) -> None:
-        """Close the bag and move it to its path; RecordError if it is empty."""
+        """Close the bag and move it to its final path; RecordError if it is empty."""
         if self.context.ok():
             self._drain()
         bag, self._bag = self._bag, None

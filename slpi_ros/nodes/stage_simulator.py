@@ -52,15 +52,15 @@ DECLARATIONS = (
 class StageSimulator(Node):
     """Simulate a stage with the topics of a real one.
 
-    Subscribes ``voltage_command`` (std_msgs/Float64MultiArray, volts in the order of the axes) and publishes
-    ``stage_state`` (sensor_msgs/JointState: ``position`` in metres as measured, ``effort`` in volts as
-    applied). Commands beyond the voltage limits are clipped, as the amplifier saturates. Parameters are those in
-    `DECLARATIONS`, and ``hardware_id``, by default ``simulated-`` with the preset, or the seed without a preset: the
-    seed of a preset only affects noise.
+    Subscribes to ``voltage_command`` (std_msgs/Float64MultiArray, volts in the order of the axes) and publishes
+    ``stage_state`` (sensor_msgs/JointState: measured displacement in metres in ``position``, applied voltage in volts
+    in ``effort``). Commands beyond the voltage limits are clipped, as the amplifier saturates. Parameters are those in
+    `DECLARATIONS`, and ``hardware_id``, by default ``simulated-PRESET``, or ``simulated-SEED`` without a preset: with a
+    preset, the seed affects the noise only.
 
-    Without preset the stage has random hysteresis for the given seed and no other effects. Preset "p11" is the stage of
-    the MPI paper with creep and resonance, axes x and y, and its own sensor noise, drawn from the seed; it uses the
-    node's clock, which may be a simulated one.
+    Without a preset the stage has random hysteresis, drawn from the seed, and no other effects. Preset "p11" is the
+    stage of the MPI paper with axes x and y, creep, resonance and its own sensor noise. Its dynamics run on the clock
+    of the node, which may be a simulated one.
 
     Attributes
     ----------

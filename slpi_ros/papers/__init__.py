@@ -1,1 +1,1 @@
-"""The two papers' tables and figures, computed anew on simulated and measured stages."""
+"""Tables and figures of the SLPI and the MPI paper, reproduced on simulated and measured stages."""

@@ -1,4 +1,4 @@
-"""The MPI paper's feedforward and compound control, Fig. 11 to 14 and Table 6, computed anew on both axes."""
+"""Feedforward and compound control of the MPI paper (Fig. 11 to 14, Table 6), reproduced on two simulated axes."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,18 +38,19 @@ from slpi_ros.simulation.stage import p11_stage
 
 FloatArray = NDArray[np.float64]
 
-# Samples per second of the controller.
+# Sampling rate of the controller, hertz.
 RATE = 2000.0
-# Volts: what the stage takes (paper, 2.1).
+# Voltage range of the stage (section 2.1 of the paper), volts.
 LIMITS = Limits(-20.0, 150.0)
-# Volts of the record that models are identified on, at 1 Hz, 500 samples per cycle: 100 µm need more than the nominal
-# 120 V. The first cycle wipes the memory and is not fitted.
+# Amplitudes (V) of the cycles at 1 Hz on which models are identified, and samples per cycle. 100 µm need more than the
+# nominal 120 V. The first cycle resets the hysteresis state and is not fitted.
 RECORD, RECORD_SAMPLES = (150, 150, 150, 140, 120, 100, 80, 60, 40, 20), 500
-# Cycles at 1 Hz before a path; where they end is the sensor's zero. Where a rest follows, it takes this long, seconds.
+# Number of warm-up cycles at 1 Hz before a path, and duration (s) of an optional rest after them; then the sensor is
+# zeroed.
 WARM_UP, REST = 2, 2.0
-# Fig. 11, volts; its path has the peak that the record has at this voltage.
+# Amplitude of Fig. 11, volts; the desired peak is that of the identification record at this voltage.
 FEEDFORWARD_VOLTAGE = 80
-# Shares of the gains at which the loop gain would reach 1 at the flexure's mode.
+# Controller gains as shares of those with which the loop gain at the flexure mode would be 1.
 INTEGRAL_SHARE, PROPORTIONAL_SHARE = 1 / 3, 1 / 10
 
 KINDS = {SMPI: "smpi", FAMILY: "slpi"}
@@ -64,9 +65,9 @@ class Outcome:
     ----------
     desired : ndarray, shape (N,), metres
     measured : ndarray, shape (N,), metres
-        By the sensor.
+        Sensor readings.
     displacement : ndarray, shape (N,), metres
-        Of the stage itself, without sensor errors.
+        True displacement, without sensor errors.
     """
 
     desired: FloatArray
@@ -75,22 +76,22 @@ class Outcome:
 
     @property
     def by_sensor(self) -> ErrorMetrics:
-        """Errors by the sensor."""
+        """Error metrics of the sensor readings."""
         return error_metrics(self.desired, self.measured)
 
     @property
     def by_truth(self) -> ErrorMetrics:
-        """Errors of the stage itself."""
+        """Error metrics of the true displacement."""
         return error_metrics(self.desired, self.displacement)
 
     @property
     def offset(self) -> float:
-        """Mean error by the sensor, signed, metres."""
+        """Signed mean error of the sensor readings, metres."""
         return float(np.mean(self.measured - self.desired))
 
     @property
     def scatter(self) -> float:
-        """Standard deviation of the error by the sensor, metres."""
+        """Standard deviation of the error of the sensor readings, metres."""
         return float(np.std(self.measured - self.desired))
 
     @property
@@ -99,23 +100,24 @@ class Outcome:
         return np.array([self.measured[a : b + 1].max() for a, b in cycles(self.desired, 0.0)])
 
     def within(self, band: float) -> float:
-        """Return the share of readings that are within `band` (m) of what was desired."""
+        """Return the share of the sensor readings that are within `band` (m) of the desired displacement."""
         return float(np.mean(np.abs(self.measured - self.desired) <= band))
 
 
 @dataclass(frozen=True)
 class AxisStudy:
-    """The experiments on one axis.
+    """Results of the experiments on one axis.
 
     Parameters
     ----------
     gains : PidGains
+        Controller gains.
     feedforward : mapping of model to Outcome
-        Fig. 11.
+        Feedforward alone, Fig. 11.
     compound : mapping of (model or "", whether with PID) to Outcome
-        Fig. 13.
+        Segments of Table 6, Fig. 13; "" is no feedforward.
     rested : mapping of model to Outcome
-        The same with PID, after a rest at 0 V that ends with setting the zero.
+        The same with PID, with a rest at 0 V between warm-up and zeroing of the sensor.
     """
 
     gains: PidGains
@@ -125,7 +127,7 @@ class AxisStudy:
 
 
 def run_study(axis: PreisachStage, name: str, path_cycles: int = 3) -> AxisStudy:
-    """Identify models of an axis and let it follow the paths of Fig. 11 and of Table 6, `path_cycles` of each part."""
+    """Identify models of an axis and run the paths of Fig. 11 and of Table 6, with `path_cycles` cycles per segment."""
     record = triangle_record(axis, name, RECORD, 1.0, RECORD_SAMPLES)
     models = {label: _warm(identify(record, kind, start=1.0).axis(name)) for label, kind in KINDS.items()}
     smpi = models[SMPI].hysteresis
@@ -155,23 +157,24 @@ def run_study(axis: PreisachStage, name: str, path_cycles: int = 3) -> AxisStudy
 
 
 def path(parts: Sequence[tuple[float, float]], path_cycles: int) -> FloatArray:
-    """Return triangles, shape (N,), metres, of peaks (m) and frequencies (Hz), at the controller's rate, up to 0."""
+    """Return triangle waves with peaks (m) and frequencies (Hz), shape (N,), metres, sampled at `RATE`, ending at 0."""
     waves = [triangles(peak, frequency, path_cycles, 2 * round(RATE / frequency / 2))[1] for peak, frequency in parts]
     return np.append(np.concatenate(waves), 0.0)
 
 
 def tune(stage: StageParameters, gain: float) -> PidGains:
-    """Return gains for an axis with a lightly damped mode, ``w`` and ``z``, and a static gain ``g`` (m/V).
+    """Return PI gains for an axis with a lightly damped mode (frequency ``w``, damping ``z``) and static gain ``g``.
 
-    At the mode the stage answers with ``g / 2z``, so integral action alone would make the loop gain 1 there with ``K_i
-    = 2 z w / g``, proportional action with ``K_p = 2 z / g``. With a third of one and a tenth of the other it stays
-    below 0.35 whatever the phase, and so whatever lag and delay there are. Derivative action would raise it.
+    At the mode the gain of the stage is ``g / 2z``, so the loop gain there would be 1 with integral action alone of
+    ``K_i = 2 z w / g``, or proportional action alone of ``K_p = 2 z / g``. With one third of the former and one tenth
+    of the latter it is below 0.35 for any phase, so for any lag and delay. Derivative action would increase it.
 
     Parameters
     ----------
     stage : StageParameters
-        Of which the frequency and damping of the mode are used, as a ring-down shows them.
+        Only the frequency and damping of the mode are used, which could be measured by a ring-down test.
     gain : float, metres per volt
+        Static gain ``g``.
     """
     omega, double_damping = 2.0 * math.pi * stage.resonance_frequency, 2.0 * stage.resonance_damping
     return PidGains(PROPORTIONAL_SHARE * double_damping / gain, INTEGRAL_SHARE * double_damping * omega / gain)
@@ -185,22 +188,22 @@ def follow(
     warm_up: float,
     rest: float = 0.0,
 ) -> Outcome:
-    """Warm an axis up, set the sensor's zero, and let the axis follow a path.
+    """Warm up an axis, zero the sensor, and let the axis follow a path.
 
-    A voltage is reached one sample after it is given. The path is known, so the feedforward is given one sample ahead.
+    A voltage is reached one sample after its command. The path is known, so the feedforward is one sample ahead.
 
     Parameters
     ----------
     axis : PreisachStage
     desired : ndarray, shape (N,), metres
-        From 0.
+        Desired displacement, starting at 0.
     feedforward : ndarray, shape (N,), volts
     gains : PidGains or None
-        None: no feedback.
+        Controller gains; None for no feedback.
     warm_up : float, volts
-        Amplitude of the cycles before.
+        Amplitude of the warm-up cycles.
     rest : float, seconds
-        Time at 0 V between them and the zero.
+        Time at 0 V between warm-up and zeroing of the sensor.
     """
     axis.rest()
     v = np.append(triangles(warm_up, 1.0, WARM_UP, round(RATE))[1], np.zeros(1 + round(rest * RATE)))
@@ -220,12 +223,12 @@ def follow(
 
 
 def _warm(model: AxisModel) -> AxisModel:
-    """Return a model that starts at 0 V and at the sensor's zero, after a long fall."""
+    """Return a model with the initial state of a warmed-up axis: 0 V and zero displacement after a long fall."""
     return replace(model, start=Start(0.0, 0.0, (0.0,) if model.causal else ()), end=None)
 
 
 def followed(outcomes: Mapping[str, Outcome], suffix: str, band: float | None) -> Figure:
-    """Draw desired and measured displacement, by model, and the errors below; shade a band (µm)."""
+    """Draw desired and measured displacement by model, and the errors below, where a band of +- `band` µm is shaded."""
     figure, (upper, lower) = panels(2, 1, (11, 6.4), height_ratios=(1, 1), sharex=True)
     for model, outcome in outcomes.items():
         t, error = np.arange(outcome.desired.size) / RATE, outcome.measured - outcome.desired
@@ -241,7 +244,7 @@ def followed(outcomes: Mapping[str, Outcome], suffix: str, band: float | None) -
 
 
 def scheme() -> Figure:
-    """Draw the block diagram of feedforward and feedback together."""
+    """Draw the block diagram of compound control: feedforward plus feedback."""
     figure, (panel,) = panels(1, 1, (9, 3.0))
     panel.set(xlim=(0, 12.6), ylim=(0, 4.2))
     panel.set_axis_off()
@@ -278,12 +281,12 @@ def scheme() -> Figure:
 
 
 def exhibits(seed: int = 0) -> list[Exhibit]:
-    """Run the experiments and return their exhibits; `seed` is that of the sensor noise."""
+    """Run the experiments and return their exhibits; `seed` is the seed of the sensor noise."""
     return present({name: run_study(axis, name) for name, axis in p11_stage(seed).axes.items()})
 
 
 def present(studies: Mapping[str, AxisStudy]) -> list[Exhibit]:
-    """Return the exhibits of studies, by axis name."""
+    """Return the exhibits for the studies of the axes, given by axis name."""
     return [_feedforward(studies), _scheme(studies), _compound(studies)]
 
 
@@ -399,7 +402,7 @@ def _compound(studies: Mapping[str, AxisStudy]) -> Exhibit:
 
 
 def _farthest(outcome: Outcome) -> FloatArray:
-    """Return how far (µm) the peak of each segment is from the expected one, in the cycle where it is farthest."""
+    """Return the largest deviation (µm, signed) of the peaks of each segment from the expected peak."""
     apart = outcome.peaks.reshape(len(TABLE_6), -1) * 1e6 - np.array(TABLE_6)[:, :1]
     farthest: FloatArray = apart[np.arange(len(TABLE_6)), np.abs(apart).argmax(axis=1)]
     return farthest

@@ -1,4 +1,4 @@
-"""An exhibit: a table or figure of a paper, the one computed here beside it, and what differs; its pictures."""
+"""Exhibits: a table or figure of a paper in comparison with the reproduced one, and functions to draw them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text cells; row `best` stands out."""
+    """A table of text cells; row `best` is highlighted."""
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -26,18 +26,18 @@ class Picture:
 
 @dataclass(frozen=True)
 class Exhibit:
-    """One section of the page.
+    """Comparison of a result of a paper with the reproduced one; a section of the page.
 
     Parameters
     ----------
     title : str
-        The paper's figure or table.
+        Figure or table of the paper.
     paper : str
-        What the paper shows, in words or numbers.
+        Result of the paper, in words or numbers.
     ours : str
-        What was computed.
+        Reproduced result.
     remark : str
-        One sentence on any difference.
+        Explanation of differences.
     tables : tuple of Table
     pictures : tuple of Picture
     """

@@ -1,4 +1,4 @@
-"""The papers' models on measured records: held out, free-run, the loop family beside them."""
+"""Held-out, free-run errors of the models of the papers and of the loop family on measured records."""
 
 import warnings
 from collections.abc import Mapping
@@ -19,16 +19,16 @@ from slpi_ros.papers.exhibit import Exhibit, Table
 
 @dataclass(frozen=True)
 class Case:
-    """Which parts of a record are fitted and which are predicted.
+    """The parts of a record that are fitted and predicted.
 
     Parameters
     ----------
     name : str
         The record is the file ``<name>.csv``.
     fitted : (float, float), seconds
-        Up to 1, a share of the record.
+        Start and end of the fitted part; values up to 1 are shares of the record.
     predicted : mapping of str to (float, float), seconds
-        Up to 1, shares of the record.
+        Start and end of each predicted part, by name; values up to 1 are shares of the record.
     """
 
     name: str
@@ -54,7 +54,7 @@ REMARK = (
 
 @dataclass(frozen=True)
 class Scores:
-    """Held-out rms errors of one kind of model on one record, metres; `refusal` says why there are none."""
+    """Held-out rms errors (m) of a kind of model on parts of a record; `refusal` is the reason if there are none."""
 
     kind: str
     errors: tuple[float, ...]
@@ -97,7 +97,7 @@ def _rms(model: AxisModel, record: Record, start: float, stop: float) -> float:
 
 
 def exhibits(folder: Path | None) -> list[Exhibit]:
-    """Return one exhibit for each measured record in `folder`; one that says so where there is none."""
+    """Return one exhibit for each measured record in `folder`; if there are none, an exhibit that states this."""
     if folder is None or not folder.is_dir():
         return [
             Exhibit(

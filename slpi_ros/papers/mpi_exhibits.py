@@ -1,4 +1,4 @@
-"""The MPI paper's hysteresis curves and models, Fig. 2 to 10 and Tables 1 to 5, computed anew."""
+"""Hysteresis curves and models of the MPI paper (Fig. 2 to 10, Tables 1 to 5), reproduced on a simulated axis."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -45,7 +45,7 @@ ERRORS = "maximum / mean / root mean square (µm)"
 
 
 def loops(groups: Mapping[str, Mapping[str, Drive]], columns: int) -> Figure:
-    """Draw the settled loops of drives: a panel for each group, a shade for each drive, one legend for all."""
+    """Draw the settled loops of drives: a panel for each group, a colour for each drive, one common legend."""
     rows = -(-len(groups) // columns)
     figure, drawn = panels(rows, columns, (11 if columns > 1 else 8, 4.6 if rows == 1 else 3.0 * rows))
     for panel, (title, drives) in zip(drawn, groups.items(), strict=False):
@@ -59,7 +59,7 @@ def loops(groups: Mapping[str, Mapping[str, Drive]], columns: int) -> Figure:
 
 
 def peaks(study: Study) -> Figure:
-    """Draw the peaks over amplitude and frequency, and over frequency with the lines of Eq. 1."""
+    """Draw the peak displacements over amplitude and frequency, and over frequency with the fits of Eq. 1."""
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     left: Any = figure.add_subplot(1, 2, 1, projection="3d")
     right = figure.add_subplot(1, 2, 2)
@@ -81,7 +81,7 @@ def peaks(study: Study) -> Figure:
 
 
 def fits(drives: Mapping[float, Drive], simulated: Mapping[float, FloatArray], name: str) -> Figure:
-    """Draw settled loops and one model of each."""
+    """Draw the settled loop of each amplitude (V), and its simulation by the model `name`."""
     figure, drawn = panels(2, 3, (11, 6.4))
     for panel, (amplitude, y_model) in zip(drawn, simulated.items(), strict=False):
         v, y = drives[amplitude].settled
@@ -109,7 +109,7 @@ def fit_errors(drives: Mapping[float, Drive], simulated: Mapping[str, Mapping[fl
 
 
 def variable(path: VariablePath) -> Figure:
-    """Draw measured and simulated displacement over the cycles, and the errors below."""
+    """Draw measured and simulated displacement of the path of Fig. 8 over the cycles, and the errors below."""
     figure, (upper, lower) = panels(2, 1, (11, 7.0), height_ratios=(1, 1), sharex=True)
     cycle = np.arange(path.y.size) * sum(cycles for _, _, cycles in VARIABLE) / path.y.size
     upper.plot(cycle, path.y * 1e6, color=MEASURED, linewidth=3.0, label="measured")
@@ -132,14 +132,14 @@ def _shades(count: int) -> Sequence[tuple[float, float, float, float]]:
 
 
 def _outer_labels(panel: Axes, x: str, y: str) -> None:
-    """Name only the axes at the figure's left and lower edge."""
+    """Label only the axes at the left and the lower edge of the figure."""
     place = panel.get_subplotspec()
     assert place is not None
     label_axes(panel, x if place.is_last_row() else "", y if place.is_first_col() else "")
 
 
 def legend(figure: Figure, drawn: Sequence[Axes], used: int) -> None:
-    """Put one legend above all panels, and hide those that are not used."""
+    """Add one legend above all panels, and hide the panels after the first `used` ones."""
     handles, names = drawn[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=7, frameon=False)
     for panel in drawn[used:]:
@@ -147,7 +147,7 @@ def legend(figure: Figure, drawn: Sequence[Axes], used: int) -> None:
 
 
 def exhibits(seed: int = 0) -> list[Exhibit]:
-    """Run the experiments and return their exhibits; `seed` is that of the sensor noise."""
+    """Run the experiments and return their exhibits; `seed` is the seed of the sensor noise."""
     return present(run_study(p11_stage(seed).axes["x"]))
 
 
@@ -165,7 +165,7 @@ def present(study: Study) -> list[Exhibit]:
 
 
 def errors(metrics: ErrorMetrics) -> str:
-    """Return maximum, mean and root mean square error in micrometres."""
+    """Return maximum, mean and root mean square error in micrometres, as text."""
     return " / ".join(um(value) for value in (metrics.maximum, metrics.mean, metrics.root_mean_square))
 
 
@@ -174,7 +174,7 @@ def _printed(table: Mapping[float, tuple[float, ...]]) -> dict[float, str]:
 
 
 def _table(key: str, unit: str, columns: Mapping[str, Mapping[float, str]]) -> Table:
-    """Return a table of named columns; the first one says which rows there are."""
+    """Return a table of named columns; the keys of the first column determine the rows."""
     rows = [(f"{k:g} {unit}", *(column[k] for column in columns.values())) for k in next(iter(columns.values()))]
     return Table((key, *columns), tuple(rows))
 

@@ -1,4 +1,4 @@
-"""The MPI paper's measurements on a simulated stage like its own, and the models fitted to them."""
+"""Measurements of the MPI paper on a similar simulated stage, and the models fitted to them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -47,20 +47,20 @@ TABLE_5: dict[float, float] = {20: 0.9939, 40: 0.9973, 60: 0.9970, 80: 0.9982, 1
 # Expected displacement (µm) and frequency (Hz) of the five segments.
 TABLE_6 = ((60, 1), (80, 1), (100, 1), (80, 2), (80, 3))
 
-# Mean and "mean square" error (µm), and the band (µm) in which errors basically are: Fig. 11, then Fig. 13 and 14.
+# Mean and "mean square" error (µm), and half-width (µm) of the band that contains most errors: Fig. 11; Fig. 13 and 14.
 FEEDFORWARD_MEAN, FEEDFORWARD_ROOT, FEEDFORWARD_BAND = 0.0485, 0.1201, 1.0
 COMPOUND_MEAN, COMPOUND_ROOT, COMPOUND_BAND = 0.1192, 0.2949, 0.5
 
 FloatArray = NDArray[np.float64]
 
-# Volts and hertz of Fig. 4. Models are those of the highest frequency.
+# Amplitudes (V) and frequencies (Hz) of Fig. 4. Models are fitted at the highest frequency.
 AMPLITUDES = (20, 40, 60, 80, 100, 120)
 FREQUENCIES = (0.1, 0.5, 1, 2, 5, 10, 20)
-# Of each drive from rest: two cycles to settle, one that is shown and fitted, and the one after it.
+# Number of cycles of each drive from rest; index of the settled cycle, which is shown and fitted, and of the next one.
 CYCLES, SETTLED, NEXT = 4, 2, 3
-# Volts of the record that the loop family is fitted to; its first cycle wipes the memory and is not fitted.
+# Amplitudes (V) of the record for the loop family; its first cycle resets the hysteresis state and is not fitted.
 FALLING = (120, 120, 120, 100, 80, 60, 40, 20)
-# Volts, hertz and cycles of Fig. 8.
+# Amplitude (V), frequency (Hz) and number of cycles of each part of Fig. 8.
 VARIABLE = ((120, 20, 2), (80, 20, 2), (40, 20, 2), (120, 2, 2))
 
 MPI, SMPI, PI, FAMILY = "MPI", "SMPI", "classical PI", "loop family"
@@ -70,7 +70,7 @@ ONE_MPI, OWN_MPI, SCALED_MPI = "MPI of 120 V", "MPI of each amplitude", "and of 
 
 @dataclass(frozen=True)
 class Drive:
-    """Equal triangles from rest, and what the sensor read.
+    """Drive with equal triangles from rest, and the sensor readings.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class Drive:
     y: FloatArray
 
     def cycle(self, number: int) -> slice:
-        """Return the samples of a cycle; the first one is number 0."""
+        """Return the slice of the samples of a cycle; the first cycle has the number 0."""
         samples = self.t.size // CYCLES
         return slice(number * samples, (number + 1) * samples)
 
@@ -100,13 +100,13 @@ class Drive:
 
     @property
     def settled_peak(self) -> float:
-        """Largest displacement of the settled cycle, above that at its start, metres."""
+        """Largest displacement of the settled cycle relative to its start, metres."""
         y = self.settled[1]
         return float(y.max() - y[0])
 
     @property
     def bows(self) -> tuple[float, float, float]:
-        """Mean width of the settled loop, and how far rise and fall leave its chord, as shares of the stroke."""
+        """Mean width of the settled loop, and largest deviations of rise and fall from its chord, over the stroke."""
         share = (self.settled[1] - self.settled[1][0]) / self.settled_peak
         top = share.size // 2
         chord, rise, fall = np.linspace(0.0, 1.0, top + 1), share[: top + 1], np.append(0.0, share[top:][::-1])
@@ -121,9 +121,9 @@ class CycleFit:
     ----------
     model : AxisModel
     simulated : ndarray, shape (n,), metres
-        On the cycle fitted.
+        Displacement of the model on the fitted cycle.
     fitted, following : ErrorMetrics
-        On the cycle fitted, and on the next one.
+        Errors on the fitted cycle, and on the next one.
     """
 
     model: AxisModel
@@ -148,11 +148,11 @@ class VariablePath:
     ----------
     t : ndarray, shape (N,), seconds
     y : ndarray, shape (N,), metres
-        What the sensor read.
+        Sensor readings.
     parts : tuple of slice
         The samples of each amplitude and frequency, as in `VARIABLE`.
     models : mapping of name to ndarray, shape (N,), metres
-        What the models say; their zero is such that their mean error in the first part is 0.
+        Displacements of the models, with an offset such that the mean error in the first part is 0.
     """
 
     t: FloatArray
@@ -163,7 +163,7 @@ class VariablePath:
 
 @dataclass(frozen=True)
 class Study:
-    """Everything measured and fitted.
+    """All measurements and fits.
 
     Parameters
     ----------
@@ -171,9 +171,9 @@ class Study:
     peaks : mapping of amplitude (V) to PeakFrequency
         Eq. 1, fitted to the peaks of the first cycles.
     ringing : mapping of frequency (Hz) to float, metres
-        By how much the flexure's mode moves the stage at the highest amplitude, at most.
+        Largest displacement due to the flexure mode, at the highest amplitude.
     fits : mapping of kind's name to mapping of amplitude (V) to CycleFit
-        Each at the highest frequency.
+        Fits at the highest frequency.
     scaled : mapping of amplitude (V) to ScaledFit
     variable : VariablePath
     """
@@ -204,11 +204,11 @@ def run_study(
     ----------
     axis : PreisachStage
     amplitudes : sequence of float, volts
-        Rising; the last one is that of the SMPI model.
+        In ascending order; the SMPI model is scaled from the last one.
     frequencies : sequence of float, hertz
-        Rising.
+        In ascending order.
     samples : int
-        In one cycle; even.
+        Samples per cycle, an even number.
     """
     drives = {(a, f): _drive(axis, a, f, samples) for f in frequencies for a in amplitudes}
     fastest = {a: drives[a, frequencies[-1]] for a in amplitudes}
@@ -235,7 +235,7 @@ def triangles(amplitude: float, frequency: float, cycles: int, samples: int = 20
     frequency : float, hertz
     cycles : int
     samples : int
-        In one cycle; even.
+        Samples per cycle, an even number.
 
     Returns
     -------
@@ -268,7 +268,7 @@ def _drive(axis: PreisachStage, amplitude: float, frequency: float, samples: int
 
 
 def _ringing(axis: PreisachStage, amplitude: float, frequency: float, samples: int) -> float:
-    """Compare a settled cycle (m) with that of the same axis without its mode."""
+    """Return the largest difference (m) between a settled cycle and that of the same axis without the flexure mode."""
     stiff = PreisachStage(replace(axis.parameters, resonance_frequency=0.0))
     t, v = triangles(amplitude, frequency, SETTLED + 1, samples)
     axis.rest()
@@ -277,7 +277,7 @@ def _ringing(axis: PreisachStage, amplitude: float, frequency: float, samples: i
 
 
 def _fit(drive: Drive, kind: str) -> CycleFit:
-    """Fit the settled cycle; the voltage before it moves the memory."""
+    """Fit the settled cycle; the voltage before it determines the hysteresis state."""
     fitted, following = drive.cycle(SETTLED), drive.cycle(NEXT)
     start, stop = drive.t[fitted.start] - 1e-9, drive.t[fitted.stop] - 1e-9
     model = identify(_record(drive.t, drive.v, drive.y), kind, start=start, stop=stop).axis("x")
@@ -292,7 +292,7 @@ def _shape(fit: CycleFit) -> MultiSlope:
 
 
 def _scale(drives: Mapping[float, Drive], base: MultiSlope) -> dict[float, ScaledFit]:
-    """Scale the model of one amplitude to that of each drive; only the displacement at the start is fitted."""
+    """Scale the model `base` to the amplitude (V) of each drive; only an offset is fitted."""
     peaks = np.array([drive.settled_peak for drive in drives.values()])
     path = AmplitudeScaled(base, np.array(list(drives), dtype=np.float64), peaks).along(0.0, 0.0)
     fits = {}
@@ -307,7 +307,7 @@ def _scale(drives: Mapping[float, Drive], base: MultiSlope) -> dict[float, Scale
 def _variable_path(
     axis: PreisachStage, fits: Mapping[float, CycleFit], peaks: Mapping[float, PeakFrequency], samples: int
 ) -> VariablePath:
-    """Drive the path of Fig. 8, its first part twice, and let models follow it; the first time is left out."""
+    """Run the path of Fig. 8 and the models on it; the first part is run twice, and its first run is discarded."""
     path = (VARIABLE[0], *VARIABLE)
     waves = [triangles(amplitude, frequency, cycles, samples) for amplitude, frequency, cycles in path]
     starts = np.cumsum([0.0, *(cycles / frequency for _, frequency, cycles in path)])
@@ -317,7 +317,7 @@ def _variable_path(
     y = axis.run(t, v)[1]
 
     def own(exponent: float) -> FloatArray:
-        """Follow each cycle by the model of its amplitude, its displacement scaled by a power of its frequency."""
+        """Simulate each cycle by the model of its amplitude, scaled by relative frequency to the power `exponent`."""
         parts, present = [], 0.0
         for amplitude, frequency, cycles in path:
             scale = (frequency / VARIABLE[0][1]) ** exponent

@@ -1,4 +1,4 @@
-"""All experiments of the two papers, and their page."""
+"""The page with all experiments of the two papers."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,19 +16,19 @@ SECOND = "Paper 2: multi-slope Prandtl-Ishlinskii (MPI) model"
 
 
 def write_experiments(folder: Path, data: Path | None) -> Path:
-    """Compute everything anew and write ``index.html`` and ``separation.csv`` into `folder`; return the page's path.
+    """Run all experiments, write ``index.html`` and ``separation.csv`` into `folder`, and return the page's path.
 
     Parameters
     ----------
     folder : Path
-        Made if need be.
+        Created if it does not exist.
     data : Path or None
         Folder of measured records.
 
     Raises
     ------
     SlpiError
-        If something cannot be written or read.
+        If a file cannot be read or written.
     """
     make_folder(folder)
     random = study(RANDOM_PATH)
@@ -64,7 +64,7 @@ def _show(page: Page, exhibits: Sequence[Exhibit]) -> None:
 
 
 def _write_separation(path: Path, separation: Separation) -> None:
-    """Write ``NewData`` (Eq. 4)."""
+    """Write the table of separated loops, ``NewData`` in the SLPI paper (Eq. 4), as CSV."""
     with all_or_nothing(path) as file:
         file.write("k,voltage_V,displacement_m,tr,lv,sp\n")
         for k, voltage, displacement, tr, lv, sp in separation.table().tolist():

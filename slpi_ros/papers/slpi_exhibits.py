@@ -1,4 +1,4 @@
-"""The SLPI paper's figures and tables, from the studies."""
+"""Figures and tables of the SLPI paper, reproduced on a simulated stage."""
 
 from collections.abc import Mapping
 
@@ -40,19 +40,19 @@ FloatArray = NDArray[np.float64]
 COLOUR = dict(zip((CLASSICAL, AT_REST, CLOSING, FAMILY), COLOURS, strict=True))
 ROMAN = ("0", "I", "II", "III", "IV", "V")
 V, UM = "voltage (V)", "displacement (µm)"
-# The weights that the paper prints, by level, and the figures by which it compares SLPI with classical PI.
+# Weights in the paper, by level, and the four quantities by which it compares SLPI with classical PI.
 PRINTED = {2: TABLES[2], 1: TABLES[3], 0: TABLES[4]}
 FIGURES = ("outer loop's maximum", "highest loop's mean", "spread between loops", "overall mean")
 PAPER = (OUTER_MAXIMUM, HIGHEST_MEAN, SPREAD, OVERALL_MEAN)
 
 
 def turns_of(study: Study) -> str:
-    """Return the path in words."""
+    """Return the reversals of the path as text."""
     return " → ".join(f"{turn:.0f}" for turn in study.turns) + " V"
 
 
 def errors_table(errors: Mapping[str, LoopErrors], separation: Separation, what: str = "") -> Table:
-    """Return the errors of all models, loop by loop; the best one stands out."""
+    """Return a table of the errors of all models by loop; the model with the lowest mean error is highlighted."""
     v = separation.voltage
     levels = [f"{ROMAN[loop.level]} from {v[loop.vertex]:.0f} V" for loop in separation.loops]
     rows = [
@@ -65,7 +65,7 @@ def errors_table(errors: Mapping[str, LoopErrors], separation: Separation, what:
 
 
 def path_and_curve(v: FloatArray, y: FloatArray) -> Figure:
-    """Draw a path over time, and displacement over voltage."""
+    """Draw the voltage over time, and the displacement over voltage."""
     figure, (left, right) = panels(1, 2, (11, 4.2))
     left.plot(STEP_S * np.arange(v.size), v, ".-", color=DESIRED, markersize=3, linewidth=0.8)
     label_axes(left, "time (s)", V)
@@ -75,7 +75,7 @@ def path_and_curve(v: FloatArray, y: FloatArray) -> Figure:
 
 
 def separated(separation: Separation) -> Figure:
-    """Draw every single loop: a triangle at its vertex, circles where inner loops were taken out."""
+    """Draw each separated loop, with a triangle at its vertex and circles where inner loops were removed."""
     loops = separation.loops
     figure, drawn = panels(1, len(loops), (11, 4.0), sharex=True, sharey=True)
     v, y = separation.voltage, separation.displacement * 1e6
@@ -94,7 +94,7 @@ def separated(separation: Separation) -> Figure:
 
 
 def inclinations(separation: Separation) -> Figure:
-    """Draw all single loops from their vertices, one over the other."""
+    """Draw all separated loops in one panel, relative to their vertices."""
     figure, (panel,) = panels(1, 1, (7, 4.2))
     for colour, loop in zip(COLOURS, separation.loops, strict=False):
         drive, y = _own(separation, loop)
@@ -105,7 +105,7 @@ def inclinations(separation: Separation) -> Figure:
 
 
 def singles(separation: Separation, models: Mapping[str, SeparatedLoops], *, inverse: bool = False) -> Figure:
-    """Draw each single loop from its vertex and the PI models of it, or their inverses: voltage over displacement."""
+    """Draw each separated loop, relative to its vertex, and its PI models or, if `inverse`, their inverses."""
     loops = separation.loops
     figure, drawn = panels(1, len(loops), (11, 4.0))
     order = slice(None, None, -1 if inverse else 1)
@@ -130,7 +130,7 @@ def _own(separation: Separation, loop: Loop) -> tuple[FloatArray, FloatArray]:
 
 
 def over_data(separation: Separation, errors: Mapping[str, LoopErrors], names: tuple[str, ...]) -> Figure:
-    """Draw models over the measured curve, and their errors below."""
+    """Draw the models on top of the measured curve, and their errors below."""
     figure, drawn = panels(2, len(names), (11, 6.4), height_ratios=(3, 2), sharex=True, sharey="row")
     v, y = separation.voltage, separation.displacement
     for column, name in enumerate(names):
@@ -146,7 +146,7 @@ def over_data(separation: Separation, errors: Mapping[str, LoopErrors], names: t
 
 
 def inverses(study: Study, names: tuple[str, ...]) -> Figure:
-    """Draw the rebuilt inverse: voltage over desired displacement; stars where loops are linked."""
+    """Draw the inverse models: voltage over desired displacement, with stars where loops are linked."""
     figure, drawn = panels(1, len(names), (11, 4.0), sharex=True, sharey=True)
     for panel, name in zip(drawn, names, strict=True):
         desired, voltage = study.desired * 1e6, study.voltages[name]
@@ -178,7 +178,7 @@ def draw_compensation(study: Study, names: tuple[str, ...]) -> Figure:
 
 
 def exhibits(random: Study) -> list[Exhibit]:
-    """Run the experiments of the SLPI paper beside the study of its random path, and return their exhibits."""
+    """Return the exhibits of the SLPI paper, from the given study of its random path and from further experiments."""
     return [
         _nonlinear_curve(random),
         _inclinations(random),
@@ -274,7 +274,7 @@ def _single_models(study: Study) -> Exhibit:
 
 
 def _gaps(loops: SeparatedLoops) -> dict[int, float]:
-    """Return by how much each inner loop misses its vertex, metres, by level."""
+    """Return the gap (m) by which each inner loop fails to close at its vertex, by level."""
     there_and_back = (np.array([0.0, loop.span[0], 0.0]) for loop in loops.loops)
     return {
         loop.level: abs(float(loop.memory().forward_array(path)[-1]))
@@ -346,7 +346,7 @@ def _percentages(errors: Mapping[str, LoopErrors]) -> Table:
 
 
 def _falls(errors: Mapping[str, LoopErrors], name: str) -> tuple[float, float, float, float]:
-    """Return by how much a model beats classical PI, in per cent, in the order of the paper's four figures."""
+    """Return the reductions of the errors in `FIGURES` by a model, relative to classical PI, in per cent."""
     classical, other = errors[CLASSICAL], errors[name]
     return (
         gain(classical.maxima[0], other.maxima[0]),
@@ -357,7 +357,7 @@ def _falls(errors: Mapping[str, LoopErrors], name: str) -> tuple[float, float, f
 
 
 def _verdict(errors: Mapping[str, LoopErrors], name: str) -> str:
-    """Return a comparison with each of the paper's four figures, as text."""
+    """Return a comparison of these reductions with those of the paper, as text."""
     parts = []
     for what, paper, ours in zip(FIGURES, PAPER, _falls(errors, name), strict=True):
         parts.append(f"{what} {-ours:+.1f} % ({'met' if ours >= paper else 'not met'})")
@@ -365,7 +365,7 @@ def _verdict(errors: Mapping[str, LoopErrors], name: str) -> str:
 
 
 def compensation(study: Study) -> Exhibit:
-    """Return the exhibit of compensation along a path that turns where the record did."""
+    """Return the exhibit of compensation along a path with the reversals of the record."""
     errors = study.compensated
     return Exhibit(
         title="Fig. 15 and the four percentages: compensation",
@@ -396,7 +396,7 @@ def straight_line(study: Study) -> Exhibit:
 
 
 def other(title: str, study: Study) -> Exhibit:
-    """Return the exhibit of the models of another path."""
+    """Return the exhibit of the models and the compensation on another path."""
     errors = study.modelled
     worst = {name: max(errors[name].means[1:]) for name in (CLASSICAL, CLOSING, FAMILY)}
     return Exhibit(
@@ -417,7 +417,7 @@ def other(title: str, study: Study) -> Exhibit:
 
 
 def unseen(unseen: UnseenPaths) -> Exhibit:
-    """Return the exhibit of paths that were not identified."""
+    """Return the exhibit of paths that were not used for the identification."""
     rows = [
         (name, *(um(mean) for mean in means), um(float(np.mean(means)))) for name, means in unseen.mean_errors.items()
     ]

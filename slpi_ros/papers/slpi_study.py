@@ -1,4 +1,4 @@
-"""The SLPI paper's experiment on a simulated stage: one path, four models, the errors of each loop."""
+"""Experiment of the SLPI paper on a simulated stage: models identified on one path, and their errors by loop."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +28,7 @@ from slpi_ros.simulation.stage import flexure_stage
 FloatArray = NDArray[np.float64]
 
 # Tables 2 (level II), 3 (level I), 4 (level 0) and 5 (classical PI). They give no unit for the weights, which are taken
-# for micrometres per volt.
+# as micrometres per volt.
 THRESHOLDS = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0)
 TABLES = {
     2: (0.02943, 0.01351, 0.00040, 0.00206, 0.00230, 0.00265, 0.00249, 0.00550, 0.02802, 0.09411),
@@ -37,17 +37,17 @@ TABLES = {
     5: (0.03040, 0.01116, 0.01516, 0.00478, 0.00000, 0.00000, 0.00823, 0.00057, 0.00000, 0.00000),
 }
 
-# By how much SLPI is better than classical PI, in per cent (section 4.1).
+# Error reductions by SLPI relative to classical PI, per cent (section 4.1).
 OUTER_MAXIMUM, HIGHEST_MEAN, SPREAD, OVERALL_MEAN = 10.0, 97.5, 53.7, 50.3
 
-# Like the random path of Fig. 4: up to level II; a sample every 4 V and 0.8 s, and at every turn (2.2).
+# Similar to the random path of Fig. 4: up to level II; a sample every 4 V and 0.8 s, and at every reversal (2.2).
 RANDOM_PATH = (0.0, 80.0, 12.0, 68.0, 20.0, 80.0, 100.0, 0.0)
 # Fig. 16: a second inner loop, whose vertex lies on the back branch. Fig. 18: inner and outer loop share their rise.
 DOUBLE_INNER_LOOP = (0.0, 64.0, 24.0, 100.0, 40.0, 76.0, 0.0)
 OVERLAPPED = (0.0, 60.0, 0.0, 100.0, 0.0)
 STEP_V, STEP_S = 4.0, 0.8
 VOLTAGE_RANGE = (0.0, 100.0)
-# As many passes are averaged (2.2, step 4).
+# Number of measurements that are averaged (2.2, step 4).
 PASSES = 2
 UNSEEN = 6
 
@@ -67,7 +67,7 @@ class LoopErrors:
     ----------
     error : ndarray, shape (N,)
     means, maxima : tuple of float
-        Mean and largest size on each loop, the outer one first.
+        Mean and largest absolute error on each loop, the outer one first.
     """
 
     error: FloatArray
@@ -86,12 +86,12 @@ class LoopErrors:
 
     @property
     def overall(self) -> float:
-        """Mean size over the whole path."""
+        """Mean absolute error over the whole path."""
         return float(np.mean(np.abs(self.error)))
 
     @property
     def spread(self) -> float:
-        """Difference between the worst and the best loop's mean."""
+        """Difference between the largest and the smallest mean error of the loops."""
         return max(self.means) - min(self.means)
 
 
@@ -102,22 +102,23 @@ class Study:
     Parameters
     ----------
     turns : tuple of float, volts
+        Reversals of the path.
     separation : Separation
-        Voltage and displacement, and their loops.
+        Voltage and displacement, separated into loops.
     classical : PrandtlIshlinskii
     at_rest, closing : SeparatedLoops
     modelled : dict of model name to LoopErrors
         Model - measured.
     compensated : dict of model name to LoopErrors
-        Achieved - desired displacement; desired are straight lines between the displacements at the turns.
+        Achieved - desired displacement; the desired one consists of straight lines between the measured reversals.
     straight : dict of model name to LoopErrors
-        The same for the straight line through zero and the largest displacement (4.1), which turns elsewhere.
+        The same for the straight line through zero and the largest displacement (4.1), with other reversals.
     desired : ndarray, shape (N,), metres
-        Of `compensated`.
+        Desired displacement of `compensated`.
     voltages : dict of model name to ndarray, shape (N,), volts
-        Of `compensated`.
+        Voltages of `compensated`.
     drives : dict of model name to callable
-        Makes the model's memory, at the start.
+        Function that returns the model in its initial state.
     """
 
     turns: tuple[float, ...]
@@ -134,7 +135,7 @@ class Study:
 
 
 def study(turns: tuple[float, ...]) -> Study:
-    """Drive the stage through `turns` (V), identify every model on it, and let each compensate."""
+    """Drive the stage through the reversals `turns` (V), identify each model on this path, and compensate with it."""
     v = ramps(turns, STEP_V)
     t = _times(v)
     y = np.mean([measure(v, seed) for seed in range(PASSES)], axis=0)
@@ -185,11 +186,11 @@ class UnseenPaths:
     Parameters
     ----------
     turns : tuple of tuple of float, volts
-        The paths.
+        Reversals of the paths.
     mean_errors : dict of model name to tuple of float, metres
-        Of model - stage, free-run, for each path.
+        Mean absolute free-run error, model - stage, for each path.
     loops, replaced : int
-        Inner loops of all paths, and how many of them were never identified.
+        Number of inner loops of all paths, and number of those that were never identified.
     """
 
     turns: tuple[tuple[float, ...], ...]
@@ -199,7 +200,7 @@ class UnseenPaths:
 
 
 def unseen_paths(known: Study, seed: int = 1) -> UnseenPaths:
-    """Draw other paths within the same range, and let the models of a study predict them."""
+    """Generate random paths within the same range, and predict them with the models of a study."""
     rng = np.random.default_rng(seed)
     paths = tuple(_draw(rng) for _ in range(UNSEEN))
     errors: dict[str, list[float]] = {name: [] for name in MODELS}
@@ -219,7 +220,7 @@ def unseen_paths(known: Study, seed: int = 1) -> UnseenPaths:
 
 
 def _draw(rng: np.random.Generator) -> tuple[float, ...]:
-    """Return turns of a path from 0 V with five inner turns and the highest voltage somewhere among them."""
+    """Return the reversals (V) of a random path: from 0 V through six inner reversals to 100 V, and back to 0 V."""
     levels = STEP_V * rng.choice(np.arange(2, 24), 6, replace=False)
     low, high = np.sort(levels[:3]), np.sort(levels[3:])
     inner = np.column_stack([np.maximum(low, high), np.minimum(low, high)])[rng.permutation(3)]
@@ -228,7 +229,7 @@ def _draw(rng: np.random.Generator) -> tuple[float, ...]:
 
 
 def classical_model(v: FloatArray, y: FloatArray) -> PrandtlIshlinskii:
-    """Fit the classical PI model as Table 5 does: its thresholds, at rest and zero where the record starts."""
+    """Fit the classical PI model of Table 5: with its thresholds, and at rest and zero at the start of the record."""
     thresholds = default_thresholds(float(np.ptp(v)))
     everything = np.ones(v.size, dtype=bool)
     fit = fit_plays(
@@ -244,14 +245,14 @@ def classical_model(v: FloatArray, y: FloatArray) -> PrandtlIshlinskii:
 
 
 def ramps(turns: Sequence[float], step: float) -> FloatArray:
-    """Return straight ramps through turning points, a sample every `step`; every turn is a sample too.
+    """Return straight ramps between reversals, with a sample every `step` and at every reversal.
 
     Parameters
     ----------
     turns : sequence of float
-        Neighbours differ.
+        Reversals; successive values must differ.
     step : float
-        In the unit of `turns`.
+        Distance of the samples, in the unit of `turns`.
 
     Returns
     -------
@@ -262,7 +263,7 @@ def ramps(turns: Sequence[float], step: float) -> FloatArray:
 
 
 def straight_between_reversals(x: FloatArray, at: FloatArray) -> FloatArray:
-    """Return `x`, shape (N,), made a straight line over `at`, shape (N,), between neighbouring reversals of `at`."""
+    """Return `x`, shape (N,), replaced by straight lines over `at`, shape (N,), between the reversals of `at`."""
     path = x.copy()
     for a, b in pairwise(stop - 1 for _, stop in monotone_runs(at)):
         path[a : b + 1] = x[a] + (x[b] - x[a]) * (at[a : b + 1] - at[a]) / (at[b] - at[a])
@@ -274,29 +275,29 @@ def _times(v: FloatArray) -> FloatArray:
 
 
 def measure(v: FloatArray, seed: int) -> FloatArray:
-    """Drive a fresh stage through `v`, shape (N,), volts; return what the interferometer reads, shape (N,), metres."""
+    """Drive a new stage through `v`, shape (N,), volts, and return the sensor readings, shape (N,), metres."""
     return flexure_stage(seed).run(_times(v), v)[1]
 
 
 def reached(v: FloatArray) -> FloatArray:
-    """Drive a fresh stage through `v`, shape (N,), volts; return where it is, shape (N,), metres."""
+    """Drive a new stage through `v`, shape (N,), volts, and return its true displacement, shape (N,), metres."""
     return flexure_stage().run(_times(v), v)[0]
 
 
 def forward(drive: Drive, v: FloatArray) -> FloatArray:
-    """Return the model's displacement, shape (N,), metres; unidentified loops are reported by `UnseenPaths`."""
+    """Return the model's displacement, shape (N,), metres, for voltages (V), without warnings of unidentified loops."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnidentifiedLoopWarning)
         return drive.forward_array(v)
 
 
 def voltage_for(drive: Drive, y: FloatArray) -> FloatArray:
-    """Return the model's voltage within what was identified, shape (N,), volts, for displacements (m)."""
+    """Return the model's voltage, shape (N,), volts, within the identified range, for displacements `y` (m)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnidentifiedLoopWarning)
         return drive.inverse_array(y, *VOLTAGE_RANGE)
 
 
 def gain(before: float, after: float) -> float:
-    """Return by how much an error has fallen, in per cent."""
+    """Return the reduction of an error, in per cent."""
     return 100.0 * (1.0 - after / before)

@@ -86,7 +86,7 @@ def _holes(signal: FloatArray, length: int) -> IntArray:
 
 
 def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArray:
-    """Return the sample indices of a thinned scatter plot, shape (N,) each: its envelope along `x`, and some inside."""
+    """Return the sample indices of a thinned scatter plot of `x`, `y`, shape (N,): envelope and some inner points."""
     finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if finite.size <= most:
         return finite
@@ -152,7 +152,7 @@ class Panel:
 
 @dataclass
 class Chart:
-    """Panels in a row or a column with a common legend, which shows or hides a name in all panels.
+    """Panels in a row or a column with a common legend; a legend entry shows or hides its curves in all panels.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ class Chart:
         return {"xaxis": f"x{number}", "yaxis": f"y{number}"}
 
     def _domain(self, panel: int) -> tuple[float, float]:
-        """Return the range (0..1) of the width (in a row) or of the height (in a column, from below) of a panel."""
+        """Return start and end (0..1) of a panel within the width of a row, or the height of a column from below."""
         length = _WIDTH - 90 if self.arrangement == "row" else self.height - _MARGIN["t"] - _MARGIN["b"]
         gap = _GAP[self.arrangement] / length
         shares = np.array([part.share for part in self.panels])

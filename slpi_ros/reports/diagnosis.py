@@ -20,7 +20,7 @@ from slpi_ros.reports.views import Curve, Motion
 
 FloatArray = NDArray[np.float64]
 
-# With effects, errors up to this multiple of the floor count as noise; relative difference of equal steps.
+# With effects, errors up to this multiple of the floor count as noise; relative difference of equal errors.
 _NOISE_ONLY = 1.5
 _SAME = 0.01
 

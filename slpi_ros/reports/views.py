@@ -107,7 +107,7 @@ class Motion:
 
 
 def _arrivals(v: FloatArray, runs: IntArray) -> IntArray:
-    """Return the sample at which each run first reaches its final value."""
+    """Return the index of the sample at which the voltage first reaches its final value between two reversals."""
     near = _ARRIVED * float(np.ptp(v))
     return np.array(
         [start + int(np.argmax(np.abs(v[start : stop + 1] - v[stop]) <= near)) for start, stop in pairwise(runs)],
@@ -246,7 +246,7 @@ def _straight(v: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _some_runs(v: FloatArray, y: FloatArray, motion: Motion) -> tuple[FloatArray, str]:
-    """Return the samples to be drawn, with NaN between non-adjacent runs, and a note if runs are omitted."""
+    """Return the sample indices to be drawn, with NaN between non-adjacent branches, and a note if some are omitted."""
     count = motion.runs.size - 1
     most = LINE_POINTS // _POINTS_OF_RUN
     if count <= most:
@@ -366,9 +366,9 @@ def histogram(chart: Chart, panel: int, curve: Curve) -> None:
 
 
 def coverage(v: FloatArray, left: FloatArray, motion: Motion) -> Chart:
-    """Draw the number of residual samples (m; NaN excluded) on the Everett plane, and their rms.
+    """Draw the number of samples with a finite residual `left` (m) on the Everett plane, and their rms residual.
 
-    The plane covers the range of the voltages `v`, shape (N,).
+    The plane covers the range of the voltages `v`, shape (N,); a point is a pair of branch start and present voltage.
     """
     chart = Chart([Panel(BEGAN, NOW), Panel(BEGAN, NOW)], height=490)
     low, high = float(v.min()), float(v.max())
@@ -385,7 +385,7 @@ def coverage(v: FloatArray, left: FloatArray, motion: Motion) -> Chart:
 
 
 def focus(chart: Chart, panels: Sequence[int], errors: Sequence[FloatArray], chosen: Mask | slice = slice(None)) -> str:
-    """Zoom to nearly all of the `chosen` errors, shape (N,) each, metres; return the number of samples outside."""
+    """Zoom to nearly all of the `chosen` errors, shape (N,) each, metres; return a note on those outside."""
     values = np.concatenate([error[chosen][np.isfinite(error[chosen])] for error in errors])
     if not values.size:
         return ""
@@ -466,7 +466,7 @@ def _add(
 
 
 def _means(x: FloatArray, values: FloatArray, *, alike: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Return class centres along `x`, shape (N,), and means, shape (M,); `alike`: classes of equal sample count."""
+    """Return the means of `x` and `values` by class of `x`, shape (M,) each; `alike`: classes of equal sample count."""
     finite = np.isfinite(values)
     x, values = x[finite], values[finite]
     if x.size < _FEWEST:

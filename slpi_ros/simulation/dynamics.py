@@ -60,8 +60,8 @@ class Relaxation:
 class FlexureMode:
     """A second-order mode, ``d2x/dt2 + 2 z w dx/dt + w^2 x = w^2 u``, with a static gain of 1.
 
-    The update is exact for steps of any length if the input is linear between samples (first-order hold): the steady-
-    state response to the ramp is known, and the deviation decays by the closed-form matrix exponential.
+    The update is exact for steps of any length if the input is linear between samples (first-order hold): the response
+    to the ramp in steady state is known, and the deviation decays by the closed-form matrix exponential.
 
     Parameters
     ----------

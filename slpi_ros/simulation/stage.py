@@ -101,14 +101,14 @@ _P11_HALF_PERIOD = 0.5
 def flexure_stage(seed: int = 0) -> PreisachStage:
     """Return a stage similar to that of the SLPI paper: 0 to 100 V, quasi-static, loops that vary with bias.
 
-    - 0 to 100 V: the range of its voltage controller (2.2).
-    - Stroke 24 µm: chosen. The text states none; the operators of its Table 4 add up to 6.5 in a unit it leaves open.
+    - 0 to 100 V: the range of the paper's voltage controller (section 2.2).
+    - Stroke 24 µm: chosen. The paper states none; its Table 4 gives 6.5 at 100 V, in an unstated unit.
     - Hysteresis 14 % of the stroke: chosen, usual for soft piezo ceramics at full range. Table 4 gives 18 %.
     - Thresholds from -30 V: chosen for a remanence near 8 % of the stroke; Table 4 leaves 0.545 of 6.52, 8.4 %.
-    - Density growing with bias (slope 0.8), wider relays at higher bias, flexure stiffening by 1 %: chosen, so that
-      inner loops of one width have another inclination at another bias and history (Fig. 7).
+    - Density growing with bias (slope 0.8), wider relays at higher bias, flexure stiffening by 1 %: chosen, so that the
+      slope of inner loops of equal width depends on bias and history (Fig. 7).
     - No dynamics: a sample every 0.8 s, creep and temperature "can be ignored" (2.2).
-    - Noise 5 nm rms, digits of 1 nm: chosen; the resolution of a laser interferometer such as the paper's is 1 nm,
+    - Noise 5 nm rms, resolution 1 nm: chosen; the resolution of a laser interferometer such as the paper's is 1 nm,
       and the mean of two passes (2.2) leaves little noise.
 
     Parameters
@@ -139,22 +139,22 @@ def flexure_stage(seed: int = 0) -> PreisachStage:
 def p11_stage(seed: int = 0) -> Stage:
     """Return a stage similar to the P11.XY100 of the MPI paper: two axes, 0 to 120 V nominal, with creep and resonance.
 
-    - -20 to 150 V: stated (2.1).
-    - Peak of 89.189 µm for a triangle of 120 V at 1 Hz: Table 1, where ``a`` is the peak at 1 Hz. The relays' part of
-      it is what creep, reckoned for a ramp of half a second, leaves.
-    - Exponent 1.15 and stiffening 0.03: the other five ``a`` of Table 1, met within 2 %. A larger exponent would meet
-      them better and make the rise, "highly linear" (2.3), less so.
+    - -20 to 150 V: stated (section 2.1).
+    - Peak of 89.189 µm for a triangle of 120 V at 1 Hz: Table 1, where ``a`` is the peak at 1 Hz. The stroke of the
+      relays is this peak divided by the growth due to creep during a ramp of half a second.
+    - Exponent 1.15 and stiffening 0.03: the other five ``a`` of Table 1, reproduced within 2 %. A larger exponent would
+      reproduce them better, but make the rise, "highly linear" (2.3), less linear.
     - Relays of the power-law material: "the change in voltage amplitude basically does not affect the shape of the
       hysteresis curve" (5); a nearly straight rise and a bulging fall (2.3, Fig. 2 and 3).
     - Hysteresis of the relays 11 %, a loop of 13 % with creep at 0.1 Hz: chosen, usual for piezo stacks.
     - Creep of 4.2 % in a decade between 1 ms and 100 s: makes the peaks fall as ``f^b`` with ``b = -0.015``, the mean
-      of Table 1, over its 0.1 to 20 Hz; the time constants reach beyond these on both sides.
+      of Table 1, from 0.1 to 20 Hz; the time constants exceed this range on both sides.
     - Flexure mode at 350 Hz, damping 0.05: chosen; triangles oscillate visibly at 10 and 20 Hz only (2.4, Fig. 4f and
-      g). At 20 Hz and 120 V it does so by 2.2 µm, where Table 2 leaves 1.4 µm to all that its model misses.
-    - Amplifier lag 0.2 ms: chosen; "the greater the frequency, the more obvious the hysteresis" (2.3), and yet its
-      influence "is not visible" (2.4): from 0.1 to 10 Hz the loop widens by 1 % of the stroke.
-    - Noise 10 nm rms: chosen, usual for strain gauges. Digits of 3 nm: 16 bits over -10 to 10 V (2.1), where 10 V stand
-      for 100 µm (chosen).
+      g). At 20 Hz and 120 V the oscillation is 2.2 µm; the maximum error of the model in Table 2 is 1.4 µm.
+    - Amplifier lag 0.2 ms: chosen; "the greater the frequency, the more obvious the hysteresis" (2.3), but the
+      influence of frequency "is not visible" (2.4): from 0.1 to 10 Hz the loop widens by 1 % of the stroke.
+    - Noise 10 nm rms: chosen, usual for strain gauges. Resolution 3 nm: 16 bits over -10 to 10 V (2.1), where 10 V
+      correspond to 100 µm (chosen).
     - The y axis differs by a few per cent: chosen; the paper says only that the axes are independent (2.2).
 
     Parameters

@@ -102,7 +102,7 @@ def check_inverse(axis: AxisModel, allowed: Limits) -> None:
 
 
 def require_near(present: float, allowed: Limits) -> None:
-    """Refuse a model whose identified voltages are far from the present voltage (V): it would extrapolate.
+    """Refuse a model if the present voltage (V) is far outside its identified range: it would extrapolate.
 
     Raises
     ------

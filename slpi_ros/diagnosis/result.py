@@ -45,7 +45,7 @@ UP_TO_DATE = "`slpi refit` with this record brings the model up to date; no othe
 ANOTHER_HYSTERESIS = {
     NOT_CLOSING: "No model with return-point memory can follow loops that do not close: compensate with "
     "feedback, and record the drive of `slpi excite --for creep` to see whether they close where time is left.",
-    LEVEL: "Loops between the same two voltages differ with the level they hang on, which no "
+    LEVEL: "Loops between the same two voltages differ with the loop that they lie in, which no "
     "model here can follow: identify on drives like those to be compensated, or compensate with feedback.",
     BIAS: "The shape of the loops depends on the bias voltage, which the kind of the given "
     "model cannot follow: identify this record with kind 'slpi'; no new one is needed.",
@@ -287,7 +287,7 @@ class Given:
 
     @property
     def changed(self) -> bool:
-        """Whether the stage has changed: loops or gain of the model are wrong, unlike at its identification."""
+        """Whether the stage has changed since the model was identified: its loops or its gain no longer fit."""
         if self.own_rms <= AS_BEFORE * self.rms and self.rms <= AS_BEFORE * self.own_rms:
             return False
         excess = np.sqrt(max(self.hysteresis_rms**2 - self.refitted_rms**2, 0.0))
@@ -442,7 +442,7 @@ def _summary(
     before, after = before_rms * 1e9, selection.now.held_out.rms_of_records * 1e9
     left = f"{after:.3g} nm rms are left, the floor of the record is {floor.rms * 1e9:.3g} nm"
     found = ", then ".join(
-        f"{named.name}, which takes away {named.gain_percent:.0f} % of {'the rest' if place else 'the error'}"
+        f"{named.name}, which reduces {'the rest' if place else 'the error'} by {named.gain_percent:.0f} %"
         for place, named in enumerate(effects)
     )
     if verdict == NOTHING_FOUND:
@@ -489,7 +489,7 @@ def _more_loops(evidence: Evidence) -> str:
 
 
 def _separating(names: Sequence[str], evidence: Evidence) -> str:
-    """Return sentences that recommend an experiment to separate the effects `names`, the most likely one first."""
+    """Return sentences that recommend an experiment to distinguish the effects `names` (likeliest first)."""
     chosen = next((drive for pair, drive in SEPARATES if pair <= set(names)), names[0])
     axes = " --axis OTHER THIS" if chosen == "cross_coupling" else ""
     other = OTHER_FREQUENCIES if one_speed(evidence) else ""

@@ -78,7 +78,7 @@ class StreamingCoercivity:
         return self.ahead(wanted, copysign(1.0, way)) if way else self._v
 
     def ahead(self, u: float, direction: float) -> float:
-        """Return the command (V) at which the hysteresis starts to move from `u` (V) in `direction`, -1 or 1."""
+        """Return the command (V) beyond which the input of the hysteresis leaves `u` (V) in `direction`, -1 or 1."""
         return u + direction * self._half_width(self._rate_out)
 
     def within(self, reversible_bypass: float) -> tuple[float | None, float]:

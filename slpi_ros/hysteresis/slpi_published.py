@@ -50,7 +50,7 @@ class Loop:
     samples : ndarray of int, shape (m,)
         Samples of this loop without its inner loops, in order. The vertex belongs to the loop that contains it, except
         for the vertex of the outer loop, sample 0.
-    sewn : ndarray of int, shape (n,)
+    joined : ndarray of int, shape (n,)
         Samples of this loop that are vertices of separated inner loops.
     closed : bool
         Whether the voltage returned to the vertex. The outer loop is open by definition.
@@ -62,7 +62,7 @@ class Loop:
     vertex: int
     direction: int
     samples: IntArray
-    sewn: IntArray
+    joined: IntArray
     closed: bool
     below: int
 
@@ -196,7 +196,7 @@ def _loops(closed: list[tuple[int, int]], suspects: list[int], falls_first: bool
             vertex=vertex,
             direction=int(phase[vertex]),
             samples=samples[number],
-            sewn=np.array(inner[number], dtype=np.int64),
+            joined=np.array(inner[number], dtype=np.int64),
             closed=end < phase.size,
             below=below[number],
         )

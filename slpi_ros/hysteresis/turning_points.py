@@ -102,7 +102,7 @@ class Branches(NamedTuple):
 
 
 class Shape(Protocol):
-    """Branch shapes of a hysteresis model, as required by the engine."""
+    """Shapes of the branches of a hysteresis model, as `Memory` requires them."""
 
     @property
     def symmetric_rest(self) -> bool:

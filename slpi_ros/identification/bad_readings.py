@@ -34,7 +34,7 @@ LEAST_SPIKE = 0.001
 _FAR, _APART, _WINDOW, _PASSES = 15.0, 5.0, 7, 5
 # Window length of the running median of a model error, in readings.
 _MODEL_WINDOW = 15
-# Readings next to an outlier deviate by less than this share of the outlier.
+# The deviation changes by more than this share of an outlier from the reading before and to the reading after it.
 _SUDDEN = 0.5
 # Largest delay of a displacement reversal, and duration of ringing after a jump, in samples.
 _TURN_REACH, _RINGING = 5, 200
@@ -212,9 +212,9 @@ def outliers_beside(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[n
 def _off_path(path: FloatArray, y: FloatArray, v: FloatArray) -> Mask:
     if y.size < 5:
         return np.zeros(y.size, dtype=bool)
-    off = y - path
+    error = y - path
     # The error of the model itself is similar in neighbouring readings.
-    off = np.abs(off - median_filter(off, _MODEL_WINDOW, mode="mirror"))
+    off = np.abs(error - median_filter(error, _MODEL_WINDOW, mode="mirror"))
     if not off.any():
         return np.zeros(y.size, dtype=bool)
     turned = np.pad(np.abs(_off_neighbours(v)), 2)
@@ -225,11 +225,14 @@ def _off_path(path: FloatArray, y: FloatArray, v: FloatArray) -> Mask:
     far: Mask = off > least + explained
     if not far.any():
         return far
-    # A model error grows gradually, an outlier appears within one reading.
+    # A model error comes or goes gradually or without a step of the readings, an outlier with one.
     bounds = np.flatnonzero(np.diff(far, prepend=False, append=False))
-    padded = np.concatenate([[0.0], off, [0.0]])
-    beside = np.maximum(padded[bounds[::2]], padded[bounds[1::2] + 1])
-    sudden = beside < _SUDDEN * np.minimum.reduceat(padded[1:], bounds)[::2]
+    first, last = bounds[::2], bounds[1::2] - 1
+    steps = np.diff(y)
+    steps = np.minimum(np.abs(steps - median_filter(steps, _MODEL_WINDOW, mode="mirror")), np.abs(np.diff(error)))
+    jumps = np.concatenate([[np.inf], steps, [np.inf]])
+    size = _SUDDEN * np.maximum.reduceat(np.append(off, 0.0), bounds)[::2]
+    sudden = (jumps[first] > size) & (jumps[last + 1] > size)
     far[far] = np.repeat(sudden, np.diff(bounds)[::2])
     return far
 

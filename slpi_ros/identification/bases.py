@@ -40,7 +40,7 @@ class Basis(Protocol):
         """Return the displacement increment along each sample's branch per unit of each parameter, shape (N, size)."""
 
     def roughness(self) -> sp.csr_array:
-        """Return the matrix R of the roughness ``|R x|^2``, shape (r, size + 1)."""
+        """Return the matrix R, shape (r, size + 1), of the roughness penalty ``|R x|^2`` on the coefficients x."""
 
     def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
         """Return ``C``, shape (m, size + 1), and bound of ``C x >= bound``, for a mean gain in units of x per volt."""

@@ -1,4 +1,4 @@
-"""Fits of the published models: SLPI (a classical PI model per separated loop), MPI and SMPI."""
+"""Fits of the published models: SLPI (a classical PI model for each separated loop), multi-slope PI, simplified MPI."""
 
 import warnings
 from collections.abc import Sequence
@@ -366,7 +366,7 @@ def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return peak displacement ``X_p`` against amplitude for the SMPI model, averaged over cycles of similar amplitude.
+    """Return amplitudes and mean peak displacements of the cycles, for the simplified multi-slope PI model (SMPI).
 
     Parameters
     ----------
@@ -457,7 +457,7 @@ def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
 
 
 def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
-    """Fit the SMPI model to one record, given as a sequence of one element.
+    """Fit the simplified multi-slope PI model (SMPI) to one record, given as a sequence of one element.
 
     Raises
     ------

@@ -437,14 +437,16 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
         size = f"off by up to {signal.mixed_size * 1e6:.3g} um"
         yield Finding("warn", f"{text}, {share}, {size}: the link delivers old or mixed values; they are not fitted")
     if signal.stale:
-        text = f"{name} stale, a reading of before, in {_of(signal.stale, samples)}"
+        text = f"{name} stale, repeating an earlier reading, in {_of(signal.stale, samples)}"
         yield Finding("warn" if signal.stale > _OUTLIERS * samples else "ok", text)
     if signal.spikes:
         text = f"{name} with outliers in {_of(signal.spikes, samples)}"
-        left = (
-            "a line between their neighbours stands for them" if name == "voltage" else "the small ones stay in the fit"
+        use = (
+            "replaced by a line between their neighbours"
+            if name == "voltage"
+            else "left out of the fit unless noise or a kink may explain them"
         )
-        yield Finding("warn", f"{text}: the other signal does not follow; {left}")
+        yield Finding("warn", f"{text}: the other signal does not follow; {use}")
 
 
 def _drive_findings(quality: Quality) -> Iterator[Finding]:

@@ -46,11 +46,11 @@ class Samples:
     fitted : ndarray of bool, shape (N,)
         Samples whose displacement is to be fitted.
     history : int
-        Number of leading samples that form an assumed initial history. The first of them is reached by a long fall,
-        which erases the hysteresis memory. Default 0: the axis starts at rest.
+        Number of leading samples that form an assumed initial history. Before the first of them the voltage falls from
+        far above, which erases the hysteresis memory. Default 0: the axis starts at rest.
     mixed, side : int
-        Number of samples that are not fitted because their displacement is early, late or mixed with that of a
-        neighbour, and the side of that neighbour, as in `slpi_ros.identification.bad_readings.Mixed`. Default 0: none.
+        Number of samples that are not fitted because their displacement belongs to a neighbouring sample or is a
+        mixture with it, and the side of that neighbour, as in `slpi_ros.identification.bad_readings.Mixed`. Default 0.
     """
 
     v: FloatArray
@@ -62,7 +62,7 @@ class Samples:
 
     @property
     def primed(self) -> bool:
-        """Whether the samples begin with an assumed initial history, and so with a long fall to the first voltage."""
+        """Whether the samples begin with an assumed initial history, and so with a fall from far above."""
         return self.history > 0
 
     def after(self, history: tuple[float, ...]) -> "Samples":

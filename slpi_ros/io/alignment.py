@@ -144,7 +144,7 @@ def held_at(desired: Signals, record: Record, where: str) -> dict[str, FloatArra
         Decoded messages of a topic with desired displacements.
     record : Record
     where : str
-        Bag and topic, for messages.
+        Bag and topic, named in error messages.
 
     Returns
     -------

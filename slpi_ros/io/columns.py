@@ -221,7 +221,7 @@ def _axis(stem: str) -> str:
 
 
 def match_column(name: str, columns: Sequence[str]) -> str:
-    """Return the only column that equals `name` except for case; else, or if `name` is a column, `name` itself."""
+    """Return `name` if it is a column, else the only column that equals it except for case; `name` if there is none."""
     alike = [column for column in columns if column.casefold() == name.casefold()]
     return alike[0] if len(alike) == 1 and name not in columns else name
 

@@ -83,9 +83,15 @@ def separated(separation: Separation) -> Figure:
         panel.plot(v, y, color="#dfe5ea", linewidth=2.5)
         panel.plot(v[loop.path], y[loop.path], ".-", color=DESIRED, markersize=3, linewidth=0.8)
         panel.plot(v[loop.vertex], y[loop.vertex], "^", color=COLOURS[0], markersize=9, label="vertex")
-        if loop.sewn.size:
+        if loop.joined.size:
             panel.plot(
-                v[loop.sewn], y[loop.sewn], "o", color=COLOURS[2], markersize=9, fillstyle="none", label="sewn here"
+                v[loop.joined],
+                y[loop.joined],
+                "o",
+                color=COLOURS[2],
+                markersize=9,
+                fillstyle="none",
+                label="joined here",
             )
         panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
         panel.legend(frameon=False, loc="upper left")
@@ -233,14 +239,14 @@ def _separation(study: Study) -> Exhibit:
     for loop in separation.loops:
         v = separation.voltage
         far = v[loop.samples][int(np.argmax(np.abs(v[loop.samples] - v[loop.vertex])))]
-        sewn = ", ".join(f"{vertex:.0f}" for vertex in v[loop.sewn]) or "-"
-        rows.append((ROMAN[loop.level], f"{v[loop.vertex]:.0f}", f"{far:.0f}", sewn, str(loop.samples.size)))
+        joined = ", ".join(f"{vertex:.0f}" for vertex in v[loop.joined]) or "-"
+        rows.append((ROMAN[loop.level], f"{v[loop.vertex]:.0f}", f"{far:.0f}", joined, str(loop.samples.size)))
     return Exhibit(
         title="Fig. 9: loops separated",
         paper="Single loops of levels II, I and 0; a triangle at each vertex, a circle where a loop was taken out.",
         ours=f"{len(separation.loops)} single loops; the table of all samples is in separation.csv.",
         remark="None: level and vertex are as the paper's rules give them.",
-        tables=(Table(("level", "vertex (V)", "turns at (V)", "sewn at (V)", "samples"), tuple(rows)),),
+        tables=(Table(("level", "vertex (V)", "turns at (V)", "joined at (V)", "samples"), tuple(rows)),),
         pictures=(Picture(separated(separation), "Single loops, the highest level first."),),
     )
 
@@ -427,7 +433,7 @@ def unseen(unseen: UnseenPaths) -> Exhibit:
         title="Paths whose loops were never identified",
         paper="Not tried.",
         ours=f"Models of the random path on {len(unseen.turns)} other paths (V): {paths}. "
-        f"{unseen.replaced} of their {unseen.loops} inner loops were never identified; the nearest stand in.",
+        f"{unseen.replaced} of their {unseen.loops} inner loops were never identified; the nearest ones replace them.",
         remark="Published SLPI has nothing to say about loops it has not seen, and is no better than classical PI with "
         "more operators there; the loop family interpolates.",
         tables=(Table(header, tuple(rows), best=int(np.argmin([np.mean(e) for e in unseen.mean_errors.values()]))),),

@@ -107,18 +107,19 @@ class Study:
         Voltage and displacement, separated into loops.
     classical : PrandtlIshlinskii
     at_rest, closing : SeparatedLoops
+        Published model with play operators that start at rest in every loop, and primed, so that loops close.
     modelled : dict of model name to LoopErrors
         Model - measured.
     compensated : dict of model name to LoopErrors
         Achieved - desired displacement; the desired one consists of straight lines between the measured reversals.
     straight : dict of model name to LoopErrors
-        The same for the straight line through zero and the largest displacement (4.1), with other reversals.
+        The same for a desired displacement proportional to the voltage (section 4.1 of the SLPI paper).
     desired : ndarray, shape (N,), metres
         Desired displacement of `compensated`.
     voltages : dict of model name to ndarray, shape (N,), volts
         Voltages of `compensated`.
     drives : dict of model name to callable
-        Function that returns the model in its initial state.
+        Function that makes the model anew in its initial state.
     """
 
     turns: tuple[float, ...]

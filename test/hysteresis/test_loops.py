@@ -126,7 +126,7 @@ def test_a_single_loop_turns_once(v: FloatArray) -> None:
         assert np.count_nonzero(np.diff(moves[moves != 0])) <= 1
         if loop.closed:
             assert own[0] == own[-1]
-        assert set(loop.sewn) <= set(loop.samples.tolist())
+        assert set(loop.joined) <= set(loop.samples.tolist())
 
 
 CASES = {
@@ -152,7 +152,7 @@ def test_loops_of_known_paths(v: FloatArray, expected: list[tuple[int, float, in
 def test_inner_loops_are_sewn_at_their_vertices() -> None:
     v = ramps(0, 80, 12, 68, 20, 68, 80, 100, 0)
     outer, first, second = separate(v).loops
-    assert v[outer.sewn].tolist() == [80.0] and v[first.sewn].tolist() == [68.0] and not second.sewn.size
+    assert v[outer.joined].tolist() == [80.0] and v[first.joined].tolist() == [68.0] and not second.joined.size
     # Sewn together, the outer loop is the plain 0 -> 100 -> 0, with the vertex and the closing sample at 80 V.
     plain = ramps(0, 100, 0)
     assert v[outer.path].tolist() == sorted([*plain[:26], 80.0]) + plain[26:].tolist()

@@ -148,3 +148,10 @@ def test_what_a_model_gets_wrong_is_no_outlier(kind, noise):
     y = y + noise * np.random.default_rng(6).standard_normal(t.size)
     model = slpi_ros.identify(slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y}), kind).axes["x"]
     assert not outliers_beside(model.memory("start").forward_array(v), y, v).size
+
+
+@pytest.mark.parametrize("readings", [1, 3, 2000])
+def test_a_sudden_error_of_a_model_is_no_outlier(clean, readings):
+    path = clean.displacement["x"].copy()
+    path[2500 : 2500 + readings] += 400 * NOISE
+    assert not outliers_beside(path, clean.displacement["x"], clean.voltage["x"]).size

@@ -110,9 +110,13 @@ def require_one_stage(records: Sequence[Record]) -> None:
     for record in records[1:]:
         if record.hardware_id != records[0].hardware_id:
             raise RecordError(
-                f"{record.source}: of stage '{record.hardware_id}', but {records[0].source} of "
-                f"'{records[0].hardware_id}'; give bags of one stage"
+                f"{record.source}: of {_stage_of(record)}, but {records[0].source} of {_stage_of(records[0])}; give "
+                "bags of one stage, with the same hardware id"
             )
+
+
+def _stage_of(record: Record) -> str:
+    return f"stage '{record.hardware_id}'" if record.hardware_id else "a stage without hardware id"
 
 
 def read_desired(path: _Path, record: Record, topic: str | None = None) -> dict[str, NDArray[np.float64]] | None:

@@ -22,13 +22,15 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-soak bench-trajectory bench-xy bench-readme clean distclean FORCE
+.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-soak bench-trajectory bench-xy bench-readme bench-faults audit docs package bench-calibrator bench-fleet clean distclean FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
 	@echo 'make test       build, lint, types, docstrings, tests'
+	@echo 'make docs       build, then the documentation site: docs/_build/html/index.html'
+	@echo 'make package    source distribution and wheel, installed and tried in a fresh environment without ROS'
 	@echo 'make demo       build, then simulated stage, calibration, identification and compensation over DDS'
-	@echo 'make bench      build, then the benchmarks'
+	@echo 'make bench      build, then the benchmarks; ratios that have grown by more than 20 % are marked'
 	@echo 'make bench-robustness  spoiled records beside clean ones, 8 seeds, 2 minutes'
 	@echo 'make bench-diagnosis   hidden effects: named, missed, invented; about an hour'
 	@echo 'make bench-records     what is found on some measured records, judged on others; half an hour'
@@ -39,6 +41,10 @@ help:
 	@echo 'make bench-trajectory  a trajectory of a million points: acceptance and deadlines'
 	@echo 'make bench-xy       the five segments of the MPI paper through the nodes, with and without feedback'
 	@echo 'make bench-readme   the commands of README on five simulated stages, and on the next day, 10 minutes'
+	@echo 'make bench-faults   mutated files, node lives under faults, half an hour at 1 kHz, a day at accelerated time; 90 minutes'
+	@echo 'make audit      known vulnerabilities of the pinned dependencies, by pip-audit'
+	@echo 'make bench-calibrator  20 hidden stages that calibrate themselves, and 30 faults; an hour'
+	@echo 'make bench-fleet    300 bags of 30 stages on Dask: changes found, one worker beside two, 20 minutes'
 	@echo 'make clean      remove what was built and all caches'
 	@echo 'make distclean  the same, and .venv'
 	@echo 'PYTHON=/path/to/python3.12 chooses the Python; 3.11 and 3.12 work'
@@ -59,6 +65,12 @@ test: build
 	$(VENV) -m ruff format --check .
 	$(VENV) -m mypy
 	$(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 3 --dist worksteal
+
+docs: build
+	$(VENV) -m sphinx -E -W --keep-going -q docs docs/_build/html
+
+package: $(VENV_STAMP)
+	$(VENV) tools/check_package.py --install
 
 demo: build
 	$(IN_WORKSPACE) $(VENV) demo/run_demo.py
@@ -96,9 +108,24 @@ bench-xy: build
 bench-readme: build
 	$(IN_WORKSPACE) $(VENV) benchmarks/readme_steps.py
 
+bench-faults: build
+	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/faults.py $(FAULTS)
+
+# A tool of its own environment: what it needs is not what the package needs. A package that could not be asked for is a
+# failure (--strict), as nothing is known of it then.
+audit:
+	@test -x .audit/bin/pip-audit || { $(or $(PYTHON),python3) -m venv .audit && .audit/bin/pip install -q pip-audit; }
+	.audit/bin/pip-audit --strict --disable-pip --no-deps -r requirements/lock.txt
+
+bench-calibrator: build
+	$(IN_WORKSPACE) OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/calibrator.py
+
+bench-fleet: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/fleet.py
+
 clean:
-	rm -rf build install log .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf build install log dist docs/_build .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -path ./.venv -prune -o -name __pycache__ -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv slpi_ros.egg-info
+	rm -rf .venv .audit slpi_ros.egg-info

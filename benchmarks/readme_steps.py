@@ -29,8 +29,8 @@ import slpi_ros
 FloatArray = NDArray[np.float64]
 CHECKOUT = Path(__file__).resolve().parents[1]
 PROGRAMS = CHECKOUT / "install" / "slpi_ros" / "lib" / "slpi_ros"
-SECTION = re.compile(r"^## Calibrate a real stage.*?(?=^### )", re.DOTALL | re.MULTILINE)
-BLOCK = re.compile(r"^```\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+SECTION = re.compile(r"^## No stage yet.*^## Calibrate a real stage.*?(?=^## )", re.DOTALL | re.MULTILINE)
+BLOCK = re.compile(r"^```bash\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 # Set points after that of the README, as fractions of the identified range.
 SHARES = (0.85, 0.2, 0.65, 0.4)
 # Readings averaged at each set point, after half as many are discarded: 8 nm of noise become 1.1 nm.
@@ -41,7 +41,7 @@ SETTLE_S = 1.0
 
 
 def readme_commands() -> list[str]:
-    """Return the commands of the calibration section of the README, in order, without comments."""
+    """Return the commands of the sections of the README on a stage, in order, without comments."""
     section = SECTION.search((CHECKOUT / "README.md").read_text())
     assert section, "README has no section on calibration"
     lines = [line for block in BLOCK.findall(section[0]) for line in block.splitlines()]
@@ -135,7 +135,7 @@ class Readme:
         return process
 
     def calibrate(self) -> slpi_ros.StageModel:
-        """Record a calibration drive and identify the model."""
+        """Record a calibration drive and identify the model, by hand."""
         recorder = self.start("ros2 run slpi_ros recorder")
         self.until(lambda: self.node.count_subscribers("/stage_state") >= 2, "the recorder")
         words = "ros2 run slpi_ros exciter"
@@ -143,7 +143,7 @@ class Readme:
         self.interrupt(recorder)
         for words in ("slpi identify", "slpi show"):
             self.finish(words, self.start(words))
-        return slpi_ros.load_model(self.folder / "stage.json")
+        return slpi_ros.load_model(self.folder / "my_stage" / "model.json")
 
     def compensator(self, more: str = "") -> subprocess.Popen[bytes]:
         """Start the compensator and wait until its topics are visible."""
@@ -174,9 +174,12 @@ class Readme:
         listener = self.node.create_subscription(Float64MultiArray, "/voltage_command", answers.append, 100)
         timer, found = self.node.create_timer(1.0 / float(rate), send), []
         for point in points:
-            # On a busy machine, answers to earlier messages may still arrive.
+            # Answers to earlier messages may still arrive, and a stage reports its rest until it is driven.
             new = len(sent) + 2
-            self.until(lambda new=new: len(answers) >= new, f"the voltage for {point} m")
+            self.until(
+                lambda new=new: len(answers) >= new and self.turns[-1] == answers[-1].data[0],
+                f"the voltage for {point} m",
+            )
             self.readings.clear()
             self.until(lambda: len(self.readings) >= 3 * READINGS // 2, f"the stage at {point} m")
             found.append(float(np.mean(self.readings[READINGS // 2 :])) - point)

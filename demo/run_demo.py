@@ -28,6 +28,7 @@ from benchmarks.paths import scan_path  # noqa: E402
 from slpi_ros.excitation.drives import calibration_drive  # noqa: E402
 from slpi_ros.reports.page import Page, png  # noqa: E402
 from slpi_ros.reports.text import describe_model  # noqa: E402
+from slpi_ros.reports.views import show_model  # noqa: E402
 
 RATE = 250.0
 V_MIN, V_MAX = 0.0, 100.0
@@ -110,16 +111,17 @@ def write_page(
         "ROS 2 processes. Errors in the table are without the constant offset of each run."
     )
     page.table(HEADER, rows, best=len(rows) - 1)
-    named = {run.name: run for run in runs}
-    picture = plots.tracking(named)
-    page.figure(picture, "Displacement and error over time.")
-    page.figure(plots.linearity(named), "Achieved over desired displacement: a straight line is the aim.")
+    chart, said = plots.over_time(runs)
+    page.chart("tracking", chart, f"Displacement, and measured - desired displacement, over time. {said}")
+    page.chart("linearity", plots.over_desired(runs), "Measured over desired displacement: a straight line is the aim.")
     page.heading("The model")
     page.lines(describe_model(model))
+    page.section("The calibration")
     v, y = record.voltage["x"], record.displacement["x"]
-    page.figure(plots.loops(v, y, model.simulate(record.t, v)), "The calibration drive, measured and simulated.")
+    floor, whole = model.axes["x"].quality.floor_rms, np.ones(v.size, dtype=bool)
+    show_model(page, "model", record.t, v, y, model.simulate(record.t, v), floor, whole)
     page.write(path)
-    path.with_name("tracking.png").write_bytes(png(picture))
+    path.with_name("tracking.png").write_bytes(png(plots.picture(runs)))
 
 
 def main() -> int:

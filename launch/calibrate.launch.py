@@ -1,9 +1,13 @@
-"""Record a calibration bag: the exciter excites the stage, the recorder stores it, and both end together.
+"""Calibrate a stage by itself: from an unknown stage to a verified model that knows its causes.
 
-ros2 launch slpi_ros calibrate.launch.py params_file:=exciter.yaml bag:=calibration
+ros2 launch slpi_ros calibrate.launch.py params_file:=calibrator.yaml output:=my_stage
+ros2 launch slpi_ros calibrate.launch.py params_file:=calibrator.yaml output:=demo simulate:=true
+
+The launch ends with the calibrator, whose exit code is 0 if the target is met, else 1.
 """
 
 from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
+from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
@@ -12,40 +16,62 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from launch import LaunchDescription
 
+# Argument, and topic of the nodes that it remaps, with its meaning.
+TOPICS = {
+    "voltage_topic": ("voltage_command", "topic of the voltage commands"),
+    "state_topic": ("stage_state", "topic of the stage state"),
+    "model_topic": ("stage_model", "topic of the stage model"),
+    "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),
+}
+
 
 def generate_launch_description() -> LaunchDescription:
-    recorder = Node(
+    params_file, namespace = LaunchConfiguration("params_file"), LaunchConfiguration("namespace")
+    topics = [(topic, LaunchConfiguration(argument)) for argument, (topic, _) in TOPICS.items()]
+    simulator = Node(
         package="slpi_ros",
-        executable="recorder",
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[{"output": ParameterValue(LaunchConfiguration("bag"), value_type=str)}],
-        remappings=[("stage_state", LaunchConfiguration("state_topic"))],
+        executable="stage_simulator",
+        namespace=namespace,
+        parameters=[
+            params_file,
+            {"character": "hidden", "seed": ParameterValue(LaunchConfiguration("simulated_seed"), value_type=int)},
+        ],
+        remappings=topics,
+        condition=IfCondition(LaunchConfiguration("simulate")),
         output="screen",
     )
-    exciter = Node(
+    calibrator = Node(
         package="slpi_ros",
-        executable="exciter",
-        name="exciter",
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params_file")],
-        remappings=[
-            ("voltage_command", LaunchConfiguration("voltage_topic")),
-            ("stage_state", LaunchConfiguration("state_topic")),
+        executable="calibrator",
+        name="calibrator",
+        namespace=namespace,
+        parameters=[
+            params_file,
+            {
+                "output": ParameterValue(LaunchConfiguration("output"), value_type=str),
+                "resume": ParameterValue(LaunchConfiguration("resume"), value_type=bool),
+            },
         ],
-        # The return to the initial voltage may exceed the default timeout of launch.
+        remappings=topics,
+        # The return to rest may exceed the default timeout of launch.
         sigterm_timeout="60",
         sigkill_timeout="60",
         output="screen",
     )
     return LaunchDescription([
-        DeclareLaunchArgument("params_file", description="parameters of the exciter: see config/exciter.yaml"),
-        DeclareLaunchArgument("bag", description="folder of the bag to create"),
+        DeclareLaunchArgument("params_file", description="parameters of the calibrator: see config/calibrator.yaml"),
+        DeclareLaunchArgument("output", description="folder for bags, model, diagnosis and page"),
+        DeclareLaunchArgument("resume", default_value="false", description="go on with the bags that output holds"),
         DeclareLaunchArgument("namespace", default_value="", description="namespace of the nodes and their topics"),
-        DeclareLaunchArgument(
-            "voltage_topic", default_value="voltage_command", description="topic of the voltage commands"
+        *(
+            DeclareLaunchArgument(argument, default_value=topic, description=meaning)
+            for argument, (topic, meaning) in TOPICS.items()
         ),
-        DeclareLaunchArgument("state_topic", default_value="stage_state", description="topic of the stage state"),
-        recorder,
-        exciter,
-        RegisterEventHandler(OnProcessExit(target_action=exciter, on_exit=[EmitEvent(event=Shutdown())])),
+        DeclareLaunchArgument(
+            "simulate", default_value="false", description="start a simulated stage with hidden effects"
+        ),
+        DeclareLaunchArgument("simulated_seed", default_value="1", description="seed of the simulated stage"),
+        simulator,
+        calibrator,
+        RegisterEventHandler(OnProcessExit(target_action=calibrator, on_exit=[EmitEvent(event=Shutdown())])),
     ])  # fmt: skip

@@ -11,6 +11,16 @@ from launch import LaunchDescription
 
 ONE_AXIS = PathJoinSubstitution([FindPackageShare("slpi_ros"), "config", "one_axis.yaml"])
 
+# Argument, and topic of the nodes that it remaps, with its meaning.
+TOPICS = {
+    "desired_topic": ("desired_displacement", "topic of the desired displacements"),
+    "trajectory_topic": ("desired_trajectory", "topic of the desired trajectories"),
+    "measured_topic": ("measured_displacement", "topic of the measured displacements; stage_state for feedback"),
+    "voltage_topic": ("voltage_command", "topic of the voltage commands"),
+    "model_topic": ("stage_model", "topic of the stage model"),
+    "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),
+}
+
 
 def generate_launch_description() -> LaunchDescription:
     model_file = LaunchConfiguration("model_file")
@@ -21,8 +31,9 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("params_file", default_value=ONE_AXIS, description="parameters of the compensator"),
         DeclareLaunchArgument("model_file", default_value="", description="model document, if not in params_file"),
         DeclareLaunchArgument("namespace", default_value="", description="namespace of the node and its topics"),
-        DeclareLaunchArgument(
-            "voltage_topic", default_value="voltage_command", description="topic of the voltage commands"
+        *(
+            DeclareLaunchArgument(argument, default_value=topic, description=meaning)
+            for argument, (topic, meaning) in TOPICS.items()
         ),
         compensator(as_in_params_file, IfCondition(no_model_file)),
         compensator(with_model_file, UnlessCondition(no_model_file)),
@@ -37,7 +48,7 @@ def compensator(parameters: list, condition: IfCondition) -> LifecycleNode:
         name="compensator",
         namespace=LaunchConfiguration("namespace"),
         parameters=parameters,
-        remappings=[("voltage_command", LaunchConfiguration("voltage_topic"))],
+        remappings=[(topic, LaunchConfiguration(argument)) for argument, (topic, _) in TOPICS.items()],
         output="screen",
         condition=condition,
     )

@@ -15,18 +15,35 @@ from launch import LaunchDescription
 
 ONE_AXIS = PathJoinSubstitution([FindPackageShare("slpi_ros"), "config", "one_axis.yaml"])
 
+# Argument, and topic of the nodes that it remaps, with its meaning.
+TOPICS = {
+    "desired_topic": ("desired_displacement", "topic of the desired displacements"),
+    "trajectory_topic": ("desired_trajectory", "topic of the desired trajectories"),
+    "measured_topic": ("measured_displacement", "topic of the measured displacements; stage_state for feedback"),
+    "voltage_topic": ("voltage_command", "topic of the voltage commands"),
+    "state_topic": ("stage_state", "topic of the stage state"),
+    "model_topic": ("stage_model", "topic of the stage model"),
+    "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),
+}
+
 
 def generate_launch_description() -> LaunchDescription:
     # Written as YAML: launch would concatenate a plain list to one string.
     bags = ParameterValue(["['", LaunchConfiguration("bag"), "']"], value_type=list[str])
+    topics = [(topic, LaunchConfiguration(argument)) for argument, (topic, _) in TOPICS.items()]
     return LaunchDescription([
         DeclareLaunchArgument("bag", default_value="", description="recorded calibration to identify at once"),
         DeclareLaunchArgument("namespace", default_value="", description="namespace of all nodes and their topics"),
+        *(
+            DeclareLaunchArgument(argument, default_value=topic, description=meaning)
+            for argument, (topic, meaning) in TOPICS.items()
+        ),
         Node(
             package="slpi_ros",
             executable="stage_simulator",
             namespace=LaunchConfiguration("namespace"),
             parameters=[{"axes": ["x"]}],
+            remappings=topics,
             output="screen",
         ),
         LifecycleNode(
@@ -35,6 +52,7 @@ def generate_launch_description() -> LaunchDescription:
             name="compensator",
             namespace=LaunchConfiguration("namespace"),
             parameters=[ONE_AXIS],
+            remappings=topics,
             output="screen",
         ),
         Node(
@@ -42,6 +60,7 @@ def generate_launch_description() -> LaunchDescription:
             executable="identify",
             namespace=LaunchConfiguration("namespace"),
             parameters=[{"bags": bags}],
+            remappings=topics,
             output="screen",
         ),
     ])  # fmt: skip

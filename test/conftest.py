@@ -42,19 +42,30 @@ os.environ["ROS_DOMAIN_ID"] = str(_reserve_ros_domain())
 # A shell starts background jobs with SIGINT ignored, and the nodes that tests start and interrupt inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# No verdict depends on the clock, and CI draws the same examples every time.
+# No verdict depends on the clock. CI draws the same examples every time: more of them would find nothing new there.
 CI = bool(os.environ.get("CI"))
-hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize=CI)
+hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize=CI, max_examples=50 if CI else 100)
 hypothesis.settings.load_profile("slpi_ros")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs ROS and what needs the measured records."""
+    """Mark what needs ROS and what needs the measured records; let the longest tests begin first."""
     for item in items:
         if "nodes" in item.path.parent.name or "rclpy" in getattr(item.module, "__dict__", {}):
             item.add_marker("ros")
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")
+    # A worker gets an equal part of the tests, in their order: each begins with its share of the longest.
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    longest = [item for item in items if item.get_closest_marker("minutes")]
+    others = [item for item in items if not item.get_closest_marker("minutes")]
+    ordered: list[pytest.Item] = []
+    for worker in range(workers):
+        own = longest[worker::workers]
+        room = len(items) * (worker + 1) // workers - len(ordered) - len(own)
+        ordered += own + others[:room]
+        del others[:room]
+    items[:] = ordered
 
 
 def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:

@@ -15,8 +15,9 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 # From top to bottom. A module may import its own layer and those below it, of its own layer only its own folder.
 LAYERS = (
     {"cli"},
-    {"papers", "nodes"},
+    {"papers", "nodes", "fleet"},
     {"reports"},
+    {"calibration"},
     {"diagnosis"},
     {"identification", "compensator"},
     {"model"},
@@ -92,7 +93,7 @@ def test_folder_is_a_package(path: Path) -> None:
 def test_imports_point_down(path: Path) -> None:
     part, imported = part_of(path), parts_imported_by(path)
     if part == "":
-        allowed = LEVEL.keys() - {"cli", "nodes", "papers"}
+        allowed = LEVEL.keys() - {"cli", "fleet", "nodes", "papers"}
     else:
         allowed = {below for below in LEVEL if LEVEL[below] > LEVEL[part]} | {part}
         allowed |= {"", *LAYERS[0]} if part == "cli" else {""} if part in LAYERS[1] else set()
@@ -125,6 +126,16 @@ def test_public_api_loads_neither_ros_nor_rosbags() -> None:
     loaded = set(subprocess.run(command, cwd=ROOT.parent, stdout=subprocess.PIPE, text=True, check=True).stdout.split())
     assert PACKAGE in loaded
     assert not {module for module in loaded if needs_ros(module)} | loaded & ONLY_IO
+
+
+def test_only_a_fleet_loads_dask() -> None:
+    code = f"import sys, {PACKAGE}.cli, {PACKAGE}.fleet; {PACKAGE}.cli.parser('fleet'); print(*sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT.parent, stdout=subprocess.PIPE, text=True, check=True
+    )
+    assert not {"dask", "distributed", "pandas", "pyarrow"} & set(loaded.stdout.split())
+    using = {path.name for path in FILES if outside_imported_by(path) & {"dask", "distributed", "pandas", "pyarrow"}}
+    assert {path.name for path in FILES if part_of(path) == "fleet"} >= using
 
 
 def test_only_whole_paths_load_the_compiler() -> None:

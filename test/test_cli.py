@@ -1,8 +1,11 @@
 """The command line as a user meets it: real processes, real files."""
 
 import json
+import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +13,8 @@ from identification.records import calibration, stage
 from refusals import holds
 
 import slpi_ros
+from slpi_ros.cli import MOST_LINES
+from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.tables import read_table, write_table
 
@@ -19,6 +24,12 @@ pytestmark = pytest.mark.slow
 def slpi(*arguments):
     command = [sys.executable, "-m", "slpi_ros.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def assert_in_form(text):
+    """Check that a verdict comes first, few lines follow, and a command comes last."""
+    first, *lines, last = text.splitlines()
+    assert first.startswith(("GOOD: ", "LIMITED BY: ")) and len(lines) <= MOST_LINES and last.startswith("next: slpi ")
 
 
 def one_line(result, code):
@@ -55,13 +66,22 @@ def test_from_table_to_bag_to_model_to_voltages(folder, tmp_path):
     assert found.returncode == 0 and "slpi" in found.stdout
     assert (tmp_path / "report" / "report.html").read_text().startswith("<!doctype html>")
     shown = slpi("show", tmp_path / "model.json")
-    # What the record is good for comes first.
-    assert found.stdout.startswith("axis x: ") and found.stdout.endswith(shown.stdout)
-    assert "'s1'" in shown.stdout
+    assert_in_form(found.stdout)
+    lines = shown.stdout.splitlines()
+    # The verdict on the model and its lines are the same.
+    assert found.stdout.splitlines()[0] == lines[0] and set(lines[1:-2]) <= set(found.stdout.splitlines())
+    assert "'s1'" in shown.stdout and "µm" in shown.stdout
+    everything = slpi("show", tmp_path / "model.json", "-v").stdout.splitlines()
+    assert len(everything) > len(lines) and set(lines[1:-2]) <= set(everything)
+    assert json.loads(slpi("show", tmp_path / "model.json", "--json").stdout) == json.loads(
+        (tmp_path / "model.json").read_text()
+    )
     # `simulate` starts where the record did.
     asked = slpi("compensate", tmp_path / "model.json", folder / "desired.csv", "-o", tmp_path / "v.csv",
                  "--start-memory", "start")  # fmt: skip
-    assert asked.returncode == 0 and len(asked.stdout.splitlines()) == 1
+    assert (
+        asked.returncode == 0 and not asked.stderr and asked.stdout.splitlines()[-1].startswith("next: slpi simulate ")
+    )
     assert slpi("simulate", tmp_path / "model.json", tmp_path / "v.csv", "-o", tmp_path / "y.csv").returncode == 0
     t, reached = read_table(tmp_path / "y.csv", "m")
     t_wished, wished = read_table(folder / "desired.csv", "m")
@@ -69,6 +89,7 @@ def test_from_table_to_bag_to_model_to_voltages(folder, tmp_path):
     np.testing.assert_allclose(reached["x"], wished["x"], rtol=0, atol=1e-9 * np.ptp(wished["x"]))
 
 
+SETUP = Path(__file__).resolve().parents[1] / "setup.py"
 COMMANDS = ("import", "excite", "identify", "refit", "diagnose", "simulate", "compensate", "show", "experiments")
 
 
@@ -82,12 +103,74 @@ def test_excite_identify_refit(tmp_path):
         write_bag(tmp_path / name, slpi_ros.Record(stamps, v, {"x": y}))
     assert slpi("identify", tmp_path / "first", "-o", tmp_path / "m.json", "--kind", "pi").returncode == 0
     done = slpi("refit", tmp_path / "m.json", tmp_path / "second", "-o", tmp_path / "m.json")
-    assert done.returncode == 0 and [line.split()[:2] for line in done.stdout.splitlines()] == [["axis", "x:"]] * 2
+    assert done.returncode == 0
+    assert_in_form(done.stdout)
+    assert [line.split()[:2] for line in done.stdout.splitlines()[1:-1]] == [["axis", "x:"]] * 2
+    found = slpi(
+        "refit", tmp_path / "m.json", tmp_path / "second", "-o", tmp_path / "n.json", "--axis", "x", "--start", 2,
+        "--stop", 28, "--report", tmp_path / "page", "--json",
+    )  # fmt: skip
+    (record,) = json.loads(found.stdout)["records"]
+    assert found.returncode == 0 and record["axes"].keys() == {"x"} and record["axes"]["x"]["error_after_rms_m"] < 1e-6
+    samples = [slpi_ros.load_model(tmp_path / name).axes["x"].quality.samples for name in ("m.json", "n.json")]
+    assert 0 < samples[1] - samples[0] < 26.1 * 100
+    assert (tmp_path / "page" / "report.html").exists()
+    assert one_line(
+        slpi("refit", tmp_path / "m.json", tmp_path / "second", "-o", tmp_path / "n.json", "--axis", "q"), 2
+    )
+
+
+def test_a_refit_takes_several_bags_in_the_order_of_their_records(tmp_path):
+    t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=100.0, seed=2)
+    for number, gain in enumerate((1.0, 1.01, 1.03)):
+        y = gain * stage(2).run(t, v)[1]
+        stamps = np.round(t * 1e9).astype(np.int64) + number * 10**12
+        write_bag(tmp_path / f"bag{number}", slpi_ros.Record(stamps, {"x": v}, {"x": y}))
+    model, bags = tmp_path / "m.json", [tmp_path / "bag1", tmp_path / "bag2"]
+    assert slpi("identify", tmp_path / "bag0", "-o", model, "--kind", "pi").returncode == 0
+    step, both = tmp_path / "step.json", tmp_path / "both.json"
+    assert slpi("refit", model, bags[0], "-o", step).returncode == 0
+    assert slpi("refit", step, bags[1], "-o", step).returncode == 0
+    done = slpi("refit", model, *reversed(bags), "-o", both)
+    assert done.returncode == 0
+    assert [line.split(": ")[:2] for line in done.stdout.splitlines()[1:-1]] == [
+        [str(bag), "axis x"] for bag in bags for _ in range(2)
+    ]
+    at_once, in_steps = (json.loads(path.read_text())["axes"] for path in (both, step))
+    assert at_once == in_steps
+    assert one_line(slpi("refit", model, bags[0], bags[0], "-o", both), 2)
 
 
 def test_help_tells_every_command():
     text = slpi("--help").stdout
     assert all(command in text for command in COMMANDS)
+    bare = slpi()
+    assert one_line(bare, 2) and bare.stdout == text
+
+
+def test_the_version_is_that_of_the_package():
+    told = slpi("--version")
+    assert (told.returncode, told.stderr) == (0, "")
+    assert told.stdout == f"slpi {re.search(r'version=.([0-9.]+)', SETUP.read_text())[1]}\n"
+
+
+def test_a_first_sample_that_jumps_is_told_and_a_slew_limit_kept(folder, tmp_path):
+    start = slpi_ros.load_model(folder / "pi.json").axes["x"].initial("end")
+    command = ("compensate", folder / "pi.json", folder / "desired.csv", "-o", tmp_path / "v.csv")
+    jump = json.loads(slpi(*command, "--json").stdout)["axes"]["x"]["first_jump_V"]
+    t, free = read_table(tmp_path / "v.csv", "V")
+    assert jump == pytest.approx(free["x"][0] - start.voltage) and abs(jump) > 1.0
+    assert holds(slpi(*command).stdout, f"{jump:+.4g} V", "--slew")
+    fastest = float(np.max(np.abs(np.diff(free["x"]) / np.diff(t))))
+    for slew in (0.5 * fastest, 1e6):
+        found = json.loads(slpi(*command, "--slew", slew, "--json").stdout)["axes"]["x"]
+        _, limited = read_table(tmp_path / "v.csv", "V")
+        assert found["first_jump_V"] == 0.0 and limited["x"][0] == pytest.approx(start.voltage)
+        assert np.max(np.abs(np.diff(limited["x"]) / np.diff(t))) <= slew * (1 + 1e-6)
+        assert (found["slew_limited"] > 0) == (slew < fastest)
+    # Where the limit does not hold it back, the voltage is that of the whole path.
+    np.testing.assert_allclose(limited["x"][1:], free["x"][1:], atol=1e-6)
+    assert one_line(slpi(*command, "--slew", -1), 2)
 
 
 def test_an_import_tells_what_it_took_for_what(tmp_path):
@@ -96,7 +179,7 @@ def test_an_import_tells_what_it_took_for_what(tmp_path):
     columns = ("--time", "zeit", "--voltage", "spannung", "--displacement", "weg [nm]")
     done = slpi("import", tmp_path / "d.csv", "-o", tmp_path / "b", *columns)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.splitlines()[1:] == [
+    assert done.stdout.splitlines()[1:-1] == [
         "time: column 'Zeit' taken as s",
         "axis Weg: Spannung 0 to 100.5 V (unit assumed), Weg [nm] -0.5 to 19.8 um",
     ]
@@ -269,3 +352,27 @@ CASES = (
 def test_bad_input_is_told_in_one_line(folder, tmp_path, case):
     arguments, code, words = case(folder, tmp_path)
     assert holds(one_line(slpi(*arguments), code), words)
+
+
+def test_the_doctor_checks_files_without_ros(folder, tmp_path):
+    slpi_ros.save_model(slpi_ros.identify(slpi_ros.read_bag(folder / "bag")), tmp_path / "m.json")
+    command = ("doctor", folder / "bag", "--model", tmp_path / "m.json", "--no-ros")
+    well = slpi(*command, "--json")
+    assert well.returncode == 0 and json.loads(well.stdout)["well"] and not well.stderr
+    (tmp_path / "half.json").write_text((folder / "pi.json").read_text()[:300])
+    for wrong in (("--voltage-min", 0, "--voltage-max", 40), ("--model", tmp_path / "half.json"), ("--topic", "other")):
+        done = slpi(*command, *wrong)
+        assert done.returncode == 1 and done.stdout.startswith("MEND: ") and "\nmend " in done.stdout
+        assert done.stdout.splitlines()[-1].startswith("next: slpi doctor ") and not done.stderr
+    for wrong in (("--voltage-min", 0), ("--voltage-min", 5, "--voltage-max", 5), ("--seconds", 0)):
+        assert one_line(slpi(*command, *wrong), 2)
+
+
+@pytest.mark.parametrize(("line", "wanted"), [("slpi ver", "verify"), ("slpi show --ver", "--verbose")])
+def test_the_shell_is_told_completions(line, wanted, tmp_path):
+    pytest.importorskip("argcomplete")
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n",
+             "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "told")}  # fmt: skip
+    command = [sys.executable, "-m", "slpi_ros.cli"]
+    subprocess.run(command, env=os.environ | asked, capture_output=True, check=True, timeout=120)
+    assert wanted in (tmp_path / "told").read_text()

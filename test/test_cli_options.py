@@ -1,8 +1,16 @@
 """Options that make no sense: refused in one line, before anything is read."""
 
-import pytest
+import argparse
+import shlex
 
-from slpi_ros.cli import main
+import numpy as np
+import pytest
+from strategies import two_axes
+
+from slpi_ros.cli import COMMANDS, main, parser
+from slpi_ros.io.tables import write_table
+from slpi_ros.model.document import save_model
+from slpi_ros.model.stage_model import StageModel
 
 BAG = "no such bag"
 IDENTIFY = ("identify", BAG, "-o", "m.json")
@@ -53,3 +61,70 @@ def test_voltages_that_no_stage_has(limits, capsys, folder):
     low, high = limits
     options = ("excite", "-o", "drive.csv", f"--voltage-min={low}", "--voltage-max", high)
     assert "10000 V" in refused(capsys, folder, *options)
+
+
+@pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE])
+def test_a_bag_is_given_once(command, capsys, folder):
+    assert BAG in refused(capsys, folder, *command[:2], *command[1:])
+
+
+def test_a_link_that_leads_to_itself_is_no_bag(capsys, folder):
+    link = folder / "elsewhere" / "loop"
+    link.parent.mkdir()
+    link.symlink_to(link)
+    assert main(("identify", str(link), "-o", "m.json")) == 1
+    said = capsys.readouterr()
+    assert not said.out and said.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("option", ["--start", "--stop"])
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf"])
+def test_times_are_finite(option, text, capsys, folder):
+    assert option in refused(capsys, folder, *IDENTIFY, f"{option}={text}")
+
+
+@pytest.mark.parametrize("name", ["a,b", "", " ", "\x1b[2J", "a" * 101])
+def test_names_of_axes_to_excite(name, capsys, folder):
+    assert "--axis" in refused(capsys, folder, *EXCITE, "--voltage-max", "9", "--axis", name)
+
+
+def test_a_slew_limit_near_zero(capsys, folder):
+    refused(capsys, folder, *EXCITE, "--voltage-max", "9", "--slew", "1e-30")
+
+
+def subparsers():
+    whole = parser()
+    (found,) = (action for action in whole._actions if isinstance(action, argparse._SubParsersAction))
+    return found.choices
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_defaults_and_an_example_that_is_taken(command, capsys):
+    own = subparsers()[command]
+    for action in own._actions:
+        if not isinstance(action, argparse._HelpAction) and action.option_strings and not action.required:
+            assert "default" in action.help, action.option_strings
+        assert action.help
+    words = shlex.split(own.format_help().split("example:\n")[1])
+    assert words[:2] == ["slpi", command] and parser().parse_args(words[1:]).command == command
+
+
+def test_a_run_that_fails_leaves_no_folder(capsys, folder):
+    assert main((*IDENTIFY, "--report", "a/b")) == 1
+    assert capsys.readouterr().err.count("\n") == 1 and not list(folder.iterdir())
+
+
+def test_one_line_where_remarks_and_an_error_meet(capsys, folder):
+    """Commands out of reach, and a place that cannot be written."""
+    inputs = folder / "in"
+    inputs.mkdir()
+    axis = two_axes().axes["x"]
+    save_model(StageModel({"x": axis}), inputs / "m.json")
+    low, high = axis.displacement_range
+    t = np.arange(3.0)
+    write_table(inputs / "d.csv", t, {"x": np.array([low, high, high + 0.1 * (high - low)])}, "m")
+    command = ("compensate", str(inputs / "m.json"), str(inputs / "d.csv"), "--voltage-max", "20", "-o")
+    assert main((*command, str(folder / "nowhere" / "v.csv"))) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main((*command, str(folder / "v.csv"))) == 0
+    assert "axis 'x'" in capsys.readouterr().err

@@ -37,26 +37,28 @@ if [ "$(cat .venv/.identity 2>/dev/null)" != "$identity" ]; then
     "$python" -m venv $site .venv
 fi
 
-# What the sourced ROS and the system bring stays as it is; only what pip adds is pinned.
-constraints=.venv/constraints.txt
+# What the sourced ROS and the system bring stays as it is; only what pip adds is pinned, and checked by its hashes.
+lock=.venv/lock.txt
 if [ "$flavour" = sourced ]; then
-    .venv/bin/python - requirements/lock.txt >$constraints <<'PY'
+    .venv/bin/python - requirements/lock.txt >$lock <<'PY'
 import re, sys
 from importlib.metadata import distributions
 
 def plain(name): return re.sub(r"[-_.]+", "-", name).lower()
 
 present = {plain(d.name) for d in distributions() if not d.locate_file("").is_relative_to(sys.prefix)}
-for line in open(sys.argv[1]):
-    if line.startswith("#") or plain(line.split("==")[0]) not in present:
-        print(line, end="")
+# A pin and its hashes are one line, continued by backslashes.
+for pin in re.split(r"(?<!\\)\n", open(sys.argv[1]).read()):
+    name = plain(pin.split("==")[0])
+    if name not in present and not name.startswith("ros-"):
+        print(pin)
 PY
 else
-    cp requirements/lock.txt $constraints
+    cp requirements/lock.txt $lock
 fi
 
-pip() { .venv/bin/python -m pip install -qq --disable-pip-version-check -c $constraints "$@"; }
-pip -r requirements/build.txt
-if [ "$flavour" = wheels ]; then pip -r requirements/ros.txt; fi
-pip --no-build-isolation --use-pep517 -e '.[test]'
+pip() { .venv/bin/python -m pip install -qq --disable-pip-version-check "$@"; }
+pip --require-hashes --no-deps -r $lock
+# Everything that the package needs is there: without an index, a dependency that the lock lacks is an error.
+pip --no-index --no-build-isolation --use-pep517 -e '.[docs,test]'
 echo "$identity" >.venv/.identity

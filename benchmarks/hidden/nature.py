@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.simulation.dynamics import Creep
+from slpi_ros.simulation.surroundings import Hum, Interferometer
 
 from .drives import log_uniform
 from .physics import (
     Ageing,
     Amplifier,
     Flexure,
-    Hum,
-    Interferometer,
     Physics,
     RateLaw,
     SlowDomains,

@@ -8,10 +8,10 @@ import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing
+from slpi_ros.io.input_limits import MEMORY_BYTES, open_input, read_input
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
 from slpi_ros.model.limits import Limits
@@ -87,7 +87,9 @@ class LastVoltages:
     def __init__(self, path: str | os.PathLike[str], mark: int) -> None:
         self._path, self.mark, self._number = _beside(path), mark, 0
         try:
-            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+            self._file = os.open(
+                self._path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC, 0o644
+            )
         except (OSError, ValueError) as error:
             raise ModelError(f"{path}: cannot be written: {error}; choose another path") from None
 
@@ -117,7 +119,7 @@ def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tu
     """Return the last voltages (V) stored with a saved memory; None if no intact entry has the identifier `mark`."""
     size = HEAD.size + VOLTAGE_BYTES * axes + CHECKSUM_BYTES
     try:
-        with open(_beside(path), "rb") as file:
+        with open_input(_beside(path), MEMORY_BYTES) as file:
             data = file.read(2 * size)
     except (OSError, ValueError):
         return None
@@ -132,8 +134,6 @@ def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tu
 
 
 SCHEMA = "slpi_ros/saved_memory/1"
-# Maximum length of a document, characters; a document with many axes has a few thousand.
-LONGEST = 1_000_000
 INTERRUPTED = "the reset was interrupted"
 CRASHED = "restored from before a crash: the last voltage is correct, the latest reversals may be missing; reset it"
 
@@ -237,8 +237,7 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
         If the file cannot be read or is not a valid document.
     """
     try:
-        with Path(path).open(encoding="utf-8") as file:
-            text = file.read(LONGEST + 1)
+        text = read_input(path, MEMORY_BYTES).decode()
         document = json.loads(text, parse_constant=_refuse)
     except FileNotFoundError:
         return None

@@ -303,10 +303,14 @@ class Columns:
             for fold in self.joint.held_out[0]
         ]
 
+    @cached_property
+    def _products(self) -> FloatArray:
+        return self.at.T @ self.at
+
     @property
     def precision(self) -> FloatArray:
         """Inverse covariance of the gains of the columns, shape (k, k), m^2, for independent errors of 1 m."""
-        left: FloatArray = self.at.T @ self.at - self.whole.T @ self.solved
+        left: FloatArray = self._products - self.whole.T @ self.solved
         return left * self.joint.problem.scale**2
 
     def fit(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -320,8 +324,9 @@ class Columns:
         """
         own = self.joint.columns(y)
         solved = np.column_stack([own.solved, self.solved])
-        at = np.column_stack([own.at, self.at])
-        gains = _gains(np.column_stack([own.whole, self.whole]), at.T @ at, solved)
+        cross = self.at.T @ own.at
+        products = np.block([[own.at.T @ own.at, cross.T], [cross, self._products]])
+        gains = _gains(np.column_stack([own.whole, self.whole]), products, solved)
         return solved @ _missed(gains), gains
 
 

@@ -286,7 +286,8 @@ def _readings(
 
 def _trusted(part: Part, residual: FloatArray, samples: Samples, *, only_wiped: bool) -> Part:
     """Return the data of a record without bad samples, as seen in the residual, shape (N,), of hysteresis alone."""
-    samples = samples.without_mixed(part.y - residual)
+    path = part.y - residual
+    samples = samples.without_mixed(path).without_outliers(path)
     used = part.used & samples.fitted
     used = used & ~_outliers(residual, used)
     if only_wiped or _beginning_disagrees(residual, used, part.wiped):

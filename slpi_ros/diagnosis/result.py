@@ -23,6 +23,7 @@ from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
 from slpi_ros.excitation.effects import for_effect
 from slpi_ros.identification.repeatability_floor import Floor
+from slpi_ros.model.axis_model import ABOVE_FLOOR, RESOLUTION
 from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
@@ -57,10 +58,6 @@ AS_BEFORE = 1.1
 # Thresholds for a changed stage: excess rms error as a share of the motion; relative change of gain; change of gain in
 # standard deviations.
 CHANGED, LEAST_CHANGE, CERTAIN = 1e-3, 3e-3, 5.0
-# An error up to this multiple of the noise floor counts as noise.
-ABOVE_FLOOR = 1.5
-# Best accuracy of a hysteresis model without noise, as a share of the displacement range.
-RESOLUTION = 2e-4
 
 SCHEMA = "slpi_ros/diagnosis/1"
 NAMED, AMBIGUOUS, UNEXPLAINED, NOTHING_FOUND = "named", "ambiguous", "unexplained", "nothing_found"
@@ -372,7 +369,7 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) ->
     )
     on = "records" if named.after.records.size and not named.own else "blocks"
     gained = (
-        f"with it the error on {on} left out falls from {before:.3g} to {after:.3g} nm rms "
+        f"with it the error on held-out {on} falls from {before:.3g} to {after:.3g} nm rms "
         f"(chance gains as much in {100 * chance:.2g} % of cases)"
     )
     if not named.runner_up:
@@ -409,7 +406,7 @@ def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
     error, anew = given.rms * 1e9, before_rms * 1e9
     moved = ""
     if given.zero_moved is not None:
-        moved = f"The zero has moved by {given.zero_moved * 1e6:+.3g} um. "
+        moved = f"The zero has moved by {given.zero_moved * 1e6:+.3g} µm. "
     if _stale(given, selection):
         return (
             f"The given model is off by {error:.3g} nm rms, one fitted to the record by {anew:.3g} nm: the stage has "

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.diagnose import diagnose
-from slpi_ros.diagnosis.result import RESOLUTION
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
 from slpi_ros.identification.cross_validation import (
@@ -27,7 +26,7 @@ from slpi_ros.identification.initial_history import Match, match
 from slpi_ros.identification.repeatability_floor import floor_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
-from slpi_ros.model.axis_model import START_MEMORIES, AxisModel
+from slpi_ros.model.axis_model import RESOLUTION, START_MEMORIES, AxisModel
 from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
@@ -152,6 +151,8 @@ class RecordVerification:
         Whether the offset exceeds its uncertainty.
     gain, width : float
         Relative change of the height of the loops from those of the model, and additional change of their width.
+    match : Match
+        Comparison of the model with the record, with the uncertainties of these changes.
     outside : int
         Number of samples with a voltage outside the range of the identification.
     t, v, measured, model : ndarray, shape (N,), seconds, volts and metres
@@ -173,6 +174,7 @@ class RecordVerification:
     zero_moved: bool
     gain: float
     width: float
+    match: Match
     outside: int
     t: FloatArray
     v: FloatArray
@@ -415,6 +417,8 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
     axis = replace(axis, effects=tuple(effect for effect in axis.effects if effect.removable != "record"))
     found = match(axis, samples, t)
     simulated = replace(axis, start=found.start).simulate(t, samples.v)
+    # The outliers that `identify` leaves out are no error of the model.
+    samples = samples.without_outliers(simulated)
     after = samples.fitted & (np.arange(t.size) >= found.known_from)
     judged = after if np.count_nonzero(after) >= FEWEST else samples.fitted
     # A change of gain leaves the start displacement of the model unchanged.
@@ -459,6 +463,7 @@ def _judge(run: _Run, axis: AxisModel, source: str, tolerance: float | None) -> 
         zero_moved=bool(abs(run.offset) > found.offset_uncertainty),
         gain=found.gain_change,
         width=found.width_change,
+        match=found,
         outside=int(np.count_nonzero((samples.v < low - margin) | (samples.v > high + margin))),
         t=run.t,
         v=samples.v,

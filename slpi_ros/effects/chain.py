@@ -98,7 +98,7 @@ class Chain:
         u = inverse(h)
         if not rate and not coercivity:
             return h, u
-        slower, last_change = h, np.inf
+        slower, last_change, around = h, np.inf, replace(around, grid=around.uniform)
         for _ in range(_TRIALS):
             if rate:
                 tried = rate.invert(slower, replace(around, u=u))

@@ -20,7 +20,7 @@ from slpi_ros.effects.base import (
     require,
     usual_step,
 )
-from slpi_ros.effects.filters import Hold, filtered, hold
+from slpi_ros.effects.filters import Hold, hold
 
 # Shortest time constant (s) of creep; shorter ones are modelled as lag.
 FASTEST = 0.1
@@ -92,18 +92,13 @@ class Creep:
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement before creep, shape (N,), metres."""
+        from slpi_ros.effects.paths import unrelaxed
+
         grid = around.uniform
         crept = grid.on(signal)
-        moved = crept = crept - crept[:1]
-        holds = self._holds(grid.dt)
-        direct = 1.0 + sum(gain * one.now for gain, one in zip(self.gains, holds, strict=True))
-        poles = np.array([one.kept for one in holds])
-        # State z' = kept z + input, output gain (now kept + before) z + direct: the zeros are poles of the inverse.
-        output = np.array([g * (one.before + one.now * one.kept) for g, one in zip(self.gains, holds, strict=True)])
-        zeros = np.linalg.eigvals(np.diag(poles) - output[None, :] / direct)
-        for zero, pole in zip(np.sort(zeros), np.sort(poles), strict=True):
-            moved = filtered([1.0, -pole], [1.0, -zero], moved)
-        return signal - grid.off(crept - np.real(moved) / direct)
+        crept = crept - crept[:1]
+        moved = unrelaxed(crept, np.array(self.gains), np.array(self._holds(grid.dt)))
+        return signal - grid.off(crept - moved)
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:

@@ -113,8 +113,11 @@ class Uniform:
         if span <= 0.0:
             return cls(t, t, 0.0)
         dt = span / (t.size - 1)
-        even = t[0] + dt * np.arange(t.size)
-        if np.abs(t - even).max() <= EVEN * dt:
+        late = np.arange(t.size, dtype=np.float64)
+        late *= -dt
+        late += t
+        late -= t[0]
+        if max(late.max(), -late.min()) <= EVEN * dt:
             return cls(t, t, dt)
         step = max(float(np.median(np.diff(t))), span / (FINEST * t.size))
         points = int(np.ceil(span / step)) + 1

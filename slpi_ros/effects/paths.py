@@ -34,6 +34,13 @@ def play(v: FloatArray, half_width: FloatArray) -> FloatArray:
     return seen
 
 
+def smoothed(signal: FloatArray, count: int) -> FloatArray:
+    """Return the mean of a signal over `count` samples around each, shape (N,); its ends go on at their values."""
+    from scipy.ndimage import uniform_filter1d
+
+    return np.asarray(uniform_filter1d(signal, max(count, 1), mode="nearest"), dtype=np.float64)
+
+
 @compiled
 def direction(u: FloatArray, transition: float) -> FloatArray:
     """Return the direction of a path, shape (N,), volts, from -1 to 1, smoothed over a voltage `transition` (V)."""
@@ -61,6 +68,24 @@ def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArr
             total += gains[i] * states[i]
         crept[k], before = total, moved[k]
     return crept
+
+
+@compiled
+def unrelaxed(crept: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArray:
+    """Return the displacement, shape (N,), metres, whose sum with its relaxations, as in `relaxed`, is `crept`."""
+    moved, last, states = np.empty_like(crept), 0.0, np.zeros(gains.size)
+    # `states` are without the part of the present input, which is added with the next sample.
+    step, kept = holds[:, 1] + holds[:, 2] * holds[:, 0], holds[:, 2].copy()
+    direct = 1.0 + gains @ np.ascontiguousarray(holds[:, 0])
+    if crept.size:
+        moved[0] = last = crept[0] / direct
+    for k in range(1, crept.size):
+        total = 0.0
+        for i in range(gains.size):
+            states[i] = step[i] * last + kept[i] * states[i]
+            total += gains[i] * states[i]
+        moved[k] = last = (crept[k] - total) / direct
+    return moved
 
 
 @compiled

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import copysign, exp
-from typing import ClassVar, overload
+from typing import TYPE_CHECKING, ClassVar, overload
 
 import numpy as np
 
@@ -25,12 +25,20 @@ from slpi_ros.effects.base import (
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import ModelError
 
-CoercivityState = tuple[float, float, float, float]
+if TYPE_CHECKING:
+    from slpi_ros.hysteresis.compiled import Play
 
+CoercivityState = tuple[float, float, float, float, float, float]
+
+# Fixed-point iterations: the coercivity depends weakly on the resulting voltage.
+TRIALS = 4
 # Number of secant steps for inverting the reversible part, which is nearly linear within the play.
 CHORDS = 8
 # Rounding tolerance for a command at the end of the play.
 INSIDE = 1 - 1e-9
+# Shares of the half-width, and smoothing times (s) of the crossing of the play at a turn, that the inverse of a whole
+# path tries; the error, as a share of that without compensation, with which the first of them is good enough.
+SHARES, CROSSINGS, ENOUGH = (1.0, 0.75, 0.5, 0.25, 0.12), (0.0, 0.005, 0.02, 0.1), 0.5
 
 
 def reversible(v: FloatArray, gains: Sequence[float]) -> FloatArray:
@@ -41,8 +49,9 @@ def reversible(v: FloatArray, gains: Sequence[float]) -> FloatArray:
 class StreamingCoercivity:
     """Streaming (sample by sample) play operator with rate-dependent half-width.
 
-    The inverse takes the rate from the voltage at the hysteresis, or from the command if that voltage rests; with the
-    rate of the commands alone, the recursion would be unstable.
+    The inverse takes the rate from the voltage at the hysteresis, or from the command if that voltage rests, but never
+    a higher one than that of the wanted voltages: with the rate of its own commands, or of what they lead to, the
+    recursion is unstable where the width grows nearly in proportion to the rate.
 
     Parameters
     ----------
@@ -58,24 +67,35 @@ class StreamingCoercivity:
 
     def start(self, x: float) -> None:
         """Initialise to equilibrium at `x` (V)."""
-        self._v = self._u = x
-        self._rate = self._rate_out = 0.0
+        self._v = self._u = self._aimed = x
+        self._rate = self._rate_out = self._rate_aimed = 0.0
+        self._aim: float | None = None
 
     def forward(self, dt: float, x: float) -> float:
         """Advance by `dt` (s) to the command `x` (V) and return the voltage (V) at the hysteresis."""
-        way, before = x - self._v, self._u
+        way, before, aim = x - self._v, self._u, self._aim
         self._rate = self._settled(dt, self._rate, way)
         half_width = self._half_width(self._rate)
-        self._v, self._u = x, min(max(before, x - half_width), x + half_width)
+        self._v, self._u, self._aim = x, min(max(before, x - half_width), x + half_width), None
         moved = self._u - before
         if moved or abs(x - before) < INSIDE * self._half_width(self._rate_out):
             self._rate_out = self._settled(dt, self._rate_out, moved or way)
+        if aim is None:
+            self._aimed, self._rate_aimed = self._u, self._rate_out
+        else:
+            self._rate_aimed, self._aimed = self._settled(dt, self._rate_aimed, aim - self._aimed), aim
+            self._rate_out = min(self._rate_out, self._rate_aimed)
         return self._u
 
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the command (V) for the voltage `wanted` (V) at the hysteresis."""
         way = wanted - self._u
-        return self.ahead(wanted, copysign(1.0, way)) if way else self._v
+        return self.aim(wanted, copysign(1.0, way)) if way else self._v
+
+    def aim(self, u: float, direction: float) -> float:
+        """Return the command (V) that brings the hysteresis to `u` (V), or near it, in `direction`, -1 or 1."""
+        self._aim = u
+        return self.ahead(u, direction)
 
     def ahead(self, u: float, direction: float) -> float:
         """Return the command (V) beyond which the input of the hysteresis leaves `u` (V) in `direction`, -1 or 1."""
@@ -102,15 +122,21 @@ class StreamingCoercivity:
 
     def between(self, v: float, u: float) -> float:
         """Return the reversible displacement (m) at a command `v` (V) and a voltage `u` (V) of the hysteresis."""
-        return sum(gain * (v**power - u**power) for power, gain in enumerate(self._reversible, start=1))
+        # In the order of the compiled inverse, so that both round alike.
+        total, v_power, u_power = 0.0, 1.0, 1.0
+        for gain in self._reversible:
+            v_power, u_power = v_power * v, u_power * u
+            total += gain * (v_power - u_power)
+        return total
 
     def snapshot(self) -> CoercivityState:
-        """Return command and hysteresis voltage (V) and their rates (V/s)."""
-        return self._v, self._u, self._rate, self._rate_out
+        """Return command and hysteresis voltage (V), their rates (V/s), and the last wanted voltage and its rate."""
+        return self._v, self._u, self._rate, self._rate_out, self._aimed, self._rate_aimed
 
     def restore(self, state: CoercivityState) -> None:
         """Replace the state by one returned by `snapshot`."""
-        self._v, self._u, self._rate, self._rate_out = state
+        self._v, self._u, self._rate, self._rate_out, self._aimed, self._rate_aimed = state
+        self._aim = None
 
     def _settled(self, dt: float, before: float, way: float) -> float:
         if dt <= 0.0:
@@ -322,13 +348,33 @@ class RateDependence:
         In the coercivity form return the command, shape (N,), volts, using the rate of the voltage at the hysteresis.
         """
         if self.coercivity:
-            from slpi_ros.effects.paths import settled_rate
-
-            half_width = self._growth(settled_rate(around.t, signal, self.settling))
-            return signal + half_width * np.sign(np.gradient(signal)) if signal.size > 1 else signal.copy()
+            return self._command(signal, around) if signal.size > 1 else signal.copy()
         middle, speed, direction = self._drive(around)
         back = signal + speed * (self.widening * middle + self.backlash * direction)
         return np.asarray(back / (1 + speed * self.widening), dtype=np.float64)
+
+    def _command(self, wanted: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the command for the voltages `wanted` at the hysteresis, shape (N,) each, volts.
+
+        A command that jumps over the play at a turn widens it. Where that costs too much, a slower crossing or a part
+        of the compensation is better; the best of them is returned, or `wanted` itself if none does better.
+        """
+        from slpi_ros.effects.paths import settled_rate, smoothed
+
+        ahead = self._growth(settled_rate(around.t, wanted, self.settling)) * np.sign(np.gradient(wanted))
+        period = float(around.t[-1] - around.t[0]) / (wanted.size - 1)
+        best = ignored = float(np.linalg.norm(self.apply(wanted, around) - wanted))
+        chosen = wanted.copy()
+        for crossing in CROSSINGS:
+            over = smoothed(ahead, round(crossing / period)) if period and crossing else ahead
+            for share in SHARES:
+                command = wanted + share * over
+                missed = float(np.linalg.norm(self.apply(command, around) - wanted))
+                if missed < best:
+                    best, chosen = missed, command
+                if best <= ENOUGH * ignored:
+                    return chosen
+        return chosen
 
     def reversible_bypass(self, v: FloatArray, u: FloatArray) -> FloatArray:
         """Return the reversible displacement, shape (N,), m, at commands `v` and hysteresis voltages `u`, volts."""
@@ -398,6 +444,22 @@ class RateDependence:
             return StreamingCoercivity(self._growth, self.settling, self.reversible)
         return StreamingRateDependence(
             self.widening, self.backlash, self.exponent, self.reference_rate, self.transition
+        )
+
+    def compiled_play(self) -> "Play":
+        """Return the coercivity form for the compiled inverse of whole paths."""
+        from slpi_ros.hysteresis.compiled import Play
+
+        return Play(
+            coercivity=float(self.coercivity),
+            exponent=float(self.exponent),
+            reference_rate=float(self.reference_rate),
+            onset=float(self.onset),
+            settling=float(self.settling),
+            reversible=np.array(self.reversible, dtype=np.float64),
+            inside=INSIDE,
+            trials=TRIALS,
+            chords=CHORDS,
         )
 
     def _drive(self, around: EffectContext) -> tuple[FloatArray, FloatArray, FloatArray]:

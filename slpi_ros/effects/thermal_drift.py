@@ -68,7 +68,7 @@ class ThermalDrift:
     def describe(self) -> str:
         """Describe the range and the duration."""
         way, span = max(self.values) - min(self.values), self.times[-1] - self.times[0]
-        return f"whatever the voltage, the stage drifts by {way * 1e6:.3g} um within {span:.3g} s of this record"
+        return f"whatever the voltage, the stage drifts by {way * 1e6:.3g} µm within {span:.3g} s of this record"
 
     def streaming(self) -> None:
         """Return None: drift is known only for the time of the record and cannot be predicted in operation."""

@@ -141,7 +141,10 @@ class Path:
     def fewest_steps(self, spec: DriveSpec) -> NDArray[np.int64]:
         """Return the smallest number of steps of each leg, shape (n,)."""
         spans = np.diff(self._turns).tolist()
-        fewest = [spec.fewest_steps(span, leg.straight) for span, leg in zip(spans, self.legs, strict=True)]
+        # A slew limit near zero would ask for more steps than an integer holds.
+        fewest = [
+            min(spec.fewest_steps(span, leg.straight), MOST_STEPS) for span, leg in zip(spans, self.legs, strict=True)
+        ]
         return np.array(fewest, dtype=np.int64)
 
     def voltages(self, spec: DriveSpec) -> FloatArray:

@@ -4,13 +4,15 @@ Importing Numba takes about 0.5 s: import this module only where a long path is 
 """
 
 from collections.abc import Callable
-from math import inf
-from typing import Any, TypeVar, cast
+from math import exp, inf, isnan, nan
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numba import njit
+from numba.core import event
 from numpy.typing import NDArray
 
+from slpi_ros.hysteresis import compilation
 from slpi_ros.hysteresis.turning_points import END, Branches
 
 FloatArray = NDArray[np.float64]
@@ -30,6 +32,20 @@ def compiled(function: Function) -> Function:
         except RuntimeError:
             continue
     return function
+
+
+class _Announcer(event.Listener):
+    """Listener of Numba's compilations; functions loaded from the cache are none."""
+
+    def on_start(self, event: event.Event) -> None:
+        """Announce a compilation."""
+        compilation.announce()
+
+    def on_end(self, event: event.Event) -> None:
+        """Do nothing."""
+
+
+event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
 
 
 @compiled
@@ -98,11 +114,12 @@ def through(
     point: FloatArray,
     turns: FloatArray,
     depth: int,
+    walk: NDArray[np.int64],
+    piece: FloatArray,
     rest: FloatArray,
     symmetric_rest: bool,
     first: FloatArray,
     branches: Branches,
-    walk: NDArray[np.int64],
 ) -> tuple[int, float, int]:
     """Move a memory along a path, as `Memory.forward` or `Memory.inverse` does at each sample.
 
@@ -122,14 +139,17 @@ def through(
     turns : ndarray, shape (2, depth + N), volts and metres
         Stack of reversals; the first `depth` columns are in use. Modified in place.
     depth : int
+    walk : ndarray of int, shape (3, depth + N), or (3, 0)
+        Rows 0 and 1 are set to each sample's branch: the sample at which it started and its direction. Row 2 holds the
+        sample of each reversal. A branch without reversal starts at sample -1.
+    piece : ndarray, shape (2, 4) or (2, 0), volts and metres
+        If the path moves, columns 0 to 3 are set to starting point and closing point of the last branch, and to the
+        knots before and after the last sample, relative to the starting point.
     rest : ndarray, shape (2,), volts and metres
     symmetric_rest, branches : bool, Branches
         As in `Shape`.
     first : ndarray, shape (2, k), volts and metres
         Knots of the first rise from rest.
-    walk : ndarray of int, shape (3, depth + N), or (3, 0)
-        Rows 0 and 1 are set to each sample's branch: the sample at which it started and its direction. Row 2 holds the
-        sample of each reversal. A branch without reversal starts at sample -1.
 
     Returns
     -------
@@ -212,4 +232,204 @@ def through(
             point[coordinate], point[other] = now, out[n - 1]
         for k in range(present if walk.size else n, n):
             walk[0, k], walk[1, k] = walk[2, depth - 1] if depth else -1, int(s)
+    if entered and piece.size:
+        for c in range(2):
+            piece[c, 0], piece[c, 1], piece[c, 2], piece[c, 3] = begin[c], close[c], knots[c, i - 1], knots[c, i]
     return n, s, depth
+
+
+class Play(NamedTuple):
+    """A play operator with rate-dependent half-width before the hysteresis.
+
+    Parameters
+    ----------
+    coercivity, exponent, reference_rate, onset, settling : float
+    reversible : ndarray, shape (k,)
+        As in `slpi_ros.effects.rate_dependence.RateDependence`.
+    inside : float
+        Share of the half-width from which on a command is at the end of the play.
+    trials, chords : int
+        Numbers of iterations for the voltage at the hysteresis, and for a command within the play.
+    """
+
+    coercivity: float
+    exponent: float
+    reference_rate: float
+    onset: float
+    settling: float
+    reversible: FloatArray
+    inside: float
+    trials: int
+    chords: int
+
+
+@compiled
+def half_width(rate: float, coercivity: float, exponent: float, reference_rate: float, onset: float) -> float:
+    """Return the half-width (V) of a play operator at a rate (V/s); parameters as in `RateDependence`."""
+    if not onset:
+        grown: float = (rate / reference_rate) ** exponent
+    else:
+        # The compiler moves this constant out of a loop.
+        at_reference = (1.0 + reference_rate / onset) ** exponent - 1.0
+        grown = ((1.0 + rate / onset) ** exponent - 1.0) / at_reference
+    return coercivity * grown
+
+
+@compiled
+def bypass(gains: FloatArray, v: float, u: float) -> float:
+    """Return the reversible displacement (m) at a command `v` (V) and a voltage `u` (V) of the hysteresis."""
+    total, v_power, u_power = 0.0, 1.0, 1.0
+    for gain in gains:
+        v_power, u_power = v_power * v, u_power * u
+        total += gain * (v_power - u_power)
+    return total
+
+
+@compiled
+def on_piece(x: float, now: float, s: float, here: int, piece: FloatArray) -> float:
+    """Return the other coordinate at `x`, ahead of `now`, on a piece of a branch as in `through`; NaN beyond it."""
+    there, u = 1 - here, s * (x - piece[here, 0])
+    if s * (x - now) > 0.0 and piece[here, 2] <= u < piece[here, 3] and s * (x - piece[here, 1]) < 0.0:
+        slope = (piece[there, 3] - piece[there, 2]) / (piece[here, 3] - piece[here, 2])
+        answer: float = piece[there, 0] + s * (piece[there, 2] + (u - piece[here, 2]) * slope)
+        return answer
+    return nan
+
+
+@compiled
+def through_play(
+    elapsed: FloatArray,
+    pause: float,
+    h: FloatArray,
+    lower: float,
+    upper: float,
+    rounding: FloatArray,
+    out: FloatArray,
+    held: NDArray[np.bool_],
+    direction: float,
+    point: FloatArray,
+    turns: FloatArray,
+    depth: int,
+    play: Play,
+    rest: FloatArray,
+    symmetric_rest: bool,
+    first: FloatArray,
+    branches: Branches,
+) -> tuple[int, float]:
+    """Compensate a play operator before the hysteresis, as `StreamingInverse.move` does at each sample.
+
+    Parameters
+    ----------
+    elapsed : ndarray, shape (N,), seconds
+        Time since the preceding sample.
+    pause : float, seconds
+        Of a longer time only this last part counts for the new command.
+    h : ndarray, shape (N,), metres
+        Desired displacement of hysteresis and reversible part.
+    rounding : ndarray, shape (2,), relative and metres
+        Tolerances for rounding errors of voltages and displacements.
+    out : ndarray, shape (N,), volts
+        Output: the commands.
+    held : ndarray of bool, shape (N,)
+        Output: whether the command is held at the limit beyond which the displacement lies.
+    turns : ndarray, shape (2, depth + 2 N + 2), volts and metres
+    play : Play
+    lower, upper, direction, point, depth, rest, symmetric_rest, first, branches
+        As in `through`.
+
+    Returns
+    -------
+    done : int
+        Number of samples evaluated; less than N if the model cannot reach the next one.
+    wanted : float, metres
+        Last displacement of the hysteresis.
+    """
+    s, gains, shape = direction, play.reversible, (rest, symmetric_rest, first, branches)
+    law = play.coercivity, play.exponent, play.reference_rate, play.onset
+    settling, inside, trials, chords = play.settling, play.inside, play.trials, play.chords
+    one, other, walk = np.empty(1), np.empty(1), np.empty((3, 0), dtype=np.int64)
+    # Before the first motion the piece is not known; comparisons with NaN are false.
+    piece, kept = np.full((2, 4), nan), np.empty((2, 4))
+    command = u = aimed = point[0]
+    rate = rate_out = rate_aimed = wanted = 0.0
+    for n in range(h.size):
+        missing = 0.0
+        # Part 0: the last command during a pause; part 1: the new command.
+        for part in range(0 if elapsed[n] > pause else 1, 2):
+            dt = min(elapsed[n], pause) if part else elapsed[n] - pause
+            width, aim = half_width(rate_out, *law), nan
+            v, s_0, v_0, y_0, depth_0, moved = command, s, point[0], point[1], depth, False
+            if part:
+                low, high = bypass(gains, u - width, u), bypass(gains, u + width, u)
+                way = 1.0 if h[n] - y_0 > 0.5 * (low + high) else -1.0
+                if low < h[n] - y_0 < high:
+                    v, slope = u, 0.5 * (high - low) / width
+                    for _ in range(chords):
+                        v += (h[n] - y_0 - bypass(gains, v, u)) / slope
+                    missing = h[n] - bypass(gains, v, v_0) - y_0
+                else:
+                    before, reached = nan, v_0
+                    for _ in range(trials):
+                        wanted = h[n] - bypass(gains, reached + way * width, reached)
+                        wanted = max(wanted, y_0) if way > 0.0 else min(wanted, y_0)
+                        if wanted == before:
+                            break
+                        if moved:
+                            s, depth, point[0], point[1] = s_0, depth_0, v_0, y_0
+                            piece[:] = kept
+                        before = wanted
+                        if wanted == y_0:
+                            reached = v_0
+                            continue
+                        moved = True
+                        kept[:] = piece
+                        reached = on_piece(wanted, y_0, s, 1, piece)
+                        if lower <= reached <= upper:
+                            point[0], point[1] = reached, wanted
+                            continue
+                        one[0] = wanted
+                        done, s, depth = through(
+                            one, 1, lower, upper, other, s, point, turns, depth, walk, piece, *shape
+                        )
+                        if not done:
+                            return n, wanted
+                        reached = point[0]
+                    v, aim = reached + way * width, reached
+                    missing = h[n] - bypass(gains, v, reached) - point[1]
+                goal, v = v, min(max(v, lower), upper)
+                if abs(missing) <= rounding[1]:
+                    missing = goal - v if abs(goal - v) > rounding[0] * (1.0 + abs(goal)) else 0.0
+            # The play operator moves with the command.
+            change, u_0 = v - command, u
+            if dt > 0.0:
+                faded = exp(-dt / settling) if settling else 0.0
+                rate = abs(change) / dt + (rate - abs(change) / dt) * faded
+            reach = half_width(rate, *law)
+            command, u = v, min(max(u_0, v - reach), v + reach)
+            if dt > 0.0 and (u != u_0 or abs(v - u_0) < inside * width):
+                speed = abs(u - u_0 if u != u_0 else change) / dt
+                rate_out = speed + (rate_out - speed) * faded
+            if isnan(aim):
+                aimed, rate_aimed = u, rate_out
+            else:
+                if dt > 0.0:
+                    speed = abs(aim - aimed) / dt
+                    rate_aimed = speed + (rate_aimed - speed) * faded
+                aimed, rate_out = aim, min(rate_out, rate_aimed)
+            if u != point[0]:
+                if moved:
+                    s, depth, point[0], point[1] = s_0, depth_0, v_0, y_0
+                    piece[:] = kept
+                answer = on_piece(u, v_0, s, 0, piece)
+                if not isnan(answer):
+                    point[0], point[1] = u, answer
+                    continue
+                one[0] = u
+                done, s, depth = through(one, 0, lower, upper, other, s, point, turns, depth, walk, piece, *shape)
+                if not done:
+                    return n, wanted
+        short = h[n] - (point[1] + bypass(gains, command, u))
+        limit = upper if missing > 0.0 else lower
+        near = abs(command - limit) <= rounding[0] * (1.0 + abs(limit))
+        out[n], held[n] = command, near and missing * short > 0.0
+    return h.size, wanted

@@ -16,13 +16,16 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.reversals import require_finite
+
+if TYPE_CHECKING:
+    from slpi_ros.hysteresis.compiled import Play
 
 FloatArray = NDArray[np.float64]
 
@@ -360,15 +363,13 @@ class Memory:
 
         if coordinate and not lower <= self._v <= upper:
             self.forward(min(max(self._v, lower), upper))
-        out, turns = np.empty_like(x), np.empty((2, self.depth + x.size))
-        turns[:, : self.depth] = self._turns
-        point, rest = np.array([self._v, self._y]), np.array(self._rest, dtype=np.float64)
-        first = np.ascontiguousarray(self._shape.first_rise(self._rest[0]).knots)
+        out = np.empty_like(x)
+        direction, point, turns, depth = self._arrays(x.size)
         done, direction, depth = through(
-            *(x, coordinate, float(lower), float(upper), out),
-            *(float(self._direction), point, turns, self.depth, rest),
-            *(self._shape.symmetric_rest, first, self._shape.branches),
+            *(x, coordinate, float(lower), float(upper), out, direction, point, turns, depth),
             np.empty((3, 0), dtype=np.int64) if walk is None else walk,
+            np.empty((2, 0)),
+            *self._shape_arrays(),
         )
         v_turns, y_turns = turns[:, :depth].tolist()
         v, y = point.tolist()
@@ -377,6 +378,43 @@ class Memory:
             # Beyond the last knot: raises the error of the sample.
             (self.inverse if coordinate else self.forward)(float(x[done]))
         return out
+
+    def inverse_behind_play(
+        self,
+        elapsed: FloatArray,
+        pause: float,
+        h: FloatArray,
+        limits: tuple[float, float],
+        rounding: FloatArray,
+        play: "Play",
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return the commands before a play operator (V) and where they are held, shape (N,) each.
+
+        `slpi_ros.hysteresis.compiled.through_play` describes the arguments. The memory itself does not move.
+        """
+        from slpi_ros.hysteresis.compiled import through_play
+
+        v, held = np.empty_like(h), np.zeros(h.size, dtype=np.bool_)
+        lower, upper = float(limits[0]), float(limits[1])
+        direction, point, turns, depth = self._arrays(2 * h.size + 2)
+        done, wanted = through_play(
+            *(elapsed, pause, h, lower, upper, rounding, v, held, direction, point, turns, depth, play),
+            *self._shape_arrays(),
+        )
+        if done < h.size:
+            raise UsageError(f"displacement {wanted} m cannot be reached by this model; leave such samples out")
+        return v, held
+
+    def _arrays(self, more: int) -> tuple[float, FloatArray, FloatArray, int]:
+        """Return direction, current point, stack with room for `more` reversals, and depth, for the compiled engine."""
+        turns = np.empty((2, self.depth + more))
+        turns[:, : self.depth] = self._turns
+        return float(self._direction), np.array([self._v, self._y]), turns, self.depth
+
+    def _shape_arrays(self) -> tuple[FloatArray, bool, FloatArray, Branches]:
+        """Return rest point, symmetry, knots of the first rise, and branches, for the compiled engine."""
+        first = np.ascontiguousarray(self._shape.first_rise(self._rest[0]).knots)
+        return np.array(self._rest, dtype=np.float64), self._shape.symmetric_rest, first, self._shape.branches
 
 
 def worth_compiling(samples: int) -> bool:

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
-from scipy.special import ndtri
-from scipy.stats import binomtest
+from scipy.special import betainc, ndtri
 
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.signal_statistics import ENOUGH, FEWEST, digit, median_rms, noise, spread
@@ -27,17 +26,23 @@ LEAST_GAIN = 0.2
 _BLOCK = 1_000_000
 # Number of preceding readings with which a reading is compared.
 _EARLIER = 3
+# Noise below this share of the range is the round-off error of a signal without noise.
+ROUND_OFF = 1e-9
 # Least size of an outlier as a share of the range; piecewise excitation signals have smaller kinks.
 LEAST_SPIKE = 0.001
 # Large outliers: distance from the running median, as multiples of the median (non-zero) distance in the record and of
-# that in the window; window length of the running median, in readings; number of passes.
-_FAR, _APART, _WINDOW, _PASSES = 15.0, 5.0, 7, 5
+# that in the window; number of passes.
+_FAR, _APART, _PASSES = 15.0, 5.0, 5
 # Window length of the running median of a model error, in readings.
 _MODEL_WINDOW = 15
 # The deviation changes by more than this share of an outlier from the reading before and to the reading after it.
 _SUDDEN = 0.5
 # Largest delay of a displacement reversal, and duration of ringing after a jump, in samples.
 _TURN_REACH, _RINGING = 5, 200
+# Window length of the running median, in readings: the longest run of outliers is shorter than half of it, and it spans
+# the readings in which the other signal may explain a deviation. At the ends of a record, where a jump and a delay look
+# like outliers, the other signal is taken over this many windows.
+_WINDOW, _END_WINDOWS = 2 * _TURN_REACH + 1, 3
 
 
 @dataclass(frozen=True)
@@ -119,6 +124,10 @@ def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
     noise_rms, step = noise(y, v), digit(y)
     if noise_rms <= step:
         return np.empty(0, np.int64)
+    if noise_rms < ROUND_OFF * spread(y):
+        # Without noise, coarse sampling hides the resolution; it is at most the smallest change between two readings.
+        changes = np.abs(np.diff(y))
+        step = float(np.min(changes[changes > ROUND_OFF * spread(y)], initial=np.inf))
     repeats = frozen(y, v, spread(y) / spread(v), noise_rms, step)
     repeats = repeats.where(repeats.length > 2)
     again = [np.arange(first + 1, first + length) for first, length in zip(repeats.first, repeats.length, strict=True)]
@@ -142,7 +151,8 @@ def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repe
 def far_outliers(v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the indices of large outliers in voltage and displacement that the other signal does not explain.
 
-    Unlike `lone_outliers`, this needs no noise estimate, which such large outliers would distort.
+    Unlike `lone_outliers`, this needs no noise estimate, which such large outliers would distort. Readings where both
+    signals are suddenly 0 are outliers of both: a lost message, and no motion that the other signal explains.
 
     Parameters
     ----------
@@ -153,33 +163,59 @@ def far_outliers(v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArr
     tuple of ndarray of int, shapes (M,) and (K,)
     """
     found = np.zeros((2, v.size), dtype=bool)
+    zero = (v == 0.0) & (y == 0.0)
     for _ in range(_PASSES):
         # Neighbouring outliers mask each other.
         cleaned = [without(x, np.flatnonzero(off)) for x, off in zip((v, y), found, strict=True)]
-        more = np.array([_far(*cleaned), _far(*cleaned[::-1])])
+        (beyond_v, unexplained_v), (beyond_y, unexplained_y) = _far(*cleaned), _far(*cleaned[::-1])
+        lost = _sudden(zero & beyond_v & beyond_y, v, y)
+        more = np.array([unexplained_v | lost, unexplained_y | lost])
         if not more.any():
             break
         found |= more
     return np.flatnonzero(found[0]), np.flatnonzero(found[1])
 
 
-def _far(x: FloatArray, other: FloatArray) -> Mask:
-    middle = median_filter(x, _WINDOW, mode="nearest")
-    off, reach = np.abs(x - middle), 2 * _TURN_REACH + 1
+def _sudden(off: Mask, *signals: FloatArray) -> Mask:
+    """Return the runs of a mask, shape (N,), at whose ends every signal changes by most of what it does around them."""
+    kept = off.copy()
+    bounds = np.flatnonzero(np.diff(off, prepend=False, append=False))
+    for first, end in zip(bounds[::2].tolist(), bounds[1::2].tolist(), strict=True):
+        for x in signals:
+            around = np.median(x[max(first - _TURN_REACH, 0) : end + _TURN_REACH])
+            least = _SUDDEN * max(abs(x[first:end] - around))
+            if (first and abs(x[first] - x[first - 1]) < least) or (end < x.size and abs(x[end] - x[end - 1]) < least):
+                kept[first:end] = False
+    return kept
+
+
+def _far(x: FloatArray, other: FloatArray) -> tuple[Mask, Mask]:
+    """Return the masks of the readings far from the running median, and of those that `other` does not explain."""
+    middle = _running_median(x)
+    off = np.abs(x - middle)
     if not off.any():
-        return np.zeros(x.size, dtype=bool)
-    moved = maximum_filter1d(other, reach) - minimum_filter1d(other, reach)
+        return off > 0.0, off > 0.0
+    moved = maximum_filter1d(other, _WINDOW) - minimum_filter1d(other, _WINDOW)
+    ends = _END_WINDOWS * _WINDOW
+    moved[:_TURN_REACH], moved[-_TURN_REACH:] = np.ptp(other[:ends]), np.ptp(other[-ends:])
     # During a monotone move the median is the reading itself, at distance 0.
     least = max(_FAR * float(np.median(off[off > 0.0])), LEAST_SPIKE * spread(middle))
+    far = off > least
+    if far.any():
+        # Ringing moves all readings away from the median, an outlier only one.
+        far &= off > _APART * _running_median(off)
     gain = spread(middle) / (spread(other) or np.inf)
-    far: Mask = off > least + 2.0 * gain * moved
-    if not far.any():
-        return far
-    # Ringing moves all readings away from the median, an outlier only one.
-    return np.asarray(far & (off > _APART * median_filter(off, _WINDOW, mode="nearest")))
+    return far, np.asarray(far & (off > least + 2.0 * gain * moved))
 
 
-def outliers_beside(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
+def _running_median(x: FloatArray) -> FloatArray:
+    """Return the median of each reading and its neighbours, shape (N,); at the ends that of the outermost window."""
+    middle = np.asarray(median_filter(x, _WINDOW, mode="nearest"))
+    middle[:_TURN_REACH], middle[-_TURN_REACH:] = np.median(x[:_WINDOW]), np.median(x[-_WINDOW:])
+    return middle
+
+
+def outliers_by_model(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
     """Return the displacement readings with a sudden deviation from a model that no reversal explains.
 
     This includes groups of outliers and outliers at kinks, which cannot be distinguished from motion without a model.
@@ -192,7 +228,7 @@ def outliers_beside(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[n
     kept = np.arange(y.size)
     for _ in range(_PASSES):
         # Neighbouring outliers mask each other.
-        off = _off_path(path[kept], y[kept], v[kept])
+        off = _sudden_deviations(path[kept], y[kept], v[kept])
         if not off.any():
             break
         kept = kept[~off]
@@ -205,11 +241,13 @@ def outliers_beside(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[n
     near = maximum_filter1d(near, 4 * _MODEL_WINDOW + 1)
     groups = near[found[np.diff(found, prepend=-_MODEL_WINDOW) >= _MODEL_WINDOW]]
     share = float(np.mean(near))
-    coincidental = binomtest(int(groups.sum()), groups.size, share, alternative="greater").pvalue > FALSE_ALARMS
+    # Chance of at least as many of n independent groups near reversals, the tail of the binomial distribution.
+    k, n = int(groups.sum()), groups.size
+    coincidental = k == 0 or float(betainc(k, n - k + 1, share)) > FALSE_ALARMS
     return found if coincidental else found[~near[found]]
 
 
-def _off_path(path: FloatArray, y: FloatArray, v: FloatArray) -> Mask:
+def _sudden_deviations(path: FloatArray, y: FloatArray, v: FloatArray) -> Mask:
     if y.size < 5:
         return np.zeros(y.size, dtype=bool)
     error = y - path
@@ -262,6 +300,10 @@ def lone_of(
         As for `lone_outliers`; applies to the displacement.
     """
     gain, noise_v, noise_y = spread(y) / spread(v), noise(v, t), noise(y, v, t)
+    if noise_y < ROUND_OFF * spread(y):
+        # Without noise, the usual distance from the neighbours, by curvature or by digits, stands in its place.
+        off = _off_neighbours(y)
+        noise_y = max(noise_y, median_rms(off[off != 0.0])) if off.any() else 0.0
     off_v = lone_outliers(v, y, 1.0 / gain, max(noise_v, digit(v), LEAST_SPIKE * float(np.ptp(v))), noise_y)
     off_y = lone_outliers(y, v, gain, max(noise_y, digit(y)), noise_v, at_kinks)
     return off_v, np.setdiff1d(off_y, off_v)
@@ -409,7 +451,7 @@ def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
     return Mixed(np.concatenate(found), judged, side)
 
 
-def mixed_beside(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> NDArray[np.int64]:
+def mixed_by_model(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> NDArray[np.int64]:
     """Return the mixed readings among the `fitted` ones by comparison with a model, including those near reversals.
 
     Parameters

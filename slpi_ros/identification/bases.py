@@ -39,8 +39,9 @@ class Basis(Protocol):
     def branch_part(self, walk: Walk) -> sp.csr_array:
         """Return the displacement increment along each sample's branch per unit of each parameter, shape (N, size)."""
 
+    @property
     def roughness(self) -> sp.csr_array:
-        """Return the matrix R, shape (r, size + 1), of the roughness penalty ``|R x|^2`` on the coefficients x."""
+        """The matrix R, shape (r, size + 1), of the roughness penalty ``|R x|^2`` on the coefficients x."""
 
     def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
         """Return ``C``, shape (m, size + 1), and bound of ``C x >= bound``, for a mean gain in units of x per volt."""
@@ -122,8 +123,9 @@ class SurfaceBasis:
         values = np.concatenate([factor * (1 - p), factor * p])
         return sp.csr_array((values, (np.concatenate([row, row]), columns)), shape=(v.size, self.size))
 
+    @cached_property
     def roughness(self) -> sp.csr_array:
-        """Return the rows of the roughness penalty, shape (r, size + 1).
+        """Rows of the roughness penalty, shape (r, size + 1).
 
         Third differences along branches penalise uneven loops; second differences along the diagonal penalise uneven
         change of the loops from vertex to vertex (zero for the classical PI model); the first rise is penalised for
@@ -203,6 +205,7 @@ class OperatorWeights:
         """Number of operators."""
         return self.thresholds.size
 
+    @property
     def roughness(self) -> sp.csr_array:
         """Return a zero row: the non-negative weights need no roughness penalty."""
         return sp.csr_array((1, self.size + 1))

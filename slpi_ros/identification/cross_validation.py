@@ -19,7 +19,7 @@ from slpi_ros.identification.drive import smallest_turn
 from slpi_ros.identification.fit import FITS, fit_of
 from slpi_ros.identification.initial_history import InitialHistoryWarning
 from slpi_ros.identification.repeatability_floor import Floor, floor_of
-from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.samples import Samples, select_thinned
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
 
@@ -104,7 +104,7 @@ class CrossValidationReport:
 
     def lines(self) -> list[str]:
         """Return the held-out errors as a text table, in nanometres."""
-        head = f"{'on blocks left out, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}{'classical PI':>14}"
+        head = f"{'held-out error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}{'classical PI':>14}"
         parts = (self.overall, *self.by_level, *self.by_region, *self.by_speed)
         floor = f"{'repeatability floor':<33}{self.floor.rms * 1e9:9.1f}   from {self.floor.source}"
         return [head, *(part.line() for part in parts), floor]
@@ -119,11 +119,8 @@ class _Part:
 
     @classmethod
     def of(cls, record: Record, axis: str, start: float | None, stop: float | None, most: int) -> "_Part":
-        samples = select_samples(record, axis, start, stop)
-        # `samples` excludes those without a voltage and those after `stop`.
-        t = record.t[np.isfinite(record.voltage[axis])][: samples.v.size]
-        kept = samples.thinning(most)
-        return cls(samples.at(kept), t[kept])
+        samples, at = select_thinned(record, axis, start, stop, most)
+        return cls(samples, (record.time_ns[at] - record.time_ns[0]) * 1e-9)
 
 
 def cross_validate(

@@ -126,10 +126,12 @@ class Design:
     @cached_property
     def at_turns(self) -> sp.csr_array:
         """Rows of the linear prediction at the reversals, accumulated from earlier reversals, shape (turns, p)."""
-        rows = self.local[self.turns].toarray()
-        for row, before in self._before:
-            rows[row] += rows[before]
-        return sp.csr_array(rows)
+        # Products with powers of the selection double the number of accumulated reversals: (1 + P)(1 + P^2)(1 + P^4)...
+        rows, before = sp.csr_array(self.local[self.turns]), self.pick[self.turns]
+        while before.nnz:
+            rows, before = rows + before @ rows, before @ before
+        rows.eliminate_zeros()
+        return rows
 
     @classmethod
     def of(cls, walk: Walk, branch_part: sp.csr_array) -> "Design":
@@ -187,8 +189,13 @@ class Rows:
 
     def project(self, signals: FloatArray) -> FloatArray:
         """Return ``A' J`` for `signals` J, shape (n,) or (n, k)."""
-        result: FloatArray = self.local.T @ signals + self.at_turns.T @ (self.pick.T @ signals)
+        local, pick, at_turns = self._transposed
+        result: FloatArray = local @ signals + at_turns @ (pick @ signals)
         return result
+
+    @cached_property
+    def _transposed(self) -> tuple[sp.csc_array, sp.csc_array, sp.csc_array]:
+        return self.local.T, self.pick.T, self.at_turns.T
 
     def gram(self, weights: FloatArray | None = None) -> FloatArray:
         """Return ``A' W A``, shape (p, p), for `weights`, shape (n,); 1 by default."""

@@ -1,5 +1,6 @@
 """Identification of a stage model from records: each axis separately, by the fit of the requested kind."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -10,10 +11,10 @@ from threadpoolctl import threadpool_limits
 
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.identification.least_squares import Fitted, noise_rms
-from slpi_ros.identification.linear_kinds import fit_family, fit_multi_slope, fit_plays
+from slpi_ros.identification.linear_kinds import FIT_SAMPLES, fit_family, fit_multi_slope, fit_plays
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import fit_amplitude_scaled, fit_at_rest, fit_primed
-from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_samples
+from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_thinned
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.stage_model import StageModel
@@ -81,20 +82,27 @@ def identify(
     models = {}
     for axis in axes or records[0].axes:
         report_progress(f"axis {axis}: identification")
-        samples = [select_samples(part, axis, start, stop) for part in records]
+        samples = [select_thinned(part, axis, start, stop, FIT_SAMPLES)[0] for part in records]
         try:
             # The matrices are small: one thread is fastest.
             with threadpool_limits(1):
-                fitted = fit(samples)
+                with warnings.catch_warnings(record=True) as raised:
+                    warnings.simplefilter("always")
+                    fitted = fit(samples)
                 model = _axis_model(kind, fitted, source)
-                if model.causal:
-                    good = _without_bad(samples, model, fitted.starts)
-                    if any(after is not before for after, before in zip(good, samples, strict=True)):
-                        samples, fitted = good, fit(good)
-                        model = _axis_model(kind, fitted, source)
+                good = _without_bad_readings(samples, model, fitted.starts) if model.causal else samples
+                if all(after is before for after, before in zip(good, samples, strict=True)):
+                    for warning in raised:
+                        warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+                else:
+                    # What the first fit warned of may be due to the outliers; the second one warns for itself.
+                    samples, fitted = good, fit(good)
+                    model = _axis_model(kind, fitted, source)
                 if model.causal:
                     # The final state includes the voltage after `stop`.
-                    whole = samples[last] if stop is None else select_samples(records[last], axis, None, None)
+                    whole = samples[last]
+                    if stop is not None:
+                        whole, _ = select_thinned(records[last], axis, None, None, FIT_SAMPLES)
                     model = replace(model, end=replace(model, start=fitted.starts[last]).after(whole.v))
                 models[axis] = model
         except SlpiError as error:
@@ -102,7 +110,7 @@ def identify(
     return StageModel(models, hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))
 
 
-def _without_bad(samples: Sequence[Samples], model: AxisModel, starts: Sequence[Start]) -> list[Samples]:
+def _without_bad_readings(samples: Sequence[Samples], model: AxisModel, starts: Sequence[Start]) -> list[Samples]:
     """Return the samples of each record without the mixed readings and outliers found with a first model."""
     good = []
     for part, start in zip(samples, starts, strict=True):

@@ -160,7 +160,7 @@ class Problem:
         design = Design.of(walk, basis.branch_part(walk))
         volts, metres = np.max([part.spread for part in samples], axis=0).tolist()
         rough = np.zeros((design.local.shape[1],) * 2)
-        own = basis.roughness()
+        own = basis.roughness
         rough[: own.shape[1], : own.shape[1]] = (own.T @ own).toarray()
         return cls(
             basis=basis,

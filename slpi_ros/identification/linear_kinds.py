@@ -22,7 +22,7 @@ SMOOTHNESS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PLAY_OPERATORS = 30
 # Numbers of samples to which a long record is thinned: for the choice of initial history, grid and smoothness, and for
 # the final fit. More samples cost time and memory without changing the result.
-SELECTION_SAMPLES, FIT_SAMPLES = 100_000, 1_000_000
+SELECTION_SAMPLES, FIT_SAMPLES = 100_000, 300_000
 # Factor on these numbers for play operators: every sample moves every operator, and there are few parameters.
 PLAYS_SHARE = 0.2
 

@@ -7,7 +7,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from threading import Timer
 from typing import TextIO
+
+from slpi_ros.hysteresis import compilation
 
 Listener = Callable[[str], None]
 
@@ -23,6 +26,9 @@ def report_progress(what: str) -> None:
     listener = _listener.get()
     if listener:
         listener(what)
+
+
+compilation.listeners.append(report_progress)
 
 
 @contextmanager
@@ -41,20 +47,25 @@ def shown_on(stream: TextIO, clock: Callable[[], float] = time.monotonic) -> Ite
     if not stream.isatty():
         yield
         return
-    began, shown = clock(), False
+    began, shown, latest = clock(), False, ""
 
     def show(what: str) -> None:
-        nonlocal shown
-        seconds = clock() - began
-        if seconds >= PATIENCE:
+        nonlocal shown, latest
+        seconds, latest = clock() - began, what
+        if what and seconds >= PATIENCE:
             shown = True
             stream.write(f"{_CLEAR}{seconds:.0f} s: {what}")
             stream.flush()
 
+    # A message that came before `PATIENCE` may be followed by a long step.
+    timer = Timer(PATIENCE, lambda: show(latest))
+    timer.daemon = True
+    timer.start()
     with listening(show):
         try:
             yield
         finally:
+            timer.cancel()
             if shown:
                 stream.write(_CLEAR)
                 stream.flush()

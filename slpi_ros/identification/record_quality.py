@@ -11,13 +11,15 @@ from scipy.ndimage import minimum_filter1d
 from slpi_ros.errors import IdentificationError
 from slpi_ros.identification import bad_readings, drive, signal_statistics
 from slpi_ros.identification.drive import SPEED_FACTOR
-from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, part_of, select_samples
-from slpi_ros.io.record import Record
+from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, WINDOW, bounds, select_thinned, windows
+from slpi_ros.io.record import Record, release
 
 FloatArray = NDArray[np.float64]
 
 # Time steps, in periods, above which samples are missing, and above which the step is a gap.
 _LOST, _GAP = 1.5, 5.0
+# Samples to which the drive of a record longer than `WINDOW` is thinned, besides its reversals.
+_DRIVE_SAMPLES = 500_000
 # Number of samples within which stamps recover after a late stamp.
 _CATCHES_UP = 51
 
@@ -192,23 +194,62 @@ def assess(record: Record, axis: str, *, start: float | None = None, stop: float
     RecordError, IdentificationError
         If no fit is possible: too few samples, unordered stamps, no motion, or wrong units.
     """
-    samples = select_samples(record, axis, start, stop)
-    driving, wiped = samples.v, np.flatnonzero(samples.wiped)[:1]
-    # Free the memory of long records.
-    del samples
-    t, v, y = record.t, record.voltage[axis], record.displacement[axis]
-    part = slice(*part_of(t, start, stop))
-    until = slice(0, part.stop)
-    driven = np.isfinite(v[until])
-    when = t[until] if driven.all() else t[until][driven]
-    voltage, displacement = _signals(t[part], v[part], y[part])
+    samples, at = select_thinned(record, axis, start, stop, WINDOW if len(record) <= WINDOW else _DRIVE_SAMPLES)
+    wiped = np.flatnonzero(samples.wiped)[:1]
+    first, until = bounds(record, start, stop)
+    stamps, v, y = record.time_ns, record.voltage[axis], record.displacement[axis]
+    clocks, voltages, displacements = [], [], []
+    for begin, end in windows(v, first, until) if until - first > WINDOW else [(first, until)]:
+        # Windows of a long record share a sample, so that every time step is counted.
+        part = slice(max(begin - 1, first), end)
+        t = (stamps[part] - stamps[0]) * 1e-9
+        voltage, displacement = _signals(t, v[part], y[part])
+        clocks.append(_clock(t, v[part], NEAR_END * voltage.range))
+        voltages.append(voltage)
+        displacements.append(displacement)
+        release(stamps, v, y)
+    voltage = _whole_signal(voltages)
+    when = (stamps[at] - stamps[0]) * 1e-9
     return Quality(
         axis=axis,
-        clock=_clock(t[part], v[part], NEAR_END * voltage.range),
+        clock=_whole_clock(clocks),
         voltage=voltage,
-        displacement=displacement,
-        drive=_drive(when, driving, voltage, float(when[wiped[0]]) if wiped.size else None),
+        displacement=_whole_signal(displacements),
+        drive=_drive(when, samples.v, at, voltage, float(when[wiped[0]]) if wiped.size else None),
         notes=record.notes,
+    )
+
+
+def _whole_clock(parts: list[ClockQuality]) -> ClockQuality:
+    """Return the quality of stamps examined in parts that share a sample."""
+    if len(parts) == 1:
+        return parts[0]
+    totals = {name: sum(getattr(part, name) for part in parts) for name in ("lost", "gaps", "duplicates", "unseen")}
+    return ClockQuality(
+        samples=sum(part.samples for part in parts) - len(parts) + 1,
+        duration=sum(part.duration for part in parts),
+        period=float(np.median([part.period for part in parts])),
+        jitter=float(np.sqrt(np.mean([part.jitter**2 for part in parts]))),
+        longest_gap=max(part.longest_gap for part in parts),
+        **totals,
+    )
+
+
+def _whole_signal(parts: list[SignalQuality]) -> SignalQuality:
+    """Return the quality of readings examined in parts: sums of counts, medians of noise, resolution and sizes."""
+    if len(parts) == 1:
+        return parts[0]
+    counts = ("missing", "stuck", "clipped", "stale", "spikes", "mixed")
+    sizes = [part.mixed_size for part in parts if part.mixed]
+    return SignalQuality(
+        low=min(part.low for part in parts),
+        high=max(part.high for part in parts),
+        noise=float(np.median([part.noise for part in parts])),
+        digit=float(np.median([part.digit for part in parts])),
+        longest_stuck=max(part.longest_stuck for part in parts),
+        mixed_share=float(np.mean([part.mixed_share for part in parts])),
+        mixed_size=float(np.median(sizes)) if sizes else 0.0,
+        **{name: sum(getattr(part, name) for part in parts) for name in counts},
     )
 
 
@@ -296,13 +337,16 @@ def _signal(
     )
 
 
-def _drive(t: FloatArray, v: FloatArray, voltage: SignalQuality, wiped: float | None) -> DriveQuality:
+def _drive(
+    t: FloatArray, v: FloatArray, at: NDArray[np.int64], voltage: SignalQuality, wiped: float | None
+) -> DriveQuality:
+    """Return the properties of a voltage, shape (N,), at samples `at` of a record."""
     runs = drive.Runs.of(t, v, drive.smallest_turn(v, voltage.noise))
     near = NEAR_END * np.ptp(v)
     return DriveQuality(
         turns=runs.turns,
         covered=drive.covered(v, runs),
-        samples_per_run=float(np.median(np.diff(runs.ends))),
+        samples_per_run=float(np.median(np.diff(at[runs.ends]))),
         speeds=runs.speeds,
         speed_range=runs.speed_range,
         holds=tuple(drive.holds(t, v, drive.hold_band(v, voltage.noise, voltage.digit)).tolist()),
@@ -403,7 +447,7 @@ def _displacement(y: SignalQuality) -> Iterator[Finding]:
     noise = f"{y.noise * 1e9:.3g} nm rms" if y.noise else "below its digits"
     yield _warn_if(
         y.noise > _NOISY_DISPLACEMENT * y.range,
-        f"displacement from {y.low * 1e6:.5g} to {y.high * 1e6:.5g} um, noise {noise}",
+        f"displacement from {y.low * 1e6:.5g} to {y.high * 1e6:.5g} µm, noise {noise}",
         "a large part of the range; go the same way several times",
     )
     digits = f"displacement in steps of {y.digit * 1e9:.3g} nm"
@@ -434,7 +478,7 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
     if signal.mixed:
         text = f"{name} early, late or mixed with the reading beside it in {_of(signal.mixed, samples)}"
         share = f"{100.0 * signal.mixed_share:.2g} % of those not beside a turn"
-        size = f"off by up to {signal.mixed_size * 1e6:.3g} um"
+        size = f"off by up to {signal.mixed_size * 1e6:.3g} µm"
         yield Finding("warn", f"{text}, {share}, {size}: the link delivers old or mixed values; they are not fitted")
     if signal.stale:
         text = f"{name} stale, repeating an earlier reading, in {_of(signal.stale, samples)}"

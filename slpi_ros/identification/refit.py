@@ -74,7 +74,14 @@ class AxisChange:
     match: Match
 
 
-def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, AxisChange]]:
+def refit(
+    model: StageModel,
+    record: Record,
+    *,
+    axes: Sequence[str] | None = None,
+    start: float | None = None,
+    stop: float | None = None,
+) -> tuple[StageModel, dict[str, AxisChange]]:
     """Update a model with a new record, keeping the regions that the record does not visit.
 
     Parameters
@@ -83,6 +90,10 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
         Model with axes of kind ``slpi`` or ``pi``. Its effects are kept, and subtracted from the record before the fit.
     record : Record
         Record within the voltage range of the model. Axes that are not in the record are kept unchanged.
+    axes : sequence of str, optional
+        Axes to be updated; default: all that the model and the record share.
+    start, stop : float, seconds, optional
+        Part of the record to be used, from its first stamp; default: all of it.
 
     Returns
     -------
@@ -99,22 +110,25 @@ def refit(model: StageModel, record: Record) -> tuple[StageModel, dict[str, Axis
         If the record does not allow an update.
     """
     common_stage([record], model.hardware_id)
-    shared = [axis for axis in model.axes if axis in record.axes]
+    for axis in axes or ():
+        model.axis(axis)
+        record.require_axis(axis)
+    shared = [axis for axis in model.axes if axis in (axes or record.axes)]
     if not shared:
         raise UsageError(f"{record.source} holds none of the model's axes {', '.join(model.axes)}")
     record = _without_effects(model, record, shared)
-    axes, changes = dict(model.axes), {}
+    updated, changes = dict(model.axes), {}
     for name in shared:
         where = f"{record.source}: axis '{name}': "
         try:
-            samples = select_samples(record, name, None, None)
+            samples = select_samples(record, name, start, stop)
             with threadpool_limits(1):
                 bare = replace(model.axes[name], effects=())
                 new, changes[name] = _refit_axis(bare, samples, record.source)
-            axes[name] = replace(new, effects=model.axes[name].effects)
+            updated[name] = replace(new, effects=model.axes[name].effects)
         except SlpiError as error:
             raise type(error)(where + str(error).removeprefix(where)) from None
-    return replace(model, axes=axes, created=datetime.now(UTC).isoformat(timespec="seconds")), changes
+    return replace(model, axes=updated, created=datetime.now(UTC).isoformat(timespec="seconds")), changes
 
 
 def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -> Record:
@@ -219,8 +233,8 @@ def require_own(error: float, fitted_anew: float, span: float) -> None:
     """
     if error > FOREIGN_SHARE * span and error > FOREIGN_TIMES * fitted_anew:
         raise IdentificationError(
-            f"this model does not belong to this bag: its error is {error * 1e6:.4g} um rms of {span * 1e6:.4g} um, "
-            f"that of one fitted to it {fitted_anew * 1e6:.4g} um; give this stage's model, or identify anew"
+            f"this model does not belong to this bag: its error is {error * 1e6:.4g} µm rms of {span * 1e6:.4g} µm, "
+            f"that of one fitted to it {fitted_anew * 1e6:.4g} µm; give this stage's model, or identify anew"
         )
 
 

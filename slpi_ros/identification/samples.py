@@ -1,6 +1,7 @@
 """Selection and checks of the samples of one axis for a fit."""
 
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,14 +12,14 @@ from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.identification.bad_readings import (
     far_outliers,
     lone_of,
-    mixed_beside,
+    mixed_by_model,
     mixed_readings,
-    outliers_beside,
+    outliers_by_model,
     stuck,
     without,
 )
 from slpi_ros.identification.signal_statistics import without_noise
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import Record, each_block, first_step_back, release
 
 FloatArray = NDArray[np.float64]
 
@@ -26,6 +27,9 @@ FloatArray = NDArray[np.float64]
 FEWEST = 50
 # Number of samples to which a record is thinned; more samples do not change the result.
 ENOUGH = 1_000_000
+# Length of the windows in which a longer record is examined, and samples that a window sees beyond its ends; it is
+# extended until it holds this share of the range of the voltage.
+WINDOW, MARGIN, WINDOW_RANGE = 2_000_000, 1_000, 0.5
 NEVER_TURNS = "the voltage never turns back; drive it up and down over the range to be used"
 # Negative correlation of voltage and displacement above which one sign is wrong.
 CLEARLY = 0.3
@@ -87,7 +91,7 @@ class Samples:
         """
         if not self.side:
             return self
-        fitted, mixed = self.fitted.copy(), mixed_beside(path, self.y, self.fitted, self.side)
+        fitted, mixed = self.fitted.copy(), mixed_by_model(path, self.y, self.fitted, self.side)
         fitted[mixed] = False
         return replace(self, fitted=fitted, mixed=self.mixed + mixed.size)
 
@@ -98,8 +102,13 @@ class Samples:
         """
         if self.side:
             return self
-        off = np.flatnonzero(self.fitted)[outliers_beside(path[self.fitted], self.y[self.fitted], self.v[self.fitted])]
-        return self.only(np.isin(np.arange(self.v.size), off, invert=True)) if off.size else self
+        at = np.flatnonzero(self.fitted)
+        outliers = at[outliers_by_model(path[at], self.y[at], self.v[at])]
+        if not outliers.size:
+            return self
+        fitted = self.fitted.copy()
+        fitted[outliers] = False
+        return replace(self, fitted=fitted)
 
     def thinned(self, most: int) -> "Samples":
         """Return about `most` evenly spaced samples plus all reversals, which preserves the hysteresis state."""
@@ -174,44 +183,137 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
         If the voltage has no reversal.
     """
     record.require_axis(axis)
-    where = f"{record.source}: axis '{axis}'"
-    back = np.flatnonzero(record.time_ns[1:] < record.time_ns[:-1])
-    if back.size:
-        at = int(back[0]) + 1
-        raise RecordError(
-            f"{record.source}: time runs backwards at sample {at} (t = {record.t[at]:.6g} s); sort the record"
-        )
+    _require_order(record)
     # Stamps are ordered, so the selection is a slice and long records are not copied.
     t = record.t
     first, until = part_of(t, start, stop)
-    t = t[:until]
     v, y = record.voltage[axis][:until], record.displacement[axis][:until]
     fitted = np.isfinite(y)
     fitted[:first] = False
     driven = np.isfinite(v)
-    if not driven.all():
-        v, y, fitted = v[driven], y[driven], fitted[driven]
-    count = int(np.count_nonzero(fitted))
+    _require_enough(record, axis, int(np.count_nonzero(fitted & driven)), start, stop)
+    if driven.all():
+        return _examined(t[:until], v, y, fitted, f"{record.source}: axis '{axis}'")
+    return _examined(t[:until][driven], v[driven], y[driven], fitted[driven], f"{record.source}: axis '{axis}'")
+
+
+def select_thinned(
+    record: Record, axis: str, start: float | None, stop: float | None, most: int
+) -> tuple[Samples, NDArray[np.int64]]:
+    """Return what `thinned` returns for the samples of `select_samples`, and their indices in the record.
+
+    A record longer than `WINDOW` is examined in windows, which need little memory: noise, resolution and outliers are
+    those of each window.
+
+    Raises
+    ------
+    SlpiError
+        As `select_samples`.
+    """
+    if len(record) <= WINDOW:
+        samples = select_samples(record, axis, start, stop)
+        kept = samples.thinning(most)
+        # `samples` excludes those without a voltage and those after `stop`.
+        return samples.at(kept), np.flatnonzero(np.isfinite(record.voltage[axis]))[: samples.v.size][kept]
+    record.require_axis(axis)
+    _require_order(record)
+    stamps, origin = record.time_ns, int(record.time_ns[0])
+    first, until = bounds(record, start, stop)
+    every = max(1, round(until / most))
+    parts, indices, count = [], [], 0
+    for begin, end in windows(record.voltage[axis], 0, until):
+        seen = slice(max(begin - MARGIN, 0), min(end + MARGIN, until))
+        v, y = record.voltage[axis][seen], record.displacement[axis][seen]
+        driven = np.flatnonzero(np.isfinite(v))
+        at = driven + seen.start
+        v, y, t = v[driven], y[driven], np.asarray((stamps[seen][driven] - origin) * 1e-9)
+        fitted = np.isfinite(y) & (at >= first)
+        own = (at >= begin) & (at < end)
+        count += int(np.count_nonzero(fitted & own))
+        if np.count_nonzero(fitted) >= FEWEST:
+            samples = _examined(t, v, y, fitted, "")
+        else:
+            samples = Samples(v, np.where(fitted, y, 0.0), np.zeros(v.size, dtype=bool))
+        kept = own & samples.thinning(max(1, round(samples.v.size / every)))
+        parts.append(samples.at(kept))
+        indices.append(at[kept])
+        release(stamps, record.voltage[axis], record.displacement[axis])
+    _require_enough(record, axis, count, start, stop)
+    sides = np.array([part.side for part in parts])
+    whole = Samples(
+        v=np.concatenate([part.v for part in parts]),
+        y=np.concatenate([part.y for part in parts]),
+        fitted=np.concatenate([part.fitted for part in parts]),
+        mixed=sum(part.mixed for part in parts),
+        side=int(np.sign(sides.sum())),
+    )
+    _require_motion(whole.v, whole.y, whole.fitted, f"{record.source}: axis '{axis}'")
+    return whole, np.concatenate(indices)
+
+
+def windows(v: FloatArray, first: int, until: int) -> Iterator[tuple[int, int]]:
+    """Yield the bounds of windows of a voltage (V), shape (N,), from `first` to `until`, each with enough of its range.
+
+    The memory of a mapped voltage is released after each window.
+    """
+    low, high = np.inf, -np.inf
+    for (part,) in each_block(v[first:until]):
+        finite = part[np.isfinite(part)]
+        low, high = min(low, finite.min(initial=np.inf)), max(high, finite.max(initial=-np.inf))
+    begin = first
+    for end in [*range(first + WINDOW, until - WINDOW // 2, WINDOW), until]:
+        finite = v[begin:end][np.isfinite(v[begin:end])]
+        if end == until or finite.max(initial=-np.inf) - finite.min(initial=np.inf) >= WINDOW_RANGE * (high - low):
+            yield begin, end
+            begin = end
+        release(v)
+
+
+def _require_order(record: Record) -> None:
+    at = first_step_back(record.time_ns)
+    if at is not None:
+        seconds = (int(record.time_ns[at]) - int(record.time_ns[0])) * 1e-9
+        raise RecordError(f"{record.source}: time runs backwards at sample {at} (t = {seconds:.6g} s); sort the record")
+
+
+def _require_enough(record: Record, axis: str, count: int, start: float | None, stop: float | None) -> None:
     if count < FEWEST:
-        part = "" if start is None and stop is None else f" between start and stop, of {record.t[-1]:.6g} s in all"
-        raise RecordError(f"{where}: {count} usable samples of {len(record)}{part}; at least {FEWEST} are needed")
-    if count < fitted.size:
+        seconds = (int(record.time_ns[-1]) - int(record.time_ns[0])) * 1e-9 if len(record) else 0.0
+        part = "" if start is None and stop is None else f" between start and stop, of {seconds:.6g} s in all"
+        raise RecordError(
+            f"{record.source}: axis '{axis}': {count} usable samples of {len(record)}{part}; "
+            f"at least {FEWEST} are needed"
+        )
+
+
+def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> Samples:
+    """Return samples with a finite voltage without outliers, stuck and mixed readings, and noise of the voltage.
+
+    Parameters
+    ----------
+    t, v, y : ndarray, shape (N,), seconds, volts and metres
+    fitted : ndarray of bool, shape (N,)
+        Samples to be fitted, at least `FEWEST`; modified in place.
+    where : str
+        Name of the record for the error of signals without motion; "" for a part of a record, which is not tested.
+    """
+    if not fitted.all():
         y = np.where(fitted, y, 0.0)
     # Outliers of the voltage must not count as reversals or extend the range.
-    when = t if driven.all() else t[driven]
     far_v, far_y = far_outliers(v, without(y, np.flatnonzero(~fitted)))
     v = without(v, far_v)
     fitted[far_y] = False
-    _require_motion(v, y, fitted, where)
+    if where:
+        _require_motion(v, y, fitted, where)
     # Stuck and mixed readings are not fitted.
     known = np.flatnonzero(fitted)
     fitted[known[stuck(y[known], v[known])]] = False
     known = np.flatnonzero(fitted)
     mixed = mixed_readings(y[known], v[known])
-    off_v, off_y = lone_of(when[known], v[known], y[known], at_kinks=False)
+    off_v, off_y = lone_of(t[known], v[known], y[known], at_kinks=False)
     # If the record has mixed readings, only these are excluded: they look like outliers, too.
     fitted[known[mixed.readings if mixed.side else off_y]] = False
-    smooth = without_noise(when, without(v, known[off_v]))
+    smooth = without_noise(t, without(v, known[off_v]))
     return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side)
 
 
@@ -221,6 +323,17 @@ def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int
     if not low < high:
         raise UsageError(f"start {start} s is not before stop {stop} s; give seconds from the first stamp, in order")
     return int(np.searchsorted(t, low)), int(np.searchsorted(t, high))
+
+
+def bounds(record: Record, start: float | None, stop: float | None) -> tuple[int, int]:
+    """Return `part_of` for a record with ordered stamps, without its times as an array."""
+    part_of(np.empty(0), start, stop)
+    low, high = -np.inf if start is None else start, np.inf if stop is None else stop
+    origin = int(record.time_ns[0])
+    first, until = (
+        bisect_left(record.time_ns, at, key=lambda stamp: (int(stamp) - origin) * 1e-9) for at in (low, high)
+    )
+    return first, until
 
 
 def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> None:

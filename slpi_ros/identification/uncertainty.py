@@ -15,7 +15,7 @@ from slpi_ros.errors import UsageError
 from slpi_ros.identification.least_squares import Problem
 from slpi_ros.identification.linear_kinds import SMOOTHNESS, choose, plays, surfaces
 from slpi_ros.identification.progress import report_progress
-from slpi_ros.identification.samples import Samples, select_samples
+from slpi_ros.identification.samples import Samples, select_thinned
 from slpi_ros.io.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -106,7 +106,7 @@ def curve_uncertainty(
     """
     require_known_uncertainty(kind)
     records = [record] if isinstance(record, Record) else list(record)
-    samples = [select_samples(part, axis, start, stop).thinned(SAMPLES // len(records)) for part in records]
+    samples = [select_thinned(part, axis, start, stop, SAMPLES // len(records))[0] for part in records]
     bases, smoothness = _KINDS[kind]
     with threadpool_limits(1):
         chosen = choose(samples, bases(samples), smoothness)

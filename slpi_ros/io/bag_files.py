@@ -4,15 +4,26 @@ import errno
 import os
 import re
 import shutil
+import sqlite3
 import struct
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import BinaryIO
 
 from slpi_ros.errors import RecordError, SlpiError, UsageError
-from slpi_ros.io.bag_storage import zstd
+from slpi_ros.io.bag_storage import bounded_records, is_packed, zstd
+from slpi_ros.io.input_limits import (
+    BAG_BYTES,
+    METADATA_BYTES,
+    LimitError,
+    most_unpacked,
+    open_input,
+    read_input,
+    require_inputs,
+)
 
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 # The parts of a split bag end in their number.
@@ -20,8 +31,12 @@ _PART = re.compile(r"(.*)_(\d+)(\.(?:mcap|db3)(?:\.zstd)?)")
 _WANTED = "give a rosbag2 folder or an .mcap or .db3 file"
 # The last bytes of a complete mcap file.
 _MCAP_END = b"\x89MCAP0\r\n"
+# An alias in YAML. No recorder writes one, and nested ones stand for more text than any memory holds.
+_ALIAS = re.compile(rb"(?:[:?-]\s+|[\[,{]\s*)\*\S")
 # Seconds without growth until a recording counts as abandoned: a writer fills a whole chunk before its file grows.
 PATIENCE = 120.0
+# Bytes that are unpacked at once.
+_BLOCK = 2**20
 
 
 def partial_path(path: str | os.PathLike[str]) -> Path:
@@ -52,6 +67,8 @@ def locate(path: Path) -> list[Path]:
             ".bag": "convert a ROS 1 bag first with `rosbags-convert`",
         }.get(path.suffix, _WANTED)
         raise RecordError(f"{path}: not a bag of ROS 2; {hint}")
+    if not path.is_dir():
+        raise RecordError(f"{path}: neither a folder nor a regular file; {_WANTED}")
     if (path / "metadata.yaml").exists():
         return [path]
     files = [file for file in path.iterdir() if file.name.endswith(_SUFFIXES)]
@@ -89,10 +106,11 @@ def unpacked(file: Path) -> Iterator[Path]:
 def translated(source: Path) -> Iterator[None]:
     """Translate every exception raised while reading a damaged bag into a one-line RecordError."""
     try:
-        _require_whole(source)
         yield
     except SlpiError:
         raise
+    except LimitError as error:
+        raise RecordError(f"{source}: {error.strerror}: no recording of a stage; {_WANTED}") from None
     except PermissionError as error:
         raise RecordError(f"{source}: cannot be read ({one_line(error)}); check the permissions") from error
     except MemoryError as error:
@@ -105,22 +123,61 @@ def translated(source: Path) -> Iterator[None]:
         raise RecordError(f"{source}: damaged or unfinished ({reason}); {_remedy(source)}") from error
 
 
-def _require_whole(source: Path) -> None:
-    """Raise EOFError if an SQLite file is truncated (SQLite would read zeros) or its write-ahead log is not empty."""
+def require_bounded(source: Path) -> None:
+    """Raise an error if a file of a bag is truncated, or would let other readers read without an end."""
     files = sorted(source.iterdir()) if source.is_dir() else [source]
-    for file in (file for file in files if file.suffix == ".db3"):
-        journal = file.with_name(f"{file.name}-wal")
-        if journal.exists() and journal.stat().st_size:
-            raise EOFError(f"messages still in {journal.name}: `sqlite3 {file} 'PRAGMA wal_checkpoint'` moves them")
-        with file.open("rb") as stream:
-            header = stream.read(100)
-        # https://sqlite.org/fileformat.html: the size in the header counts if both change counters agree
-        if len(header) < 100 or header[24:28] != header[92:96]:
-            continue
+    require_inputs(files, BAG_BYTES)
+    for file in files:
+        _require_bounded(file)
+
+
+def _require_bounded(file: Path) -> None:
+    if file.is_dir():
+        return
+    if file.name == "metadata.yaml":
+        if _ALIAS.search(read_input(file, METADATA_BYTES)):
+            raise LimitError(f"{file.name} has an alias, which no recorder writes")
+        return
+    with open_input(file, BAG_BYTES) as stream:
+        header = stream.read(100)
+        if is_packed(header):
+            # rosbags unpacks a file as a whole.
+            _require_small(stream, file)
+        elif header.startswith(_MCAP_END):
+            bounded_records(stream)
+    if file.suffix == ".db3" or header.startswith(b"SQLite format 3"):
+        _require_whole(file, header)
+
+
+def _require_small(packed: BinaryIO, file: Path) -> None:
+    """Raise LimitError if a packed file unpacks to more than any recording."""
+    allowed = most_unpacked(file.stat().st_size)
+    packed.seek(0)
+    with zstd().open(packed) as plain:
+        while data := plain.read(_BLOCK):
+            allowed -= len(data)
+            if allowed < 0:
+                raise LimitError(f"{file.name} unpacks to more than any recording")
+
+
+def _require_whole(file: Path, header: bytes) -> None:
+    """Raise EOFError if an SQLite file is truncated (SQLite would read zeros) or its write-ahead log is not empty.
+
+    LimitError if it has a view: a query instead of data, which may not end.
+    """
+    journal = file.with_name(f"{file.name}-wal")
+    if journal.exists() and journal.stat().st_size:
+        raise EOFError(f"messages still in {journal.name}: `sqlite3 {file} 'PRAGMA wal_checkpoint'` moves them")
+    # https://sqlite.org/fileformat.html: the size in the header counts if both change counters agree
+    if len(header) == 100 and header[24:28] == header[92:96]:
         page, pages = struct.unpack_from(">H", header, 16)[0], struct.unpack_from(">I", header, 28)[0]
         size, wanted = file.stat().st_size, pages * (65536 if page == 1 else page)
         if size < wanted:
             raise EOFError(f"{size} bytes of {wanted} in {file.name}")
+    with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
+        query = "SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'CREATE VIRTUAL%' LIMIT 1"
+        if found := base.execute(query).fetchone():
+            raise LimitError(f"{file.name} has a view {found[0]!r}, which no recorder writes")
 
 
 def _remedy(source: Path) -> str:
@@ -163,7 +220,9 @@ def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str]
     found = [name for name in topics if absolute_name(name) == wanted]
     found = found or sorted(name for name in topics if name.endswith(wanted))
     if not found:
-        raise RecordError(f"{source}: no topic '{topic}'; the bag holds {contents}")
+        raise RecordError(
+            f"{source}: no topic '{topic}'; the bag holds {contents}; name the one of the stage (--topic)"
+        )
     if len(found) > 1:
         raise RecordError(f"{source}: topic '{topic}' may be {' or '.join(found)}; give the full name")
     if topics[found[0]] not in msgtypes:
@@ -246,7 +305,7 @@ def _finished(path: Path) -> int | None:
         return metadata.stat().st_mtime_ns if metadata.is_file() and metadata.stat().st_size else None
     if path.suffix != ".mcap" or path.stat().st_size <= 2 * len(_MCAP_END):
         return None
-    with path.open("rb") as file:
+    with open_input(path, BAG_BYTES) as file:
         file.seek(-len(_MCAP_END), os.SEEK_END)
         return path.stat().st_mtime_ns if file.read() == _MCAP_END else None
 

@@ -17,10 +17,11 @@ from rosbags.rosbag2 import Reader
 
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.alignment import SeparateTopics, Signals, combine, held_at
-from slpi_ros.io.bag_files import absolute_name, locate, match_topic, translated, unpacked
+from slpi_ros.io.bag_files import absolute_name, locate, match_topic, require_bounded, translated, unpacked
 from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
+from slpi_ros.io.input_limits import MOST_AXES, require_count
 from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, SECOND_NS, Message, read_message
-from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.io.record import BLOCK, FloatArray, Record, each_block, first_step_back, new_column, release
 
 _Path = str | os.PathLike[str]
 
@@ -94,15 +95,21 @@ def read_bags(
     RecordError
         As for `read_bag`; also if the bags are of different stages.
     """
+    places = require_different(paths)
+    records = [read_bag(place, topic, axes=axes) for place in places]
+    require_one_stage(records)
+    return records
+
+
+def require_different(paths: Iterable[_Path]) -> list[Path]:
+    """Return the paths of bags; UsageError if there is none, or one is given twice."""
     places = [Path(path) for path in paths]
     if not places:
         raise UsageError("no bag given; name at least one")
     for number, place in enumerate(places):
-        if place.resolve() in {earlier.resolve() for earlier in places[:number]}:
+        if os.path.realpath(place) in {os.path.realpath(earlier) for earlier in places[:number]}:
             raise UsageError(f"{place}: given twice; name every bag once")
-    records = [read_bag(place, topic, axes=axes) for place in places]
-    require_one_stage(records)
-    return records
+    return places
 
 
 def require_one_stage(records: Sequence[Record]) -> None:
@@ -165,6 +172,7 @@ class _Bag:
         with ExitStack() as stack:
             for source in self._sources:
                 with translated(source):
+                    require_bounded(source)
                     self._open(source, stack)
             self._stack = stack.pop_all()
         return self
@@ -213,7 +221,7 @@ def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tupl
         if axis not in state.names:
             raise RecordError(f"{where}: no axis '{axis}'; there is {names}")
         for field in ("position", "effort"):
-            if np.isnan(state.fields[field][axis]).all():
+            if all(np.isnan(part).all() for (part,) in each_block(state.fields[field][axis])):
                 raise RecordError(
                     f"{where}: axis '{axis}' has no value in {field}[] of any message; position[] must hold "
                     f"the measured metres, effort[] the applied volts; else read other axes, of {names}"
@@ -247,7 +255,7 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
         return None
     arrays = columns.arrays()
     logged, stamp = arrays[_LOGGED], arrays[_STAMP]
-    if (logged[1:] < logged[:-1]).any():
+    if first_step_back(logged) is not None:
         order = np.argsort(logged, kind="stable")
         arrays = {key: array[order] for key, array in arrays.items()}
         logged, stamp = arrays[_LOGGED], arrays[_STAMP]
@@ -256,13 +264,15 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
     for (field, name), array in arrays.items():
         if field:
             fields[field][name] = array
-    return Signals(logged, stamp if stamp.any() else None, frame_id, fields, kind.named)
+    stamped = any(part.any() for (part,) in each_block(stamp))
+    return Signals(logged, stamp if stamped else None, frame_id, fields, kind.named)
 
 
 # Key of a column: field and name; for times the field is empty.
 _Key = tuple[str, str]
 _Part = tuple[str, dict[_Key, NDArray[Any]]]
 _LOGGED, _STAMP = ("", "logged"), ("", "stamp")
+_MOST_EXPECTED = 10_000_000
 
 
 class _Columns:
@@ -270,20 +280,31 @@ class _Columns:
 
     def __init__(self, expected: int) -> None:
         self.count = 0
-        self._room = expected
+        # What metadata say is only believed within reason.
+        self._room = min(expected, _MOST_EXPECTED)
         self._arrays: dict[_Key, NDArray[Any]] = {}
 
     def append(self, part: Mapping[_Key, NDArray[Any]]) -> None:
         start, self.count = self.count, self.count + part[_LOGGED].size
         if self.count > self._room:
             self._room = 2 * self.count
-            self._arrays = {key: np.resize(array[:start], self._room) for key, array in self._arrays.items()}
-        for key in [key for key in part if key not in self._arrays]:
-            self._arrays[key] = np.empty(self._room, part[key].dtype)
+            before, self._arrays = self._arrays, {}
+            for key, array in before.items():
+                wider = self._arrays[key] = new_column(self._room, array.dtype)
+                for first in range(0, start, BLOCK):
+                    part_of_it = slice(first, min(first + BLOCK, start))
+                    wider[part_of_it] = array[part_of_it]
+                    release(wider, array)
+        new = [key for key in part if key not in self._arrays]
+        require_count(len({name for _, name in (*self._arrays, *new)}), MOST_AXES + len((_LOGGED, _STAMP)), "names")
+        for key in new:
+            self._arrays[key] = new_column(self._room, part[key].dtype)
             if start:
                 self._arrays[key][:start] = np.nan
         for key, array in self._arrays.items():
             array[start : self.count] = part.get(key, np.nan)
+        if self.count // BLOCK > start // BLOCK:
+            release(*self._arrays.values())
 
     def arrays(self) -> dict[_Key, NDArray[Any]]:
         return {key: array[: self.count] for key, array in self._arrays.items()}
@@ -313,7 +334,9 @@ def _each(block: MessageBlock, msgtype: str, messages: Sequence[Message]) -> _Pa
     """Return frame id and columns of messages of different layouts, whose numbers are assigned by name."""
     stamp = np.array([message.stamp_ns for message in messages], np.int64)
     columns: dict[_Key, NDArray[Any]] = {_LOGGED: block.logged, _STAMP: stamp}
-    for name in dict.fromkeys(name for message in messages for name in message.names):
+    names = dict.fromkeys(name for message in messages for name in message.names)
+    require_count(len(names), MOST_AXES, "names")
+    for name in names:
         columns |= {(field, name): np.full(len(messages), np.nan) for field in MESSAGE_TYPES[msgtype].fields}
     for row, message in enumerate(messages):
         for field, numbers in message.values.items():

@@ -9,7 +9,7 @@ rosbags.
 import struct
 import sys
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -19,10 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.io.cdr import ByteArray
+from slpi_ros.io.input_limits import BAG_BYTES, CHUNK_BYTES, MESSAGE_BYTES, LimitError, most_unpacked, open_input
 
 # Number of messages per block where the file itself has no chunks.
 BLOCK = 4_000
 
+# SQLITE_LIMIT_LENGTH of sqlite3.h
+_LIMIT_LENGTH = 0
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
@@ -49,8 +52,8 @@ class MessageBlock:
             rows = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
             if not is_compressed(rows):
                 return cls(times, rows)
-        if any(message[:4] == _ZSTD_MAGIC for message in messages):
-            return cls.of(logged, [_unpacked(message) for message in messages])
+        if any(map(is_packed, messages)):
+            return cls.of(logged, list(_unpacked(messages)))
         return cls(times, list(messages))
 
     def each(self) -> list[bytes]:
@@ -66,29 +69,54 @@ def is_compressed(rows: ByteArray) -> bool:
     return rows.shape[1] >= magic.size and bool((rows[:, : magic.size] == magic).all(axis=1).any())
 
 
-def _unpacked(message: bytes) -> bytes:
-    return decompressed(message, "zstd") if message[:4] == _ZSTD_MAGIC else message
+def is_packed(data: bytes) -> bool:
+    """Return whether data begin with the zstd signature."""
+    return data[:4] == _ZSTD_MAGIC
 
 
-def decompressed(data: bytes, compression: str) -> bytes:
-    """Decompress data of an MCAP or rosbag2 file; `compression` is "" (none), "zstd" or "lz4".
+def _unpacked(messages: Iterable[bytes]) -> Iterator[bytes]:
+    """Yield the messages of a block, unpacked; LimitError if they are larger than a chunk."""
+    left = CHUNK_BYTES
+    for message in messages:
+        plain = decompressed(message, "zstd", left) if is_packed(message) else message
+        left -= len(plain)
+        yield plain
+
+
+def decompressed(data: bytes, compression: str, most: int) -> bytes:
+    """Decompress data of an MCAP or rosbag2 file to at most `most` bytes; `compression` is "", "zstd" or "lz4".
 
     Raises
     ------
     ValueError
         If `compression` has another value.
+    LimitError
+        If there are more bytes.
+    EOFError
+        If the data are cut off.
     """
-    match compression:
-        case "":
+    unpacked = b""
+    while data:
+        if compression == "":
             return data
-        case "zstd":
-            return bytes(zstd().decompress(data))
-        case "lz4":
+        if compression == "zstd":
+            decoder = zstd().ZstdDecompressor()
+        elif compression == "lz4":
             # Rarely needed; lz4 is installed with rosbags, as is zstd.
-            from lz4.frame import decompress  # type: ignore[import-untyped]
+            from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 
-            return bytes(decompress(data))
-    raise ValueError(f"compression {compression!r} is not known")
+            decoder = LZ4FrameDecompressor()
+        else:
+            raise ValueError(f"compression {compression!r} is not known")
+        part = bytes(decoder.decompress(data, max_length=most + 1 - len(unpacked)))
+        unpacked = unpacked + part if unpacked else part
+        if len(unpacked) > most:
+            raise LimitError(f"more than {most} bytes in one packed part")
+        if not decoder.eof:
+            raise EOFError("a packed part is cut off")
+        # Several frames may follow each other.
+        data = decoder.unused_data or b""
+    return unpacked
 
 
 def zstd() -> Any:
@@ -129,8 +157,16 @@ def read_mcap(path: Path, topic: str) -> Iterator[MessageBlock]:
     Exception
         Of any type if the file is damaged.
     """
-    with path.open("rb") as file:
+    with open_input(path, BAG_BYTES) as file:
         yield from _McapFile(file, topic).blocks()
+
+
+def bounded_records(file: BinaryIO) -> None:
+    """Raise an error if the chunks of an MCAP file without a summary are too large: rosbags unpacks all of them."""
+    records = _McapFile(file, "")
+    if not records.has_summary:
+        for _ in records.blocks():
+            pass
 
 
 class _McapFile:
@@ -141,11 +177,13 @@ class _McapFile:
         self._topic = topic.encode()
         self._channels: set[int] = set()
         self._end = file.seek(-_FOOTER_SIZE, 2)
+        self._left = most_unpacked(self._end)
         self._summary = int.from_bytes(self._read(self._end + _RECORD.size, 8), "little")
         if self._summary:
             for op, start, length in self._records(self._summary):
                 if op == _CHANNEL:
                     self._learn(self._read(start, length))
+        self.has_summary = bool(self._summary)
         # Without a summary a channel may be announced within any chunk.
         self._all_known = bool(self._channels)
 
@@ -187,6 +225,8 @@ class _McapFile:
 
     def _read(self, position: int, size: int) -> bytes:
         self._file.seek(position)
+        if size > CHUNK_BYTES:
+            raise LimitError(f"record of {size} bytes at {position}, larger than any recorder writes")
         data = self._file.read(size)
         if len(data) < size:
             raise EOFError(f"{len(data)} of {size} bytes at {position}")
@@ -204,12 +244,20 @@ class _McapFile:
             offsets = _indexed(indexes, self._channels)
             if not offsets.size:
                 return
-            records = _records_of_chunk(self._read(start, length))
+            records = self._unpack(start, length)
         else:
-            records = _records_of_chunk(self._read(start, length))
+            records = self._unpack(start, length)
             offsets = self._walk(records)
         if offsets.size:
             yield _gather(np.frombuffer(records, np.uint8), offsets, self._channels)
+
+    def _unpack(self, start: int, length: int) -> bytes:
+        """Return the records in a chunk."""
+        records = _records_of_chunk(self._read(start, length))
+        self._left -= len(records)
+        if self._left < 0:
+            raise LimitError("the chunks unpack to more than any recording")
+        return records
 
     def _walk(self, records: bytes) -> NDArray[np.int64]:
         """Return the offsets of the wanted messages in a chunk without index."""
@@ -242,7 +290,9 @@ def _records_of_chunk(chunk: bytes) -> bytes:
     start = _CHUNK_HEAD.size + name
     compression = chunk[_CHUNK_HEAD.size : start].decode()
     stored = int.from_bytes(chunk[start : start + 8], "little")
-    records = decompressed(chunk[start + 8 : start + 8 + stored], compression)
+    if size > CHUNK_BYTES:
+        raise LimitError(f"chunk of {size} bytes, larger than any recorder writes")
+    records = decompressed(chunk[start + 8 : start + 8 + stored], compression, size)
     if len(records) != size:
         raise EOFError(f"chunk of {len(records)} bytes, not {size}")
     if checksum and zlib.crc32(records) != checksum:
@@ -298,6 +348,17 @@ def read_sqlite(storage: Any, topic: str) -> Iterator[MessageBlock]:
         Of any type if the file is damaged.
     """
     connections = [connection for connection in storage.connections if connection.topic == topic]
-    messages = storage.messages(connections) if connections else iter(())
+    messages = _bounded(storage, connections) if connections else iter(())
     while block := list(islice(messages, BLOCK)):
         yield MessageBlock.of([logged for _, logged, _ in block], [message for _, _, message in block])
+
+
+def _bounded(storage: Any, connections: Any) -> Iterator[tuple[Any, int, bytes]]:
+    """Yield the messages of an SQLite file; an error if a column computes them, larger than the file."""
+    storage.dbconn.limit(_LIMIT_LENGTH, MESSAGE_BYTES)
+    left = most_unpacked(storage.path.stat().st_size)
+    for row in storage.messages(connections):
+        left -= len(row[2])
+        if left < 0:
+            raise LimitError(f"{storage.path.name} holds more bytes in messages than any recording")
+        yield row

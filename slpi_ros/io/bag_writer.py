@@ -86,7 +86,7 @@ class BagWriter:
             self._writer.open()
         except _WRITE_ERRORS as error:
             shutil.rmtree(self.partial, ignore_errors=True)
-            raise RecordError(f"{path}: cannot be made ({one_line(error)}); choose another place") from error
+            raise RecordError(f"{path}: cannot be made ({one_line(error)}); choose another name or place") from error
         if topic is not None:
             self.add_topic(topic)
 

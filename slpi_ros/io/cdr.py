@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.io.input_limits import MOST_AXES, require_count
+
 ByteArray = NDArray[np.uint8]
 
 ENCAPSULATION = 4
@@ -152,8 +154,10 @@ class CdrReader:
         return text.rstrip(b"\0").decode()
 
     def strings(self) -> tuple[str, ...]:
-        """Read a sequence of strings."""
-        return tuple(self.string() for _ in range(self.integer()))
+        """Read a sequence of names; LimitError if there are more than a stage has axes."""
+        count = self.integer()
+        require_count(count, MOST_AXES, "names in a message")
+        return tuple(self.string() for _ in range(count))
 
     def doubles(self, name: str = "", count: int | None = None) -> tuple[int, int]:
         """Skip `count` doubles, default: a sequence preceded by its length; return their number and offset."""

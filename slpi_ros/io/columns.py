@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.io.input_limits import MOST_AXES
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,6 +296,11 @@ def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) ->
         match_column(options.time, names) if options.time else _time_column(names, source), TIME, source=source
     )
     moved_names = [match_column(name, names) for name in options.displacement] or _displacement_columns(names, source)
+    if len(moved_names) > MOST_AXES:
+        raise RecordError(
+            f"{source}: {len(moved_names)} displacement columns, more than the {MOST_AXES} axes that a stage may have; "
+            "choose some (--displacement or displacement=)"
+        )
     moved = [parse_column(name, DISPLACEMENT, given_unit=given_unit, source=source) for name in moved_names]
     driven_names = [match_column(name, names) for name in options.voltage] or _voltage_columns(
         names, time, moved, source
@@ -331,7 +337,8 @@ def _voltage_columns(names: Sequence[str], time: Column, moved: Sequence[Column]
     found = [n for n in names if n not in taken and (begins(n, VOLTAGE) or unit_in(n, VOLTAGE))]
     if not found:
         _missing(names, source, VOLTAGE)
-    of_axes = [[n for n in found if axis_of(n, VOLTAGE).casefold() == m.axis.casefold()] for m in moved]
+    axes = [axis_of(n, VOLTAGE).casefold() for n in found]
+    of_axes = [[n for n, axis in zip(found, axes, strict=True) if axis == m.axis.casefold()] for m in moved]
     return [names[0] for names in of_axes] if all(len(names) == 1 for names in of_axes) else found
 
 

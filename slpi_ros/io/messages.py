@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError
 from slpi_ros.io.cdr import CdrLayout, CdrReader, serialise
+from slpi_ros.io.input_limits import MOST_AXES, LimitError, require_count
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 SECOND_NS = 1_000_000_000
@@ -30,12 +31,15 @@ def _read_number(reader: CdrReader) -> tuple[str, ...]:
 
 
 def _read_array(reader: CdrReader) -> tuple[str, ...]:
-    for _ in range(reader.integer()):
+    dimensions = reader.integer()
+    require_count(dimensions, MOST_AXES, "dimensions of an array")
+    for _ in range(dimensions):
         reader.string()
         reader.integer()
         reader.integer()
     reader.integer()
     count, _ = reader.doubles("data")
+    require_count(count, MOST_AXES, "values in a message")
     return tuple(map(str, range(count)))
 
 
@@ -111,6 +115,8 @@ def read_message(data: bytes, msgtype: str) -> Message:
     ------
     struct.error, UnicodeDecodeError
         If the data are not a valid message of this type.
+    LimitError
+        If the message has more columns than a stage has axes.
     """
     kind, reader = MESSAGE_TYPES[msgtype], CdrReader(data)
     stamp_ns, frame_id = 0, ""
@@ -189,7 +195,7 @@ class JointStates:
         if not known:
             try:
                 values = self._learn(data)
-            except (struct.error, UnicodeDecodeError, MemoryError):
+            except (struct.error, UnicodeDecodeError, MemoryError, LimitError):
                 return None
         return values[1] * SECOND_NS + values[2], self._names, values[self._fixed_end :]
 
@@ -242,7 +248,7 @@ def decode_trajectory(data: bytes) -> TrajectoryArrays | None:
     """
     try:
         return _decode(data)
-    except (struct.error, UnicodeDecodeError, IndexError, ValueError, TypeError, MemoryError):
+    except (struct.error, UnicodeDecodeError, IndexError, ValueError, TypeError, MemoryError, LimitError):
         return None
 
 

@@ -1,14 +1,71 @@
 """Record of a stage: voltage and displacement of each axis with common time stamps."""
 
-from collections.abc import Mapping, Sequence
+import mmap
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.io.input_limits import LONGEST_NAME, MOST_AXES
 
 FloatArray = NDArray[np.float64]
+
+# Columns of this size and above, in bytes, are kept in a temporary file.
+MAPPED_FROM = 32 * 2**20
+# Number of samples of a block, where a long record is worked on in blocks.
+BLOCK = 1_000_000
+# Mappings made here. Another one may be private: its changes would be lost with its memory.
+_OWN: WeakSet[mmap.mmap] = WeakSet()
+
+
+def new_column(size: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return an uninitialised column of a record, shape (size,); a long one is mapped from an unnamed temporary file.
+
+    Without room for such a file the column is kept in memory.
+    """
+    if size * dtype.itemsize >= MAPPED_FROM:
+        try:
+            with tempfile.TemporaryFile() as file:
+                # Reserved at once: a full disk must not be noticed later, at a write into the mapping.
+                os.posix_fallocate(file.fileno(), 0, size * dtype.itemsize)
+                pages = mmap.mmap(file.fileno(), size * dtype.itemsize)
+                _OWN.add(pages)
+                return np.ndarray(size, dtype, pages)
+        except OSError:
+            pass
+    return np.empty(size, dtype)
+
+
+def release(*columns: NDArray[Any]) -> None:
+    """Give back the memory that mapped columns occupy; their values stay in the file and are read again when used."""
+    for column in columns:
+        owner: Any = column
+        while isinstance(owner, np.ndarray):
+            owner = owner.base
+        if isinstance(owner, mmap.mmap) and owner in _OWN:
+            owner.madvise(mmap.MADV_DONTNEED)
+
+
+def each_block(*columns: NDArray[Any]) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield equal parts of columns of one length, overlapping by one sample, and release each part afterwards."""
+    for start in range(0, columns[0].size, BLOCK):
+        yield tuple(column[start : start + BLOCK + 1] for column in columns)
+        release(*columns)
+
+
+def first_step_back(times: NDArray[np.int64]) -> int | None:
+    """Return the first sample whose time is before that of the preceding one, or None."""
+    for number, (part,) in enumerate(each_block(times)):
+        back = part[1:] < part[:-1]
+        if back.any():
+            return number * BLOCK + int(np.argmax(back)) + 1
+    return None
 
 
 @dataclass(frozen=True)
@@ -46,14 +103,19 @@ class Record:
 
     def __post_init__(self) -> None:
         """Check that every axis has both signals, one value for each stamp."""
+        if len(self.voltage) > MOST_AXES:
+            raise RecordError(f"{self.source}: {len(self.voltage)} axes, more than {MOST_AXES}; choose some of them")
         if set(self.voltage) != set(self.displacement) or not self.voltage:
             raise RecordError(
                 f"{self.source}: voltage of axes {sorted(self.voltage)} but displacement of "
                 f"{sorted(self.displacement)}; each axis needs both"
             )
         for axis in self.voltage:
-            if not axis or not axis.isprintable():
-                raise RecordError(f"{self.source}: {axis!r} is no name of an axis; give it a printable one")
+            if not axis or not axis.isprintable() or len(axis) > LONGEST_NAME:
+                raise RecordError(
+                    f"{self.source}: {axis[:LONGEST_NAME]!r} is no name of an axis: give it one of 1 to "
+                    f"{LONGEST_NAME} printable characters"
+                )
             for name, signal in (("voltage", self.voltage[axis]), ("displacement", self.displacement[axis])):
                 if signal.shape != self.time_ns.shape:
                     raise RecordError(

@@ -3,11 +3,14 @@
 import csv
 import io
 import re
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +18,17 @@ from scipy.io import loadmat, whosmat
 
 from slpi_ros.errors import RecordError
 from slpi_ros.io.columns import is_unit, joined, printable
+from slpi_ros.io.input_limits import (
+    ARRAY_BYTES,
+    LONGEST_HEADER,
+    MOST_COLUMNS,
+    TABLE_BYTES,
+    LimitError,
+    most_unpacked,
+    open_input,
+    read_input,
+    require_count,
+)
 from slpi_ros.io.record import FloatArray
 
 # The comma is last: in tables with another separator it may be the decimal mark.
@@ -23,6 +37,8 @@ _LINES_TO_SEARCH = 100
 _UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _NO_TEXT = re.compile(r"[\0-\x08\x0e-\x19\x7f]")
 _ENOUGH = 10_000
+# Type of a compressed element in a MATLAB file, and bytes that are unpacked at once.
+_MAT_COMPRESSED, _UNPACKED_AT_ONCE = 15, 2**20
 
 
 @dataclass(frozen=True)
@@ -159,9 +175,13 @@ def load_csv(path: Path) -> CsvTable:
         If the file cannot be read, or is not a table with column names above its numbers.
     """
     text = _text(path)
-    lines = _first_lines(text)
-    header = next(filter(None, (_header(lines, separator) for separator in _SEPARATORS)), None)
-    header = header or _first_line(lines, path)
+    try:
+        lines = _first_lines(text)
+        header = next(filter(None, (_header(lines, separator) for separator in _SEPARATORS)), None)
+        header = header or _first_line(lines, path)
+        require_count(len(header.columns), MOST_COLUMNS, "columns")
+    except LimitError as error:
+        raise RecordError(f"{path}: {error.strerror}; give a table with the columns of the stage only") from None
     if len(header.columns) < 2:
         raise RecordError(
             f"{path}: no line with the names of columns above lines of as many numbers, separated by comma, semicolon "
@@ -193,7 +213,7 @@ class _Header:
 def _text(path: Path) -> str:
     """Return the text of a file, with line feeds as line ends."""
     try:
-        content = path.read_bytes()
+        content = read_input(path, TABLE_BYTES)
     except FileNotFoundError:
         raise RecordError(f"{path}: no such file; give a table with comma-separated values") from None
     except OSError as error:
@@ -213,6 +233,7 @@ def _first_lines(text: str) -> list[_Line]:
     end = 0
     for number in range(1, _LINES_TO_SEARCH + 1):
         begin, end = end, (text.find("\n", end) + 1 or len(text))
+        require_count(end - begin, LONGEST_HEADER, f"characters in line {number}")
         if text[begin:end].strip():
             lines.append(_Line(number, text[begin:end], end))
     return lines
@@ -334,7 +355,7 @@ def load_mat(path: Path) -> MatTable:
     columns: list[str] = []
     others = []
     for name, shape, kind in _joined(path):
-        if kind not in _NUMERIC or len(shape) != 2 or 0 in shape:
+        if kind not in _NUMERIC or len(shape) != 2 or 0 in shape or len(columns) + min(shape) > MOST_COLUMNS:
             others.append(f"{name} ({kind}, {'x'.join(map(str, shape))})")
         elif 1 in shape:
             columns.append(name)
@@ -349,8 +370,11 @@ def load_mat(path: Path) -> MatTable:
 def _joined(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
     """Return name, shape and class of the variables in a file."""
     try:
-        with path.open("rb") as file:
+        with open_input(path, TABLE_BYTES) as file:
+            _require_small(file)
             return list(whosmat(file))
+    except LimitError as error:
+        raise RecordError(f"{path}: {error.strerror}; save only the vectors of the record") from None
     except FileNotFoundError:
         raise RecordError(f"{path}: no such file; give a MATLAB file") from None
     except NotImplementedError:
@@ -360,9 +384,38 @@ def _joined(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
         raise _unreadable(path, error) from error
 
 
+def _require_small(file: BinaryIO) -> None:
+    """Raise LimitError if a MATLAB file unpacks to more than any record, or has too many variables.
+
+    From version 5 on it is a header of 128 bytes and elements: type, size and data, each as a whole compressed or not
+    (https://www.mathworks.com/help/pdf_doc/matlab/matfile_format.pdf).
+    """
+    size = file.seek(0, 2)
+    left = min(ARRAY_BYTES, most_unpacked(size))
+    file.seek(124)
+    order = {b"IM": "<", b"MI": ">"}.get(file.read(4)[2:], "")
+    variables, at = 0, 128
+    while order and at + 8 <= size:
+        file.seek(at)
+        kind, length = struct.unpack(f"{order}II", file.read(8))
+        at += 8 + length
+        variables += 1
+        require_count(variables, MOST_COLUMNS, "variables")
+        if kind != _MAT_COMPRESSED:
+            continue
+        decoder, packed = zlib.decompressobj(), file.read(length)
+        while packed:
+            data = decoder.decompress(packed, _UNPACKED_AT_ONCE)
+            packed = decoder.unconsumed_tail if data else b""
+            left -= len(data)
+            if left < 0:
+                raise LimitError("unpacks to more than any record")
+    file.seek(0)
+
+
 def _loaded(path: Path, variables: list[str]) -> dict[str, NDArray[np.generic]]:
     try:
-        with path.open("rb") as file:
+        with open_input(path, TABLE_BYTES) as file:
             return dict(loadmat(file, variable_names=variables))
     except Exception as error:
         raise _unreadable(path, error) from error

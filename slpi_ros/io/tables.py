@@ -1,5 +1,6 @@
 """Import of measured data from tables; reading and writing of the tables of the command line."""
 
+import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.columns import Column, ColumnChoice, ColumnOptions, choose_columns, match_column
+from slpi_ros.io.input_limits import MOST_AXES
 from slpi_ros.io.record import FloatArray, Record
 from slpi_ros.io.table_files import CsvTable, MatTable, load_csv, load_mat
 
@@ -148,10 +150,17 @@ def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, d
     columns = {n.removesuffix(ending): n for n in table.columns if n.endswith(ending) and n != ending}
     if not columns:
         raise RecordError(f"{path}: no column <axis>{ending}; there is {table.listing()}")
+    if len(columns) > MOST_AXES:
+        raise RecordError(f"{path}: {len(columns)} columns <axis>{ending}, more than {MOST_AXES} axes; leave some out")
     time = match_column("time_s", table.columns)
     values = table.read((time, *columns.values()))
     for column, samples in values.items():
-        table.require(np.isfinite(samples), column, samples, "every cell needs a finite number")
+        table.require(
+            np.isfinite(samples),
+            column,
+            samples,
+            "no finite number (an empty cell counts as nan); write one into every cell",
+        )
     _require_order(values[time], time, table)
     return values[time], {axis: values[column] for axis, column in columns.items()}
 
@@ -181,11 +190,10 @@ def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[st
     for axis, values in columns.items():
         if len(values) != len(t):
             raise RecordError(f"{path}: {len(values)} values of axis '{axis}' but {len(t)} times")
-    header = ",".join(["time_s", *(f"{axis}{_ending(suffix)}" for axis in columns)])
     texts: list[Iterable[str]] = [(f"{second:.9f}" for second in np.asarray(t, float).tolist())]
     texts += [map(repr, np.asarray(values, float).tolist()) for values in columns.values()]
     with all_or_nothing(path, RecordError) as file:
-        file.write(f"{header}\n")
+        csv.writer(file, lineterminator="\n").writerow(["time_s", *(f"{axis}{_ending(suffix)}" for axis in columns)])
         file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.chain import Chain, Middle, backward, forward, loop_middle, reaching
+from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis import multi_slope as smpi
@@ -19,7 +20,7 @@ from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.reversals import require_finite
 from slpi_ros.hysteresis.turning_points import FAR, Memory
-from slpi_ros.model.limits import Limits, decaying_turns
+from slpi_ros.model.limits import MAX_DT, Limits, decaying_turns
 from slpi_ros.model.streaming import ROUNDING, StreamingInverse, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]
@@ -52,6 +53,12 @@ class Start:
     displacement: float
     history: tuple[float, ...] = ()
     from_rest: bool = False
+
+
+# An error up to this multiple of the noise floor counts as noise.
+ABOVE_FLOOR = 1.5
+# Best accuracy of a hysteresis model without noise, as a share of the displacement range.
+RESOLUTION = 2e-4
 
 
 @dataclass(frozen=True)
@@ -302,23 +309,23 @@ class AxisModel:
         between = replace(allowed, lower=max(allowed.lower, lowest), upper=max(min(allowed.upper, highest), lowest))
         around = EffectContext(t - t[:1], middle=self._middle if chain.rate_dependence else None)
         if chain.coercivity and self.causal:
-            return self._through_play(around, own, allowed, between)
+            return self._through_play(chain.coercivity, around, own, allowed, between)
         h, u = chain.hysteresis_for(own, around, lambda h: self._invert_hysteresis(h, between)[0])
         held = self._missed(h, u, between)
         return self._kept(backward(chain.before, u, around), held, allowed)
 
     def _through_play(
-        self, around: EffectContext, own: FloatArray, allowed: Limits, between: Limits
+        self, coercivity: RateDependence, around: EffectContext, own: FloatArray, allowed: Limits, between: Limits
     ) -> tuple[FloatArray, Mask]:
-        """Return the result of `command` for a play operator before the hysteresis, computed sample by sample."""
+        """Return the result of `command` for a play operator before the hysteresis, equal to streaming."""
         chain = self.chain
         h = backward(chain.own, own, around)
-        stream = StreamingInverse(self.memory("start"), self.displacement_range, between, chain.before[-1:])
-        u, held = np.empty_like(h), np.zeros(h.size, dtype=np.bool_)
-        elapsed = np.diff(around.t, prepend=around.t[:1]).tolist()
-        for k, (dt, desired) in enumerate(zip(elapsed, h.tolist(), strict=True)):
-            u[k] = stream.move(dt, desired)
-            held[k] = stream.held
+        # The axis may start outside its limits; the first output voltage is inside.
+        memory = StreamingInverse(self.memory("start"), self.displacement_range, between).memory
+        rounding = np.array([ROUNDING, ROUNDING * (self.displacement_range[1] - self.displacement_range[0])])
+        elapsed = np.diff(around.t, prepend=around.t[:1])
+        play = coercivity.compiled_play()
+        u, held = memory.inverse_behind_play(elapsed, MAX_DT, h, (between.lower, between.upper), rounding, play)
         return self._kept(backward(chain.before[:-1], u, around), held, allowed)
 
     def _kept(self, wanted: FloatArray, held: Mask, allowed: Limits) -> tuple[FloatArray, Mask]:

@@ -4,20 +4,18 @@ import json
 import os
 import textwrap
 from math import isfinite
-from pathlib import Path
 from typing import Any
 
 from slpi_ros.effects import registry
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis import kinds
 from slpi_ros.io.atomic_file import all_or_nothing
+from slpi_ros.io.input_limits import MODEL_BYTES, read_input
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.stage_model import StageModel
 
 SCHEMA = "slpi_ros/model/1"
-# Maximum length of a document, characters; a model of many axes has a few hundred thousand.
-LONGEST = 50_000_000
 
 
 def load_model(path: str | os.PathLike[str]) -> StageModel:
@@ -37,13 +35,10 @@ def load_model(path: str | os.PathLike[str]) -> StageModel:
         If there is no such file, or it is not a valid model document of this version.
     """
     try:
-        with Path(path).open(encoding="utf-8") as file:
-            text = file.read(LONGEST + 1)
+        text = read_input(path, MODEL_BYTES).decode()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not a text file"
         raise ModelError(f"{path}: cannot read a model: {reason}; give a file written by 'slpi identify'") from None
-    if len(text) > LONGEST:
-        raise ModelError(f"{path}: longer than any model document; give a file written by 'slpi identify'")
     return parse_model(text, str(path))
 
 

@@ -1,5 +1,6 @@
 """Model of a stage: the models of all axes and their cross-coupling."""
 
+import math
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -118,7 +119,8 @@ class StageModel:
         t, y, start_memory
             As in `compensate`.
         limits : Limits, optional
-            Limits of every axis, within the identified voltage range; default: that range.
+            Limits of every axis, within the identified voltage range; default: that range. With a slew or acceleration
+            limit the voltage is that of `streams`: it begins at the voltage of the start memory.
 
         Returns
         -------
@@ -130,6 +132,8 @@ class StageModel:
             As `compensate`.
         """
         time, desired = self._signals(t, y, "displacement")
+        if limits is not None and min(limits.slew, limits.acceleration) < math.inf:
+            return self._streamed(time, desired, limits, start_memory)
         own: dict[str, FloatArray] = {}
         for name, signal in desired.items():
             with _naming(name, "displacement"):
@@ -142,6 +146,22 @@ class StageModel:
         for name, z in own.items():
             with _naming(name, "displacement"):
                 answers[name] = self.axes[name].command(time, z, limits, start_memory)
+        return answers
+
+    def _streamed(
+        self, t: FloatArray, desired: Mapping[str, FloatArray], limits: Limits, start_memory: StartMemory
+    ) -> dict[str, tuple[FloatArray, Mask]]:
+        """Return the result of `command`, sample by sample, within limits of the rate."""
+        streams = {name: axis.stream(limits, start_memory) for name, axis in self.axes.items()}
+        stage = StageStream(streams, self.coupling, self.origins)
+        answers = {name: (np.empty(t.size), np.zeros(t.size, dtype=bool)) for name in desired}
+        for number, time in enumerate(t.tolist()):
+            try:
+                step = stage.step(time, {name: float(y[number]) for name, y in desired.items()})
+            except SlpiError as error:
+                raise type(error)(f"sample {number}: {error}") from None
+            for name, (v, held) in answers.items():
+                v[number], held[number] = step[name], streams[name].held
         return answers
 
     def stream(self, axis: str, start_memory: StartMemory = "end") -> StreamingInverse:

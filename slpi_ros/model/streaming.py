@@ -13,7 +13,7 @@ from slpi_ros.effects.base import DrivenStreamingEffect, Effect, StreamingEffect
 from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.creep import StreamingCreep
 from slpi_ros.effects.cross_coupling import Coupling
-from slpi_ros.effects.rate_dependence import RateDependence, StreamingCoercivity
+from slpi_ros.effects.rate_dependence import TRIALS, RateDependence, StreamingCoercivity
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
 from slpi_ros.hysteresis.turning_points import Memory, MemoryState
@@ -27,8 +27,6 @@ StreamingEffects = dict[str, StreamingEffect]
 TOLERATED_SHARE = 0.2
 # Tolerance for rounding errors, as a share of the displacement range, or of the voltage.
 ROUNDING = 1e-9
-# Fixed-point iterations: the coercivity depends weakly on the resulting voltage.
-TRIALS = 4
 
 
 @dataclass(frozen=True)
@@ -351,7 +349,7 @@ class StreamingInverse:
             wanted = max(h - reversible_bypass, rest) if direction > 0 else min(h - reversible_bypass, rest)
             memory.restore(state)
             u = memory.inverse(wanted, limits.lower, limits.upper)
-        v = play.ahead(u, direction)
+        v = play.aim(u, direction)
         return v, play.between(v, u)
 
     def _beyond_rounding(self, h: float) -> float:
@@ -390,8 +388,8 @@ def accepted_range(displacement_range: tuple[float, float]) -> tuple[float, floa
 def refusal(y: float, accepted: tuple[float, float], kind: str = "desired") -> str:
     """Return the message for a refused displacement `y` (m); `kind` is "desired" or "measured"."""
     return (
-        f"{kind} displacement {y * 1e6:.6g} um is far outside the identified range "
-        f"(accepted: {accepted[0] * 1e6:.6g} to {accepted[1] * 1e6:.6g} um); "
+        f"{kind} displacement {y * 1e6:.6g} µm is far outside the identified range "
+        f"(accepted: {accepted[0] * 1e6:.6g} to {accepted[1] * 1e6:.6g} µm); "
         "check units and offset, or identify on a larger range"
     )
 

@@ -26,8 +26,10 @@ from rclpy.utilities import ok, try_shutdown
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import SlpiError, UsageError, shown
 from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.nodes import start
+from slpi_ros.nodes.start import SIGNALS, Stop
 
 COMMANDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 # Late subscribers receive the last message.
@@ -182,9 +184,9 @@ class Diagnostics:
         status = DiagnosticStatus(
             level=health.level,
             name=self._name,
-            message=health.message,
-            hardware_id=health.hardware_id,
-            values=[KeyValue(key=key, value=str(value)) for key, value in health.values.items()],
+            message=shown(health.message),
+            hardware_id=shown(health.hardware_id),
+            values=[KeyValue(key=shown(key), value=shown(value)) for key, value in health.values.items()],
         )
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
@@ -194,10 +196,7 @@ class Diagnostics:
 # A signal is noticed between two calls of spin_once: this bounds the wait on an idle graph.
 SPIN_TIMEOUT = 0.1
 
-# Ctrl-C often arrives twice (terminal and launcher), so only the third signal interrupts an orderly shutdown.
-PATIENT_SIGNALS = 2
-
-_START_ERRORS = (
+START_ERRORS = (
     NameValidationException,
     ParameterException,
     rclpy_implementation.RCLError,
@@ -205,23 +204,7 @@ _START_ERRORS = (
 )
 
 
-@dataclass
-class _Stop:
-    """Stop request for the running node, with its reason."""
-
-    requested: bool = False
-    signals: int = 0
-    failure: SlpiError | None = None
-
-    def on_signal(self, *_: object) -> None:
-        """Request an orderly shutdown, also while the node is being created."""
-        self.requested = True
-        self.signals += 1
-        if self.signals > PATIENT_SIGNALS:
-            raise KeyboardInterrupt
-
-
-_stop = _Stop()
+_stop = Stop()
 
 
 def request_stop(failure: SlpiError | None = None) -> None:
@@ -285,10 +268,12 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
         Exit code of the process: 0 after a signal, a shutdown of ROS or a stop without an error.
     """
     global _stop
-    _stop = _Stop()
+    _stop = start.of_process or Stop()
     with _signals_to(_stop.on_signal):
         try:
-            _live(make_node, executor)
+            # A signal may have arrived during the imports.
+            if not _stop.requested:
+                _live(make_node, executor)
         except (KeyboardInterrupt, ExternalShutdownException):
             return 0
         except SlpiError as error:
@@ -304,7 +289,7 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
-    except _START_ERRORS as error:
+    except START_ERRORS as error:
         raise UsageError(f"the node cannot start: {' '.join(str(error).split())}") from error
     try:
         executor = make_executor(getattr(node, "executor_kind", kind))
@@ -333,7 +318,7 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
 def _signals_to(handler: Callable[..., None]) -> Iterator[None]:
     """Install a handler for SIGINT and SIGTERM for the duration of the ``with`` block."""
     # Python allows signal handlers in the main thread only; in other threads none is set.
-    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    numbers = SIGNALS if threading.current_thread() is threading.main_thread() else ()
     previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield

@@ -27,7 +27,7 @@ from slpi_ros.compensator.controller import Controller, Mode
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis, model_id
 from slpi_ros.compensator.ramps import PERIOD
 from slpi_ros.compensator.validation import RejectedError
-from slpi_ros.errors import ModelError, SlpiError
+from slpi_ros.errors import ModelError, SlpiError, shown
 from slpi_ros.io.cdr import multiarray_header
 from slpi_ros.io.messages import SECOND_NS, JointStates, decode_trajectory
 from slpi_ros.model.document import load_model
@@ -46,6 +46,7 @@ from slpi_ros.nodes.common import (
 )
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings
+from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.jobs import Read, Reading
 from slpi_ros.nodes.parameters import Parameters
 
@@ -421,6 +422,9 @@ class Compensator(LifecycleNode):
     def _use_model(self, model: StageModel, fingerprint: str, source: str) -> None:
         """Replace the model unless it is already in use: a latched document may arrive repeatedly."""
         controller, settings, reporter = self._controller, self._settings, self._reporter
+        wanted = settings.values["model_sha256"]
+        if wanted and fingerprint != wanted:
+            raise ModelError(f"{source}: SHA-256 {fingerprint}, not {wanted} of model_sha256; give that model")
         if controller.model is None or fingerprint != reporter.model_id:
             try:
                 saved = None
@@ -432,7 +436,9 @@ class Compensator(LifecycleNode):
                 controller.use_model(model, saved, settings.values["start_memory"])
             except SlpiError as error:
                 raise ModelError(f"{source}: {error}") from None
-            self.get_logger().info(f"using the model of {source}, identified {model.created or 'at an unknown time'}")
+            self.get_logger().info(
+                shown(f"using the model of {source}, identified {model.created or 'at an unknown time'}")
+            )
             reporter.model_id = fingerprint
             if controller.active:
                 self._save_memory(complete=False)
@@ -537,6 +543,8 @@ def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayL
 
 def main() -> int:
     """Run the node; return the exit code of the process."""
+    if help_asked("compensator", Compensator, DECLARATIONS):
+        return 0
     return run(Compensator)
 
 

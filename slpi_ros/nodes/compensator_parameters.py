@@ -1,5 +1,6 @@
 """Parameters of the compensator: one table for their declaration, validation and documentation in the README."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
@@ -50,6 +51,12 @@ DECLARATIONS = (
     ),
     text(
         "hardware_id", "", "Hardware id of the stage; other models are refused. Empty: any model is accepted.",
+        read_only=True,
+    ),
+    text(
+        "model_sha256", "",
+        "SHA-256 of the only model document that is accepted, 64 hexadecimal digits: `sha256sum MODEL.json`. "
+        "Empty: any.",
         read_only=True,
     ),
     # Limits
@@ -177,6 +184,11 @@ class CompensatorSettings:
             raise UsageError(
                 f"desired_type Float64 holds one value, but axes are {', '.join(axes)}; "
                 "use Float64MultiArray or JointState"
+            )
+        if not re.fullmatch("([0-9a-f]{64})?", values["model_sha256"]):
+            raise UsageError(
+                f"model_sha256 {values['model_sha256']!r} is not 64 hexadecimal digits in lower case; give the output "
+                "of sha256sum, or nothing"
             )
         gains = zip(values["kp"], values["ki"], values["kd"], values["derivative_filter"], strict=True)
         timeout = values["measurement_timeout"]

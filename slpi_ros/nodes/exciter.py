@@ -17,10 +17,11 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, Drive, Playback, excite
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes.common import COMMANDS, LATCHED, request_stop, run
+from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 
 # A reported voltage outside the limits by at most this fraction of the range counts as at the limit.
@@ -136,6 +137,9 @@ POLL_PERIOD = 0.1
 LOG_PERIOD = 5.0
 # Time to wait at shutdown for the delivery of the last voltage.
 PATIENCE = Duration(seconds=1.0)
+# Time to wait at the end for stage_state to report the last voltage, and what a report within READ_BACK must then last
+# for a slow stage to have come all the way, seconds.
+REPORT_PATIENCE, REPORT_LASTS = 3.0, 0.2
 # A warning is logged if the excitation takes longer than planned by this factor.
 SLUGGISH = 1.02
 
@@ -146,8 +150,11 @@ class Exciter(Node):
     Publishes ``voltage_command`` with one sample per period of a monotonic clock: after a stall of the process the
     excitation continues with the next sample, without a voltage step. With the parameter ``output`` "trajectory" all
     samples are published in one message on ``voltage_trajectory``, volts in ``effort``, no positions. Subscribes to
-    ``stage_state`` for the initial voltages. The node waits for a subscriber before it starts.
-    Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
+    ``stage_state`` for the initial voltages. The node waits for a subscriber before it starts, and at the end for
+    ``stage_state`` to report the last voltage: a record that ends earlier would not hold the memory at its end.
+    It drives only while no other node publishes the topic of its voltages: beside one it does not start, and if one
+    appears later it returns to the initial voltages; in both cases it ends with exit code 1 (without ``autostart`` it
+    stays). Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
 
     Raises
     ------
@@ -174,6 +181,11 @@ class Exciter(Node):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._polls_left = self._listeners = 0
         self._waiting = self.create_timer(POLL_PERIOD, self._poll_subscribers, clock=self._steady, autostart=False)
+        self._refusal: SlpiError | None = None
+        self._watching = self.create_timer(POLL_PERIOD, self._watch_for_others, clock=self._steady, autostart=False)
+        self._last: list[float] = []
+        self._away = 0.0
+        self._leaving = self.create_timer(POLL_PERIOD, self._poll_report, clock=self._steady, autostart=False)
         if self._values["autostart"]:
             self._wait()
 
@@ -235,18 +247,42 @@ class Exciter(Node):
     def _begin(self) -> None:
         values = self._values
         try:
+            self._require_alone()
             drive = self._parameter_set.settings.drawn(self._heard)
         except SlpiError as error:
-            self.get_logger().error(str(error))
-            if values["autostart"]:
-                request_stop(error)
+            self._give_up(error)
             return
+        self._refusal = None
+        self._watching.reset()
         self._playback, self._begun = Playback(drive, repeat=values["repeat"]), time.monotonic()
         self._timer = self.create_timer(1.0 / drive.rate, self._step, clock=self._steady)
         self._publish_trajectory(self._playback)
-        if self.count_publishers(self._publisher.topic_name) > 1:
-            self.get_logger().warning(f"{self._publisher.topic_name} has other publishers; stop them and repeat")
         self.get_logger().info(f"exciting {', '.join(drive.axes)} for {values['duration']:g} s. {drive.why}")
+
+    def _require_alone(self) -> None:
+        """Raise RecordError if another node publishes the topic of the voltages."""
+        others = self.count_publishers(self._publisher.topic_name) - 1
+        if others > 0:
+            raise RecordError(
+                f"exciter: {others} other publisher of {self._publisher.topic_name}; stop it, as the voltage would "
+                "jump between the commands of both"
+            )
+
+    def _watch_for_others(self) -> None:
+        """Start the return to the initial voltages if another publisher of voltages has appeared."""
+        if self._playback and not self._playback.stopping:
+            try:
+                self._require_alone()
+            except RecordError as error:
+                self._refusal = error
+                self._return(self._playback)
+
+    def _give_up(self, error: SlpiError) -> None:
+        """Report the error; end with its exit code if the node has started by itself."""
+        if self._values["autostart"]:
+            request_stop(error)
+        else:
+            self.get_logger().error(str(error))
 
     def _step(self) -> None:
         if self._playback:
@@ -264,17 +300,38 @@ class Exciter(Node):
 
     def _end(self, playback: Playback) -> None:
         self.destroy_timer(self._timer)
+        self._watching.cancel()
         self._playback = None
         took, planned = time.monotonic() - self._begun, playback.drive.t[-1]
         rest = ", ".join(f"{axis} at {v[0]:g} V" for axis, v in playback.drive.voltage.items())
         self.get_logger().info(f"{'stopped' if playback.stopping else 'done'} after {took:.1f} s; {rest}")
-        if not playback.stopping:
+        if self._refusal is not None:
+            self._give_up(self._refusal)
+        elif not playback.stopping:
             if took > SLUGGISH * planned:
                 self.get_logger().warning(
                     f"the excitation took {took:.1f} s instead of {planned:.1f} s; use a lower rate on this machine"
                 )
             if self._values["autostart"]:
-                request_stop()
+                self._last = [float(v[-1]) for v in playback.drive.voltage.values()]
+                self._begun = self._away = time.monotonic()
+                self._leaving.reset()
+
+    def _poll_report(self) -> None:
+        """Stop once ``stage_state``, if it was ever received, has reported the last voltages for some time."""
+        now = time.monotonic()
+        spans = [high - low for low, high in zip(*self._parameter_set.settings.limits, strict=True)]
+        heard = self._heard or self._last
+        if any(abs(v - last) > READ_BACK * span for v, last, span in zip(heard, self._last, spans, strict=True)):
+            self._away = now
+        if self._heard is None or now - self._away >= REPORT_LASTS:
+            request_stop()
+        elif now - self._begun > REPORT_PATIENCE:
+            self.get_logger().warning(
+                f"stage_state reports {', '.join(f'{v:.6g}' for v in heard)} V, {REPORT_PATIENCE:g} s after the end at "
+                f"{', '.join(f'{v:.6g}' for v in self._last)} V; a record that ends now does not hold the end"
+            )
+            request_stop()
 
     # Stop
 
@@ -309,6 +366,8 @@ def _duration(seconds: float) -> DurationMsg:
 
 def main() -> int:
     """Run the node; return the exit code of the process: 0 when the excitation is complete or was stopped."""
+    if help_asked("exciter", Exciter, DECLARATIONS):
+        return 0
     return run(Exciter)
 
 

@@ -15,12 +15,13 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
 from slpi_ros.identification.fit import KINDS
 from slpi_ros.io.bag_files import PATIENCE, BagWatch
 from slpi_ros.model.document import parse_model, save_model
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, run
+from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.jobs import (
     DiagnosisOutcome,
     DiagnosisRequest,
@@ -235,8 +236,8 @@ class DiagnosisService:
                 for axis, verdict in outcome.verdicts.items()
             )
             said += f" Page: {folder / 'report.html'}; extended model, not in use: {folder / 'extended_model.json'}"
-            self._logger.info(said)
-            self._service.answer(True, said)
+            self._logger.info(shown(said))
+            self._service.answer(True, shown(said))
         self._report()
 
 
@@ -323,11 +324,15 @@ class Identify(Node):
     def _poll_bags(self) -> None:
         """Queue newly completed bags of the watched folder; warn once about abandoned ones."""
         for bag in self._watch.poll() if self._watch else ():
-            self.get_logger().info(f"{bag} is complete")
+            if not _is_utf8(bag):
+                # Neither a parameter nor a message can name it.
+                self._fail(RecordError(f"{bag}: skipped: its name is not UTF-8; rename it"))
+                continue
+            self.get_logger().info(shown(f"{bag} is complete"))
             self._waiting.append(bag)
         abandoned = set(self._watch.abandoned) if self._watch else set()
         for bag in sorted(abandoned - self._abandoned):
-            self.get_logger().warning(abandonment([bag]))
+            self.get_logger().warning(shown(abandonment([bag])))
         self._abandoned = abandoned
         self._start_next()
 
@@ -337,7 +342,7 @@ class Identify(Node):
             (asked, document), self._doubtful = self._doubtful, None
             self._take(asked, FitOutcome(document, self._written(asked, document)))
             response.success = not self._error
-            response.message = self._error or f"published the model of {asked.source}"
+            response.message = self._error or shown(f"published the model of {asked.source}")
             return response
         try:
             self._begin(self._parameter_set.settings)
@@ -345,7 +350,7 @@ class Identify(Node):
             response.success, response.message = False, str(error)
             return response
         response.success = self._job is not None
-        response.message = f"identifying {self._job.request.source}" if self._job else NOTHING_TO_DO
+        response.message = shown(f"identifying {self._job.request.source}") if self._job else NOTHING_TO_DO
         return response
 
     def _start_next(self) -> None:
@@ -393,7 +398,7 @@ class Identify(Node):
     def _take(self, request: FitRequest, outcome: FitOutcome) -> None:
         if outcome.doubt:
             self._doubtful = request, outcome.document
-            self._error = f"{outcome.doubt}; not published: call ~/identify to publish it nevertheless"
+            self._error = shown(f"{outcome.doubt}; not published: call ~/identify to publish it nevertheless")
             self.get_logger().warning(self._error)
             self._report()
             return
@@ -404,12 +409,17 @@ class Identify(Node):
             self._identified = DiagnosisRequest(request.bags, request.topic, outcome.document)
             self._diagnosis.forget()
             self._publisher.publish(String(data=outcome.document))
-            self.get_logger().info(described(self._model))
-        self._error = outcome.error
-        if self._error:
-            self._failed += 1
-            self.get_logger().error(self._error)
+            self.get_logger().info(shown(described(self._model)))
+        self._error = ""
+        if outcome.error:
+            self._fail(outcome.error)
         self._report()
+
+    def _fail(self, error: SlpiError | str) -> None:
+        """Count and log the reason why a bag gave no model, or why the model was not written."""
+        self._error = shown(error)
+        self._failed += 1
+        self.get_logger().error(self._error)
 
     def _report(self) -> None:
         model = self._model
@@ -451,6 +461,15 @@ class Identify(Node):
         return self._diagnosis.activity or (described(self._model) if self._model else "")
 
 
+def _is_utf8(path: Path) -> bool:
+    """Return whether the name of a path is UTF-8; other bytes reach Python as lone surrogates."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def abandonment(bags: Sequence[Path]) -> str:
     """Return a one-line message that names the abandoned bags and the remedy."""
     return (
@@ -473,6 +492,8 @@ def described(model: StageModel) -> str:
 
 def main() -> int:
     """Run the node; return the exit code of the process."""
+    if help_asked("identify", Identify, DECLARATIONS):
+        return 0
     return run(Identify)
 
 

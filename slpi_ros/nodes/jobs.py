@@ -17,6 +17,7 @@ import numpy as np
 from slpi_ros.compensator.persistence import model_id
 from slpi_ros.errors import ModelError, RecordError, SlpiError
 from slpi_ros.io.atomic_file import make_folder
+from slpi_ros.io.input_limits import TOPIC_MODEL_CHARACTERS
 from slpi_ros.io.record import Record
 from slpi_ros.model.document import format_model, model_from, parse_model, save_model
 from slpi_ros.model.stage_model import StageModel
@@ -275,7 +276,7 @@ def run_diagnosis(request: DiagnosisRequest) -> DiagnosisOutcome:
 
 # Characters. The validation of a longer document could delay commands by several milliseconds in any thread of this
 # process; typical documents have ten thousand characters, the finest 300,000 for each axis.
-SMALL, LARGEST = 65_536, 2_000_000
+SMALL = 65_536
 # Polling period for the end of a validation, seconds.
 POLL_PERIOD = 0.02
 
@@ -314,9 +315,10 @@ class Reading:
     """
 
     def __init__(self, document: str, source: str) -> None:
-        if len(document) > LARGEST:
+        if len(document) > TOPIC_MODEL_CHARACTERS:
             raise ModelError(
-                f"{source}: {len(document)} characters are more than {LARGEST}; give a document of 'slpi identify'"
+                f"{source}: {len(document)} characters are more than {TOPIC_MODEL_CHARACTERS}; give a document of "
+                "'slpi identify'"
             )
         self._document, self._source = document, source
         self._unwanted = threading.Event()

@@ -1,6 +1,5 @@
 """Node parameters, declared in one table and validated together."""
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -68,13 +67,6 @@ class Declaration:
         if self.choices and given not in self.choices:
             raise UsageError(f"parameter {self.name} is {given!r}; choose one of {', '.join(self.choices)}")
         return given
-
-    def row(self) -> str:
-        """Return the row for the README table: name, default, description."""
-        default = self.default if isinstance(self.default, str | list) else f"{self.default}".lower()
-        text = json.dumps(default) if isinstance(default, list) or not default else default
-        fixed = " Read-only." if self.read_only else ""
-        return f"| `{self.name}` | `{text}` | {self.description}{fixed} |"
 
     def descriptor(self) -> ParameterDescriptor:
         """Return the ROS descriptor, including the range that rclpy checks."""

@@ -14,6 +14,7 @@ from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_writer import STORAGES, BagWriter
 from slpi_ros.io.messages import JOINT_STATE
 from slpi_ros.nodes.common import request_stop, run
+from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.parameters import Declaration, Parameters, validated
 
 # Queue length for bursts during slow disk writes.
@@ -181,6 +182,8 @@ def _message_class(topic: str, msgtype: str) -> Any:
 
 def main() -> int:
     """Run the node; return the exit code of the process."""
+    if help_asked("recorder", Recorder, DECLARATIONS):
+        return 0
     return run(Recorder)
 
 

@@ -1,27 +1,60 @@
 """Node ``stage_simulator``: a simulated stage that publishes displacements for voltage commands."""
 
+import hashlib
 import math
 import sys
+import time
 from array import array
 from collections.abc import Sequence
+from dataclasses import fields
 from functools import partial
 
-from rcl_interfaces.msg import ParameterDescriptor
+from builtin_interfaces.msg import Time
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rosgraph_msgs.msg import Clock as ClockMsg
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from slpi_ros.errors import UsageError
+from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes.common import COMMANDS, run
-from slpi_ros.nodes.parameters import Declaration, Parameters, validated
+from slpi_ros.nodes.help import help_asked
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
+from slpi_ros.simulation.character import Character, CharacterStage
 from slpi_ros.simulation.stage import Stage, p11_stage
 
 LOG_PERIOD = 5.0
 # Seconds; creep has decayed after this time.
 DAY = 86_400.0
 VOLTAGE = (-10_000.0, 10_000.0)
+GIVEN, DRAWN, HIDDEN = "given", "drawn", "hidden"
+# What `ros2 param describe` says of each effect, with the smallest and the largest value.
+EFFECTS = {
+    "delay": ("Delay of the amplifier, seconds.", 0.0, 10.0),
+    "lag": ("Time constant of the amplifier, seconds.", 0.0, 10.0),
+    "saturation": ("Upper limit of the amplifier's output, below the commands, volts; 0: none.", 0.0, 1e4),
+    "rate_dependence": ("Growth of the coercivity at 100 V/s, volts.", 0.0, 100.0),
+    "creep": ("Creep per decade of time, share of the displacement.", 0.0, 0.2),
+    "resonance": ("Frequency of the flexure mode, hertz; 0: none.", 0.0, 1e4),
+    "damping": ("Damping ratio of the flexure mode.", 1e-4, 0.999),
+    "coupling": ("Share of the motion of every other axis.", -0.499, 0.499),
+    "thermal_drift": ("Final value of the drift, metres.", -1e-3, 1e-3),
+    "gain_drift": ("Final relative change of the sensitivity.", -0.499, 0.499),
+    "drift_time": ("Time constant of both drifts, seconds.", 1e-3, 1e6),
+    "sensor_period": ("Period of the sensor's periodic error, metres.", 1e-9, 1e-3),
+    "sensor_amplitude": ("Amplitude of the sensor's periodic error, metres.", 0.0, 1e-4),
+    "hum_frequency": ("Frequency of the hum, hertz.", 1e-3, 1e4),
+    "hum_amplitude": ("Amplitude of the hum, metres.", 0.0, 1e-4),
+}
 DECLARATIONS = (
     Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
+    Declaration(
+        "hardware_id", "",
+        "Identifier of the stage in stage_state; empty: simulated-PRESET, or simulated-SEED without a preset, and what "
+        "identifies the character, if any.",
+        read_only=True,
+    ),
     Declaration("preset", "", "p11: the stage of the MPI paper; empty: a random one.", read_only=True),
     Declaration("seed", 0, "Seed of the random stage and of the noise.", read_only=True, between=(0, 2**53)),
     Declaration(
@@ -43,8 +76,26 @@ DECLARATIONS = (
         read_only=True,
     ),
     Declaration(
-        "rate", 200.0, "States per second without answer_commands, hertz.",
+        "rate", 200.0, "States per second without answer_commands, and while nobody commands, hertz.",
         read_only=True, between=(1e-3, 1e4), number=True,
+    ),
+    Declaration(
+        "speed", 1.0,
+        "Stage seconds per second. Other than 1: the node publishes /clock at `rate`, for nodes with use_sim_time.",
+        read_only=True, between=(0.01, 1000.0), number=True,
+    ),
+    Declaration(
+        "character", GIVEN,
+        "given: the effects named below. drawn: one or two effects per axis, drawn from the seed and logged. hidden: "
+        "the same, but not told.",
+        read_only=True, choices=(GIVEN, DRAWN, HIDDEN),
+    ),
+    *(
+        Declaration(
+            effect.name, effect.default, EFFECTS[effect.name][0] + " One value, or one for each axis.",
+            read_only=True, between=EFFECTS[effect.name][1:], number=True, each_axis=True,
+        )
+        for effect in fields(Character)
     ),
 )  # fmt: skip
 
@@ -54,13 +105,13 @@ class StageSimulator(Node):
 
     Subscribes to ``voltage_command`` (std_msgs/Float64MultiArray, volts in the order of the axes) and publishes
     ``stage_state`` (sensor_msgs/JointState: measured displacement in metres in ``position``, applied voltage in volts
-    in ``effort``). Commands beyond the voltage limits are clipped, as the amplifier saturates. Parameters are those in
-    `DECLARATIONS`, and ``hardware_id``, by default ``simulated-PRESET``, or ``simulated-SEED`` without a preset: with a
-    preset, the seed affects the noise only.
+    in ``effort``) from its start on: once for each command; at the parameter ``rate`` before the first command and
+    while nobody publishes commands.
+    Commands beyond the voltage limits are clipped, as the amplifier saturates. Parameters in `DECLARATIONS`.
 
-    Without a preset the stage has random hysteresis, drawn from the seed, and no other effects. Preset "p11" is the
-    stage of the MPI paper with axes x and y, creep, resonance and its own sensor noise. Its dynamics run on the clock
-    of the node, which may be a simulated one.
+    Without a preset the stage has random hysteresis, drawn from the seed, and the effects of its character. Preset
+    "p11" is the stage of the MPI paper with axes x and y, creep, resonance and its own sensor noise; the seed affects
+    its noise only. The dynamics run on the clock of the node, or with ``speed`` on the clock that the node publishes.
 
     Attributes
     ----------
@@ -78,23 +129,50 @@ class StageSimulator(Node):
         self.ignored = 0
         values = Parameters(self, DECLARATIONS, partial(validated, DECLARATIONS)).settings
         axes, preset, seed = list(values["axes"]), values["preset"], values["seed"]
-        self._stage, self._latest = _make_stage(axes, preset, seed, values["noise_rms"]), -math.inf
+        self._stage, identity = _make_stage(values)
         self._low, self._high = _limits(self._stage, values["voltage_min"], values["voltage_max"])
         history = self._initial_history(values["initial_history"])
         self._state = JointState(name=axes)
-        identified = self.declare_parameter(
-            "hardware_id", f"simulated-{preset or seed}", ParameterDescriptor(read_only=True)
-        )
-        self._state.header.frame_id = identified.value
-        self._answers = values["answer_commands"]
-        now = self.get_clock().now().nanoseconds * 1e-9
+        self._state.header.frame_id = values["hardware_id"] or f"simulated-{preset or seed}{identity}"
+        if values["character"] == DRAWN and isinstance(self._stage, CharacterStage):
+            for axis, one in self._stage.axes.items():
+                self.get_logger().info(f"axis {axis}: {one.character}")
+        self._speed, self._begun_ns = values["speed"], time.monotonic_ns()
+        self._origin_ns, self._latest_ns = self.get_clock().now().nanoseconds, 0
+        begun = self._now_ns() * 1e-9
         for v in (*history, self._clip(0.0)):
-            self._stage.step(now - DAY, [v] * len(axes))
+            self._stage.step(begun - DAY, [v] * len(axes))
+        if isinstance(self._stage, CharacterStage):
+            for one in self._stage.axes.values():
+                one.begin_drift(begun)
         self._apply([self._clip(0.0)] * len(axes))
         self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
-        if not self._answers:
-            self.create_timer(1.0 / values["rate"], self._publish)
-        self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, COMMANDS)
+        self._answers, self._commanded = values["answer_commands"], False
+        period = 1.0 / values["rate"]
+        if self._speed == 1.0:
+            self.create_timer(period, self._on_timer)
+        else:
+            self._clock_publisher = self.create_publisher(ClockMsg, "/clock", COMMANDS)
+            self.create_timer(period / self._speed, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._commands = self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, COMMANDS)
+
+    def _now_ns(self) -> int:
+        """Return the time of the stage (ns), which never decreases, even if the clock of the node is set back."""
+        if self._speed == 1.0:
+            now = self.get_clock().now().nanoseconds
+        else:
+            now = self._origin_ns + int(self._speed * (time.monotonic_ns() - self._begun_ns))
+        self._latest_ns = max(self._latest_ns, now)
+        return self._latest_ns
+
+    def _on_tick(self) -> None:
+        self._clock_publisher.publish(ClockMsg(clock=_time(self._now_ns())))
+        self._on_timer()
+
+    def _on_timer(self) -> None:
+        if not self._answers or not self._commanded or not self.count_publishers(self._commands.topic_name):
+            self._apply(self._state.effort)
+            self._publish()
 
     def _on_command(self, command: Float64MultiArray) -> None:
         voltages = command.data
@@ -106,18 +184,17 @@ class StageSimulator(Node):
                 throttle_duration_sec=LOG_PERIOD,
             )
             return
+        self._commanded = True
         self._apply([self._clip(v) for v in voltages])
         if self._answers:
             self._publish()
 
     def _apply(self, voltages: Sequence[float]) -> None:
-        # The time of the stage never decreases, even if the clock is set back.
-        self._latest = max(self._latest, self.get_clock().now().nanoseconds * 1e-9)
-        self._displacement = self._stage.step(self._latest, voltages)
+        self._displacement = self._stage.step(self._now_ns() * 1e-9, voltages)
         self._state.effort = array("d", voltages)
 
     def _publish(self) -> None:
-        self._state.header.stamp = self.get_clock().now().to_msg()
+        self._state.header.stamp = _time(self._latest_ns)
         self._state.position = array("d", self._stage.measure(self._displacement))
         self._publisher.publish(self._state)
 
@@ -133,20 +210,38 @@ class StageSimulator(Node):
         return history
 
 
-def _make_stage(axes: list[str], preset: str, seed: int, noise_rms: float) -> Stage:
-    if not preset:
-        return Stage.random(axes, seed, noise_rms)
-    if preset != "p11":
-        raise UsageError(f"stage_simulator: no preset '{preset}'; choose p11, or none")
-    stage = p11_stage(seed)
-    if axes != list(stage.axes):
-        raise UsageError(
-            f"stage_simulator: axes are {', '.join(axes)}, preset p11 has {', '.join(stage.axes)}; use these"
-        )
-    return stage
+def _time(nanoseconds: int) -> Time:
+    seconds, rest = divmod(nanoseconds, SECOND_NS)
+    return Time(sec=seconds, nanosec=rest)
 
 
-def _limits(stage: Stage, low: float, high: float) -> tuple[float, float]:
+def _make_stage(values: Values) -> tuple[Stage | CharacterStage, str]:
+    """Return the stage, and what its hardware id says of its character."""
+    axes, preset, seed, noise = list(values["axes"]), values["preset"], values["seed"], values["noise_rms"]
+    names = [effect.name for effect in fields(Character)]
+    given = [Character(**{name: values[name][place] for name in names}) for place in range(len(axes))]
+    own = values["character"] != GIVEN or any(character.effects for character in given)
+    if preset:
+        if preset != "p11":
+            raise UsageError(f"stage_simulator: no preset '{preset}'; choose p11, or none")
+        if own:
+            raise UsageError("stage_simulator: preset p11 has a character of its own; give no effects with it")
+        stage = p11_stage(seed)
+        if axes != list(stage.axes):
+            raise UsageError(
+                f"stage_simulator: axes are {', '.join(axes)}, preset p11 has {', '.join(stage.axes)}; use these"
+            )
+        return stage, ""
+    if not own:
+        return Stage.random(axes, seed, noise), ""
+    if values["character"] == GIVEN:
+        digest = hashlib.sha256(repr(given).encode()).hexdigest()[:8]
+        return CharacterStage.of(axes, given, seed, noise), f"-{digest}"
+    drawn = CharacterStage.hidden(axes, seed, noise, rate=values["rate"], voltage_max=values["voltage_max"])
+    return drawn, f"-{values['character']}"
+
+
+def _limits(stage: Stage | CharacterStage, low: float, high: float) -> tuple[float, float]:
     lowest, highest = stage.voltage_range
     if not lowest <= low < high <= highest:
         raise UsageError(
@@ -158,6 +253,8 @@ def _limits(stage: Stage, low: float, high: float) -> tuple[float, float]:
 
 def main() -> int:
     """Run the node; return the exit code of the process."""
+    if help_asked("stage_simulator", StageSimulator, DECLARATIONS):
+        return 0
     return run(StageSimulator)
 
 

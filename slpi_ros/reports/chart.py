@@ -13,6 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.errors import shown
+
 MEASURED, DESIRED, NOISE = "#8a97a5", "#1b2733", "#c9d2da"
 COLOURS = ("#c8553d", "#d99a26", "#2a7f62", "#3b6ea5")
 # Colours of unused samples: their time span, the measurement, and the model.
@@ -299,29 +301,29 @@ class Chart:
 
     def _axes(self, panel: int) -> dict[str, Any]:
         """Return the layout of the axes of a panel."""
-        shown, first = self.panels[panel], self.panels[0]
+        here, first = self.panels[panel], self.panels[0]
         number = str(panel + 1) if panel else ""
-        across: dict[str, Any] = {**_GRID, "title": {"text": shown.x.title, "font": _SMALL}, "anchor": f"y{number}"}
+        across: dict[str, Any] = {**_GRID, "title": {"text": here.x.title, "font": _SMALL}, "anchor": f"y{number}"}
         up: dict[str, Any] = {
             **_GRID,
-            "title": {"text": shown.y.title, "font": _SMALL, "standoff": 6},
+            "title": {"text": here.y.title, "font": _SMALL, "standoff": 6},
             "anchor": f"x{number}",
         }
-        for axis, quantity in ((across, shown.x), (up, shown.y)):
+        for axis, quantity in ((across, here.x), (up, here.y)):
             if quantity.logarithmic:
                 axis.update(type="log", exponentformat="none", dtick=1)
         if panel in self._ranges:
             up["range"] = self._ranges[panel]
         if self.arrangement == "row":
             across["domain"] = self._domain(panel)
-            if panel and shown.y == first.y:
+            if panel and here.y == first.y:
                 up.update(matches="y", title={"text": ""})
         else:
             up["domain"] = self._domain(panel)
-            across["unifiedhovertitle"] = {"text": f"%{{x:{shown.x.digits}}} {shown.x.unit}"}
-            if panel and shown.x == first.x:
+            across["unifiedhovertitle"] = {"text": f"%{{x:{here.x.digits}}} {here.x.unit}"}
+            if panel and here.x == first.x:
                 across["matches"] = "x"
-            if panel < len(self.panels) - 1 and shown.x == self.panels[panel + 1].x:
+            if panel < len(self.panels) - 1 and here.x == self.panels[panel + 1].x:
                 across.update(title={"text": ""})
         return {f"xaxis{number}": across, f"yaxis{number}": up}
 
@@ -334,4 +336,4 @@ def _alone(y: FloatArray) -> NDArray[np.bool_]:
 
 def _plain(name: str) -> str:
     """Return a name that plotly.js displays unchanged, without interpreting tags."""
-    return html.escape(name, quote=False)
+    return html.escape(shown(name), quote=False)

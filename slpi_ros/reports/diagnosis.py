@@ -6,7 +6,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.diagnosis.result import AMBIGUOUS, NAMED, NOTHING_FOUND, AxisDiagnosis, Diagnosis, NamedEffect, Traces
+from slpi_ros.diagnosis.result import (
+    AMBIGUOUS,
+    NAMED,
+    NOTHING_FOUND,
+    UNEXPLAINED,
+    AxisDiagnosis,
+    Diagnosis,
+    NamedEffect,
+    Traces,
+)
 from slpi_ros.effects.registry import to_document
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
@@ -15,7 +24,7 @@ from slpi_ros.model.document import format_model
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, NOISE
 from slpi_ros.reports.page import Page, Severity, Share
-from slpi_ros.reports.text import nm
+from slpi_ros.reports.text import above_floor, nm
 from slpi_ros.reports.views import Curve, Motion
 
 FloatArray = NDArray[np.float64]
@@ -114,10 +123,10 @@ def _show_records(page: Page, found: AxisDiagnosis) -> None:
             for each in found.records
         ]
         caption = (
-            "Offset: by how much the zero has moved against the given model. Errors, rms, without it; left out: by a "
+            "Offset: by how much the zero has moved against the given model. Errors, rms, without it; held out: by a "
             "fit to the other records."
         )
-        header = ("Record", "offset (µm)", "given model", "extended model", "left out")
+        header = ("Record", "offset (µm)", "given model", "extended model", "held out")
         page.table(header, rows, None, caption)
 
 
@@ -151,27 +160,34 @@ def _cause(named: NamedEffect) -> dict[str, str]:
 
 
 def _parameters(document: Mapping[str, object]) -> str:
-    """Return parameters with their standard deviations as text."""
+    """Return parameters with their standard deviations as text; "not determined" where these exceed the value."""
     parameters, uncertainty = document.get("parameters"), document.get("uncertainty")
     if not isinstance(parameters, Mapping) or not isinstance(uncertainty, Mapping):
         return ""
-    shown = (
-        f"{name} {_value(value)}" + (f" ± {_value(uncertainty[name])}" if name in uncertainty else "")
-        for name, value in parameters.items()
-    )
-    return "; ".join(shown)
+    return "; ".join(f"{name} {_value(name, value, uncertainty)}" for name, value in parameters.items())
 
 
-def _value(value: object) -> str:
+def _value(name: str, value: object, uncertainty: Mapping[str, float]) -> str:
     match value:
         case float() | int():
-            return f"{value:.4g}"
+            return _estimate(value, uncertainty.get(name), 1.0 if name == "phase" else abs(value))
         case list() | tuple():
-            return f"[{', '.join(map(_value, value))}]"
+            largest = max((abs(one) for one in value), default=0.0)
+            shown = (_estimate(one, uncertainty.get(f"{name}.{k}"), largest) for k, one in enumerate(value))
+            return f"[{', '.join(shown)}]"
         case Mapping():
-            return ", ".join(f"{name}: {_value(one)}" for name, one in value.items())
+            return ", ".join(
+                f"{key}: {_estimate(one, uncertainty.get(f'{name}.{key}'), abs(one))}" for key, one in value.items()
+            )
         case _:
             return str(value)
+
+
+def _estimate(value: float, deviation: float | None, scale: float) -> str:
+    """Return a value with its standard deviation, if this is smaller than `scale`."""
+    if deviation is None:
+        return f"{value:.4g}"
+    return f"{value:.4g} ± {deviation:.2g}" if deviation <= scale else "not determined"
 
 
 def _steps(found: AxisDiagnosis) -> tuple[list[list[str]], int, str]:
@@ -247,6 +263,23 @@ def _parts(traces: Traces) -> list[Curve]:
             effects.items(), weights.tolist(), _colours(len(effects)), strict=True
         )
     ]
+
+
+def diagnosis_limits(diagnosis: Diagnosis) -> dict[str, str]:
+    """Return what limits the accuracy of the given model on each axis; axes at the noise floor are left out."""
+    limits = {}
+    for name, found in diagnosis.axes.items():
+        low, high = diagnosis.extended.axes[name].displacement_range
+        causes = [
+            f"{' or '.join((named.name, *named.alternatives))} ({named.gain_percent:.0f} %)" for named in found.effects
+        ]
+        if found.verdict == UNEXPLAINED:
+            causes.append("a cause that is none of the known effects")
+        if not causes and above_floor(found.given_rms, found.floor_rms, high - low):
+            causes.append("a model that does not fit the stage as it is now")
+        if causes:
+            limits[name] = ", ".join(causes)
+    return limits
 
 
 def describe_diagnosis(diagnosis: Diagnosis) -> list[str]:

@@ -86,7 +86,7 @@ def write_report(
                 f"{name}-coverage",
                 views.coverage(v, np.where(fitted, y - simulated[name], np.nan), motion),
                 "Number of fitted samples by start voltage of the branch and present voltage, and the rms error. "
-                "Rising branches are above the diagonal, falling ones below. White: no data, the model extrapolates.",
+                "Rising branches are above the diagonal, falling ones below. Empty: no data, the model extrapolates.",
             )
         else:
             page.text("The record contains no voltage of this axis: there are no charts.")

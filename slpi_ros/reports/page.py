@@ -10,12 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 from urllib.parse import quote
 
+from slpi_ros.errors import shown
 from slpi_ros.identification.record_quality import Finding
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.reports.chart import Chart
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+# Characters of one text on a page: a paragraph, not a file.
+_LONGEST_TEXT = 20_000
+# Length (characters) above which the column of a table holds text and not numbers.
+_SENTENCE = 36
 
 Severity = Literal["good", "warn", "bad"]
 
@@ -55,37 +61,35 @@ class Page:
     def contents(self, axes: Sequence[str]) -> None:
         """Add links to the headings of several axes."""
         if len(axes) > 1:
-            links = (f'<a href="#{html.escape(quote(f"axis-{axis}"))}">Axis {html.escape(axis)}</a>' for axis in axes)
+            links = (f'<a href="#{html.escape(quote(shown(f"axis-{axis}")))}">Axis {_text(axis)}</a>' for axis in axes)
             self._parts.append(f"<nav>{''.join(links)}</nav>")
 
     def heading(self, text: str, axis: str | None = None) -> None:
         """Add a heading; with `axis`, it is the target of a link in `contents`."""
-        target = "" if axis is None else f' id="{html.escape(f"axis-{axis}")}"'
-        self._parts.append(f"<h2{target}>{html.escape(text)}</h2>")
+        target = "" if axis is None else f' id="{_text(f"axis-{axis}")}"'
+        self._parts.append(f"<h2{target}>{_text(text)}</h2>")
 
     def verdict(self, axis: str, text: str, severity: Severity, word: str = "") -> None:
         """Add the summary sentence of an axis, after an optional word; its element has the id ``verdict-<axis>``."""
-        name, before = html.escape(f"verdict-{axis}"), f"<b>{html.escape(word.replace('_', ' '))}</b> " if word else ""
-        said = f' data-verdict="{html.escape(word)}"' if word else ""
-        self._parts.append(f'<p class="verdict {severity}" id="{name}"{said}>{before}{html.escape(text)}</p>')
+        name, before = _text(f"verdict-{axis}"), f"<b>{_text(word.replace('_', ' '))}</b> " if word else ""
+        said = f' data-verdict="{_text(word)}"' if word else ""
+        self._parts.append(f'<p class="verdict {severity}" id="{name}"{said}>{before}{_text(text)}</p>')
 
     def tiles(self, figures: Mapping[str, str]) -> None:
         """Add key figures by name."""
-        tiles = (
-            f"<div><b>{html.escape(text)}</b><span>{html.escape(name)}</span></div>" for name, text in figures.items()
-        )
+        tiles = (f"<div><b>{_text(text)}</b><span>{_text(name)}</span></div>" for name, text in figures.items())
         self._parts.append(f'<div class="tiles">{"".join(tiles)}</div>')
 
     def findings(self, found: Iterable[Finding]) -> None:
         """Add the findings on a record."""
-        items = (f'<li><b class="{one.level}">{one.level}</b>{html.escape(one.text)}</li>' for one in found)
+        items = (f'<li><b class="{one.level}">{one.level}</b>{_text(one.text)}</li>' for one in found)
         self._parts.append(f'<ul class="findings">{"".join(items)}</ul>')
 
     def shares(self, parts: Sequence[Share]) -> None:
         """Add a bar of the parts of a whole, with names and shares."""
         bar = (f'<div style="flex:{part.share:.4f} 0 0;background:{part.colour}"></div>' for part in parts)
         keys = (
-            f'<li><i style="background:{part.colour}"></i>{html.escape(part.name)} <b>{part.share:.0%}</b></li>'
+            f'<li><i style="background:{part.colour}"></i>{_text(part.name)} <b>{part.share:.0%}</b></li>'
             for part in parts
         )
         self._parts.append(f'<div class="shares">{"".join(bar)}</div><ul class="keys">{"".join(keys)}</ul>')
@@ -96,44 +100,63 @@ class Page:
             self._parts.append(f'<p class="hint">{_HINT}</p><noscript><p>The charts need JavaScript.</p></noscript>')
         self._has_charts = True
         self._parts.append(
-            f'<figure class="chart"><div id="{html.escape(name)}" style="min-height:{chart.height}px"></div>'
+            f'<figure class="chart"><div id="{_text(name)}" style="min-height:{chart.height}px"></div>'
             f'<script type="application/json">{chart.to_json()}</script>'
-            f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+            f"<figcaption>{_text(caption)}</figcaption></figure>"
         )
 
     def section(self, text: str) -> None:
         """Add a second-level heading."""
-        self._parts.append(f"<h3>{html.escape(text)}</h3>")
+        self._parts.append(f"<h3>{_text(text)}</h3>")
 
     def subsection(self, text: str) -> None:
         """Add a third-level heading."""
-        self._parts.append(f"<h4>{html.escape(text)}</h4>")
+        self._parts.append(f"<h4>{_text(text)}</h4>")
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
-        self._parts.append(f"<p>{html.escape(text)}</p>")
+        self._parts.append(f"<p>{_text(text)}</p>")
 
     def definitions(self, texts: Mapping[str, str]) -> None:
         """Add a list of terms and their definitions."""
-        items = (f"<dt>{html.escape(term)}</dt><dd>{html.escape(text)}</dd>" for term, text in texts.items())
+        items = (f"<dt>{_text(term)}</dt><dd>{_text(text)}</dd>" for term, text in texts.items())
         self._parts.append(f"<dl>{''.join(items)}</dl>")
 
     def lines(self, lines: Sequence[str]) -> None:
         """Add a list of short lines."""
-        self._parts.append(f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>")
+        self._parts.append(f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in lines)}</ul>")
 
     def table(
-        self, header: Sequence[str], rows: Sequence[Sequence[str] | str], best: int | None = None, caption: str = ""
+        self,
+        header: Sequence[str],
+        rows: Sequence[Sequence[str] | str],
+        best: int | None = None,
+        caption: str = "",
+        links: Mapping[str, str] | None = None,
     ) -> None:
-        """Add a table; row `best` is highlighted, and a row given as text is a group heading."""
-        below = f"<caption>{html.escape(caption)}</caption>" if caption else ""
-        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+        """Add a table; row `best` is highlighted, and a row given as text is a group heading.
+
+        First cells that are in `links` are links to these paths, relative to the page.
+        """
+        below = f"<caption>{_text(caption)}</caption>" if caption else ""
+        cells_of = [row for row in rows if not isinstance(row, str)]
+        # Sentences and paths are aligned like text and broken into lines; numbers are neither.
+        worded = {k for row in cells_of for k, cell in enumerate(row) if k and len(cell) > _SENTENCE}
+
+        def line(tag: str, texts: Sequence[str]) -> str:
+            marks = (' class="words"' if k in worded else "" for k in range(len(texts)))
+            return "".join(f"<{tag}{mark}>{text}</{tag}>" for mark, text in zip(marks, texts, strict=True))
+
+        head = line("th", [_text(cell) for cell in header])
         body = []
         for k, row in enumerate(rows):
             if isinstance(row, str):
-                body.append(f'<tr class="group"><td colspan="{len(header)}">{html.escape(row)}</td></tr>')
+                body.append(f'<tr class="group"><td colspan="{len(header)}">{_text(row)}</td></tr>')
                 continue
-            cells = "".join(f"<td>{html.escape(cell)}</td>" for cell in row)
+            texts = [_text(cell) for cell in row]
+            if links and row[0] in links:
+                texts[0] = f'<a href="{html.escape(quote(links[row[0]]))}">{texts[0]}</a>'
+            cells = line("td", texts)
             body.append(f'<tr class="best">{cells}</tr>' if k == best else f"<tr>{cells}</tr>")
         rows_below = f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody>"
         self._parts.append(f'<div class="scroll"><table>{below}{rows_below}</table></div>')
@@ -142,8 +165,8 @@ class Page:
         """Add a picture with its caption."""
         picture = base64.b64encode(png(figure)).decode()
         self._parts.append(
-            f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{picture}">'
-            f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+            f'<figure><img alt="{_text(caption)}" src="data:image/png;base64,{picture}">'
+            f"<figcaption>{_text(caption)}</figcaption></figure>"
         )
 
     def write(self, path: Path) -> None:
@@ -154,7 +177,7 @@ class Page:
         SlpiError
             If the file cannot be written.
         """
-        title = html.escape(self.title)
+        title = _text(self.title)
         scripts = ("plotly-cartesian.min.js", "page.js") if self._has_charts else ()
         document = (
             f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
@@ -166,6 +189,11 @@ class Page:
         make_folder(path.parent)
         with all_or_nothing(path) as file:
             file.write(document)
+
+
+def _text(text: str) -> str:
+    """Return a text as HTML."""
+    return html.escape(shown(text, _LONGEST_TEXT))
 
 
 def _asset(name: str) -> str:

@@ -1,6 +1,6 @@
-"""Text summaries of models and of changes between models."""
+"""Text summaries of models and of changes between models, and verdicts on their accuracy."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +9,7 @@ from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops
-from slpi_ros.model.axis_model import AxisModel, StartMemory
+from slpi_ros.model.axis_model import ABOVE_FLOOR, RESOLUTION, AxisModel, StartMemory
 from slpi_ros.model.stage_model import StageModel
 
 if TYPE_CHECKING:
@@ -21,34 +21,76 @@ def nm(metres: float) -> str:
     return f"{metres * 1e9:.1f} nm" if np.isfinite(metres) else "none"
 
 
-def describe_model(model: StageModel) -> list[str]:
-    """Return a text summary of a model, in µm and nm."""
+def verdict(limits: Mapping[str, str], good: str = "at the noise floor") -> str:
+    """Return the verdict on all axes in one line: what limits the accuracy of each axis of `limits`, else `good`."""
+    if limits:
+        return f"LIMITED BY: {'; '.join(f'axis {axis}: {limit}' for axis, limit in limits.items())}"
+    return f"GOOD: {good}"
+
+
+def above_floor(rms: float, floor: float, stroke: float) -> str:
+    """Return by how much an error (m rms) exceeds the noise floor (m rms) as text; "" if it does not.
+
+    An error below `RESOLUTION` of the `stroke` (m) counts as noise, as no model of hysteresis does better.
+    """
+    if rms <= max(ABOVE_FLOOR * floor, RESOLUTION * stroke):
+        return ""
+    times = f"{rms / floor:.1f} times the noise floor" if floor > 0.0 else "without any noise"
+    return f"an error of {nm(rms)} rms, {times}"
+
+
+def model_limits(model: StageModel) -> dict[str, str]:
+    """Return what limits the accuracy of each axis of a model; axes at the noise floor are left out."""
+    limits = {}
+    for name, axis in model.axes.items():
+        quality, (low, high) = axis.quality, axis.displacement_range
+        error = quality.held_out_rms if np.isfinite(quality.held_out_rms) else quality.rms
+        if limit := above_floor(error, quality.floor_rms, high - low):
+            limits[name] = f"{limit}, of unknown cause"
+    return limits
+
+
+def change_limits(changes: Mapping[str, "AxisChange"], model: StageModel) -> dict[str, str]:
+    """Return what limits the accuracy of each axis after a refit to a record; axes at their repeatability left out."""
+    limits = {}
+    for name, change in changes.items():
+        low, high = model.axes[name].displacement_range
+        if limit := above_floor(change.error_after, change.repeatability, high - low):
+            limits[name] = limit.replace("the noise floor", "the repeatability") + ", that the refit leaves"
+    return limits
+
+
+def describe_model(model: StageModel, *, details: bool = True) -> list[str]:
+    """Return a text summary of a model, in µm and nm; without `details` the most important lines only."""
     head = f"stage '{model.hardware_id}'" if model.hardware_id else "stage of unknown hardware id"
     lines = [f"{head}, identified {model.created or 'at an unknown time'}"]
     for name, axis in model.axes.items():
-        lines += [f"axis {name}: {line}" for line in describe_axis(axis)]
+        lines += [f"axis {name}: {line}" for line in describe_axis(axis, details=details)]
     return lines
 
 
-def describe_axis(axis: AxisModel) -> list[str]:
-    """Return a text summary of one axis."""
+def describe_axis(axis: AxisModel, *, details: bool = True) -> list[str]:
+    """Return a text summary of one axis; without `details` the most important lines only."""
     quality, start, end = axis.quality, axis.start, axis.end
     (v_low, v_high), (y_low, y_high) = axis.voltage_range, axis.displacement_range
     began = "a memory assumed wiped" if start.history else "rest"
     stroke = y_high - y_low
-    return [
-        f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {_parts(axis.hysteresis)}",
-        f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} um "
-        f"({quality.covered:.0%} model covered)",
-        f"memory at the start of the record: {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um",
-        f"memory at the end of the record: at {end.voltage:.4g} V, {end.displacement * 1e6:.4g} um, "
+    more = [
+        f"memory at the start of the record: {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} µm",
+        f"memory at the end of the record: at {end.voltage:.4g} V, {end.displacement * 1e6:.4g} µm, "
         f"with {len(end.history)} reversals"
         if end
         else "memory at the end of the record: unknown",
         f"error on the record: {nm(quality.rms)} rms ({quality.rms / stroke:.3%} of the displacement range), "
         f"{nm(quality.maximum)} at most",
-        f"held-out error: {nm(quality.held_out_rms)} rms; sensor noise {nm(quality.floor_rms)} rms",
         f"from {quality.samples} samples of {quality.source}",
+    ]
+    return [
+        f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {_parts(axis.hysteresis)}",
+        f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} µm "
+        f"({quality.covered:.0%} model covered)",
+        f"held-out error: {nm(quality.held_out_rms)} rms; sensor noise {nm(quality.floor_rms)} rms",
+        *(more if details else ()),
         *(f"{effect.name}: {effect.describe()}" for effect in axis.effects),
         *(() if axis.effects else ("effects: none",)),
     ]
@@ -63,7 +105,7 @@ def describe_start(model: StageModel, axes: Iterable[str], start_memory: StartMe
         known = {"end": "end of the record", "start": "start of the record", "wiped": "memory wiped"}[start_memory]
         if start_memory == "end" and axis.end is None:
             known = "start of the record, as the model does not contain the end"
-        told.append(f"axis {name} at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} um ({known})")
+        told.append(f"axis {name} at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} µm ({known})")
     return f"assumed before the first sample: {'; '.join(told)}"
 
 
@@ -72,7 +114,7 @@ def describe_change(axis: str, change: "AxisChange") -> list[str]:
     found = change.match
     same = max(abs(found.gain_change), found.gain_uncertainty)
     zero = (
-        f"the zero has moved by {found.offset * 1e6:+.3g} (+- {found.offset_uncertainty * 1e6:.2g}) um since"
+        f"the zero has moved by {found.offset * 1e6:+.3g} (+- {found.offset_uncertainty * 1e6:.2g}) µm since"
         if found.zero_moved
         else ""
     )

@@ -17,6 +17,7 @@ from slpi_ros.diagnosis.verify import (
 )
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import format_document
+from slpi_ros.model.axis_model import ABOVE_FLOOR
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import (
     AFTER,
@@ -77,8 +78,38 @@ def write_files(folder: Path, found: Verification) -> None:
     page.write(folder / FILES[1])
 
 
-def describe_verification(found: Verification) -> list[str]:
-    """Return lines of text: for each axis pass or fail, and the errors (nm) by record, level, speed and region."""
+def verification_limits(found: Verification) -> dict[str, str]:
+    """Return what limits the accuracy of each axis: a failed model, or the largest part of a tracking error."""
+    limits = {}
+    for name, axis in found.axes.items():
+        tracked = [record.tracking for record in axis.records if record.tracking]
+        if not axis.passed:
+            worst = axis.worst
+            noisy = worst.error.rms <= ABOVE_FLOOR * worst.floor_rms
+            limits[name] = (
+                f"{'the noise of the record' if noisy else 'the model'}, {nm(worst.error.rms)} rms where "
+                f"{nm(worst.limit)} are allowed"
+            )
+        elif tracked:
+            worst_path = max(tracked, key=lambda tracking: tracking.error.rms)
+            if worst_path.error.rms > axis.worst.limit:
+                limits[name] = f"{worst_path.blame}, as the largest part of the tracking error"
+    return limits
+
+
+def verification_good(found: Verification) -> str:
+    """Return how good a verified model is that nothing limits."""
+    noise = all(
+        record.error.rms <= ABOVE_FLOOR * record.floor_rms for axis in found.axes.values() for record in axis.records
+    )
+    return "at the noise floor" if noise else "within its limit on every record"
+
+
+def describe_verification(found: Verification, *, details: bool = True) -> list[str]:
+    """Return lines of text: for each axis pass or fail, and the errors (nm) by record, level, speed and region.
+
+    Without `details`: pass or fail, and the notes of each record.
+    """
     lines = []
     for name, axis in found.axes.items():
         told = [("pass: " if axis.passed else "fail: ") + _summary(name, axis).removeprefix(f"Axis {name}: ")]
@@ -86,8 +117,9 @@ def describe_verification(found: Verification) -> list[str]:
             told += [f"{record.error.name}: {line}" for line in (_error(record), *_notes(record))]
             if record.tracking:
                 told += [f"{record.error.name}: {line}" for line in _tracking_notes(record.tracking)]
-        told.append(f"{'error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}")
-        for part in (axis.overall, *axis.by_level, *axis.by_speed, *axis.by_region):
+        parts = (axis.overall, *axis.by_level, *axis.by_speed, *axis.by_region) if details else ()
+        told += [f"{'error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}"] if parts else []
+        for part in parts:
             told.append(f"{part.name:<24}{part.samples:9}{part.rms * 1e9:9.1f}{part.maximum * 1e9:10.1f}")
         lines += [f"axis {name}: {line}" for line in told]
     return lines

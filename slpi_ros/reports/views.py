@@ -50,7 +50,7 @@ SPEED = Quantity("speed of the voltage", "V/s", digits=".4~g")
 SINCE = Quantity("time since the last reversal or stop", "s", digits=".3~g", logarithmic=True)
 FREQUENCY = Quantity("frequency", "Hz", digits=".4~g", logarithmic=True)
 DENSITY = Quantity("spectral density", "nm/√Hz", 1e9, ".3~g", logarithmic=True)
-LOOPS = "Displacement over voltage; right: deviation of the displacement from its straight-line fit."
+LOOPS = "Displacement over voltage, and its deviation from a straight-line fit."
 # Legend entry of samples that were not fitted.
 UNUSED = "not used"
 

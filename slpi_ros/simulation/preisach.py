@@ -481,9 +481,13 @@ class PreisachStage:
         """
         y = np.empty_like(v)
         for index, (voltage, seen) in enumerate(zip(v.tolist(), relay_voltage.tolist(), strict=True)):
-            self._relays.step(seen)
-            y[index] = self._bowed(self._sum(voltage))
+            y[index] = self.switch(voltage, seen)
         return y
+
+    def switch(self, v: float, relay_voltage: float) -> float:
+        """Apply one voltage (V) to the reversible part and one to the relays, as `respond`; return displacement (m)."""
+        self._relays.step(relay_voltage)
+        return self._bowed(self._sum(v))
 
     def _step_in_time(self, dynamics: Dynamics, t: float, v: float) -> float:
         self._relays.check(v)

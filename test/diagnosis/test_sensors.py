@@ -66,6 +66,7 @@ def test_readings_that_all_come_late_are_no_change(seed):
     assert diagnosis.extended.axes["x"] == model.axes["x"]
 
 
+@pytest.mark.minutes
 def test_the_measured_record_with_late_readings(measured_data):
     record = import_table(measured_data / "afm_cycles.csv")
     found = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"]

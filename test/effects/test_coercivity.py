@@ -76,6 +76,18 @@ def test_it_comes_back_from_its_inverse(effect, record):
 
 
 @given(coercivities(), records("voltage"))
+def test_a_stream_of_commands_does_not_run_away(effect, record):
+    """Also where the coercivity grows in proportion to the rate: it is at most that of the wanted voltages."""
+    streaming, steps = effect.streaming(), np.diff(record.around.t, prepend=0.0).tolist()
+    streaming.start(float(record.signal[0]))
+    bound = widest(effect, record.signal, record.around.t) * (1 + 1e-9) + 1e-9
+    for dt, wanted in zip(steps, record.signal.tolist(), strict=True):
+        command = streaming.inverse(dt, wanted)
+        assert abs(command - wanted) <= bound
+        streaming.forward(dt, command)
+
+
+@given(coercivities(), records("voltage"))
 def test_it_is_followed_nearly(effect, record):
     """Backwards only, the rate comes half a sample late."""
     streaming, steps = effect.streaming(), np.diff(record.around.t, prepend=0.0).tolist()

@@ -1,13 +1,16 @@
 """Lone outliers of voltage and displacement: found, counted, and without a say in ranges, reversals and errors."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import slpi_ros
+from slpi_ros.diagnosis.prepare import evidence_of
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.identification.bad_readings import far_outliers, outliers_beside
+from slpi_ros.identification.bad_readings import far_outliers, outliers_by_model
+from slpi_ros.identification.initial_history import InitialHistoryWarning
 from slpi_ros.identification.record_quality import assess
 from slpi_ros.identification.samples import select_samples
 from slpi_ros.simulation.parameters import StageParameters
@@ -137,7 +140,7 @@ def test_outliers_beside_each_other_are_found_with_a_model(clean, of_clean, besi
     at = np.concatenate([[0], (np.arange(1500, 4500, 500)[:, None] + np.arange(beside)).ravel(), [5999, 6000]])
     for signs in (1.0, np.where(np.arange(at.size) % 2, 1.0, -1.0)):
         y = spoiled(clean, "displacement", at, signs * 100 * NOISE).displacement["x"]
-        assert outliers_beside(path, y, clean.voltage["x"]).tolist() == at.tolist()
+        assert outliers_by_model(path, y, clean.voltage["x"]).tolist() == at.tolist()
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1 * NOISE, NOISE])
@@ -147,11 +150,77 @@ def test_what_a_model_gets_wrong_is_no_outlier(kind, noise):
     y = PreisachStage(StageParameters.random(2), 2).run(t, v)[0]
     y = y + noise * np.random.default_rng(6).standard_normal(t.size)
     model = slpi_ros.identify(slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y}), kind).axes["x"]
-    assert not outliers_beside(model.memory("start").forward_array(v), y, v).size
+    assert not outliers_by_model(model.memory("start").forward_array(v), y, v).size
 
 
 @pytest.mark.parametrize("readings", [1, 3, 2000])
 def test_a_sudden_error_of_a_model_is_no_outlier(clean, readings):
     path = clean.displacement["x"].copy()
     path[2500 : 2500 + readings] += 400 * NOISE
-    assert not outliers_beside(path, clean.displacement["x"], clean.voltage["x"]).size
+    assert not outliers_by_model(path, clean.displacement["x"], clean.voltage["x"]).size
+
+
+def selected(record, clean):
+    """Return the samples of a record, and their largest change of voltage against the clean record, volts."""
+    samples = select_samples(record, "x", None, None)
+    return samples, float(np.abs(samples.v - clean.voltage["x"]).max())
+
+
+@pytest.mark.parametrize("by", [20.0, -30.0, 500.0])
+@pytest.mark.parametrize("count", [4, 5])
+def test_runs_of_wrong_voltages_are_no_motion(clean, count, by):
+    for at in (100, 3000, 5000):
+        samples, changed = selected(spoiled(clean, "voltage", np.arange(at, at + count), by), clean)
+        assert changed < 0.1 and samples.fitted.all()
+
+
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_both_signals_at_zero_are_a_lost_message(clean, count):
+    at = np.arange(3000, 3000 + count)
+    lost = spoiled(clean, "voltage", at, -clean.voltage["x"][at])
+    lost = spoiled(lost, "displacement", at, -clean.displacement["x"][at])
+    samples, changed = selected(lost, clean)
+    assert changed < 0.1 and np.flatnonzero(~samples.fitted).tolist() == at.tolist()
+
+
+def test_a_start_at_zero_is_no_lost_message():
+    t = np.arange(3000) / 50.0
+    v = 50.0 * np.exp(-t / 20.0) * np.abs(np.sin(0.5 * np.pi * t))
+    off_v, off_y = far_outliers(v, 2e-7 * v)
+    assert not off_v.size and not off_y.size
+
+
+@pytest.mark.parametrize("at", [0, 1, 2, 4, slice(0, 5), -1, -2, -5, slice(-5, None)])
+def test_outliers_among_the_first_and_last_readings_are_left_out(clean, at):
+    at = np.atleast_1d(np.arange(len(clean))[at])
+    samples, changed = selected(spoiled(clean, "voltage", at, 50.0), clean)
+    assert changed < 1.0 and samples.fitted.all()
+    samples, changed = selected(spoiled(clean, "displacement", at, 1e-4), clean)
+    assert changed == 0.0 and np.flatnonzero(~samples.fitted).tolist() == at.tolist()
+
+
+@pytest.mark.parametrize("rate", [10.0, 200.0, 1000.0])
+def test_digits_of_a_record_without_noise_are_no_outliers(rate):
+    t = np.arange(int(60.0 * rate)) / rate
+    v = 50.0 * (1.0 - np.cos(2.0 * np.pi * (0.2 if rate < 500.0 else 1.0) * t))
+    record = slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": np.round(2e-7 * v, 9)})
+    assert select_samples(record, "x", None, None).fitted.all()
+    found = assess(record, "x")
+    assert found.displacement.spikes == found.voltage.spikes == 0
+
+
+def test_outliers_at_the_beginning_are_no_wrong_history(clean):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InitialHistoryWarning)
+        slpi_ros.identify(spoiled(clean, "displacement", np.array([3, 20, 40, 41, 60, 61, 62, 80]), 3e-7))
+
+
+def test_verify_and_diagnose_leave_out_what_identify_leaves_out(clean, of_clean):
+    # Beside each other, and small enough to be found with a model only.
+    at = (np.arange(1500, 4500, 500)[:, None] + np.arange(2)).ravel()
+    record = spoiled(clean, "displacement", at, 100 * NOISE)
+    assert select_samples(record, "x", None, None).fitted[at].any()
+    model = slpi_ros.StageModel({"x": of_clean})
+    checked = slpi_ros.verify(record, model).axes["x"].records[0]
+    assert not checked.judged[at].any() and checked.judged.sum() >= 0.9 * len(clean)
+    assert not evidence_of([record], "x", of_clean).used[at].any()

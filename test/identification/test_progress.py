@@ -1,11 +1,13 @@
 """Progress: heard by who listens, on a terminal only, and only of long work."""
 
 import io
+import time
 
 import pytest
 from identification.records import calibration
 
 import slpi_ros
+from slpi_ros.identification import progress
 from slpi_ros.identification.progress import listening, report_progress, shown_on
 
 
@@ -51,3 +53,33 @@ def test_an_identification_tells_what_it_does(kind):
     with listening(heard.append):
         slpi_ros.identify(calibration(seed=1, duration=8.0)[0], kind)
     assert heard[0].startswith("axis x") and sum("fold" in what for what in heard) >= 5
+
+
+def test_a_compilation_is_told():
+    compiled = pytest.importorskip("slpi_ros.hysteresis.compiled")
+    from numba import njit
+
+    heard = []
+    with listening(heard.append):
+        assert njit(lambda x: x + 1)(1) == 2
+    assert len(heard) >= 1 and compiled
+    heard.clear()
+    with listening(heard.append):
+        report_progress("own")
+    assert heard == ["own"]
+
+
+def test_a_long_step_shows_the_message_before_it(monkeypatch):
+    monkeypatch.setattr(progress, "PATIENCE", 0.01)
+    terminal = Terminal()
+    with shown_on(terminal, lambda: 0.0):
+        report_progress("step")
+    assert terminal.getvalue() == ""
+    times = iter([0.0, 0.0, 5.0])
+    with shown_on(terminal, lambda: next(times)):
+        report_progress("step")
+        for _ in range(1000):
+            if "5 s: step" in terminal.getvalue():
+                break
+            time.sleep(0.01)
+    assert "5 s: step" in terminal.getvalue()

@@ -219,7 +219,7 @@ def test_time_is_the_records_fault():
 @pytest.mark.parametrize("y", [-1e-6, 17e-6, 8.0, -1e300])
 def test_far_out_of_range_is_refused(y):
     axis = replace(X, displacement_range=(2e-6, 14e-6))
-    with pytest.raises(UnreachableError, match=r"^axis 'x'[^\n]*sample 3[^\n]* um [^\n]*$"):
+    with pytest.raises(UnreachableError, match=r"^axis 'x'[^\n]*sample 3[^\n]* µm [^\n]*$"):
         StageModel({"x": axis}).compensate(T, [3e-6, 3e-6, 3e-6, y, 3e-6])
 
 

@@ -35,7 +35,7 @@ class NodeProcess:
 
     def __init__(self, name: str, parameters: Mapping[str, object], arguments: Sequence[str]) -> None:
         given = [part for key, value in parameters.items() for part in ("-p", f"{key}:={yaml_of(value)}")]
-        command = [sys.executable, "-m", f"slpi_ros.nodes.{name}", "--ros-args", *given, *arguments]
+        command = [sys.executable, "-m", "slpi_ros.nodes.start", name, "--ros-args", *given, *arguments]
         self._stderr = tempfile.TemporaryFile("w+")  # noqa: SIM115
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=self._stderr, start_new_session=True)
 
@@ -101,6 +101,12 @@ class Graph:
             assert not self.tested or self.tested.process.poll() is None, f"the node died: {said}"
             self._executor.spin_once(timeout_sec=0.02)
         return found
+
+    def spin_for(self, seconds: float) -> None:
+        """Serve callbacks for some time."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.02)
 
     def record(self, kind: Any, topic: str, qos: QoSProfile = RELIABLE) -> list[Any]:
         """Return a list that the topic's messages go to."""

@@ -101,7 +101,7 @@ def test_a_measurement_that_cannot_be_is_told_and_moves_nothing(x_file):
         status, values = client.report(**{
             "measurements_rejected.not_finite": 2, "measurements_rejected.out_of_range": 3, "rejected": 0,
         })  # fmt: skip
-        assert "axis 'x': measured displacement 1000 um is far outside" in values["last_rejection"]
+        assert "axis 'x': measured displacement 1000 µm is far outside" in values["last_rejection"]
         statuses = client.graph.statuses(f"{client.name}: compensator")
         warned = [status for status in statuses if "measurements rejected, the last: axis 'x'" in status.message]
         assert warned and warned[0].level == b"\1"

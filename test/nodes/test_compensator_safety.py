@@ -1,5 +1,6 @@
 """A compensator that is left alone, told to end, or told where its memory is: what the voltages do then."""
 
+import hashlib
 import signal
 import time
 from pathlib import Path
@@ -12,7 +13,7 @@ rclpy = pytest.importorskip("rclpy")
 from builtin_interfaces.msg import Duration  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from nodes.compensator_client import Client, compensator, last_at_full_pace  # noqa: E402
-from nodes.ros_helpers import LATCHED, stage_model  # noqa: E402
+from nodes.ros_helpers import LATCHED, stage_model, started  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
@@ -232,3 +233,19 @@ def test_a_model_of_another_stage_is_refused():
         assert all(name in values["last_model_error"] for name in ("'stage under test'", "'this stage'"))
         models.publish(String(data=format_model(stage_model()).replace("stage under test", "this stage")))
         client.report("the model", **{"model.kind": "slpi"})
+
+
+def test_only_the_approved_model_is_accepted(x_file):
+    """Its sum is that of the file; another one is refused, from a file and from the topic."""
+    approved = hashlib.sha256(Path(x_file).read_bytes()).hexdigest()
+    with compensator(model_file=x_file, model_sha256=approved) as client:
+        client.connect()
+        _, values = client.report(models_refused=0)
+        assert approved.startswith(values["model.id"])
+        models = client.graph.publisher(String, "/stage_model", LATCHED)
+        models.publish(String(data=format_model(stage_model(stroke=9e-6))))
+        _, values = client.report(models_refused=1)
+        assert approved.startswith(values["model.id"]) and approved in values["last_model_error"]
+    for wrong in ("0" * 64, approved.upper(), "x"):
+        with started("compensator", {"model_file": x_file, "model_sha256": wrong}) as node:
+            assert node.wait() in (1, 2) and "model_sha256" in node.stderr and "Traceback" not in node.stderr

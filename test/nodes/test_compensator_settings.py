@@ -99,10 +99,3 @@ def test_every_parameter_is_described():
         assert described.read_only == entry.read_only
         assert bool(described.floating_point_range) == bool(entry.between and entry.number)
         assert bool(described.integer_range) == bool(entry.between and not entry.number)
-
-
-def test_the_readme_holds_the_table():
-    readme = (CONFIG.parent / "README.md").read_text().splitlines()
-    rows = [entry.row() for entry in DECLARATIONS]
-    first = readme.index(rows[0])
-    assert readme[first : first + len(rows)] == rows

@@ -3,6 +3,7 @@
 import math
 import signal
 import time
+from collections import deque
 from contextlib import contextmanager
 
 import numpy as np
@@ -113,6 +114,12 @@ def waiting():
         yield graph, node, listener
 
 
+def moving(v):
+    """Return voltages, shape (N,), from the first to the last one that is not 0."""
+    at = np.flatnonzero(v)
+    return np.asarray(v)[at[0] : at[-1] + 1] if at.size else np.empty(0)
+
+
 class TestAnExciterThatWaits:
     def test_services_start_and_stop(self, waiting):
         graph, node, listener = waiting
@@ -150,9 +157,9 @@ class TestAnExciterThatWaits:
             listener.wait_for(len(wanted))
 
             def answered():
-                # The simulator may have been the last to connect.
-                effort = [list(state.effort) for state in states]
-                return effort and np.array_equal(effort, wanted[-len(effort) :])
+                # The simulator may have been the last to connect, and reports its rest before and after the drive.
+                told, all_wanted = (moving(v) for v in ([state.effort[0] for state in states], wanted[:, 0]))
+                return told.size and np.array_equal(told, all_wanted[-told.size :])
 
             graph.spin_until(answered, "the stage to do what it is told")
         np.testing.assert_array_equal(listener.v, wanted)
@@ -200,6 +207,38 @@ def test_a_signal_brings_the_stage_back(number):
     assert len(v) < 20.0 * RATE
 
 
+def test_it_ends_after_a_slow_stage_has_reported_the_last_voltage():
+    """Who stops the recorder when the exciter has ended has the memory at the end on record."""
+    behind, reported = 1.5, []
+    with on_graph() as graph, exciter(graph, **AT_ONCE, duration=3.0) as node:
+        due: deque[tuple[float, float]] = deque([(0.0, 0.0)])
+        publisher = graph.node.create_publisher(JointState, "stage_state", RELIABLE)
+        graph.node.create_subscription(
+            Float64MultiArray, "voltage_command",
+            lambda command: due.append((time.monotonic() + behind, command.data[0])), RELIABLE,
+        )  # fmt: skip
+
+        def report():
+            while len(due) > 1 and due[1][0] <= time.monotonic():
+                due.popleft()
+            publisher.publish(JointState(name=["x"], position=[0.0], effort=[due[0][1]]))
+            if node.process.poll() is None:
+                reported.append(due[0][1])
+
+        graph.node.create_timer(0.01, report)
+        assert wait_for_end(graph, node) == 0
+        assert "does not hold the end" not in node.stderr
+    assert max(reported) > 90.0 and reported[-1] == 0.0
+
+
+def test_a_stage_that_does_not_follow_is_told_at_the_end():
+    with on_graph() as graph, exciter(graph, **AT_ONCE, duration=1.0, start_voltage=10.0) as node:
+        publish_state(graph, x=40.0)
+        Listener(graph)
+        assert wait_for_end(graph, node) == 0
+        assert holds(node.stderr.splitlines()[-1], "stage_state", 40, 10)
+
+
 def test_a_stage_outside_the_limits_is_left_alone():
     with on_graph() as graph, exciter(graph, **AT_ONCE) as node:
         publish_state(graph, x=120.0)
@@ -208,6 +247,45 @@ def test_a_stage_outside_the_limits_is_left_alone():
         said = node.stderr.splitlines()[-1]
     assert said == "exciter: axis 'x' is at 120 V, outside 0 to 100 V; move it inside first"
     assert not listener.commands
+
+
+def test_it_drives_nothing_beside_another_publisher():
+    with on_graph() as graph:
+        graph.node.create_publisher(Float64MultiArray, "voltage_command", RELIABLE)
+        listener = Listener(graph)
+        with exciter(graph, **LIMITS, settle=0.5) as node:
+            assert wait_for_end(graph, node) == 1
+            assert holds(node.stderr.splitlines()[-1], "1 other publisher", "voltage_command")
+            assert "exciting" not in node.stderr
+    assert not listener.commands
+
+
+def test_it_returns_when_another_publisher_appears():
+    with on_graph() as graph, exciter(graph, **AT_ONCE, duration=30.0, slew_limit=400.0) as node:
+        listener = Listener(graph)
+        listener.wait_for_motion()
+        graph.node.create_publisher(Float64MultiArray, "voltage_command", RELIABLE)
+        assert wait_for_end(graph, node) == 1
+        assert holds(node.stderr.splitlines()[-1], "1 other publisher", "voltage_command")
+        v = listener.v
+    assert v[-1, 0] == pytest.approx(0.0, abs=1e-9) and v.max() > 60.0
+    assert fastest(v) <= 400.0 * (1 + 1e-9) and len(v) < 20.0 * RATE
+
+
+def test_without_autostart_it_stays_beside_another_publisher():
+    with on_graph() as graph, exciter(graph, **AT_ONCE, autostart=False) as node:
+        other = graph.node.create_publisher(Float64MultiArray, "voltage_command", RELIABLE)
+        listener = Listener(graph)
+        graph.spin_until(lambda: listener.publishers == 2, "both publishers")
+        call(graph, "start")
+        graph.spin_until(lambda: "other publisher" in node.stderr, "the refusal")
+        assert not listener.commands
+        graph.node.destroy_publisher(other)
+        graph.spin_until(lambda: listener.publishers == 1, "the other publisher to leave")
+        # It may take the exciter longer to see that than this process.
+        graph.spin_for(1.0)
+        assert call(graph, "start").success
+        listener.wait_for_motion()
 
 
 def test_a_drive_as_one_trajectory():

@@ -259,6 +259,28 @@ def test_a_bag_whose_recording_was_killed_is_told_once_and_stays_watched(tmp_pat
         assert values_of(healthy)["abandoned_bags"] == "0"
 
 
+def test_bags_that_no_message_can_name_and_pipes_are_skipped(tmp_path):
+    """Reported, counted, and the next bag is identified, also after a restart in the same folder."""
+    watched = tmp_path / "watched"
+    watched.mkdir()
+    for life in range(2):
+        with identifying(watch_directory=str(watched)) as client:
+            write_calibration(tmp_path / "bag")
+            (tmp_path / "bag").rename(os.fsdecode(os.path.join(os.fsencode(watched), b"caf\xe9 %d" % life)))
+            client.failed("caf\\udce9")
+            folder = Path(write_calibration(tmp_path / "pipe"))
+            (data,) = folder.glob("*.mcap")
+            data.unlink()
+            os.mkfifo(data)
+            folder.rename(watched / f"pipe{life}\x1b[2J")
+            client.failed("no regular file")
+            bag = Path(write_calibration(tmp_path / "good")).rename(watched / f"good{life}")
+            told = client.status(lambda status, bag=bag: values_of(status).get("x.source") == str(bag), "its model")
+            assert int(values_of(told)["failed"]) >= 2
+            assert "Traceback" not in client.node.stderr and "\x1b[2J" not in client.node.stderr
+            assert client.node.stop() == 0
+
+
 @pytest.mark.parametrize(
     ("other", "why"),
     [({"hardware_id": "stage 8"}, "stage 'stage 8'"), ({"axes": ("y",)}, "no axis 'x'")],

@@ -14,7 +14,7 @@ from nodes.compensator_client import PERIOD_NS, START_NS, compensator  # noqa: E
 import slpi_ros  # noqa: E402
 from slpi_ros.io.tables import import_table, read_table, write_table  # noqa: E402
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.minutes]
 
 
 @pytest.fixture

@@ -16,10 +16,11 @@ from std_msgs.msg import String  # noqa: E402
 from slpi_ros.compensator.persistence import model_id  # noqa: E402
 from slpi_ros.errors import ModelError  # noqa: E402
 from slpi_ros.hysteresis.loop_family import LoopFamily  # noqa: E402
+from slpi_ros.io.input_limits import TOPIC_MODEL_CHARACTERS  # noqa: E402
 from slpi_ros.model.document import format_model, parse_model  # noqa: E402
 from slpi_ros.model.stage_model import StageModel  # noqa: E402
 from slpi_ros.nodes import jobs as model_reading  # noqa: E402
-from slpi_ros.nodes.jobs import LARGEST, SMALL, Reading  # noqa: E402
+from slpi_ros.nodes.jobs import SMALL, Reading  # noqa: E402
 
 
 def fine_model(vertices: int, axes: tuple[str, ...] = ("x",)) -> StageModel:
@@ -46,7 +47,7 @@ def nothing_checked_here(monkeypatch):
 
 
 def test_a_stage_with_the_finest_models_has_a_document_that_is_not_too_large():
-    assert len(FINE) > SMALL and len(format_model(fine_model(161, ("x", "y", "z")))) < LARGEST
+    assert len(FINE) > SMALL and len(format_model(fine_model(161, ("x", "y", "z")))) < TOPIC_MODEL_CHARACTERS
     assert len(format_model(fine_model(41, ("x", "y")))) < SMALL
 
 
@@ -70,8 +71,8 @@ def test_a_small_document_needs_no_process(monkeypatch):
 
 
 def test_a_document_larger_than_any_stage_has_is_refused_at_once():
-    with pytest.raises(ModelError, match=f"here: {LARGEST + 1} .*{LARGEST}"):
-        Reading("x" * (LARGEST + 1), "here")
+    with pytest.raises(ModelError, match=f"here: {TOPIC_MODEL_CHARACTERS + 1} .*{TOPIC_MODEL_CHARACTERS}"):
+        Reading("x" * (TOPIC_MODEL_CHARACTERS + 1), "here")
 
 
 def test_a_reading_that_is_cancelled_comes_to_nothing(nothing_checked_here):

@@ -15,6 +15,7 @@ rclpy = pytest.importorskip("rclpy")
 from rclpy.context import Context  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 
@@ -54,12 +55,19 @@ class Bench:
     def connect(self, process: subprocess.Popen[str], axes: int) -> None:
         """Command rest until an answer comes: neither direction loses anything from then on."""
 
+        self.spin_until(self._commands.get_subscription_count, process)
+        # Before the first command the stage reports 0 V, so the answer is told by its voltage.
+        self.spin_until(lambda: bool(self.states), process)
+        before = len(self.states)
+
         def answered() -> bool:
-            if self._commands.get_subscription_count():
-                self.send(*[0.0] * axes)
-            return bool(self.states)
+            self.send(*[0.0] * axes)
+            return len(self.states) > before
 
         self.spin_until(answered, process)
+
+    def spin_once(self) -> None:
+        self._executor.spin_once(timeout_sec=0.02)
 
     def moved(self) -> list[JointState]:
         """Return the states after those that answered `connect`."""
@@ -174,6 +182,52 @@ def test_the_stage_of_the_mpi_paper_creeps_as_time_goes_by():
     assert all(late - early > 1e-7 for early, late in zip(first, later, strict=True))
 
 
+def test_it_publishes_from_its_start_on_and_answers_once_commanded():
+    with simulator(noise_rms=0.0, rate=200) as (bench, process):
+        bench.spin_until(lambda: len(bench.states) >= 20, process)
+        assert all(list(state.effort) == [0.0] for state in bench.states)
+        bench.connect(process, axes=1)
+        bench.send(30.0)
+        bench.spin_until(lambda: bool(bench.moved()), process)
+        for _ in range(20):
+            bench.spin_once()
+        assert len(bench.moved()) == 1
+
+
+def test_stage_time_runs_faster_on_request():
+    with simulator(noise_rms=0.0, rate=100, speed=20.0, creep=0.03) as (bench, process):
+        clocks = []
+        bench.node.create_subscription(Clock, "/clock", clocks.append, QOS)
+        bench.spin_until(lambda: len(clocks) >= 2, process)
+        begun, first = time.monotonic(), clocks[-1].clock
+        bench.spin_until(lambda: clocks[-1].clock.sec - first.sec >= 40, process)
+        # The clock is that of the stage, however late its messages are.
+        assert 3 * (time.monotonic() - begun) < 39
+        stamps = [state.header.stamp.sec for state in bench.states]
+        assert stamps[-1] - stamps[0] >= 4
+
+
+def test_a_character_is_drawn_from_the_seed_and_told_only_if_not_hidden():
+    told, readings = {}, {}
+    for character in ("drawn", "hidden"):
+        with simulator(noise_rms=0.0, seed=5, character=character, answer_commands=False) as (bench, process):
+            bench.spin_until(lambda bench=bench: len(bench.states) >= 3, process)
+            readings[character] = bench.states[0].header.frame_id
+            process.send_signal(signal.SIGINT)
+            _, told[character] = process.communicate(timeout=PATIENCE_S)
+    assert readings == {"drawn": "simulated-5-drawn", "hidden": "simulated-5-hidden"}
+    assert "Character(" in told["drawn"] and "Character(" not in told["hidden"]
+
+
+def test_effects_are_given_by_parameters_and_change_the_hardware_id():
+    ids = set()
+    for creep in (0.01, 0.02):
+        with simulator(creep=creep) as (bench, process):
+            bench.spin_until(lambda bench=bench: bool(bench.states), process)
+            ids.add(bench.states[0].header.frame_id)
+    assert len(ids) == 2 and all(name.startswith("simulated-0-") for name in ids)
+
+
 @pytest.mark.parametrize(
     ("parameters", "complaint"),
     [
@@ -187,6 +241,10 @@ def test_the_stage_of_the_mpi_paper_creeps_as_time_goes_by():
         ({"preset": "p11"}, "x, y"),
         ({"preset": "best"}, "'best'"),
         ({"answer_commands": "7"}, "answer_commands"),
+        ({"creep": -0.1}, "creep"),
+        ({"character": "shy"}, "'shy'"),
+        ({"speed": 0.0}, "speed"),
+        ({"preset": "p11", "axes": "['x', 'y']", "lag": 0.01}, "p11"),
     ],
 )
 def test_parameters_of_which_no_stage_can_be_made(parameters, complaint):

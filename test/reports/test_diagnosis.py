@@ -107,6 +107,20 @@ def test_spectrum_shows_the_line_and_the_floor(written):
     assert np.isclose(np.sqrt(np.mean(density[frequency > 5.0] ** 2)), floor[0], rtol=0.2)
 
 
+def test_a_parameter_less_certain_than_its_size_is_not_determined(tmp_path):
+    effects = [
+        replace(named, effect=replace(named.effect, uncertainty=uncertainty))
+        for named, uncertainty in zip(
+            found().effects,
+            ({"time_constants.0": 0.1, "gains.0": 1e4}, {"frequency": 0.01, "amplitude": 7e-8, "phase": 0.3}),
+            strict=True,
+        )
+    ]
+    text = write(tmp_path, {"x": found(effects=tuple(effects))}).read_text(encoding="utf-8")
+    assert "time_constants [1 ± 0.1]; gains [not determined]" in text
+    assert "frequency 50 ± 0.01; amplitude not determined; phase 0 ± 0.3" in text
+
+
 @pytest.mark.parametrize("verdict", [AMBIGUOUS, UNEXPLAINED])
 def test_other_verdicts(verdict, tmp_path):
     axis = found(verdict=verdict, effects=found().effects[:1] if verdict == AMBIGUOUS else (), after_rms=150e-9)

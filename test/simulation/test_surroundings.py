@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.hidden.physics import Hum, Interferometer, Temperature
+from benchmarks.hidden.physics import Temperature
+from slpi_ros.simulation.surroundings import Hum, Interferometer
 
 T = np.linspace(0, 60, 6001)
 

@@ -1,17 +1,76 @@
 // Draws each chart from the data beside it, one after the other, so that the page can be read meanwhile.
 "use strict";
 (function () {
-  const waiting = Array.from(document.querySelectorAll("figure.chart"));
+  const figures = Array.from(document.querySelectorAll("figure.chart"));
   const buttons = [["toImage"], ["zoom2d", "pan2d"], ["zoomIn2d", "zoomOut2d", "resetScale2d"]];
   const options = { responsive: true, displaylogo: false, modeBarButtons: buttons };
-  function next() {
-    const figure = waiting.shift();
-    if (!figure) {
-      document.body.dataset.drawn = "all";
-      return;
-    }
-    const { data, layout } = JSON.parse(figure.querySelector("script").textContent);
-    Plotly.newPlot(figure.querySelector("div"), data, layout, options).then(() => setTimeout(next));
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  // Colours that would not be seen on dark paper, and theirs: text, paper, grid, axes, shades.
+  const DARK = {
+    "#1b2733": "#dfe6ec", "#fff": "#14191f", "#e4e9ee": "#2b343d", "#b9c4ce": "#56636f", "#c9d2da": "#46525e",
+    "#fbeccb": "#43381c", "#e6cc94": "#a08447", "#3b6ea5": "#6ea3d8", "#2a7f62": "#43b58d", "#8d5fb0": "#b48ad6",
+  };
+  // Below this width (pixels) the panels of a row are placed one below the other; the width of a printed page.
+  const NARROW = 640, PRINTED = 690;
+  let printing = false;
+
+  function draw(figure) {
+    const div = figure.querySelector("div");
+    let text = figure.querySelector("script").textContent;
+    if (dark.matches && !printing)
+      text = text.replace(/"(#[0-9a-f]+)"/g, (all, colour) => `"${DARK[colour] || colour}"`);
+    const { data, layout } = JSON.parse(text);
+    if (dark.matches && !printing) for (const one of data) if (one.type === "heatmap") one.reversescale = true;
+    // What the reader has zoomed and hidden stays.
+    layout.uirevision = "kept";
+    if (printing) layout.width = PRINTED;
+    figure.dataset.narrow = !printing && figure.clientWidth < NARROW;
+    if (figure.dataset.narrow === "true") stack(data, layout);
+    div.style.minHeight = `${layout.height}px`;
+    const shown = { ...options, displayModeBar: figure.dataset.narrow === "true" ? false : "hover" };
+    return Plotly.react(div, data, layout, shown).then(() => fit(div, layout));
   }
-  next();
+
+  function stack(data, layout) {
+    layout.margin = { ...layout.margin, l: 70, r: 8 };
+    const rows = Object.keys(layout).filter((name) => /^xaxis\d*$/.test(name) && layout[name].domain);
+    rows.forEach((name, k) => {
+      const y = layout[name.replace("x", "y")];
+      const legend = data.filter((one) => one.colorbar && "x" + name.slice(5) === one.xaxis);
+      const top = 1 - k / rows.length - (k || legend.length ? 0.06 : 0), bottom = 1 - (k + 1) / rows.length + 0.12;
+      y.domain = [k + 1 < rows.length ? bottom : 0, top];
+      if (!y.title.text) y.title = { ...layout.yaxis.title };
+      layout[name].domain = [0, 1];
+      for (const one of legend) Object.assign(one.colorbar, { x: 0, len: 1, y: top + 0.03 });
+    });
+    layout.height *= rows.length > 1 ? 0.8 * rows.length : 1;
+  }
+
+  // Makes room for all lines of the legend.
+  function fit(div, layout) {
+    const legend = div.querySelector(".legend .bg");
+    const more = legend ? Math.max(0, legend.getBBox().height + 14 - layout.margin.t) : 0;
+    div.style.minHeight = `${layout.height + more}px`;
+    if (more !== div._fullLayout.margin.t - layout.margin.t)
+      return Plotly.relayout(div, { height: layout.height + more, "margin.t": layout.margin.t + more });
+  }
+
+  function again() {
+    for (const figure of figures) if ("narrow" in figure.dataset) draw(figure);
+  }
+  dark.addEventListener("change", again);
+  let width = 0;
+  new ResizeObserver(() => {
+    if (document.body.clientWidth !== width && !printing) {
+      width = document.body.clientWidth;
+      again();
+    }
+  }).observe(document.body);
+  window.addEventListener("beforeprint", () => { printing = true; again(); });
+  window.addEventListener("afterprint", () => { printing = false; again(); });
+
+  (function next(k) {
+    if (k < figures.length) draw(figures[k]).then(() => setTimeout(next, 0, k + 1));
+    else document.body.dataset.drawn = "all";
+  })(0);
 })();

@@ -1,0 +1,19 @@
+"""Stand-in for the interface of your amplifier and sensor: replace the body of the three methods."""
+
+import time
+
+from slpi_ros.simulation.stage import Stage
+
+
+class Device:
+    def __init__(self):
+        """Open the amplifier and the sensor."""
+        self._stage = Stage.random(["x"], seed=4, noise_rms=8e-9)
+
+    def write(self, voltage):
+        """Apply a voltage, volts."""
+        self._displacement = self._stage.step(time.monotonic(), [voltage])
+
+    def read(self):
+        """Return the measured displacement, metres."""
+        return self._stage.measure(self._displacement)[0]

@@ -1,0 +1,22 @@
+"""Send a sine of 5 um amplitude around 10 um, one period in a second, at 1 kHz."""
+
+import math
+
+import rclpy
+from rclpy.duration import Duration
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+RATE_HZ, SAMPLES = 1000, 1001
+
+rclpy.init()
+node = rclpy.create_node("planner")
+publisher = node.create_publisher(JointTrajectory, "desired_trajectory", 10)
+while not publisher.get_subscription_count():
+    rclpy.spin_once(node, timeout_sec=0.1)
+trajectory = JointTrajectory(joint_names=["x"])  # stamp 0: start at once
+for i in range(SAMPLES):
+    position = 10e-6 - 5e-6 * math.cos(2 * math.pi * i / RATE_HZ)
+    due = Duration(nanoseconds=i * 1_000_000_000 // RATE_HZ).to_msg()
+    trajectory.points.append(JointTrajectoryPoint(positions=[position], time_from_start=due))
+publisher.publish(trajectory)
+publisher.wait_for_all_acked(Duration(seconds=5))

@@ -1,0 +1,102 @@
+"""The choice of the next drive: the cheapest record that promises most of what is still open."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from slpi_ros.calibration.settings import CALIBRATION, EFFECT, CalibrationSettings
+from slpi_ros.diagnosis.result import AMBIGUOUS, SEPARATES, UNEXPLAINED, AxisDiagnosis
+from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
+from slpi_ros.excitation.effects import EFFECTS
+
+COUPLING = "cross_coupling"
+# Conditions that the calibration drive lacks, with the drive that has them and what it may reveal at least, as a share
+# of the error: long rest after quick moves, and small steps with time to ring down.
+UNCOVERED = {
+    "creep": (0.2, "no record holds the voltage for long after a quick move, where creep would show"),
+    "resonance": (0.2, "no record holds small quick steps, where a resonance, a delay or a lag would show"),
+}
+# A cause that is named is worth this part of its share until the drive for it has been recorded; nothing below
+# LEAST is worth a record. No drive is recorded more often than MOST.
+CONFIRMED, LEAST, MOST = 0.3, 0.05, 2
+# An error up to this multiple of the noise floor has nothing more to tell.
+AT_FLOOR = 1.5
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The next drive.
+
+    Parameters
+    ----------
+    drive : str
+        One of `slpi_ros.excitation.drives.DRIVES`.
+    axes : tuple of str
+        Axes that move.
+    seconds : float
+        Duration.
+    why : str
+        What is open and how this record helps.
+    """
+
+    drive: str
+    axes: tuple[str, ...]
+    seconds: float
+    why: str
+
+
+def next_drive(
+    settings: CalibrationSettings,
+    found: Mapping[str, AxisDiagnosis] | None,
+    recorded: Sequence[tuple[str, Sequence[str]]],
+    left: float,
+) -> Choice | None:
+    """Return the drive with the largest promise per second, or None if none is worth its time.
+
+    The promise of a drive is the share of the mean square error of an axis that it may explain. One axis moves in each,
+    so that the others need not be diagnosed on it; only coupling takes them all.
+
+    Parameters
+    ----------
+    settings : CalibrationSettings
+    found : mapping of axis name to AxisDiagnosis, or None
+        Diagnosis of all records so far; None if there is none yet.
+    recorded : sequence of (str, sequence of str)
+        Name and axes of each drive recorded so far.
+    left : float, seconds
+        Time left for drives.
+    """
+    best, chosen = 0.0, None
+    for axis in settings.axes:
+        for drive, promise, why in _promises(found[axis] if found else None):
+            known = sum(name == drive and axis in axes for name, axes in recorded)
+            if known >= (MOST if found else 1):
+                continue
+            axes = settings.axes if drive == COUPLING else (axis,)
+            seconds = (CALIBRATION if drive == CALIBRATION_DRIVE else EFFECT) * len(axes)
+            if seconds <= left and promise > LEAST and promise / seconds > best:
+                best = promise / seconds
+                chosen = Choice(drive, axes, seconds, f"axis {axis}: {why}")
+    return chosen
+
+
+def _promises(found: AxisDiagnosis | None) -> list[tuple[str, float, str]]:
+    """Return drives, the share of the error that each may explain, and why."""
+    if found is None:
+        return [(drive, share, why) for drive, (share, why) in UNCOVERED.items()]
+    offers = []
+    if found.verdict == AMBIGUOUS:
+        for named in found.effects:
+            if named.alternatives:
+                names = {named.name, *named.alternatives}
+                drive = next((chosen for pair, chosen in SEPARATES if pair <= names), named.name)
+                others = ", ".join(named.alternatives)
+                offers.append((drive, named.share_of_residual, f"{named.name} may as well be {others}"))
+    if found.verdict == UNEXPLAINED and found.after_rms > AT_FLOOR * found.floor_rms:
+        share = 1.0 - (found.floor_rms / found.after_rms) ** 2
+        offers.append((CALIBRATION_DRIVE, share, "an error that no known cause explains; more loops of every size"))
+    if found.after_rms > AT_FLOOR * found.floor_rms:
+        for named in found.effects:
+            if not named.alternatives and named.name in EFFECTS:
+                share = CONFIRMED * named.share_of_residual
+                offers.append((named.name, share, f"{named.name} is named; a drive of its own tells its parameters"))
+    return offers

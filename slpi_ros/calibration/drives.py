@@ -1,0 +1,266 @@
+"""The drives of a calibration: within all limits, from rest to rest; the verification goes through the compensator."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.calibration.settings import CHECK, VERIFICATION, CalibrationSettings
+from slpi_ros.compensator.controller import Controller
+from slpi_ros.errors import UsageError
+from slpi_ros.excitation.drives import SWEEP, Drive, excite
+from slpi_ros.excitation.legs import DriveSpec, Path
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.stage_model import StageModel
+
+FloatArray = NDArray[np.float64]
+
+# Share of the voltage range that the check moves, and share of the slew limit that drives use: a late sample is
+# followed by an early one.
+CHECK_MOVE, SLEW_USED = 0.1, 0.8
+# The verification stays within these shares of the displacement range, at mean speeds between these, ranges/s.
+INNER, SPEEDS = (0.04, 0.94), (0.15, 0.8)
+# Steepest slope of the inverse relative to its mean slope, for the speed of a path under a slew limit.
+STEEPEST_INVERSE = 2.5
+# Duration of the sweep before a verification and of the return after it, seconds, if the slew limit allows it.
+SWEEP_SECONDS, RETURN_SECONDS = 4.0, 1.0
+# Time to wait for a goal that the limiter has not reached at the end of a drive, as a share of the drive; share of the
+# voltage range within which it is reached.
+PATIENCE, CLOSE = 1.0, 1e-6
+# A drive that is too short for its slew limit is made longer by this factor, at most this many times.
+LONGER, LENGTHENINGS = 1.4, 8
+# Start of the stamps for the compensator: not 0, which means none, nanoseconds.
+FIRST_STAMP = SECOND_NS
+
+
+def exciting(settings: CalibrationSettings, drive: str, duration: float, axes: Sequence[str], seed: int) -> Drive:
+    """Return an excitation drive of some axes, while the others rest.
+
+    Parameters
+    ----------
+    settings : CalibrationSettings
+    drive : str
+        One of `slpi_ros.excitation.drives.DRIVES`.
+    duration : float, seconds
+        Duration of the whole drive, which the axes share; longer if the slew limit requires it.
+    axes : sequence of str
+        Axes that move.
+    seed : int
+
+    Returns
+    -------
+    Drive
+        Voltages of all axes of the settings.
+    """
+    places = [settings.axes.index(axis) for axis in axes]
+    limits = [settings.limits[place] for place in places]
+
+    def moving(seconds: float) -> Drive:
+        return excite(
+            axes,
+            voltage_min=[each.lower for each in limits],
+            voltage_max=[each.upper for each in limits],
+            slew_limit=[_slew(each) for each in limits],
+            start=[settings.rest[place] for place in places],
+            duration=seconds,
+            rate=settings.rate,
+            seed=seed,
+            drive=drive,
+        )
+
+    for _ in range(LENGTHENINGS):
+        try:
+            return _with_resting(settings, moving(duration))
+        except UsageError:
+            # A low slew limit needs more time.
+            duration *= LONGER
+    return _with_resting(settings, moving(duration))
+
+
+def checking(settings: CalibrationSettings) -> Drive:
+    """Return a drive that moves one axis after the other a little, to see whether the stage follows and in which sense.
+
+    Parameters
+    ----------
+    settings : CalibrationSettings
+
+    Returns
+    -------
+    Drive
+    """
+    moves = []
+    for limits, rest in zip(settings.limits, settings.rest, strict=True):
+        spec = _spec(limits, CHECK, settings.rate)
+        start = (rest - limits.lower) / spec.span
+        path = Path(start)
+        for to in (start + CHECK_MOVE if start < 0.5 else start - CHECK_MOVE, start):
+            path.to(to, 0.3 * CHECK)
+            path.hold(0.2 * CHECK)
+        shortest = float(path.fewest_steps(spec).sum()) / spec.rate
+        moves.append(path.voltages(replace(spec, duration=max(CHECK, shortest)))[1:])
+    ends = np.cumsum([0, *(move.size for move in moves)])
+    voltage = {}
+    for number, (axis, rest) in enumerate(zip(settings.axes, settings.rest, strict=True)):
+        voltage[axis] = np.full(ends[-1] + 1, rest)
+        voltage[axis][ends[number] + 1 : ends[number + 1] + 1] = moves[number]
+    return _drive(settings, voltage, "Does the voltage follow the command, and the displacement the voltage?")
+
+
+def compensated(settings: CalibrationSettings, model: StageModel, seed: int) -> tuple[Drive, dict[str, FloatArray]]:
+    """Return a drive along a random path through the compensator, after a sweep that makes the memory known.
+
+    Parameters
+    ----------
+    settings : CalibrationSettings
+    model : StageModel
+        Model that the compensator uses.
+    seed : int
+        Seed of the path.
+
+    Returns
+    -------
+    drive : Drive
+    desired : dict of axis name to ndarray, shape (N,), metres
+        Desired displacement at the samples of the drive; NaN in the sweep before and the return after the path.
+    """
+    sweep = exciting(settings, SWEEP, _sweep_seconds(settings), settings.axes, seed)
+    swept = np.column_stack(list(sweep.voltage.values()))
+    controller = Controller(settings.axes, settings.limits)
+    controller.use_model(model, start_memory="wiped")
+    dt = 1.0 / settings.rate
+    for row in swept.tolist():
+        for axis, v in zip(controller.axes, row, strict=True):
+            axis.stream.drive(v, dt)
+    controller.configure()
+    controller.activate(FIRST_STAMP)
+    rng = np.random.default_rng([settings.seed, seed, 99])
+    paths = [
+        _path(settings, model, place, axis.stream.uncoupled_displacement, rng)
+        for place, axis in enumerate(controller.axes)
+    ]
+    longest = max(path.size for path in paths)
+    paths = [np.pad(path, (0, longest - path.size), mode="edge") for path in paths]
+    rows = np.empty((longest, len(paths)))
+    for index, desired in enumerate(np.column_stack(paths).tolist()):
+        stamp = FIRST_STAMP + round((index + 1) * dt * SECOND_NS)
+        controller.update(stamp, settings.axes, desired, stamp)
+        rows[index] = controller.voltages
+    back = _returns(settings, rows[-1])
+    voltage = dict(zip(settings.axes, np.concatenate([swept, rows, back]).T, strict=True))
+    gap = np.full(len(swept), np.nan), np.full(len(back), np.nan)
+    wanted = {axis: np.concatenate([gap[0], y, gap[1]]) for axis, y in zip(settings.axes, paths, strict=True)}
+    why = "A path that no record holds, through the compensator: what the model is worth."
+    drive = _drive(settings, voltage, why, limited=False)
+    return drive, {axis: np.pad(y, (0, drive.t.size - y.size), constant_values=np.nan) for axis, y in wanted.items()}
+
+
+def _path(
+    settings: CalibrationSettings, model: StageModel, place: int, begin: float, rng: np.random.Generator
+) -> FloatArray:
+    """Return desired displacements, shape (N,), metres, from `begin` (m) through random levels at random speeds."""
+    axis, limits = model.axis(settings.axes[place]), settings.limits[place]
+    low, high = axis.displacement_range
+    bottom, top = (low + share * (high - low) for share in INNER)
+    spec = DriveSpec(0.0, 1.0, VERIFICATION, settings.rate)
+    path, spent = Path(float(np.clip((begin - bottom) / (top - bottom), -0.2, 1.2))), 0.0
+    while True:
+        to = float(rng.uniform(0.0, 1.0))
+        span = abs(to - path.at)
+        seconds = max(span, 0.05) / float(np.exp(rng.uniform(*np.log(SPEEDS))))
+        seconds = max(seconds, _quickest(limits, STEEPEST_INVERSE * span))
+        if spent + seconds > VERIFICATION and path.legs:
+            break
+        path.to(to, seconds)
+        spent += seconds
+    # At rest at the end, so that the return to the rest voltage begins without a jump of the rate.
+    if spent < VERIFICATION:
+        path.hold(VERIFICATION - spent)
+    return bottom + (top - bottom) * _shares(path, spec)
+
+
+def _shares(path: Path, spec: DriveSpec) -> FloatArray:
+    """Return the path, shape (N,), without its first sample; unlike that of voltages it may start outside 0..1."""
+    ends = np.cumsum([leg.seconds for leg in path.legs])
+    t = np.arange(1, round(max(float(ends[-1]), spec.duration) * spec.rate) + 1) / spec.rate
+    levels = np.array([path.start, *(leg.to for leg in path.legs)])
+    leg = np.minimum(np.searchsorted(ends, t), ends.size - 1)
+    phase = np.clip(1.0 - (ends[leg] - t) / np.diff(ends, prepend=0.0)[leg], 0.0, 1.0)
+    return np.asarray(levels[leg] + (levels[leg + 1] - levels[leg]) * (1.0 - np.cos(np.pi * phase)) / 2.0)
+
+
+def _returns(settings: CalibrationSettings, present: FloatArray) -> FloatArray:
+    """Return the voltages (V) from the last ones to rest, shape (n, axes)."""
+    moves = list(zip(settings.limits, present.tolist(), settings.rest, strict=True))
+    seconds = max(
+        RETURN_SECONDS, *(_quickest(limits, abs(rest - v) / (limits.upper - limits.lower)) for limits, v, rest in moves)
+    )
+    phase = np.arange(1, round(seconds * settings.rate) + 1) / round(seconds * settings.rate)
+    way = (1.0 - np.cos(np.pi * phase)) / 2.0
+    return np.column_stack([v + (rest - v) * way for _, v, rest in moves])
+
+
+def _sweep_seconds(settings: CalibrationSettings) -> float:
+    """Return the duration (s) of the sweep of all axes."""
+    slowest = max(_quickest(limits, 1.0) for limits in settings.limits)
+    return len(settings.axes) * max(SWEEP_SECONDS, 5.0 * slowest)
+
+
+def _quickest(limits: Limits, span: float) -> float:
+    """Return the shortest duration (s) of a raised cosine over a `span` of the voltage range (share)."""
+    way = span * (limits.upper - limits.lower)
+    by_slew = math.pi / 2 * way / (SLEW_USED * limits.slew)
+    return max(by_slew, math.pi * math.sqrt(way / (2 * SLEW_USED * limits.acceleration)))
+
+
+def _slew(limits: Limits) -> float:
+    """Return the slew rate (V/s) for a drive; 0: no limit."""
+    return SLEW_USED * limits.slew if np.isfinite(limits.slew) else 0.0
+
+
+def _spec(limits: Limits, duration: float, rate: float) -> DriveSpec:
+    return DriveSpec(limits.lower, limits.upper, duration, rate, _slew(limits))
+
+
+def _with_resting(settings: CalibrationSettings, moving: Drive) -> Drive:
+    voltage = {
+        axis: moving.voltage.get(axis, np.full(moving.t.size, rest))
+        for axis, rest in zip(settings.axes, settings.rest, strict=True)
+    }
+    return _drive(settings, voltage, moving.why)
+
+
+def _drive(settings: CalibrationSettings, voltage: dict[str, FloatArray], why: str, *, limited: bool = True) -> Drive:
+    """Return a drive, rate-limited unless it already is."""
+    if limited:
+        columns = [
+            _limited(v, limits, settings.rate) for v, limits in zip(voltage.values(), settings.limits, strict=True)
+        ]
+        longest = max(column.size for column in columns)
+        voltage = {
+            axis: np.pad(column, (0, longest - column.size), mode="edge")
+            for axis, column in zip(settings.axes, columns, strict=True)
+        }
+    size = voltage[settings.axes[0]].size
+    specs = {
+        axis: _spec(limits, (size - 1) / settings.rate, settings.rate)
+        for axis, limits in zip(settings.axes, settings.limits, strict=True)
+    }
+    return Drive(np.arange(size) / settings.rate, voltage, specs, why)
+
+
+def _limited(v: FloatArray, limits: Limits, rate: float) -> FloatArray:
+    """Return the voltages (V) within slew and acceleration limits; longer if the end is reached late."""
+    if not np.isfinite(limits.acceleration):
+        return np.clip(v, limits.lower, limits.upper)
+    limiter, dt = RateLimiter(limits), 1.0 / rate
+    goals = [*v.tolist(), *[float(v[-1])] * int(PATIENCE * v.size)]
+    out, before = [goals[0]], goals[0]
+    for index, goal in enumerate(goals[1:], 1):
+        if index >= v.size and abs(goal - out[-1]) <= CLOSE * (limits.upper - limits.lower):
+            break
+        out.append(limiter.step(out[-1], goal, dt, before))
+        before = goal
+    return np.array(out)

@@ -1,0 +1,516 @@
+"""A whole calibration, from top to bottom: check, record, identify, verify, diagnose, choose the next drive, again.
+
+`calibrate` is given a function that drives the stage and returns the record; it knows neither ROS nor files. Given the
+same records it takes the same decisions, so a calibration that was interrupted goes on where its records end.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.calibration.choice import next_drive
+from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, exciting
+from slpi_ros.calibration.settings import CALIBRATION, VERIFICATION, CalibrationSettings
+from slpi_ros.diagnosis.diagnose import diagnose
+from slpi_ros.diagnosis.result import AxisDiagnosis, Diagnosis
+from slpi_ros.effects.base import EffectContext
+from slpi_ros.effects.chain import reaching
+from slpi_ros.errors import RecordError
+from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
+from slpi_ros.excitation.drives import SWEEP, Drive
+from slpi_ros.identification.fit import identify
+from slpi_ros.identification.signal_statistics import noise
+from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import StageModel
+
+FloatArray = NDArray[np.float64]
+
+CHECK_DRIVE, VERIFICATION_DRIVE = "check", "verification"
+# A voltage follows if the applied range is the commanded one within this share; a displacement if it moves by this
+# multiple of its noise.
+FOLLOWS, MOVES = 0.2, 10.0
+# Effects that follow time and not the voltage, or that come before it: no compensation without feedback undoes them.
+NOT_UNDONE = ("delay", "thermal_drift", "gain_drift", "hum")
+# Rest before the first move of an axis that is diagnosed with it, seconds.
+REST_BEFORE = 0.5
+# Rounds of diagnosis and verification, at most.
+MOST_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What the stage did during one drive.
+
+    Parameters
+    ----------
+    record : Record
+    desired : mapping of axis name to ndarray, shape (N,), metres
+        Desired displacement at the samples of the record, NaN where there was none; empty without compensator.
+    """
+
+    record: Record
+    desired: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class Request:
+    """A drive to be recorded.
+
+    Parameters
+    ----------
+    name : str
+        Name of the record, unique within a calibration.
+    drive : Drive
+    desired : mapping of axis name to ndarray, shape (N,), metres
+        Desired displacement at the samples of the drive; empty without compensator.
+    """
+
+    name: str
+    drive: Drive
+    desired: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class TrackingError:
+    """Error of the compensated stage on one path, measured - desired without its median.
+
+    Parameters
+    ----------
+    mean, rms, maximum : float, metres
+        Of the magnitude.
+    offset : float, metres
+        Median that was removed.
+    stroke : float, metres
+        Displacement range of the model.
+    goal : float, metres
+        Largest mean error that meets the target.
+    t : ndarray, shape (N,), seconds
+        Time of the samples along the path, from the first stamp of the record.
+    desired, error : ndarray, shape (N,), metres
+        Desired displacement, and measured - desired without the offset.
+    """
+
+    mean: float
+    rms: float
+    maximum: float
+    offset: float
+    stroke: float
+    goal: float
+    t: FloatArray
+    desired: FloatArray
+    error: FloatArray
+
+    @property
+    def met(self) -> bool:
+        """Whether the error meets the target."""
+        return self.mean <= self.goal
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a calibration.
+
+    Parameters
+    ----------
+    name : str
+        Name of the record, or of the computation.
+    seconds : float
+        Duration of the drive; 0 for a computation.
+    why : str
+        Why this step.
+    taught : str
+        What it taught.
+    errors : mapping of axis name to TrackingError
+        Errors if the step was a verification, else empty.
+    """
+
+    name: str
+    seconds: float
+    why: str
+    taught: str = ""
+    errors: Mapping[str, TrackingError] | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of a calibration.
+
+    Parameters
+    ----------
+    settings : CalibrationSettings
+    model : StageModel
+        Model with the lowest verified error.
+    errors : mapping of axis name to TrackingError
+        Its verified errors.
+    diagnosis : Diagnosis
+        Last diagnosis, of all records before the last verification.
+    steps : tuple of Step
+    why : str
+        Why the target is met or not, and why the calibration ended, in one line.
+    """
+
+    settings: CalibrationSettings
+    model: StageModel
+    errors: Mapping[str, TrackingError]
+    diagnosis: Diagnosis
+    steps: tuple[Step, ...]
+    why: str
+
+    @property
+    def met(self) -> bool:
+        """Whether every axis meets the target."""
+        return all(error.met for error in self.errors.values())
+
+    @property
+    def seconds(self) -> float:
+        """Sum of the durations of all drives, seconds."""
+        return sum(step.seconds for step in self.steps)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress of a calibration.
+
+    Parameters
+    ----------
+    doing : str
+        Present step.
+    step : int
+        Its number, from 1.
+    seconds_left : float
+        Time left for drives.
+    error : float or None, metres
+        Largest verified mean error so far; None before the first verification.
+    """
+
+    doing: str
+    step: int
+    seconds_left: float
+    error: float | None
+
+
+Recorder = Callable[[Request], Recording]
+
+
+def calibrate(
+    settings: CalibrationSettings, record: Recorder, report: Callable[[Progress], None] = lambda progress: None
+) -> Outcome:
+    """Calibrate a stage by itself.
+
+    Parameters
+    ----------
+    settings : CalibrationSettings
+    record : callable
+        Drives the stage and returns what it did; an exception ends the calibration.
+    report : callable, optional
+        Called at the beginning of each step.
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    SlpiError
+        If the stage does not follow the voltages, or the records allow no model.
+    """
+    return _Calibration(settings, record, report).run()
+
+
+class _Calibration:
+    def __init__(self, settings: CalibrationSettings, record: Recorder, report: Callable[[Progress], None]) -> None:
+        self._settings, self._record, self._report = settings, record, report
+        self._steps: list[Step] = []
+        self._records: list[Record] = []
+        self._drives: list[tuple[str, Sequence[str]]] = []
+        # Noise floor of each axis, metres, best known so far: what a diagnosis explains is no noise.
+        self._floors: dict[str, float] = {}
+        # Model and errors of each verification.
+        self._verified: list[tuple[StageModel, dict[str, TrackingError]]] = []
+
+    def run(self) -> Outcome:
+        settings = self._settings
+        self._check()
+        if len(settings.axes) > 1:
+            self._sweep()
+        self._excite(
+            CALIBRATION_DRIVE, settings.axes, CALIBRATION * len(settings.axes),
+            "all loops that a path may visit, after a sweep that makes the memory known",
+        )  # fmt: skip
+        first = self._identify()
+        self._verify(first)
+        self._survey()
+        ended = "no further record promises to tell more"
+        for _ in range(MOST_ROUNDS):
+            diagnosis = self._diagnose(first)
+            while choice := next_drive(settings, diagnosis.axes, self._drives, self._left):
+                self._excite(choice.drive, choice.axes, choice.seconds, choice.why)
+                diagnosis = self._diagnose(first)
+            if self._left < 0.0:
+                ended = "the time budget is spent"
+                break
+            if all(error.met for error in self._verify(diagnosis.extended).values()):
+                break
+        goals = {axis: settings.goal(floor) for axis, floor in self._floors.items()}
+        judged = [
+            (model, {axis: replace(error, goal=goals[axis]) for axis, error in errors.items()})
+            for model, errors in self._verified
+        ]
+        model, errors = min(judged, key=lambda pair: max(error.mean / error.goal for error in pair[1].values()))
+        model = _left_at(model, self._records[-1])
+        return Outcome(settings, model, errors, diagnosis, tuple(self._steps), _why(errors, diagnosis, ended))
+
+    @property
+    def _left(self) -> float:
+        """Time (s) left for drives before the last verification."""
+        verification = max((step.seconds for step in self._steps if step.errors), default=VERIFICATION)
+        return self._settings.budget - self._used - verification
+
+    @property
+    def _used(self) -> float:
+        """Sum of the durations of all drives so far, seconds."""
+        return sum(step.seconds for step in self._steps)
+
+    def _begin(self, doing: str) -> None:
+        errors = self._verified[-1][1] if self._verified else {}
+        worst = max((error.mean for error in errors.values()), default=None)
+        left = max(self._settings.budget - self._used, 0.0)
+        self._report(Progress(doing, len(self._steps) + 1, left, worst))
+
+    def _recorded(self, kind: str, drive: Drive, desired: Mapping[str, FloatArray]) -> Recording:
+        name = f"{len(self._steps) + 1:02d}_{kind}"
+        self._begin(f"recording {name}")
+        recording = self._record(Request(name, drive, desired))
+        return recording
+
+    def _check(self) -> None:
+        drive = checking(self._settings)
+        record = self._recorded(CHECK_DRIVE, drive, {}).record
+        taught = [_follows(axis, drive, record) for axis in self._settings.axes]
+        self._steps.append(Step(record.source, float(drive.t[-1]), drive.why, "; ".join(taught)))
+
+    def _sweep(self) -> None:
+        """Sweep all axes, so that those that wait for their turn in the calibration drive rest in a known state."""
+        axes = self._settings.axes
+        drive = exciting(self._settings, SWEEP, SWEEP_SECONDS * len(axes), axes, self._settings.seed)
+        record = self._recorded(SWEEP, drive, {}).record
+        self._steps.append(
+            Step(record.source, float(drive.t[-1]), "an axis that waits rests in a known state", drive.why)
+        )
+
+    def _excite(self, kind: str, axes: Sequence[str], seconds: float, why: str) -> None:
+        drive = exciting(self._settings, kind, seconds, axes, self._settings.seed + len(self._steps))
+        record = self._recorded(kind, drive, {}).record
+        self._records.append(record)
+        self._drives.append((kind, axes))
+        self._steps.append(Step(record.source, float(drive.t[-1]), why, drive.why))
+
+    def _identify(self) -> StageModel:
+        self._begin("identifying the hysteresis")
+        model = identify(self._records)
+        self._floors = {name: axis.quality.floor_rms for name, axis in model.axes.items()}
+        said = "; ".join(
+            f"axis {name}: held-out error {axis.quality.held_out_rms * 1e9:.3g} nm rms, "
+            f"noise floor {axis.quality.floor_rms * 1e9:.3g} nm"
+            for name, axis in model.axes.items()
+        )
+        self._steps.append(Step("identify", 0.0, "a first model, of hysteresis alone", said))
+        return model
+
+    def _survey(self) -> None:
+        """Record the conditions that the calibration drive lacks, as far as the budget allows."""
+        while choice := next_drive(self._settings, None, self._drives, self._left):
+            self._excite(choice.drive, choice.axes, choice.seconds, choice.why)
+
+    def _diagnose(self, first: StageModel) -> Diagnosis:
+        count = len(self._records)
+        self._begin(f"diagnosing {count} records")
+        diagnosis = _diagnosed(self._records, first)
+        self._floors = {name: found.floor_rms for name, found in diagnosis.axes.items()}
+        taught = "; ".join(f"axis {name}: {found.summary}" for name, found in diagnosis.axes.items())
+        self._steps.append(
+            Step("diagnose", 0.0, f"causes of the error, judged on each of {count} records held out in turn", taught)
+        )
+        return diagnosis
+
+    def _verify(self, model: StageModel) -> dict[str, TrackingError]:
+        drive, desired = compensated(self._settings, model, len(self._steps))
+        recording = self._recorded(VERIFICATION_DRIVE, drive, desired)
+        errors = {
+            axis: tracking_error(recording, axis, model, self._settings.goal(self._floors[axis]))
+            for axis in self._settings.axes
+        }
+        taught = "; ".join(
+            f"axis {axis}: mean error {error.mean * 1e9:.3g} nm ({error.mean / error.stroke:.3%} of the stroke), "
+            f"maximum {error.maximum * 1e9:.3g} nm"
+            for axis, error in errors.items()
+        )
+        self._records.append(recording.record)
+        self._steps.append(Step(recording.record.source, float(drive.t[-1]), drive.why, taught, errors))
+        self._verified.append((model, errors))
+        return errors
+
+
+def _diagnosed(records: Sequence[Record], model: StageModel) -> Diagnosis:
+    """Diagnose each axis on the records in which it moves."""
+    found, extended = {}, {}
+    for axis in model.axes:
+        moving = [_from_first_move(record, axis) for record in records if np.ptp(record.voltage[axis]) > 0.0]
+        one = diagnose(moving, model, axes=[axis])
+        found[axis], extended[axis] = one.axes[axis], one.extended.axes[axis]
+    source = ", ".join(record.source for record in records)
+    return Diagnosis(found, replace(one.extended, axes=extended), source)
+
+
+def _from_first_move(record: Record, axis: str) -> Record:
+    """Return the record from shortly before the first move of an axis on.
+
+    A long rest before tells nothing of the hysteresis, but keeps the initial history open while other axes couple in.
+    """
+    v = record.voltage[axis]
+    first = int(np.flatnonzero(np.abs(v - v[0]) > 0.0)[0])
+    begin = max(int(np.searchsorted(record.t, record.t[first] - REST_BEFORE)), 0)
+    voltage, displacement = (
+        {name: x[begin:] for name, x in signals.items()} for signals in (record.voltage, record.displacement)
+    )
+    return replace(record, time_ns=record.time_ns[begin:], voltage=voltage, displacement=displacement)
+
+
+def _left_at(model: StageModel, last: Record) -> StageModel:
+    """Return the model with the memory at the end of the last record, where the stage has been left."""
+    axes = {}
+    for name, axis in model.axes.items():
+        v = last.voltage[name]
+        known = np.isfinite(v)
+        u, _ = reaching(axis.chain.before, v[known], EffectContext(last.t[known]))
+        axes[name] = replace(axis, end=axis.after(u, "end"))
+    return replace(model, axes=axes)
+
+
+def _follows(axis: str, drive: Drive, record: Record) -> str:
+    """Return what the check has shown of an axis; RecordError if it does not follow."""
+    record.require_axis(axis)
+    v, y = record.voltage[axis], record.displacement[axis]
+    known = np.isfinite(v) & np.isfinite(y)
+    if np.count_nonzero(known) < 20:
+        raise RecordError(f"axis '{axis}': {np.count_nonzero(known)} readings during the check; check stage_state")
+    v, y = v[known], y[known]
+    wanted, applied = float(np.ptp(drive.voltage[axis])), float(np.ptp(v))
+    if abs(applied - wanted) > FOLLOWS * wanted:
+        raise RecordError(
+            f"axis '{axis}': the applied voltage moved by {applied:.3g} V, the command by {wanted:.3g} V; check the "
+            "amplifier, the order of the axes, and that effort is in volts"
+        )
+    by_chance = noise(y)
+    slope = float(np.cov(v, y)[0, 1] / np.var(v))
+    if abs(slope) * applied < MOVES * by_chance:
+        raise RecordError(
+            f"axis '{axis}': the displacement moved by {abs(slope) * applied:.3g} m for {applied:.3g} V, with noise of "
+            f"{by_chance:.3g} m; check the sensor and the order of the axes"
+        )
+    if slope < 0.0:
+        raise RecordError(
+            f"axis '{axis}': the displacement falls by {-slope * applied:.3g} m when the voltage rises by "
+            f"{applied:.3g} V; change the sign of the displacement in the driver"
+        )
+    return f"axis {axis} follows with {slope * 1e6:.3g} um/V"
+
+
+def tracking_error(recording: Recording, axis: str, model: StageModel, goal: float) -> TrackingError:
+    """Return the error of an axis along the path of a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        With desired displacements.
+    axis : str
+    model : StageModel
+        Model that the compensator used.
+    goal : float, metres
+        Largest mean error that meets the target.
+
+    Raises
+    ------
+    RecordError
+        If there are no readings along the path.
+    """
+    record, desired = recording.record, recording.desired[axis]
+    error = record.displacement[axis] - desired
+    along = np.isfinite(error)
+    if not along.any():
+        raise RecordError(f"{record.source}: axis '{axis}': no readings along the path; check stage_state")
+    offset = float(np.median(error[along]))
+    left = error[along] - offset
+    low, high = model.axis(axis).displacement_range
+    return TrackingError(
+        mean=float(np.abs(left).mean()),
+        rms=float(np.sqrt(np.mean(left**2))),
+        maximum=float(np.abs(left).max()),
+        offset=offset,
+        stroke=high - low,
+        goal=goal,
+        t=record.t[along],
+        desired=desired[along],
+        error=left,
+    )
+
+
+def aligned(
+    record: Record, sent_ns: NDArray[np.int64], commands: Mapping[str, FloatArray], desired: Mapping[str, FloatArray]
+) -> Recording:
+    """Return a recording whose desired displacements belong to the applied voltages.
+
+    Commands take some time to the stage and readings some time back. The delay between commanded and applied voltages
+    is removed, so that only what the stage itself does is left.
+
+    Parameters
+    ----------
+    record : Record
+    sent_ns : ndarray of int64, shape (M,), nanoseconds
+        Stamps of the commands, on the clock of the record.
+    commands : mapping of axis name to ndarray, shape (M,), volts
+    desired : mapping of axis name to ndarray, shape (M,), metres
+        NaN where there was none.
+    """
+    if not desired:
+        return Recording(record, {})
+    t = (record.time_ns - sent_ns[0]) * 1e-9
+    sent = (sent_ns - sent_ns[0]) * 1e-9
+    shift = _transport(t, sent, record, commands)
+    return Recording(record, {axis: np.interp(t - shift, sent, y) for axis, y in desired.items()})
+
+
+# Longest delay from a command to its reading (s) that is looked for, and the steps of the search.
+LONGEST, FINE = 0.2, 1e-4
+
+
+def _transport(t: FloatArray, sent: FloatArray, record: Record, commands: Mapping[str, FloatArray]) -> float:
+    """Return the delay (s) of the applied voltages behind the commanded ones."""
+
+    def miss(shift: float) -> float:
+        return sum(
+            float(np.nanmean(np.abs(record.voltage[axis] - np.interp(t - shift, sent, v))))
+            for axis, v in commands.items()
+        )
+
+    shifts = np.arange(-0.02, LONGEST, 2e-3)
+    best = float(shifts[int(np.argmin([miss(shift) for shift in shifts.tolist()]))])
+    fine = best + np.arange(-2e-3, 2e-3, FINE)
+    return float(fine[int(np.argmin([miss(shift) for shift in fine.tolist()]))])
+
+
+def _why(errors: Mapping[str, TrackingError], diagnosis: Diagnosis, ended: str) -> str:
+    """Return one line: error and target of the worst axis, and what stands in the way."""
+    name, worst = max(errors.items(), key=lambda item: item[1].mean / item[1].goal)
+    said = (
+        f"axis {name}: mean error {worst.mean * 1e9:.3g} nm ({worst.mean / worst.stroke:.3%} of the stroke), "
+        f"target {worst.goal * 1e9:.3g} nm"
+    )
+    if worst.met:
+        return f"target met; {said}"
+    found: AxisDiagnosis = diagnosis.axes[name]
+    lasting = [each.name for each in found.effects if each.name in NOT_UNDONE]
+    cause = f"; {', '.join(lasting)} cannot be undone without feedback" if lasting else ""
+    return f"target not met; {said}{cause}" + (f"; {ended}" if ended else "")

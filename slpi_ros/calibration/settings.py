@@ -1,0 +1,80 @@
+"""Settings of a calibration: the axes, their limits, the budget and the target."""
+
+import math
+from dataclasses import dataclass
+
+from slpi_ros.errors import UsageError
+from slpi_ros.model.limits import Limits
+
+# Durations of the drives, seconds for each axis that moves; those of separate effects take EFFECT.
+CALIBRATION, EFFECT, CHECK, VERIFICATION = 40.0, 25.0, 1.5, 20.0
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """What a calibration may do and what it shall reach.
+
+    Parameters
+    ----------
+    axes : tuple of str
+        Names of the axes, in the order of the voltages.
+    limits : tuple of Limits
+        Limits of voltage, slew rate and acceleration of each axis.
+    rest : tuple of float, volts
+        Voltage of each axis before and after every drive.
+    rate : float, hertz
+        Samples per second.
+    budget : float, seconds
+        Largest sum of the durations of all drives.
+    target : float, metres
+        Largest mean error on a path not used for the model; 0 (default): `floors` times the noise floor.
+    floors : float
+        Target in multiples of the noise floor, if `target` is 0. Default 3.
+    seed : int
+        Seed of the random parts of all drives. Default 0.
+
+    Raises
+    ------
+    UsageError
+        If a value is invalid, or the budget is too short for a calibration drive and a verification.
+    """
+
+    axes: tuple[str, ...]
+    limits: tuple[Limits, ...]
+    rest: tuple[float, ...]
+    rate: float
+    budget: float
+    target: float = 0.0
+    floors: float = 3.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        if not self.axes or not len(self.axes) == len(self.limits) == len(self.rest):
+            raise UsageError(f"calibration: axes {list(self.axes)}; give each its limits and its rest voltage")
+        for axis, limits, rest in zip(self.axes, self.limits, self.rest, strict=True):
+            if not -math.inf < limits.lower < limits.upper < math.inf:
+                raise UsageError(
+                    f"calibration: axis '{axis}' has limits {limits.lower:g} V and {limits.upper:g} V; "
+                    "give both, the lower one first"
+                )
+            if not limits.lower <= rest <= limits.upper:
+                raise UsageError(
+                    f"calibration: axis '{axis}' rests at {rest:g} V, outside {limits.lower:g} to {limits.upper:g} V; "
+                    "move it inside first"
+                )
+        if not (0.0 <= self.target < math.inf and 0.0 < self.floors < math.inf):
+            raise UsageError(f"calibration: target {self.target:g} m, {self.floors:g} floors; give positive ones")
+        if self.budget < self.least:
+            raise UsageError(
+                f"calibration: a budget of {self.budget:g} s; give at least {self.least:g} s for these axes"
+            )
+
+    @property
+    def least(self) -> float:
+        """Shortest time (s) in which a model can be identified and verified."""
+        return len(self.axes) * (CALIBRATION + CHECK) + 2 * VERIFICATION
+
+    def goal(self, floor_rms: float) -> float:
+        """Return the target (m) of an axis whose noise floor is `floor_rms` (m)."""
+        return self.target or self.floors * floor_rms

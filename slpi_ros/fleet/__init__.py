@@ -1,0 +1,20 @@
+"""Calibration records of many stages, processed on a Dask cluster; see `slpi_ros.fleet.run`.
+
+The extra ``slpi_ros[fleet]`` installs what this package needs; it is imported at the first use of `run`.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from slpi_ros.fleet.cluster import run
+
+__all__ = ["run"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import `run` at its first use."""
+    if name != "run":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from slpi_ros.fleet.cluster import run
+
+    return run

@@ -1,0 +1,463 @@
+"""Processing of the bags of a fleet as tasks of a Dask cluster."""
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.fleet import bags
+from slpi_ros.fleet.bags import Examined, Judged
+from slpi_ros.fleet.results import Results, State, as_table
+from slpi_ros.fleet.sources import Bag, find_bags, is_complete, load_models
+from slpi_ros.identification.progress import report_progress
+from slpi_ros.io.bag_files import PATIENCE
+from slpi_ros.model.document import format_model, save_model
+from slpi_ros.model.stage_model import StageModel
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from distributed import Client
+
+_Path = str | os.PathLike[str]
+
+# Tasks at the scheduler for each thread of the cluster: enough to keep every thread busy, and bounded memory.
+TASKS_PER_THREAD = 4
+# A bag is given up after this many times that Dask has given it up, each after several workers have ended.
+ATTEMPTS = 3
+# Seconds: until a lost scheduler is back, until the first worker is there, between two looks at the sources, and
+# between two tables.
+RECONNECT, FIRST_WORKER, WATCH, WRITE = 60.0, 120.0, 2.0, 30.0
+# Shortest pause between two tables, as a multiple of the time that one takes.
+WRITE_PAUSE = 20.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """A function with its arguments, and what is done with its result; `bag` is the bag that it processes."""
+
+    bag: Examined
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    finish: Callable[[Any], Iterable["Task"]]
+    attempts: int = 0
+
+
+def run(
+    sources: Sequence[_Path],
+    output: _Path | None = None,
+    *,
+    client: "Client | None" = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    models: _Path | None = None,
+    since: str | None = None,
+    diagnose: bool = True,
+    watch: bool = False,
+    topic: str = "stage_state",
+    told: Callable[[str], None] | None = None,
+    finished: Callable[[Results], None] | None = None,
+) -> "pd.DataFrame":
+    """Process the bags of many stages: quality, reference models, changes and their causes.
+
+    The first usable bag of a stage gives its reference model, unless `models` holds one; every other bag of the stage
+    is compared with it. The rows do not depend on the number of workers. A run that was interrupted is continued with
+    the same `output`, and bags that are new or changed are added.
+
+    Parameters
+    ----------
+    sources : sequence of path
+        Bags, folders of bags and CSV lists; see `slpi_ros.fleet.sources.find_bags`.
+    output : path, optional
+        Folder of the results; default: a temporary folder, and nothing but the returned table is kept. Workers read
+        the bags and write models there, so both must be at the same path on every machine of the cluster.
+    client : distributed.Client, optional
+        Cluster to be used; it stays open. Default: the cluster at `scheduler`, else a local one.
+    scheduler : str, optional
+        Address of a running scheduler, such as ``tcp://host:8786``.
+    workers : int, optional
+        Number of processes of the local cluster; default: one per core.
+    models : path, optional
+        Folder of model documents that are the references of their stages.
+    since : str, optional
+        Only bags that begin at or after this date, ISO 8601, UTC.
+    diagnose : bool
+        Whether the causes of errors that no change of gain, width or zero explains are diagnosed. Default True.
+    watch : bool
+        Whether to continue with bags that are completed later, until interrupted. Default False.
+    topic : str
+        Topic with voltage and displacement.
+    told : callable, optional
+        Receives sentences about the cluster.
+    finished : callable, optional
+        Called with the results whenever the table has been written; for example to write pages.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row for each axis of each bag; columns as in ``results.parquet``, see ``msg_schemas/README.md``.
+
+    Raises
+    ------
+    UsageError
+        If the options contradict each other.
+    SlpiError
+        If the sources, the folder or the cluster cannot be used.
+    """
+    _require_extra()
+    if sum(given is not None for given in (client, scheduler, workers)) > 1:
+        raise UsageError("client, scheduler and workers exclude each other; give at most one")
+    if workers is not None and workers < 1:
+        raise UsageError(f"workers is {workers}; give at least 1")
+    options = {"topic": topic, "diagnose": diagnose}
+    earliest = _nanoseconds(since)
+    given = load_models(models)
+    found = find_bags(sources)
+    if not found and not watch:
+        raise SlpiError(f"{', '.join(map(str, sources))}: no bag there; name folders that hold bags")
+    with ExitStack() as stack:
+        if output is None:
+            output = stack.enter_context(TemporaryDirectory(prefix="slpi_fleet_"))
+        results = stack.enter_context(Results(output, options))
+        for stage, model in sorted(given.items()):
+            _keep_given(results, stage, model)
+        cluster = stack.enter_context(_connected(client, scheduler, workers, told or _silent))
+        cluster.require_shared(results.folder, found[:1])
+        work = _Fleet(results, cluster, topic, earliest, diagnose, finished)
+        try:
+            while True:
+                now = time.time()
+                news = work.process([bag for bag in found if not watch or is_complete(bag, now, PATIENCE)])
+                if not watch:
+                    break
+                if news:
+                    work.write()
+                report_progress(f"{len(results.state.judged)} bags, waiting for new ones")
+                time.sleep(WATCH)
+                found = find_bags(sources)
+        finally:
+            # After an interruption as well: what is finished is in the table.
+            work.write()
+        return as_table(results.state.rows()).to_pandas()
+
+
+class _Fleet:
+    """The steps of a run: examine all bags, choose references, compare the other bags, explain what is left."""
+
+    def __init__(
+        self,
+        results: Results,
+        cluster: "_Cluster",
+        topic: str,
+        earliest: int | None,
+        diagnosed: bool,
+        finished: Callable[[Results], None] | None,
+    ) -> None:
+        self._results, self._cluster, self._topic = results, cluster, topic
+        self._earliest, self._diagnosed, self._finished = earliest, diagnosed, finished
+        self._next_table = time.monotonic() + WRITE
+        self._total = 0
+
+    @property
+    def _state(self) -> State:
+        return self._results.state
+
+    def process(self, found: Sequence[Bag]) -> bool:
+        """Process the bags that are new or changed, and what an earlier run left; return whether there were any."""
+        known = self._state.examined
+        new = [bag for bag in found if bag.path not in known or known[bag.path].bag != bag]
+        left = [one for one in known.values() if one.bag.path not in self._state.judged and self._wanted(one)]
+        open_ones = [path for path, judged in self._state.judged.items() if judged.unexplained]
+        if not (new or left or open_ones):
+            return False
+        self._total = len(set(self._state.judged) | {bag.path for bag in new} | {one.bag.path for one in left})
+        self._do(self._examination(bag) for bag in new)
+        waiting = [one for one in known.values() if one.bag.path not in self._state.judged and self._wanted(one)]
+        for one in waiting:
+            if not one.axes:
+                self._results.add_judged(one.bag.path, Judged(tuple(one.rows())))
+        self._do(self._stage_tasks([one for one in waiting if one.axes]))
+        self._do(self._explanation(path) for path, one in sorted(self._state.judged.items()) if one.unexplained)
+        return True
+
+    def write(self) -> None:
+        """Write the table, and call `finished`."""
+        self._write_table()
+        if self._finished:
+            self._finished(self._results)
+
+    def _write_table(self) -> None:
+        began = time.monotonic()
+        self._results.write_table()
+        now = time.monotonic()
+        self._next_table = now + max(WRITE, WRITE_PAUSE * (now - began))
+
+    def _wanted(self, one: Examined) -> bool:
+        return self._earliest is None or one.date_ns is None or one.date_ns >= self._earliest
+
+    def _do(self, tasks: Iterable[Task]) -> None:
+        for task, result in self._cluster.work(tasks):
+            self._cluster.extend(task.finish(result))
+            report_progress(f"{len(self._state.judged)} of {self._total} bags")
+            if time.monotonic() > self._next_table:
+                self._write_table()
+
+    def _examination(self, bag: Bag) -> Task:
+        def finish(one: Examined) -> Iterable[Task]:
+            self._results.add_examined(one)
+            return ()
+
+        return Task(Examined(bag, bag.stage), bags.examine, (bag, self._topic), finish)
+
+    def _stage_tasks(self, waiting: Sequence[Examined]) -> Iterator[Task]:
+        """Yield the first tasks of every stage: comparisons with its reference, or the identification of one."""
+        stages: dict[str, list[Examined]] = {}
+        for one in waiting:
+            # A bag of an unknown stage is not comparable with any other.
+            stages.setdefault(one.stage and f"stage {one.stage}" or f"bag {one.bag.path}", []).append(one)
+        for _, queue in sorted(stages.items()):
+            queue.sort(key=lambda one: (one.date_ns or 0, one.bag.path))
+            yield from self._next_of_stage(queue)
+
+    def _next_of_stage(self, queue: Sequence[Examined]) -> Iterator[Task]:
+        if not queue:
+            return
+        first = queue[0]
+        if first.stage in self._state.references and first.stage:
+            for one in queue:
+                yield self._comparison(one)
+            return
+
+        def finish(judged: Judged) -> Iterable[Task]:
+            self._results.add_judged(first.bag.path, judged, first.stage or None)
+            return self._next_of_stage(queue[1:])
+
+        name = bags.model_name(first)
+        arguments = (first, self._topic, str(self._results.folder), name)
+        yield Task(first, bags.identify_bag, arguments, finish)
+
+    def _comparison(self, one: Examined) -> Task:
+        reference = self._state.references[one.stage]
+        arguments = (one, self._topic, str(self._results.folder), reference, bags.model_name(one))
+        return Task(one, bags.compare, arguments, lambda judged: self._keep(one, judged))
+
+    def _explanation(self, path: str) -> Task:
+        one, rows = self._state.examined[path], self._state.judged[path].rows
+        others = {stage: model for stage, model in sorted(self._state.references.items()) if stage != one.stage}
+        reference = self._state.references.get(one.stage) if one.stage else None
+        reference = reference or self._state.judged[path].model
+        arguments = (one, rows, self._topic, str(self._results.folder), reference, bags.model_name(one), others)
+        return Task(one, bags.explain, (*arguments, self._diagnosed), lambda judged: self._keep(one, judged))
+
+    def _keep(self, one: Examined, judged: Judged) -> Iterable[Task]:
+        self._results.add_judged(one.bag.path, judged)
+        return ()
+
+
+class _Cluster:
+    """A Dask cluster that completes every task, whatever happens to its workers and, by address, to its scheduler."""
+
+    def __init__(self, client: "Client", reconnect: Callable[[], "Client"] | None) -> None:
+        self.client, self._reconnect = client, reconnect
+        self._waiting: deque[Task] = deque()
+        self._count, self._asked = 1, -np.inf
+
+    def require_shared(self, folder: Path, found: Sequence[Bag]) -> None:
+        """Raise SlpiError unless every worker has this package and sees the folder and the first bag."""
+        places = [str(folder), *(bag.path for bag in found if bag.modified)]
+        for attempt in range(ATTEMPTS):
+            try:
+                self.client.wait_for_workers(1, timeout=FIRST_WORKER)
+                seen = self.client.run(_sees, places)
+                break
+            except TimeoutError:
+                raise SlpiError("the cluster has no worker; start some with `dask worker ADDRESS`") from None
+            except ImportError as error:
+                raise SlpiError(f"the workers cannot run slpi_ros: {error}; install it on every machine") from None
+            except Exception as error:
+                # A worker or the scheduler has ended meanwhile.
+                if attempt + 1 == ATTEMPTS:
+                    raise SlpiError(f"the cluster failed: {error}; finished rows are kept: run again") from None
+                self._connect_again()
+        for worker, missing in seen.items():
+            if missing:
+                raise SlpiError(f"worker {worker} does not see {missing[0]}; mount it there at the same path")
+
+    def extend(self, tasks: Iterable[Task]) -> None:
+        """Add tasks while `work` runs; they precede those that wait."""
+        self._waiting.extendleft(reversed(list(tasks)))
+
+    def work(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Any]]:
+        """Yield every task with its result, as they are finished; further ones may be added by `extend`."""
+        from distributed import as_completed
+
+        source = iter(tasks)
+        running: dict[Any, Task] = {}
+        completed = as_completed(loop=self.client.loop)
+        try:
+            while True:
+                lost = False
+                for task in self._next(source, TASKS_PER_THREAD * self._threads() - len(running)):
+                    try:
+                        future = self.client.submit(task.function, *task.arguments, pure=False)
+                    except Exception:
+                        self._waiting.appendleft(task)
+                        lost = True
+                        break
+                    running[future] = task
+                    completed.add(future)
+                if not running and not lost:
+                    return
+                done: Any = None if lost else next(completed, None)
+                if done in running and done.status in ("finished", "error"):
+                    yield from self._settle(running.pop(done), done)
+                    continue
+                # The scheduler is lost, and with it every future.
+                self._waiting.extendleft(running.values())
+                running = {}
+                self._connect_again()
+                completed = as_completed(loop=self.client.loop)
+        finally:
+            with suppress(Exception):
+                self.client.cancel(list(running))
+            self._waiting.clear()
+
+    def _next(self, source: Iterator[Task], room: int) -> Iterator[Task]:
+        for _ in range(room):
+            task = self._waiting.popleft() if self._waiting else next(source, None)
+            if task is None:
+                return
+            yield task
+
+    def _settle(self, task: Task, future: Any) -> Iterator[tuple[Task, Any]]:
+        from distributed import KilledWorker
+
+        if future.status == "finished":
+            try:
+                result = future.result()
+            except Exception:
+                # The worker that held the result has ended.
+                self._waiting.appendleft(task)
+                return
+            yield task, result
+            return
+        error = future.exception()
+        if not isinstance(error, KilledWorker):
+            what = f"{task.bag.bag.path}: the cluster failed: {type(error).__name__}: {error}"
+            raise SlpiError(f"{what}; finished rows are kept: run again")
+        if task.attempts + 1 < ATTEMPTS:
+            self._waiting.append(replace(task, attempts=task.attempts + 1))
+            return
+        reason = f"{task.bag.bag.path}: every worker that processed it has ended; give workers more memory"
+        if task.function is bags.examine:
+            yield task, replace(task.bag, refused={"": reason})
+        else:
+            yield task, bags.given_up(task.bag, reason)
+
+    def _threads(self) -> int:
+        """Return the number of threads of the cluster, asked for once a second."""
+        if time.monotonic() - self._asked > 1.0:
+            with suppress(Exception):
+                self._count = max(1, int(sum(self.client.nthreads().values())))
+            self._asked = time.monotonic()
+        return self._count
+
+    def _connect_again(self) -> None:
+        if self._reconnect is None:
+            raise SlpiError("the scheduler is lost; finished rows are kept: run again to continue")
+        report_progress("the scheduler is lost; waiting for it")
+        with suppress(Exception):
+            self.client.close(timeout=1)
+        self.client = self._reconnect()
+
+
+@contextmanager
+def _connected(
+    client: "Client | None", scheduler: str | None, workers: int | None, told: Callable[[str], None]
+) -> Iterator[_Cluster]:
+    """Provide the cluster of a run; one that is started here ends with the ``with`` block."""
+    from distributed import Client, LocalCluster
+
+    if client is not None:
+        yield _Cluster(client, None)
+        return
+    if scheduler is not None:
+
+        def connect() -> Client:
+            end = time.monotonic() + RECONNECT
+            while True:
+                try:
+                    return Client(scheduler, timeout=5, set_as_default=False)
+                except (OSError, ValueError) as error:
+                    if time.monotonic() > end or isinstance(error, ValueError):
+                        raise SlpiError(
+                            f"no scheduler at {scheduler}: {error}; start one with `dask scheduler`; finished rows "
+                            "are kept"
+                        ) from None
+                    time.sleep(0.5)
+
+        cluster = _Cluster(connect(), connect)
+        try:
+            told(f"cluster at {scheduler}; dashboard: {cluster.client.dashboard_link}")
+            yield cluster
+        finally:
+            with suppress(Exception):
+                cluster.client.close(timeout=5)
+        return
+    count = workers or os.cpu_count() or 1
+    with (
+        LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50) as local,
+        Client(local, set_as_default=False) as own,
+    ):
+        held = [worker["memory_limit"] for worker in own.scheduler_info()["workers"].values()]
+        told(
+            f"local cluster of {count} workers with {min(held, default=0) / 2**30:.3g} GiB of memory each; "
+            f"dashboard: {own.dashboard_link}"
+        )
+        yield _Cluster(own, None)
+
+
+def _keep_given(results: Results, stage: str, model: StageModel) -> None:
+    """Make a given model the reference of a stage; UsageError if the stage has another one."""
+    name = f"models/{bags.plain_name(stage)}/given.json"
+    path, known = results.folder / name, results.state.references.get(stage)
+    if known is None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_model(model, path)
+        results.add_reference(stage, name)
+    elif known != name or path.read_text(encoding="utf-8") != format_model(model):
+        raise UsageError(f"{results.folder}: stage '{stage}' has another reference there, {known}; name another folder")
+
+
+def _sees(places: Sequence[str]) -> list[str]:
+    """Return the places that this machine does not see."""
+    return [place for place in places if not os.path.exists(place)]
+
+
+def _nanoseconds(since: str | None) -> int | None:
+    """Return a date as Unix time, nanoseconds; UsageError if it is none."""
+    if since is None:
+        return None
+    try:
+        return int(np.datetime64(since, "ns").astype(np.int64))
+    except ValueError:
+        raise UsageError(f"'{since}' is no date; give one such as 2026-01-31 or 2026-01-31T12:00") from None
+
+
+def _require_extra() -> None:
+    from importlib.util import find_spec
+
+    missing = [name for name in ("distributed", "pyarrow", "pandas") if find_spec(name) is None]
+    if missing:
+        raise UsageError(f"{', '.join(missing)} is not installed; run: pip install 'slpi_ros[fleet]'")
+
+
+def _silent(_: str) -> None:
+    pass

@@ -1,0 +1,157 @@
+"""The bags of a fleet: bags, folders of bags and CSV lists, and the given models."""
+
+import csv
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.model.document import load_model
+from slpi_ros.model.stage_model import StageModel
+
+_Path = str | os.PathLike[str]
+_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_LIST_COLUMNS = ("bag", "stage")
+# The last bytes of a complete mcap file.
+_MCAP_END = b"\x89MCAP0\r\n"
+
+
+@dataclass(frozen=True)
+class Bag:
+    """A bag on disk.
+
+    Parameters
+    ----------
+    path : str
+        Absolute path of the folder or file.
+    stage : str
+        Name of the stage from a CSV list; "" if the bag's hardware id names it.
+    size : int, bytes
+    modified : int, nanoseconds
+        Time of the last change of its files. Size and time tell a changed bag from a processed one; both are 0 if
+        there is no such bag.
+    """
+
+    path: str
+    stage: str = ""
+    size: int = 0
+    modified: int = 0
+
+
+def find_bags(sources: Sequence[_Path]) -> list[Bag]:
+    """Return the bags of all sources, each once, sorted by path.
+
+    Parameters
+    ----------
+    sources : sequence of path
+        Bags, folders that are searched recursively (hidden entries are skipped), and CSV files with the columns
+        ``bag`` and ``stage``; relative paths in a list start at its folder.
+
+    Raises
+    ------
+    UsageError
+        If there is no source, or a list has other columns or two stages for one bag.
+    RecordError
+        If a source does not exist.
+    """
+    if not sources:
+        raise UsageError("no source given; name bags, folders of bags or CSV lists of bags")
+    found: dict[str, str] = {}
+    for source in map(Path, sources):
+        if not source.exists():
+            raise RecordError(f"{source}: no such bag, folder or list; check the path")
+        entries = _listed(source) if source.suffix == ".csv" else ((path, "") for path in _bags_below(source))
+        for path, stage in entries:
+            key = str(path.resolve())
+            if stage and found.get(key, "") not in ("", stage):
+                raise UsageError(f"{source}: {key} is of stage '{stage}' and of '{found[key]}'; list one stage")
+            found[key] = stage or found.get(key, "")
+    return [_as_bag(path, stage) for path, stage in sorted(found.items())]
+
+
+def is_complete(bag: Bag, now: float, patience: float) -> bool:
+    """Return whether a bag is completely written, or has not grown for `patience` seconds before `now` (s, Unix time).
+
+    A folder is complete when it contains ``metadata.yaml``, a single mcap file when it ends as mcap files do.
+    """
+    path = Path(bag.path)
+    try:
+        if path.is_dir() and (path / "metadata.yaml").stat().st_size:
+            return True
+        if path.suffix == ".mcap":
+            with path.open("rb") as file:
+                file.seek(-len(_MCAP_END), os.SEEK_END)
+                if file.read() == _MCAP_END:
+                    return True
+    except OSError:
+        pass
+    return now - bag.modified * 1e-9 >= patience
+
+
+def load_models(folder: _Path | None) -> dict[str, StageModel]:
+    """Return the newest model document of each stage in a folder, searched recursively; files that name no stage fail.
+
+    Raises
+    ------
+    UsageError
+        If there is no such folder, or a model has no hardware id.
+    ModelError
+        If a document cannot be read.
+    """
+    if folder is None:
+        return {}
+    if not Path(folder).is_dir():
+        raise UsageError(f"{folder}: no such folder of models; name one, or omit it")
+    models: dict[str, StageModel] = {}
+    for path in sorted(Path(folder).rglob("*.json")):
+        model = load_model(path)
+        if not model.hardware_id:
+            raise UsageError(f"{path}: the model names no stage; identify it from a bag with a hardware id")
+        if model.hardware_id not in models or model.created > models[model.hardware_id].created:
+            models[model.hardware_id] = model
+    return models
+
+
+def _bags_below(path: Path) -> Iterator[Path]:
+    """Yield the bag at a path, or the bags below it if it is a folder without a bag of its own."""
+    if path.is_file() or (path / "metadata.yaml").exists():
+        yield path
+        return
+    entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
+    files = [entry for entry in entries if entry.is_file() and entry.name.endswith(_SUFFIXES)]
+    # A recorder names the files of a bag after its folder; other files in a folder are bags by themselves.
+    if files and all(file.name.startswith(f"{path.name}_") for file in files):
+        yield path
+        return
+    yield from files
+    for entry in entries:
+        if entry.is_dir():
+            yield from _bags_below(entry)
+
+
+def _listed(source: Path) -> Iterator[tuple[Path, str]]:
+    """Yield path and stage of each bag of a CSV list."""
+    try:
+        with source.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file, skipinitialspace=True)
+            if not set(_LIST_COLUMNS) <= set(rows.fieldnames or ()):
+                raise UsageError(f"{source}: columns are {rows.fieldnames}; give {','.join(_LIST_COLUMNS)}")
+            for row in rows:
+                if row["bag"]:
+                    yield source.parent / row["bag"].strip(), (row["stage"] or "").strip()
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise RecordError(f"{source}: cannot be read as a list of bags: {error}; give UTF-8 CSV") from None
+
+
+def _as_bag(path: str, stage: str) -> Bag:
+    place = Path(path)
+    size, modified = 0, 0
+    try:
+        for file in place.iterdir() if place.is_dir() else (place,):
+            stat = file.stat()
+            size, modified = size + stat.st_size, max(modified, stat.st_mtime_ns)
+    except OSError:
+        # A bag that cannot be read is a row of the result with its reason.
+        return Bag(path, stage)
+    return Bag(path, stage, size, modified)

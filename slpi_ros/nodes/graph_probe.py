@@ -1,0 +1,160 @@
+"""What ``slpi doctor`` asks a running ROS graph."""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import rclpy
+from rcl_interfaces.srv import GetParameters
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.document import parse_model
+from slpi_ros.nodes.common import LATCHED, START_ERRORS
+from slpi_ros.nodes.parameters import numbers
+from slpi_ros.reports.doctor import STATE_TYPE, Graph
+
+# Longest time for discovery, and for a node to answer a question about its parameters, seconds.
+DISCOVERY, ANSWER = 3.0, 2.0
+SPIN = 0.02
+ASKED = ("axes", "voltage_min", "voltage_max")
+DEPTH = 1000
+
+
+def probe(state_topic: str, command_topic: str, namespace: str, seconds: float) -> Graph:
+    """Watch a running graph for some seconds, without publishing anything.
+
+    Parameters
+    ----------
+    state_topic, command_topic : str
+        Topics of the stage state and of the voltages, relative to `namespace`.
+    namespace : str
+        Namespace of the stage; "" : the root.
+    seconds : float
+        Time for which the state is received.
+
+    Raises
+    ------
+    UsageError
+        If ROS refuses the names.
+    """
+    context = Context()
+    try:
+        rclpy.init(args=[], context=context)
+        node = rclpy.create_node("slpi_doctor", namespace=namespace or None, context=context)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        try:
+            return _Probe(node, executor, state_topic, command_topic).watch(seconds)
+        finally:
+            executor.shutdown()
+            node.destroy_node()
+    except START_ERRORS as error:
+        raise UsageError(f"ROS cannot start: {' '.join(str(error).split())}") from None
+    finally:
+        context.try_shutdown()
+
+
+class _Probe:
+    def __init__(self, node: Node, executor: SingleThreadedExecutor, state_topic: str, command_topic: str) -> None:
+        self._node, self._executor = node, executor
+        self._state, self._command = (node.resolve_topic_name(topic) for topic in (state_topic, command_topic))
+        self._times: list[tuple[float, float]] = []
+        self._last: JointState | None = None
+        self._model = ""
+
+    def watch(self, seconds: float) -> Graph:
+        node = self._node
+        node.create_subscription(String, "stage_model", self._on_model, LATCHED)
+        self._spin(DISCOVERY, lambda: bool(node.get_publishers_info_by_topic(self._state)))
+        offers = node.get_publishers_info_by_topic(self._state)
+        if offers and all(offer.topic_type == STATE_TYPE for offer in offers):
+            reliable = all(offer.qos_profile.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+            reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+            node.create_subscription(
+                JointState, self._state, self._on_state, QoSProfile(depth=DEPTH, reliability=reliability)
+            )
+        self._spin(seconds)
+        commanding = _ends(node.get_publishers_info_by_topic(self._command))
+        last = self._last or JointState()
+        stamps, arrivals = np.array(self._times).reshape(-1, 2).T
+        own = node.get_fully_qualified_name()
+        names = [(name, space) for name, space in node.get_node_names_and_namespaces() if not name.startswith("_")]
+        try:
+            model = parse_model(self._model, "stage_model") if self._model else None
+        except SlpiError:
+            # Who publishes the document says what is wrong with it.
+            model = None
+        return Graph(
+            self._state,
+            self._command,
+            seconds,
+            [name for name in (_joined(space, name) for name, space in names) if name != own],
+            _ends(node.get_publishers_info_by_topic(self._state)),
+            list(commanding),
+            list(_ends(node.get_subscriptions_info_by_topic(self._command))),
+            stamps,
+            arrivals,
+            list(last.name),
+            dict(zip(last.name, last.position.tolist(), strict=False)),
+            dict(zip(last.name, last.effort.tolist(), strict=False)),
+            last.header.frame_id,
+            self._limits(next(iter(commanding))) if len(commanding) == 1 else {},
+            model,
+        )
+
+    def _on_state(self, state: JointState) -> None:
+        stamp = state.header.stamp
+        self._times.append((stamp.sec + stamp.nanosec * 1e-9, self._node.get_clock().now().nanoseconds / SECOND_NS))
+        self._last = state
+
+    def _on_model(self, message: String) -> None:
+        self._model = message.data
+
+    def _spin(self, seconds: float, done: Any = lambda: False) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not done():
+            self._executor.spin_once(timeout_sec=SPIN)
+
+    def _limits(self, name: str) -> Mapping[str, tuple[float, float]]:
+        """Return the voltage limits (V) of the axes of a node; empty if it does not tell."""
+        client = self._node.create_client(GetParameters, f"{name}/get_parameters")
+        self._spin(ANSWER, client.service_is_ready)
+        if not client.service_is_ready():
+            return {}
+        answer = client.call_async(GetParameters.Request(names=list(ASKED)))
+        self._spin(ANSWER, answer.done)
+        values = [parameter_value_to_python(value) for value in answer.result().values] if answer.done() else []
+        given = dict(zip(ASKED, values, strict=False))
+        axes = given.get("axes")
+        if axes is None or any(given.get(limit) is None for limit in ASKED[1:]):
+            return {}
+        try:
+            low, high = (numbers(given, limit, axes, -math.inf, math.inf) for limit in ASKED[1:])
+        except SlpiError:
+            return {}
+        return {axis: (lowest, highest) for axis, lowest, highest in zip(axes, low, high, strict=True)}
+
+
+def _ends(infos: Sequence[Any]) -> dict[str, str]:
+    """Return the type of each end of a topic by name; ends of one node are numbered."""
+    ends: dict[str, str] = {}
+    for info in infos:
+        name, number = _joined(info.node_namespace, info.node_name), 2
+        while name in ends:
+            name, number = f"{_joined(info.node_namespace, info.node_name)} ({number})", number + 1
+        ends[name] = info.topic_type
+    return ends
+
+
+def _joined(namespace: str, name: str) -> str:
+    return f"{namespace.rstrip('/')}/{name}"

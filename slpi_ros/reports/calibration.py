@@ -1,0 +1,99 @@
+"""The page and the files of a calibration: what was recorded and why, what it taught, and the verified error."""
+
+from pathlib import Path
+
+from slpi_ros.calibration.run import Outcome
+from slpi_ros.io.atomic_file import make_folder
+from slpi_ros.model.document import save_model
+from slpi_ros.reports import diagnosis as diagnosis_files
+from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, DISPLACEMENT, TIME, Chart, Panel, Quantity, thin_line
+from slpi_ros.reports.page import Page
+from slpi_ros.reports.text import describe_model, nm
+
+# The model, the page, and the folder with the files of the last diagnosis.
+MODEL, PAGE, DIAGNOSIS = "model.json", "report.html", "diagnosis"
+TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
+
+
+def write_files(folder: Path, outcome: Outcome) -> None:
+    """Write ``model.json``, ``report.html`` and the files of the last diagnosis into `folder`, each atomically.
+
+    Parameters
+    ----------
+    folder : Path
+        Created if it does not exist.
+    outcome : Outcome, the result to be written
+
+    Raises
+    ------
+    SlpiError
+        If a file cannot be written.
+    """
+    make_folder(folder)
+    save_model(outcome.model, str(folder / MODEL))
+    diagnosis_files.write_files(folder / DIAGNOSIS, outcome.diagnosis)
+    page_of(outcome).write(folder / PAGE)
+
+
+def page_of(outcome: Outcome) -> Page:
+    """Return the page of a calibration."""
+    stage = f" of stage {outcome.model.hardware_id}" if outcome.model.hardware_id else ""
+    page = Page(f"Calibration{stage}")
+    page.contents(tuple(outcome.errors))
+    page.text(
+        f"{outcome.why[0].upper()}{outcome.why[1:]}. The stage moved for {outcome.seconds:.0f} s in "
+        f"{sum(step.seconds > 0 for step in outcome.steps)} drives; every verification followed a path of its own "
+        "through the compensator. Errors are without the constant offset of each path."
+    )
+    page.table(("", "error before and after", *outcome.errors), _errors(outcome), None, "Mean and maximum error.")
+    for axis, error in outcome.errors.items():
+        found = outcome.diagnosis.axes[axis]
+        page.heading(f"Axis {axis}", axis)
+        page.verdict(axis, found.summary, "good" if error.met else "warn", found.verdict)
+        page.tiles({
+            "verified error, mean": nm(error.mean),
+            "of the stroke": f"{error.mean / error.stroke:.3%}",
+            "maximum": nm(error.maximum),
+            "target": nm(error.goal),
+            "noise floor, rms": nm(found.floor_rms),
+        })  # fmt: skip
+        page.definitions({named.name: named.evidence for named in found.effects})
+        page.chart(
+            f"{axis}-tracking", _chart(outcome, axis), "The last path, and the errors of the first and the last."
+        )
+    page.heading("What was recorded and why, and what it taught")
+    rows = [
+        (step.name, f"{step.seconds:.0f} s" if step.seconds else "", step.why, step.taught) for step in outcome.steps
+    ]
+    page.table(("step", "drive", "why", "what it taught"), rows)
+    page.heading("The model")
+    page.lines(describe_model(outcome.model))
+    return page
+
+
+def _errors(outcome: Outcome) -> list[list[str]]:
+    """Return a row for each verification: mean and maximum error of each axis."""
+    return [
+        [
+            step.name,
+            "hysteresis alone" if number == 0 else "with the causes found",
+            *(
+                f"{nm(error.mean)} ({error.mean / error.stroke:.3%}), {nm(error.maximum)}"
+                for error in step.errors.values()
+            ),
+        ]
+        for number, step in enumerate(step for step in outcome.steps if step.errors)
+        if step.errors
+    ]
+
+
+def _chart(outcome: Outcome, axis: str) -> Chart:
+    verified = [step.errors[axis] for step in outcome.steps if step.errors]
+    first, last = verified[0], verified[-1]
+    chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)
+    kept = thin_line(last.desired)
+    chart.line(0, "desired", last.t[kept], last.desired[kept], DESIRED)
+    for name, one, colour in (("first", first, BEFORE), ("last", last, AFTER)):
+        kept = thin_line(one.error)
+        chart.line(1, f"{name} path", one.t[kept], one.error[kept], colour, width=1.0)
+    return chart

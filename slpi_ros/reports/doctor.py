@@ -1,0 +1,300 @@
+"""What ``slpi doctor`` says of a record, a model and a running ROS graph: what is well, and what to mend."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.identification.record_quality import assess, findings
+from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.reports.text import model_limits
+
+FloatArray = NDArray[np.float64]
+Range = tuple[float, float]
+
+OK, NOTE, MEND = "ok", "note", "mend"
+STATE_TYPE, COMMAND_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
+# Largest share of the period by which 95 % of the steps of the stamps may differ from it, and longest gap in periods.
+JITTER, GAP = 0.5, 5.0
+# Seconds by which a stamp may lie before and after the time of its arrival.
+OLDEST, NEWEST = 0.1, 0.01
+# A displacement beyond this is no reading in metres. A voltage may be outside its range by this share of the range.
+FARTHEST, READ_BACK = 0.1, 0.02
+# Fewest states from which a rate is told.
+FEWEST = 10
+
+
+@dataclass(frozen=True)
+class Check:
+    """One statement.
+
+    Parameters
+    ----------
+    level : {"ok", "note", "mend"}
+    text : str
+        What was found; for "mend" also what to do.
+    """
+
+    level: str
+    text: str
+
+    def line(self) -> str:
+        """Return the statement as a line of text."""
+        return f"{self.level:4} {self.text}"
+
+
+@dataclass(frozen=True)
+class Graph:
+    """What was seen of a running ROS graph.
+
+    Parameters
+    ----------
+    state_topic, command_topic : str
+        Names of the topics after namespace and remapping.
+    seconds : float
+        Time for which the state was received.
+    nodes : sequence of str
+        All other nodes.
+    state_publishers, command_publishers, command_subscribers : mapping of str to str
+        Type of the topic by name of the node.
+    stamps, arrivals : ndarray, shape (N,), seconds
+        Stamps of the states, and the time of the node's clock at which they came.
+    axes : sequence of str
+        Axes of the last state.
+    displacement, voltage : mapping of axis name to float, metres, volts
+        Last state.
+    hardware_id : str
+        Of the last state.
+    limits : mapping of axis name to (float, float), volts
+        Limits of the node that publishes the voltages; empty if it does not tell.
+    model : StageModel, optional
+        Model on the topic ``stage_model``; None: none.
+    """
+
+    state_topic: str
+    command_topic: str
+    seconds: float
+    nodes: Sequence[str] = ()
+    state_publishers: Mapping[str, str] = field(default_factory=dict)
+    command_publishers: Sequence[str] = ()
+    command_subscribers: Sequence[str] = ()
+    stamps: FloatArray = field(default_factory=lambda: np.empty(0))
+    arrivals: FloatArray = field(default_factory=lambda: np.empty(0))
+    axes: Sequence[str] = ()
+    displacement: Mapping[str, float] = field(default_factory=dict)
+    voltage: Mapping[str, float] = field(default_factory=dict)
+    hardware_id: str = ""
+    limits: Mapping[str, Range] = field(default_factory=dict)
+    model: StageModel | None = None
+
+
+def check_record(record: Record, model: StageModel | None = None, limits: Range | None = None) -> list[Check]:
+    """Check a record: rate, jitter, gaps, sensor, drive and memory, whether it fits a model and limits (V)."""
+    return [Check(check.level, f"{record.source}: {check.text}") for check in _of_record(record, model, limits)]
+
+
+def _of_record(record: Record, model: StageModel | None, limits: Range | None) -> Iterator[Check]:
+    for axis in record.axes:
+        for finding in findings(assess(record, axis)):
+            yield Check(OK if finding.level == "ok" else MEND, f"axis {axis}: {finding.text}")
+        v = record.voltage[axis]
+        reached = float(np.nanmin(v)), float(np.nanmax(v))
+        if limits is not None:
+            yield _within(axis, "the voltage went", reached, limits, "the limits", "correct the limits or the driver")
+        if model is not None and axis in model.axes:
+            known = model.axes[axis].voltage_range
+            yield _within(axis, "the voltage went", reached, known, "the model", "identify a model of the whole range")
+    if model is not None:
+        yield from _same_stage(record.hardware_id, record.axes, model)
+
+
+def check_model(model: StageModel, limits: Range | None = None) -> list[Check]:
+    """Check a model: its accuracy, its memory at the end of its record, and voltage limits (V)."""
+    checks = [Check(OK, "model: the document is valid")]
+    limited = model_limits(model)
+    for name, axis in model.axes.items():
+        if name in limited:
+            checks.append(Check(MEND, f"model: axis {name}: {limited[name]}; find it with 'slpi diagnose'"))
+        else:
+            checks.append(Check(OK, f"model: axis {name}: its error is at the noise floor"))
+        if axis.end is None:
+            checks.append(
+                Check(MEND, f"model: axis {name}: the memory at the end of its record is unknown; identify it again")
+            )
+        if limits is not None:
+            told = "identify within the limits, or correct them"
+            checks.append(_overlap(f"model: axis {name}", axis.voltage_range, limits, told))
+    if not model.hardware_id:
+        checks.append(Check(NOTE, "model: without hardware id: that it is of this stage cannot be checked"))
+    return checks
+
+
+def check_graph(graph: Graph, model: StageModel | None = None) -> list[Check]:
+    """Check a running graph: discovery, the state of the stage, who commands, and whether the model fits the stage.
+
+    Parameters
+    ----------
+    graph : Graph
+    model : StageModel, optional
+        Model of the stage; default: that on ``stage_model``, if any.
+    """
+    if not graph.nodes:
+        text = "ROS: no other node; start the driver of the stage, and use its ROS_DOMAIN_ID and discovery range"
+        return [Check(MEND, text)]
+    checks = [Check(OK, f"ROS: nodes {', '.join(sorted(graph.nodes))}")]
+    checks += _of_publishers(graph)
+    if graph.stamps.size:
+        checks += [*_of_times(graph), *_of_values(graph)]
+    checks += _of_commands(graph)
+    known = model or graph.model
+    if known is not None and graph.stamps.size:
+        checks += _same_stage(graph.hardware_id, graph.axes, known)
+        checks += _of_range(graph, known)
+    elif known is None:
+        checks.append(Check(NOTE, "model: none on stage_model; give one by --model to compare it with the stage"))
+    return checks
+
+
+def _of_publishers(graph: Graph) -> Iterator[Check]:
+    topic, publishers = graph.state_topic, graph.state_publishers
+    if not publishers:
+        yield Check(MEND, f"{topic}: no publisher; start the driver of the stage, or name its topic by --topic")
+        return
+    wrong = {kind for kind in publishers.values() if kind != STATE_TYPE}
+    if wrong:
+        yield Check(MEND, f"{topic}: of type {', '.join(sorted(wrong))}; publish {STATE_TYPE}")
+    elif len(publishers) > 1:
+        yield Check(MEND, f"{topic}: {len(publishers)} publishers: {', '.join(publishers)}; leave one")
+    elif not graph.stamps.size:
+        yield Check(
+            MEND, f"{topic}: {', '.join(publishers)} sent nothing for {graph.seconds:.3g} s; make the driver publish"
+        )
+    else:
+        yield Check(OK, f"{topic}: published by {', '.join(publishers)}")
+
+
+def _of_times(graph: Graph) -> Iterator[Check]:
+    topic, stamps, arrivals = graph.state_topic, graph.stamps, graph.arrivals
+    if stamps.size < FEWEST:
+        text = (
+            f"{topic}: {stamps.size} states in {graph.seconds:.3g} s, too few to be judged; publish at 100 Hz or more"
+        )
+        yield Check(MEND, text)
+        return
+    if not stamps.any():
+        yield Check(MEND, f"{topic}: without stamps; stamp each state with the time of its measurement")
+        return
+    steps = np.diff(stamps)
+    if np.any(steps < 0.0):
+        yield Check(MEND, f"{topic}: {np.count_nonzero(steps < 0.0)} stamps run backwards; send the states in order")
+    period = float(np.median(steps))
+    if period <= 0.0:
+        yield Check(MEND, f"{topic}: most stamps are equal; stamp each state with the time of its measurement")
+        return
+    jitter = float(np.percentile(np.abs(steps - period), 95)) / period
+    text = f"{topic}: {1.0 / period:.4g} states per second, jitter {jitter:.0%} of the period"
+    if jitter > JITTER:
+        yield Check(MEND, f"{text}; stamp each state with the time of its measurement")
+    else:
+        yield Check(OK, text)
+    longest = float(np.max(steps))
+    if longest > GAP * period:
+        yield Check(MEND, f"{topic}: a gap of {longest:.3g} s; relieve the processor or the network")
+    offset = float(np.median(arrivals - stamps))
+    text = f"{topic}: the stamps are {abs(offset):.3g} s {'old' if offset >= 0.0 else 'ahead'} when they come"
+    if -NEWEST <= offset <= OLDEST:
+        yield Check(OK, text)
+    else:
+        yield Check(MEND, f"{text}; synchronise the clocks (chrony, PTP), or use use_sim_time in all nodes or in none")
+
+
+def _of_values(graph: Graph) -> Iterator[Check]:
+    topic = graph.state_topic
+    if not graph.axes:
+        yield Check(MEND, f"{topic}: names no axis; fill name[], position[] (m) and effort[] (V)")
+    for axis in graph.axes:
+        y, v = graph.displacement.get(axis, np.nan), graph.voltage.get(axis, np.nan)
+        if not (np.isfinite(y) and np.isfinite(v)):
+            text = f"axis {axis}: position {y:g} m, effort {v:g} V; fill both with finite numbers"
+            yield Check(MEND, f"{topic}: {text}")
+        elif abs(y) > FARTHEST:
+            yield Check(MEND, f"{topic}: axis {axis}: position {y:.4g} is no displacement in metres; publish metres")
+        else:
+            yield Check(OK, f"{topic}: axis {axis} at {y * 1e6:.4g} µm, {v:.4g} V")
+    if not graph.hardware_id:
+        yield Check(NOTE, f"{topic}: without a hardware id in header.frame_id: models cannot be told apart by stage")
+
+
+def _of_commands(graph: Graph) -> Iterator[Check]:
+    topic, publishers = graph.command_topic, graph.command_publishers
+    if len(publishers) > 1:
+        text = f"{len(publishers)} publishers: {', '.join(publishers)}; stop all but one, as the voltage would jump"
+        yield Check(MEND, f"{topic}: {text}")
+    else:
+        yield Check(OK, f"{topic}: published by {', '.join(publishers) or 'nobody'}")
+    if graph.command_subscribers:
+        yield Check(OK, f"{topic}: received by {', '.join(graph.command_subscribers)}")
+    else:
+        yield Check(MEND, f"{topic}: no subscriber; start the driver of the amplifier, or remap its topic")
+
+
+def _same_stage(hardware_id: str, axes: Sequence[str], model: StageModel) -> Iterator[Check]:
+    if hardware_id and model.hardware_id and hardware_id != model.hardware_id:
+        text = f"model: of stage '{model.hardware_id}', but the stage is '{hardware_id}'; take its own model"
+        yield Check(MEND, text)
+    lacking = [axis for axis in model.axes if axis not in axes]
+    if lacking:
+        text = f"model: axes {', '.join(lacking)} are not among those of the stage, {', '.join(axes) or 'none'}"
+        yield Check(MEND, f"{text}; name the axes alike")
+    elif not (hardware_id and model.hardware_id and hardware_id != model.hardware_id):
+        known = "hardware id and axes agree" if hardware_id and model.hardware_id else "axes agree"
+        yield Check(OK, f"model: {known} with those of the stage")
+
+
+def _of_range(graph: Graph, model: StageModel) -> Iterator[Check]:
+    for name, axis in model.axes.items():
+        if np.isfinite(v := graph.voltage.get(name, np.nan)):
+            told = "move it inside, or identify a model of the whole range"
+            yield _within(name, "the stage is", (v, v), axis.voltage_range, "the model", told)
+        if name in graph.limits:
+            yield _overlap(
+                f"model: axis {name}", axis.voltage_range, graph.limits[name], "correct voltage_min and voltage_max"
+            )
+
+
+def _within(axis: str, what: str, reached: Range, allowed: Range, whose: str, remedy: str) -> Check:
+    slack = READ_BACK * (allowed[1] - allowed[0])
+    where = f"{reached[0]:.4g} V" if reached[0] == reached[1] else f"{reached[0]:.4g} to {reached[1]:.4g} V"
+    text = f"axis {axis}: {what} {'at' if reached[0] == reached[1] else 'from'} {where}"
+    bounds = f"{allowed[0]:.4g} to {allowed[1]:.4g} V of {whose}"
+    if allowed[0] - slack <= reached[0] and reached[1] <= allowed[1] + slack:
+        return Check(OK, f"{text}, within {bounds}")
+    return Check(MEND, f"{text}, outside {bounds}; {remedy}")
+
+
+def _overlap(what: str, known: Range, limits: Range, remedy: str) -> Check:
+    text = f"{what}: identified from {known[0]:.4g} to {known[1]:.4g} V, limits {limits[0]:.4g} to {limits[1]:.4g} V"
+    if max(known[0], limits[0]) > min(known[1], limits[1]):
+        return Check(MEND, f"{text} do not meet; {remedy}")
+    slack = READ_BACK * (known[1] - known[0])
+    narrower = limits[0] > known[0] + slack or limits[1] < known[1] - slack
+    return Check(NOTE, f"{text}: a part of the stroke is not used") if narrower else Check(OK, text)
+
+
+def described(checks: Iterable[Check]) -> tuple[str, list[str], list[str]]:
+    """Return the verdict, the lines of what is not well, and all lines; what is to be mended comes first."""
+    ordered = sorted(checks, key=lambda check: (MEND, NOTE, OK).index(check.level))
+    count = sum(check.level == MEND for check in ordered)
+    verdict = f"MEND: {count} thing{'s' * (count > 1)}" if count else "GOOD: nothing to mend"
+    return verdict, [check.line() for check in ordered if check.level != OK], [check.line() for check in ordered]
+
+
+def doctor_document(checks: Sequence[Check]) -> dict[str, Any]:
+    """Return the checks as a document for ``--json``."""
+    return {
+        "well": all(check.level != MEND for check in checks),
+        "checks": [{"level": check.level, "text": check.text} for check in checks],
+    }

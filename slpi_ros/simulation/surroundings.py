@@ -1,0 +1,62 @@
+"""What acts on the reading of a stage besides its motion: mains hum and the error of an interferometer."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Hum:
+    """A sinusoidal disturbance.
+
+    Parameters
+    ----------
+    frequency : float, hertz
+    amplitude : float, metres
+    phase : float, radians
+        Phase of the sine at time 0.
+    """
+
+    frequency: float
+    amplitude: float
+    phase: float = 0.0
+
+    def path(self, t: FloatArray) -> FloatArray:
+        """Return the disturbance, shape (N,), metres, at times `t`, shape (N,), seconds."""
+        return np.asarray(self.amplitude * np.imag(np.exp(1j * (2 * np.pi * self.frequency * t + self.phase))))
+
+
+@dataclass(frozen=True)
+class Interferometer:
+    """An interferometer with imperfect quadrature signals.
+
+    Parameters
+    ----------
+    period : float, metres
+        Displacement per fringe: half or a quarter of the wavelength.
+    amplitude : float, metres
+        Amplitude of the error's first harmonic, less than ``period / 2 pi``.
+    phase : float, radians
+        Phase of the error at displacement 0, in ``amplitude sin(2 pi y / period + phase)``.
+    form : {"offsets", "sine"}
+        ``offsets``: both signals have an uncorrected offset, which gives an error with harmonics; ``sine``: an error
+        without harmonics.
+    """
+
+    period: float
+    amplitude: float
+    phase: float = 0.0
+    form: Literal["offsets", "sine"] = "sine"
+
+    def read(self, y: FloatArray) -> FloatArray:
+        """Return the readings, shape (N,), metres, for displacements `y`, shape (N,), metres."""
+        wave = 2 * np.pi / self.period
+        angle = wave * y + self.phase
+        if self.form == "sine":
+            return np.asarray(y + self.amplitude * np.sin(angle))
+        # Angle of the phasor e^(i fringe) relative to a centre with an offset of this fraction of its length.
+        return np.asarray(y + np.angle(1.0 - wave * self.amplitude * np.exp(-1j * angle)) / wave)

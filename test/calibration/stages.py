@@ -1,0 +1,49 @@
+"""A simulated stage to calibrate, without ROS and faster than real time."""
+
+import numpy as np
+
+from slpi_ros.calibration.run import Recording, Request
+from slpi_ros.calibration.settings import CalibrationSettings
+from slpi_ros.io.record import Record
+from slpi_ros.model.limits import Limits
+from slpi_ros.simulation.character import Character, CharacterStage
+
+RATE = 200.0
+# The stage rests this long between two drives, while the calibration computes, seconds.
+PAUSE = 20.0
+
+
+def settings(axes=("x",), **changes):
+    values = {
+        "axes": tuple(axes),
+        "limits": (Limits(0.0, 100.0, 1000.0, 1e5),) * len(axes),
+        "rest": (0.0,) * len(axes),
+        "rate": RATE,
+        "budget": 240.0 * len(axes),
+    }
+    return CalibrationSettings(**values | changes)
+
+
+def stage_of(*characters: Character, seed: int = 3, noise_rms: float = 8e-9) -> CharacterStage:
+    return CharacterStage.of("xyz"[: len(characters)], characters, seed, noise_rms)
+
+
+class SimulatedRecorder:
+    """Drives a simulated stage and keeps what it was asked for."""
+
+    def __init__(self, stage: CharacterStage) -> None:
+        self.stage, self.now = stage, 1000.0
+        self.requests: list[Request] = []
+        self.recordings: list[Recording] = []
+
+    def __call__(self, request: Request) -> Recording:
+        self.requests.append(request)
+        drive = request.drive
+        rows = np.column_stack(list(drive.voltage.values())).tolist()
+        t = (self.now + drive.t).tolist()
+        y = np.array([self.stage.measure(self.stage.step(at, row)) for at, row in zip(t, rows, strict=True)])
+        time_ns = np.round((self.now + drive.t) * 1e9).astype(np.int64)
+        self.now = t[-1] + PAUSE
+        record = Record(time_ns, drive.voltage, dict(zip(drive.axes, y.T, strict=True)), request.name, "simulated")
+        self.recordings.append(Recording(record, request.desired))
+        return self.recordings[-1]

@@ -1,0 +1,70 @@
+"""The drives of a calibration stay within all limits, and begin and end at rest."""
+
+import numpy as np
+import pytest
+from calibration.stages import SimulatedRecorder, settings, stage_of
+
+from slpi_ros.calibration.drives import checking, compensated, exciting
+from slpi_ros.calibration.run import Request
+from slpi_ros.errors import UsageError
+from slpi_ros.excitation.drives import DRIVES
+from slpi_ros.identification.fit import identify
+from slpi_ros.model.limits import Limits
+from slpi_ros.simulation.character import Character
+
+LIMITS = {
+    "usual": Limits(0.0, 100.0, 1000.0, 1e5),
+    "slow": Limits(-20.0, 80.0, 40.0),
+    "sluggish": Limits(0.0, 100.0, 300.0, 2000.0),
+}
+
+
+def require_within(drive, chosen):
+    for axis, limits, rest in zip(chosen.axes, chosen.limits, chosen.rest, strict=True):
+        v = drive.voltage[axis]
+        rate = np.diff(v) * chosen.rate
+        assert limits.lower <= v.min() and v.max() <= limits.upper
+        assert np.abs(rate).max() <= limits.slew * (1 + 1e-9)
+        assert np.abs(np.diff(rate)).max(initial=0.0) * chosen.rate <= limits.acceleration * (1 + 1e-6)
+        assert v[[0, -1]] == pytest.approx(rest, abs=1e-3)
+
+
+@pytest.mark.parametrize("limits", LIMITS)
+def test_every_drive_is_within_its_limits(limits):
+    chosen = settings("xy", limits=(LIMITS[limits],) * 2, rest=(10.0, 0.0))
+    require_within(checking(chosen), chosen)
+    for drive in DRIVES:
+        require_within(exciting(chosen, drive, 20.0, chosen.axes, 1), chosen)
+
+
+@pytest.mark.parametrize("limits", LIMITS)
+def test_the_verification_goes_through_the_compensator_within_its_limits(limits):
+    chosen = settings("x", limits=(LIMITS[limits],), rest=(10.0,))
+    recorder = SimulatedRecorder(stage_of(Character(), noise_rms=1e-9))
+    calibration = exciting(chosen, "calibration", 40.0, chosen.axes, 1)
+    model = identify(recorder(Request("calibration", calibration, {})).record)
+    drive, desired = compensated(chosen, model, 7)
+    require_within(drive, chosen)
+    record = recorder(Request("verification", drive, desired)).record
+    for axis in chosen.axes:
+        error = record.displacement[axis] - desired[axis]
+        error = error[np.isfinite(error)]
+        assert error.size >= 20.0 * chosen.rate
+        assert np.abs(error - np.median(error)).mean() < 2e-3 * np.ptp(record.displacement[axis])
+    other = compensated(chosen, model, 8)[1]["x"]
+    assert not np.allclose(np.nan_to_num(other)[: drive.t.size], np.nan_to_num(desired["x"])[: other.size], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"budget": 30.0},
+        {"rest": (120.0,)},
+        {"limits": (Limits(0.0, float("inf")),)},
+        {"target": -1e-9},
+        {"axes": ()},
+    ],
+)
+def test_settings_that_allow_no_calibration_are_refused(wrong):
+    with pytest.raises(UsageError):
+        settings(**wrong)

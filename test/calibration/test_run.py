@@ -1,0 +1,107 @@
+"""A whole calibration on simulated stages, without ROS."""
+
+import numpy as np
+import pytest
+from calibration.stages import SimulatedRecorder, settings, stage_of
+
+from slpi_ros.calibration.run import Recording, aligned, calibrate
+from slpi_ros.errors import RecordError, SlpiError
+from slpi_ros.io.record import Record
+from slpi_ros.reports.calibration import write_files
+from slpi_ros.simulation.character import Character
+
+
+class Ended(SlpiError):
+    """Raised by a recorder that is interrupted."""
+
+
+class Spoiled(SimulatedRecorder):
+    """A recorder whose record of the check is spoiled."""
+
+    def __init__(self, spoil):
+        super().__init__(stage_of(Character()))
+        self._spoil = spoil
+
+    def __call__(self, request):
+        record = super().__call__(request).record
+        voltage, displacement = self._spoil(record.voltage["x"], record.displacement["x"])
+        return Recording(Record(record.time_ns, {"x": voltage}, {"x": displacement}, record.source), {})
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda v, y: (v, -y),
+        lambda v, y: (v, np.random.default_rng(0).normal(0.0, 1e-8, y.size)),
+        lambda v, y: (0.3 * v, y),
+        lambda v, y: (np.zeros_like(v), y),
+        lambda v, y: (v, np.full_like(y, np.nan)),
+    ],
+    ids=["wrong sense", "no motion", "weak amplifier", "no voltage", "no reading"],
+)
+def test_a_stage_that_does_not_follow_is_not_driven_further(spoil):
+    recorder = Spoiled(spoil)
+    with pytest.raises(RecordError, match="'x'"):
+        calibrate(settings(), recorder)
+    assert [request.name for request in recorder.requests] == ["01_check"]
+
+
+@pytest.mark.slow
+def test_what_was_recorded_leads_to_the_same_drives_again():
+    class Until(SimulatedRecorder):
+        def __call__(self, request):
+            if len(self.requests) == 3:
+                raise Ended
+            return super().__call__(request)
+
+    first = Until(stage_of(Character(lag=0.004)))
+    with pytest.raises(Ended):
+        calibrate(settings(), first)
+    kept = {recording.record.source: recording for recording in first.recordings}
+    asked = []
+
+    def again(request):
+        asked.append(request)
+        if request.name not in kept:
+            raise Ended
+        return kept[request.name]
+
+    with pytest.raises(Ended):
+        calibrate(settings(), again)
+    assert [request.name for request in asked] == ["01_check", "02_calibration", "04_verification", "05_creep"]
+    for before, after in zip(first.requests, asked, strict=False):
+        assert np.array_equal(before.drive.voltage["x"], after.drive.voltage["x"])
+
+
+def test_transport_between_command_and_reading_is_not_an_error_of_the_stage():
+    t = np.arange(2000) / 200.0
+    v = 50.0 + 40.0 * np.sin(2.0 * t)
+    late = 0.0137
+    applied = 50.0 + 40.0 * np.sin(2.0 * (t - late))
+    record = Record(np.round(t * 1e9).astype(np.int64), {"x": applied}, {"x": 1e-7 * applied})
+    found = aligned(record, record.time_ns, {"x": v}, {"x": 1e-7 * v})
+    error = (record.displacement["x"] - found.desired["x"])[20:]
+    assert np.abs(error).max() < 5e-9
+
+
+@pytest.mark.slow
+def test_a_hidden_cause_is_named_and_undone(tmp_path):
+    recorder, steps = SimulatedRecorder(stage_of(Character(creep=0.015))), []
+    outcome = calibrate(settings(), recorder, steps.append)
+    assert outcome.met and outcome.seconds <= outcome.settings.budget
+    assert [effect.name for effect in outcome.diagnosis.axes["x"].effects] == ["creep"]
+    error = outcome.errors["x"]
+    assert error.mean < 5e-4 * error.stroke
+    first = next(step.errors["x"] for step in outcome.steps if step.errors)
+    assert error.mean < 0.5 * first.mean
+    # The compensator starts where the last drive has left the stage.
+    last = recorder.recordings[-1].record
+    assert outcome.model.axes["x"].end.voltage == pytest.approx(last.voltage["x"][-1], abs=0.01)
+    model = outcome.model.axes["x"]
+    memory = model.memory("end")
+    assert memory.displacement == pytest.approx(model.simulate(last.t, last.voltage["x"])[-1], abs=0.5e-6)
+    assert [progress.step for progress in steps] == list(range(1, len(outcome.steps) + 1))
+    write_files(tmp_path, outcome)
+    assert {path.name for path in tmp_path.iterdir()} == {"model.json", "report.html", "diagnosis"}
+    page = (tmp_path / "report.html").read_text()
+    assert all(step.name in page for step in outcome.steps)

@@ -1,0 +1,72 @@
+"""README: its links lead somewhere, its commands are run, and what is not run is listed here with the reason."""
+
+import re
+import shutil
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from documentation.pages import README, Reader, commands_of  # noqa: E402
+
+# Run here, in this order, and in test/nodes/test_readme_steps.py.
+SELF_CALIBRATED = ["stage_simulator", "calibrator", "slpi show", "slpi verify", "slpi diagnose", "slpi refit"]
+BY_HAND = ["stage_simulator", "recorder", "exciter", "slpi identify", "compensator", "ros2 topic pub"]
+NOT_RUN = {
+    "make demo": "minutes of a whole demo",
+    "make test": "runs this test",
+    "make build": "has been run before any test of a node",
+    "source install/setup.bash": "has been run before any test of a node",
+    "export PATH": "the tests have a PATH of their own",
+    "ros2 launch slpi_ros calibrate.launch.py": "launch has no wheels: test_launch_files.py and test_site.py check it",
+    "ros2 bag record": "rosbag2 has no wheels: the recorder does the same",
+}
+# The stage moves faster than in life, and the clock of the other nodes is its own.
+FASTER = {"stage_simulator": "-p speed:=4.0 -p rate:=100.0", "calibrator": "-p use_sim_time:=true -p rate:=100.0"}
+
+
+def command(words):
+    """Return the only command of the page for these words."""
+    all_of_them = [line for line in blocks("bash") if line.removeprefix("ros2 run slpi_ros ").startswith(words)]
+    assert len(all_of_them) == 1, (words, all_of_them)
+    return all_of_them[0]
+
+
+def blocks(language):
+    found = re.findall(rf"^```{language}\n(.*?)^```$", README.read_text(), re.DOTALL | re.MULTILINE)
+    return [line.partition(" #")[0].strip() for block in found for line in block.splitlines()]
+
+
+def test_every_command_is_run_or_has_a_reason_why_not():
+    assert {command(words) for words in SELF_CALIBRATED + BY_HAND} == set(blocks("bash"))
+    not_run = [next((known for known in NOT_RUN if line.startswith(known)), line) for line in blocks("console")]
+    assert sorted(not_run) == sorted(NOT_RUN)
+    assert not re.search(r"^```(?!bash$|console$|$)", README.read_text(), re.MULTILINE)
+    assert len(commands_of(README, "bash", "console")) == len(blocks("bash")) + len(blocks("console"))
+
+
+def test_links_lead_to_files_and_headings():
+    for name, anchor in re.findall(r"\]\((?!\w+:)([\w./-]+)(?:#([\w-]+))?\)", README.read_text()):
+        page = README.parent / name
+        assert page.exists(), name
+        headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE) if anchor else []
+        assert not anchor or anchor in [re.sub(r"[^\w -]", "", one).lower().replace(" ", "-") for one in headings]
+
+
+@pytest.mark.slow
+@pytest.mark.minutes
+def test_a_stage_calibrates_itself_and_is_verified_diagnosed_and_refitted(tmp_path, installed):
+    installed("calibrator")
+    reader = Reader(tmp_path)
+    try:
+        for words in SELF_CALIBRATED:
+            if words == "slpi verify":
+                # The record of a verification stands for that of the next week.
+                last = max(path for path in (tmp_path / "my_stage").iterdir() if "verif" in path.name)
+                shutil.copytree(last, tmp_path / "today")
+            reader.type(f"{command(words)} {FASTER.get(words, '')}", patience=600.0)
+        reader.check_alive()
+    finally:
+        reader.close()
+    for name in ("my_stage/report.html", "verification/report.html", "diagnosis/extended_model.json"):
+        assert (tmp_path / name).exists(), name

@@ -1,0 +1,199 @@
+"""A run on a cluster within this process: rows, references, changes, exchange, continuation."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from distributed import KilledWorker
+from pandas.testing import assert_frame_equal
+
+import slpi_ros
+from slpi_ros.cli import main
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.fleet import bags, cluster, run
+from slpi_ros.fleet.pages import DOCUMENT, PAGE, report_fleet
+from slpi_ros.fleet.results import TABLE, Results
+from slpi_ros.fleet.sources import Bag, find_bags
+from slpi_ros.io.schemas import validate
+
+DAY_NS = 86_400 * 10**9
+
+
+@pytest.fixture(scope="module")
+def done(fleet, client, tmp_path_factory):
+    """Return folder, lines and table of a run."""
+    folder = tmp_path_factory.mktemp("done")
+    lines, usable = report_fleet([str(fleet)], str(folder), client=client, diagnose=False)
+    assert usable
+    return folder, lines, pd.read_parquet(folder / TABLE)
+
+
+def by_name(table):
+    return {Path(row.bag).stem: row for row in table.itertuples()}
+
+
+def test_each_bag_is_a_row(done, fleet):
+    rows = by_name(done[2])
+    assert len(done[2]) == 11 == len(rows)
+    assert {name: row.verdict for name, row in rows.items()} == {
+        "broken": bags.REFUSED,
+        "a-0": bags.IDENTIFIED, "a-10": bags.PASSED, "a-20": bags.CHANGED, "a-30": bags.CHANGED, "a-40": bags.FOREIGN,
+        "b-0": bags.IDENTIFIED, "b-10": bags.PASSED, "b-20": bags.PASSED, "b-30": bags.PASSED, "b-40": bags.FOREIGN,
+    }  # fmt: skip
+    assert "empty" in rows["broken"].error and rows["broken"].axis == ""
+    assert (rows["a-40"].like_stage, rows["b-40"].like_stage) == ("b", "a")
+    assert rows["a-20"].gain_change == pytest.approx(0.02, abs=4 * rows["a-20"].gain_uncertainty)
+    assert rows["a-20"].gain_m_per_v == pytest.approx(1.02 * rows["a-0"].gain_m_per_v, rel=3e-3)
+    assert rows["a-20"].refitted_rms_m < rows["a-20"].limit_rms_m < rows["a-20"].held_out_rms_m
+    assert rows["a-0"].date == pd.Timestamp(20_000 * DAY_NS, tz="UTC")
+
+
+def test_models_of_each_stage(done):
+    folder, _, table = done
+    rows = by_name(table)
+    for name in ("a-0", "a-20"):
+        assert slpi_ros.load_model(folder / rows[name].model).hardware_id == "a"
+    assert rows["a-10"].model == rows["a-0"].model != rows["a-20"].model
+    assert (folder / rows["a-20"].page).is_file()
+
+
+def test_changes_and_exchange(done):
+    document = json.loads((done[0] / DOCUMENT).read_text())
+    validate(document, "fleet", DOCUMENT)
+    a, b = document["stages"]
+    (step,) = [one for one in a["changes"] if one["quantity"] == "gain"]
+    assert step["kind"] == "step" and step["size"] == pytest.approx(0.02, abs=4e-3)
+    assert (step["date_ns"], step["before_ns"]) == (20_020 * DAY_NS, 20_010 * DAY_NS)
+    assert not [one for one in b["changes"] if one["quantity"] == "gain"]
+    for one, other in ((a, "b"), (b, "a")):
+        (exchange,) = one["exchanges"]
+        assert exchange == {
+            "like_stage": other, "date_ns": 20_040 * DAY_NS, "before_ns": 20_030 * DAY_NS, "mutual": True
+        }  # fmt: skip
+        assert one["health"] == "exchanged"
+
+
+def test_pages(done):
+    index = (done[0] / PAGE).read_text()
+    assert 'href="stages/a.html"' in index and "broken.mcap" in index
+    assert (done[0] / "stages" / "a.html").is_file()
+
+
+def test_a_second_run_has_nothing_to_do(done, fleet, client, monkeypatch):
+    monkeypatch.setattr(bags, "examine", None)
+    again = run([fleet], done[0], client=client, diagnose=False)
+    assert_frame_equal(again, done[2])
+
+
+def test_a_run_that_was_stopped_at_any_line_continues(done, fleet, client, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(done[0], folder)
+    lines = (done[0] / "journal.jsonl").read_bytes().splitlines(keepends=True)
+    for kept in (5, 13, len(lines) - 2):
+        (folder / "journal.jsonl").write_bytes(b"".join(lines[:kept]))
+        again = run([fleet], folder, client=client, diagnose=False)
+        assert_frame_equal(again.drop(columns="seconds"), done[2].drop(columns="seconds"))
+
+
+def test_new_and_changed_bags_are_added(stages, client, tmp_path):
+    stages.write(tmp_path / "bags", "a", 0)
+    first = run([tmp_path / "bags"], tmp_path / "out", client=client)
+    stages.write(tmp_path / "bags", "a", 5, 1.03)
+    second = run([tmp_path / "bags"], tmp_path / "out", client=client)
+    assert list(second.verdict) == [bags.IDENTIFIED, bags.CHANGED] and second.seconds[0] == first.seconds[0]
+
+
+def test_given_models_a_date_and_a_list(done, stages, client, tmp_path):
+    rows = by_name(done[2])
+    models = tmp_path / "models"
+    models.mkdir()
+    shutil.copy(done[0] / rows["a-0"].model, models / "a.json")
+    early, late = (stages.write(tmp_path, "a", day, name="") for day in (1, 7))
+    table = tmp_path / "list.csv"
+    table.write_text(f"bag,stage\n{early.name},a\n{late.name},a\nmissing,a\n".replace("unnamed-1,", f"{early},"))
+    found = run([table], client=client, models=models, since=str(np.datetime64(20_003, "D")))
+    assert {Path(row.bag).name: row.verdict for row in found.itertuples()} == {
+        late.name: bags.PASSED, "missing": bags.REFUSED
+    }  # fmt: skip
+
+
+def test_a_bag_of_an_unknown_stage_stands_alone(stages, client, tmp_path):
+    for day in (0, 1):
+        stages.write(tmp_path, "a", day, name="")
+    assert list(run([tmp_path], client=client).verdict) == [bags.IDENTIFIED] * 2
+
+
+def test_what_cannot_be_run(fleet, client, tmp_path):
+    with pytest.raises(UsageError):
+        run([fleet], client=client, workers=2)
+    with pytest.raises(UsageError, match="yesterday"):
+        run([fleet], client=client, since="yesterday")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SlpiError):
+        run([tmp_path / "empty"], client=client)
+    with Results(tmp_path / "out", {}), pytest.raises(SlpiError):
+        run([fleet], tmp_path / "out", client=client)
+
+
+def test_watch_takes_bags_as_they_are_completed(stages, client, tmp_path, monkeypatch):
+    looks = []
+
+    def find(sources):
+        looks.append(len(looks))
+        if looks[-1] == 1:
+            stages.write(tmp_path / "bags", "a", 5)
+            (tmp_path / "bags" / "growing.mcap").write_bytes(b"not yet complete")
+        if looks[-1] == 2:
+            raise KeyboardInterrupt
+        return find_bags(sources)
+
+    stages.write(tmp_path / "bags", "a", 0)
+    monkeypatch.setattr(cluster, "find_bags", find)
+    with pytest.raises(KeyboardInterrupt):
+        run([tmp_path / "bags"], tmp_path / "out", client=client, watch=True)
+    assert list(pd.read_parquet(tmp_path / "out" / TABLE).verdict) == [bags.IDENTIFIED, bags.PASSED]
+
+
+@pytest.mark.parametrize("axes", [(), ("x",)])
+def test_a_bag_that_ends_its_workers_is_a_row(axes):
+    class Future:
+        status = "error"
+
+        def exception(self):
+            return KilledWorker("task", None, 3)
+
+    one = bags.Examined(Bag("/huge.mcap", "a"), "a", axes=axes)
+    task = cluster.Task(one, bags.compare if axes else bags.examine, (), lambda _: ())
+    work = cluster._Cluster(None, None)
+    for attempt in range(cluster.ATTEMPTS - 1):
+        assert list(work._settle(replace(task, attempts=attempt), Future())) == []
+        assert work._waiting.pop().attempts == attempt + 1
+    ((_, result),) = work._settle(replace(task, attempts=cluster.ATTEMPTS - 1), Future())
+    (row,) = result.rows if axes else result.rows()
+    assert row.verdict == bags.REFUSED and row.axis == "".join(axes) and "/huge.mcap" in row.error
+
+
+@pytest.mark.parametrize(
+    ("options", "code"),
+    [
+        (("nothing",), 1),
+        ((".", "--workers", "0"), 2),
+        ((".", "--workers", "2", "--scheduler", "tcp://host:1"), 2),
+        ((".", "--since", "soon"), 2),
+        ((".", "--models", "nothing"), 2),
+        ((".",), 1),
+    ],
+)
+def test_the_command_refuses_in_one_line(options, code, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    try:
+        ended = main(["fleet", *options, "-o", "out"])
+    except SystemExit as end:
+        ended = end.code
+    said = capsys.readouterr()
+    assert ended == code and not said.out and said.err.count("\n") == 1 and said.err.startswith("slpi fleet: ")
+    assert not list(tmp_path.iterdir())

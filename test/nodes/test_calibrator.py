@@ -1,0 +1,207 @@
+"""The calibrator as a process of its own, on a stage in the test that obeys, and then does not."""
+
+import math
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from nodes.ros_helpers import LATCHED, RELIABLE, on_graph, started  # noqa: E402
+from std_msgs.msg import Float64MultiArray, String  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from benchmarks.faulty_stage import FAULTS, FaultyStage  # noqa: E402
+from slpi_ros.io.bag_reader import read_bag  # noqa: E402
+from slpi_ros.model.document import parse_model  # noqa: E402
+
+LOW, HIGH, SLEW, RATE, REST = -10.0, 90.0, 300.0, 100.0, 5.0
+PARAMETERS = {
+    "voltage_min": LOW, "voltage_max": HIGH, "slew_limit": SLEW, "rate": RATE, "rest_voltage": REST,
+    # The stage shares its process with the test, and the machine with other tests.
+    "state_timeout": 1.5,
+}  # fmt: skip
+
+
+def require_safe(stage) -> None:
+    """Within the limits, never faster than the slew limit, and at rest at the end."""
+    assert not stage.harm(LOW, HIGH, SLEW, RATE, REST)
+
+
+def begun(graph, node, stage):
+    """Wait until the calibration drive is well on its way."""
+    graph.tested = node
+    graph.spin_until(lambda: "02_calibration" in node.stderr and max(stage.commands) > 40.0, "the calibration drive")
+    count = len(stage.commands)
+    graph.spin_until(lambda: len(stage.commands) > count + 20, "more of the drive")
+
+
+def ended(graph, node) -> int:
+    graph.tested = None
+    graph.spin_until(lambda: node.process.poll() is not None, "the end of the node")
+    return node.process.returncode
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_of_the_stage_ends_in_a_ramp_to_rest(tmp_path, fault):
+    with on_graph() as graph, started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}) as node:
+        stage = FaultyStage(graph.node)
+        begun(graph, node, stage)
+        stage.fault = fault
+        assert ended(graph, node) == 1
+        last = node.stderr.strip().splitlines()[-1]
+        assert last.startswith("calibrator: ") and "Traceback" not in node.stderr
+    require_safe(stage)
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"01_check", "interrupted_02_calibration"}
+    assert len(read_bag(tmp_path / "out" / "interrupted_02_calibration")) > 100
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("how", ["stop", "signal", "other publisher", "no disk"])
+def test_whoever_ends_it_the_stage_comes_to_rest(tmp_path, how):
+    with on_graph() as graph, started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}) as node:
+        stage = FaultyStage(graph.node)
+        begun(graph, node, stage)
+        if how == "stop":
+            assert graph.call(Trigger, "/calibrator/stop", Trigger.Request()).success
+        elif how == "signal":
+            os.killpg(node.process.pid, signal.SIGTERM)
+        elif how == "other publisher":
+            graph.node.create_publisher(Float64MultiArray, "voltage_command", RELIABLE)
+        else:
+            for path in (tmp_path / "out").glob(".*.partial/*"):
+                path.rename(path.with_name("elsewhere"))
+            assert graph.call(Trigger, "/calibrator/stop", Trigger.Request()).success
+        assert ended(graph, node) == 1
+        assert node.stderr.strip().splitlines()[-1].startswith("calibrator: ") and "Traceback" not in node.stderr
+    require_safe(stage)
+    assert (tmp_path / "out" / "01_check").exists()
+
+
+@pytest.mark.ros
+def test_a_killed_calibration_is_resumed_with_the_bags_that_are_complete(tmp_path):
+    parameters = {**PARAMETERS, "output": str(tmp_path / "out")}
+    with on_graph() as graph:
+        stage = FaultyStage(graph.node)
+        with started("calibrator", parameters) as node:
+            begun(graph, node, stage)
+            os.killpg(node.process.pid, signal.SIGKILL)
+            node.wait()
+        first = read_bag(tmp_path / "out" / "01_check").time_ns
+        with started("calibrator", {**parameters, "resume": True}) as node:
+            count = len(stage.commands)
+            graph.tested = node
+            graph.spin_until(lambda: "02_calibration" in node.stderr, "the calibration drive")
+            # What comes before is the return to rest.
+            graph.spin_until(lambda: REST in stage.commands[count:], "rest")
+            graph.spin_until(lambda: abs(stage.commands[-1] - REST) > 1.0, "its voltages")
+            os.killpg(node.process.pid, signal.SIGINT)
+            assert ended(graph, node) == 1
+        require_safe(stage)
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"01_check", "killed_02_calibration", "interrupted_02_calibration"}
+    assert np.array_equal(read_bag(tmp_path / "out" / "01_check").time_ns, first)
+
+
+@pytest.mark.ros
+def test_it_pauses_and_goes_on(tmp_path):
+    with on_graph() as graph, started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}) as node:
+        stage = FaultyStage(graph.node)
+        begun(graph, node, stage)
+        assert graph.call(Trigger, "/calibrator/pause", Trigger.Request()).success
+        count = len(stage.commands)
+        graph.spin_until(lambda: len(stage.commands) > count + 50, "held voltages")
+        assert np.ptp(stage.commands[-30:]) == 0.0
+        assert graph.call(Trigger, "/calibrator/start", Trigger.Request()).success
+        graph.spin_until(lambda: np.ptp(stage.commands[-30:]) > 1.0, "motion")
+        graph.watch_diagnostics()
+        graph.wait_for_status("/calibrator: calibrator", lambda status: "02_calibration" in status.message, "progress")
+
+
+@pytest.mark.ros
+def test_nothing_moves_while_another_node_publishes_voltages(tmp_path):
+    with on_graph() as graph:
+        graph.node.create_publisher(Float64MultiArray, "voltage_command", RELIABLE)
+        stage = FaultyStage(graph.node)
+        with started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out"), "patience": 2.0}) as node:
+            assert ended(graph, node) == 1
+    assert not stage.commands
+
+
+@pytest.mark.ros
+def test_topics_may_be_remapped_in_a_namespace(tmp_path):
+    remapped = [part for name in ("stage_state", "voltage_command") for part in ("-r", f"{name}:=/{name}")]
+    arguments = ["-r", "__ns:=/left", *remapped]
+    with (
+        on_graph() as graph,
+        started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}, *arguments) as node,
+    ):
+        stage = FaultyStage(graph.node)
+        begun(graph, node, stage)
+        assert graph.call(Trigger, "/left/calibrator/stop", Trigger.Request()).success
+        assert ended(graph, node) == 1
+    require_safe(stage)
+
+
+@pytest.mark.ros
+def test_without_a_stage_it_ends(tmp_path):
+    with started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out"), "patience": 1.0}) as node:
+        assert node.wait() == 1
+        assert "stage_state" in node.stderr
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ("changed", "complaint"),
+    [
+        ({"voltage_max": math.nan}, "voltage_max"),
+        ({"output": ""}, "output"),
+        ({"budget": 20.0}, "budget"),
+        ({"rest_voltage": 200.0}, "200"),
+        ({"rate": 1.0}, "rate"),
+    ],
+)
+def test_parameters_with_which_it_cannot_start(tmp_path, changed, complaint):
+    with started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out"), **changed}) as node:
+        assert node.wait() == 2
+        assert complaint in node.stderr and "Traceback" not in node.stderr
+
+
+@pytest.mark.ros
+def test_a_folder_in_use_is_not_touched(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with started("calibrator", {**PARAMETERS, "output": str(tmp_path)}) as node:
+        assert node.wait() == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.minutes
+def test_a_stage_with_a_hidden_cause_calibrates_itself(tmp_path):
+    rate = 100.0
+    simulated = {"creep": 0.02, "rate": rate, "speed": 4.0}
+    parameters = {
+        "voltage_min": 0.0, "voltage_max": 100.0, "slew_limit": 1000.0, "rate": rate, "target": 0.1,
+        "output": str(tmp_path / "out"), "use_sim_time": True,
+    }  # fmt: skip
+    with on_graph() as graph, started("stage_simulator", simulated):
+        models = graph.record(String, "stage_model", LATCHED)
+        with started("calibrator", parameters) as node:
+            graph.tested = None
+            deadline = time.monotonic() + 600.0
+            while node.process.poll() is None and time.monotonic() < deadline:
+                graph.spin_for(0.1)
+            assert node.process.returncode == 0, node.stderr
+            graph.spin_until(lambda: models, "the model")
+    out = Path(tmp_path / "out")
+    model = parse_model(models[-1].data, "stage_model")
+    assert "creep" in [effect.name for effect in model.axes["x"].effects]
+    assert parse_model((out / "model.json").read_text(), "model.json").hardware_id.startswith("simulated-0-")
+    assert {"report.html", "diagnosis", "01_check", "02_calibration"} <= {path.name for path in out.iterdir()}

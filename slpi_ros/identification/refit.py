@@ -41,6 +41,9 @@ BEYOND_REPEATABILITY = 2.0
 # A model belongs to another stage if its error exceeds this share of the displacement range, and this multiple of the
 # error of a model fitted to the record.
 FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
+# A voltage may exceed the range of the model by this share of it: a measured voltage has an error, and the inverse of an
+# effect may overshoot.
+EXCESS_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -160,12 +163,8 @@ def _held(v: FloatArray) -> FloatArray:
 
 def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisModel, AxisChange]:
     basis, x_old = basis_of(old)
-    low, high = samples.voltage_range
-    if isinstance(basis, SurfaceBasis) and not basis.grid[0] <= samples.v.min() <= samples.v.max() <= basis.grid[-1]:
-        raise IdentificationError(
-            f"the record goes from {low:g} to {high:g} V, the model from {basis.grid[0]:g} to {basis.grid[-1]:g} V; "
-            "identify the stage anew"
-        )
+    if isinstance(basis, SurfaceBasis):
+        samples = _within(samples, float(basis.grid[0]), float(basis.grid[-1]))
     recorded, samples = samples.v, samples.thinned(FIT_SAMPLES)
     found = match(old, samples)
     # Fit only samples independent of the initial history, unless these are too few.
@@ -219,6 +218,17 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
         ),
     )
     return new, change
+
+
+def _within(samples: Samples, low: float, high: float) -> Samples:
+    """Return the samples with a voltage held within the range of the model; IdentificationError if far beyond it."""
+    excess = max(low - samples.v.min(), samples.v.max() - high)
+    if excess > EXCESS_SHARE * (high - low):
+        raise IdentificationError(
+            f"the record goes from {samples.v.min():g} to {samples.v.max():g} V, the model from {low:g} to {high:g} V; "
+            "identify the stage anew"
+        )
+    return replace(samples, v=np.clip(samples.v, low, high)) if excess > 0.0 else samples
 
 
 def require_own(error: float, fitted_anew: float, span: float) -> None:

@@ -195,7 +195,8 @@ def without_noise(t: FloatArray, v: FloatArray) -> FloatArray:
         # The parabola takes part of the noise, and the mean square of few readings scatters.
         explained = noise**2 * (1.0 - _weight_of_own(window)) * (1.0 + np.sqrt(2.0 / window)) ** 2
         smooth = np.where(off < explained, parabola, smooth)
-    return without_small_reversals(smooth, _DEAD_BAND * noise)
+    # A parabola overshoots where the voltage reaches a limit of the amplifier.
+    return without_small_reversals(np.clip(smooth, v.min(), v.max()), _DEAD_BAND * noise)
 
 
 def _weight_of_own(window: int) -> float:

@@ -124,3 +124,17 @@ def test_the_record_of_another_stage_is_refused(model):
     with pytest.raises(IdentificationError, match="this model does not belong to this bag") as refusal:
         refit(model, foreign)
     assert str(refusal.value).count("axis 'x'") == 1
+
+
+@pytest.mark.parametrize("excess", [1e-4, 5e-3])
+def test_a_voltage_slightly_beyond_the_range_is_held_at_its_end(model, excess):
+    low, high = model.axes["x"].voltage_range
+    t, v = calibration_drive(low, high, duration=15.0, rate=200.0, seed=3)
+    record = record_of(t, v, stage(SEED).run(t, v)[1])
+    middle, width = (low + high) / 2, high - low
+    beyond = np.where(np.abs(v - middle) > 0.495 * width, v + excess * width * np.sign(v - middle), v)
+    within, _ = refit(model, record)
+    new, changes = refit(model, replace(record, voltage={"x": beyond}))
+    assert not changes["x"].drifted
+    assert new.axes["x"].voltage_range == (low, high)
+    assert unseen_error(new, 1.0) < 1.1 * unseen_error(within, 1.0)

@@ -37,6 +37,14 @@ def test_noise_is_measured_and_mostly_gone(rate):
     # Turns are where they were, and there are no more of them than twice as many.
     assert np.abs(cleaned - v).max() < 6 * 0.05
     assert len(monotone_runs(cleaned)) < 2 * len(monotone_runs(v))
+    assert noisy.min() <= cleaned.min() and cleaned.max() <= noisy.max()
+
+
+def test_no_voltage_beyond_the_limits_of_the_amplifier():
+    t = np.arange(6000) / 200.0
+    clipped = np.clip(50.0 + 51.0 * np.sin(2.0 * t) + np.random.default_rng(0).normal(0.0, 0.05, t.size), 0.0, 100.0)
+    cleaned = without_noise(t, clipped)
+    assert cleaned is not clipped and 0.0 <= cleaned.min() and cleaned.max() <= 100.0
 
 
 def test_sharp_turns_stay():

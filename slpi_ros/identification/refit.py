@@ -41,8 +41,8 @@ BEYOND_REPEATABILITY = 2.0
 # A model belongs to another stage if its error exceeds this share of the displacement range, and this multiple of the
 # error of a model fitted to the record.
 FOREIGN_SHARE, FOREIGN_TIMES = 0.02, 4.0
-# A voltage may exceed the range of the model by this share of it: a measured voltage has an error, and the inverse of an
-# effect may overshoot.
+# A voltage may exceed the range of the model by this share of it: a measured voltage has an error, and an effect may
+# overshoot.
 EXCESS_SHARE = 0.01
 
 

@@ -44,7 +44,7 @@ def test_no_voltage_beyond_the_limits_of_the_amplifier():
     t = np.arange(6000) / 200.0
     clipped = np.clip(50.0 + 51.0 * np.sin(2.0 * t) + np.random.default_rng(0).normal(0.0, 0.05, t.size), 0.0, 100.0)
     cleaned = without_noise(t, clipped)
-    assert cleaned is not clipped and 0.0 <= cleaned.min() and cleaned.max() <= 100.0
+    assert cleaned is not clipped and cleaned.min() >= 0.0 and cleaned.max() <= 100.0
 
 
 def test_sharp_turns_stay():

@@ -29,7 +29,7 @@ help:
 	@echo 'make test       build, lint, types, docstrings, tests'
 	@echo 'make docs       build, then the documentation site: docs/_build/html/index.html'
 	@echo 'make package    source distribution and wheel, installed and tried in a fresh environment without ROS'
-	@echo 'make demo       build, then simulated stage, calibration, identification and compensation over DDS'
+	@echo 'make demo       build, then a simulated stage that calibrates itself and follows a path; SEED= repeats one'
 	@echo 'make bench      build, then the benchmarks; ratios that have grown by more than 20 % are marked'
 	@echo 'make bench-robustness  spoiled records beside clean ones, 8 seeds, 2 minutes'
 	@echo 'make bench-diagnosis   hidden effects: named, missed, invented; about an hour'
@@ -73,7 +73,7 @@ package: $(VENV_STAMP)
 	$(VENV) tools/check_package.py --install
 
 demo: build
-	$(IN_WORKSPACE) $(VENV) demo/run_demo.py
+	$(IN_WORKSPACE) $(VENV) demo/run_demo.py $(if $(SEED),--seed $(SEED))
 
 bench: build
 	$(IN_WORKSPACE) $(VENV) benchmarks/run_all.py

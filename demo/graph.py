@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
 
 FloatArray = NDArray[np.float64]
 # Samples sent but not yet answered: fewer than the compensator's queue holds.
@@ -27,16 +28,17 @@ EXECUTABLES = Path(__file__).resolve().parents[1] / "install" / "slpi_ros" / "li
 
 
 @contextmanager
-def executable(name: str, **parameters: str | float | bool) -> Iterator[subprocess.Popen[bytes]]:
+def executable(name: str, *, log: str = "warn", **parameters: str | float | bool) -> Iterator[subprocess.Popen[bytes]]:
     """Run one of the package's nodes until the block ends; it gets the time to finish its work."""
-    command = [str(EXECUTABLES / name), "--ros-args", "--log-level", "warn"]
+    command = [str(EXECUTABLES / name), "--ros-args", "--log-level", log]
     for key, value in parameters.items():
         command += ["-p", f"{key}:={value}"]
     process = subprocess.Popen(command, start_new_session=True)
     try:
         yield process
     finally:
-        os.killpg(process.pid, signal.SIGINT)
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGINT)
         try:
             process.wait(timeout=20)
         except subprocess.TimeoutExpired:
@@ -64,6 +66,15 @@ class Operator(Node):
             if time.monotonic() > end:
                 raise SystemExit(f"demo: {what} did not happen within {timeout:g} s")
             time.sleep(0.02)
+
+    def reset(self, compensator: str) -> None:
+        """Let a compensator sweep the stage, so that the memory is known."""
+        client = self.create_client(Trigger, f"{compensator}/reset_memory")
+        self.wait_until(f"the service of {compensator}", client.service_is_ready)
+        answer = client.call_async(Trigger.Request())
+        self.wait_until("the reset of the memory", answer.done)
+        if not answer.result().success:
+            raise SystemExit(f"demo: {answer.result().message}")
 
     def drive(self, voltages: Sequence[float], rate: float) -> FloatArray:
         """Apply voltages (V) one after the other; return voltage and measured displacement, shape (N, 2), V and m."""

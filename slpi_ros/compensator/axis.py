@@ -136,7 +136,7 @@ class Axis:
         if self.driven:
             stream.resume(self.stream)
         self.model, self.stream, self.driven = model, stream, True
-        self.confidence = self.confidence.over(model.voltage_range)
+        self.confidence = self.confidence.over(model.hysteresis_range)
         if self._feedback:
             self._applied = continue_from(model, stream.limits, self._applied)
             self._feedback.limits = stream.limits

@@ -224,7 +224,7 @@ class Controller:
                 axis.start_memory = None if saved else start_memory
             axis.use(one, stream)
             if saved:
-                axis.confidence = saved[axis.name].confidence(one.voltage_range)
+                axis.confidence = saved[axis.name].confidence(one.hysteresis_range)
         self.model = model
         self._couple()
 
@@ -629,7 +629,7 @@ class Controller:
         for axis, span in zip(self.axes, self._spans, strict=True):
             axis.confidence = MemoryConfidence(doubt=INTERRUPTED)
             if axis.ramp and axis.ramp.done and axis.model:
-                axis.confidence = MemoryConfidence(KNOWN, spanned=span).over(axis.model.voltage_range)
+                axis.confidence = MemoryConfidence(KNOWN, spanned=span).over(axis.model.hysteresis_range)
 
     def _release(self, but: Collection[Axis], now_ns: int) -> None:
         """End all ramps; axes in `but` follow new commands, the others decelerate to rest if in motion, then hold."""

@@ -339,6 +339,12 @@ class AxisModel:
         return Chain.of(self.effects)
 
     @cached_property
+    def hysteresis_range(self) -> tuple[float, float]:
+        """Voltage range (V) of the hysteresis in the record: `voltage_range` within the limits of a saturation."""
+        (low, high), (lowest, highest) = self.voltage_range, self.chain.clipped
+        return max(low, lowest), min(high, highest)
+
+    @cached_property
     def _middle(self) -> Middle:
         """Function from voltage (V) to the mid-line of the largest loop (m)."""
         voltages, middle = loop_middle(self._forward_array, *self.voltage_range)

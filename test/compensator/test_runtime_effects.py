@@ -15,6 +15,7 @@ from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.resonance import Resonance
+from slpi_ros.effects.saturation import Saturation
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 
@@ -217,7 +218,7 @@ def test_feedback_with_effects():
     assert errors[True] < 0.05 * errors[False]
 
 
-@pytest.mark.parametrize("effects", [(LAG,), (CREEP,), (LAG, CREEP, MODE)])
+@pytest.mark.parametrize("effects", [(LAG,), (CREEP,), (LAG, CREEP, MODE), (Saturation(0.0, 90.0),)])
 def test_reset_and_ramps_move_the_effects_too(effects):
     made = Controller(["x"], [Limits(*X.voltage_range)])
     made.activate(0)

@@ -70,6 +70,6 @@ def picture(runs: Sequence[Run]) -> Figure:
         lower.plot(run.t, run.error * 1e6, color=colour, linewidth=0.9, label=run.name)
     upper.plot(runs[0].t, runs[0].desired * 1e6, color=DESIRED, linewidth=0.9, linestyle=(0, (4, 3)), label="desired")
     label_axes(upper, "", "displacement (µm)")
-    upper.legend(frameon=False, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    upper.legend(frameon=False, ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     label_axes(lower, "time (s)", "measured - desired (µm)")
     return figure

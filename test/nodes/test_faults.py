@@ -138,14 +138,17 @@ PUBLISHER = """
 import sys, time, json, rclpy
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
-rows, start, period = json.loads(sys.stdin.read())
+rows, start, period = json.loads(sys.stdin.readline())
 rclpy.init()
 node = rclpy.create_node("planner")
 publisher = node.create_publisher(JointState, "desired_displacement", QoSProfile(depth=5000))
 while not publisher.get_subscription_count():
     time.sleep(0.01)
 message = JointState(name=["x", "y"])
+allowed = 0
 for i, row in enumerate(rows):
+    while i >= allowed:
+        allowed = int(sys.stdin.readline())
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(start + i * period, 1_000_000_000)
     message.position = row
     publisher.publish(message)
@@ -160,9 +163,12 @@ def test_a_publisher_killed_in_the_middle_of_a_move(model_file):
         planner = subprocess.Popen([sys.executable, "-c", PUBLISHER], stdin=subprocess.PIPE, text=True)
         try:
             assert planner.stdin
-            planner.stdin.write(f"[{rows}, {START_NS}, {2 * MS}]")
-            planner.stdin.close()
-            client.graph.spin_until(lambda: client.answered > 100, "answers to the planner")
+            planner.stdin.write(f"[{rows}, {START_NS}, {2 * MS}]\n")
+            # Never more on their way than the queue of a busy compensator holds.
+            for allowed in range(40, 400, 20):
+                planner.stdin.write(f"{allowed}\n")
+                planner.stdin.flush()
+                client.graph.spin_until(lambda: client.answered > allowed - 40, "answers to the planner")  # noqa: B023
         finally:
             planner.send_signal(signal.SIGKILL)
             planner.wait()

@@ -31,7 +31,8 @@ def test_a_stage_with_one_and_with_two_who_command():
             assert found.stamps.shape == found.arrivals.shape and found.model is None
             assert not faults("/voltage_command", found)
             graph.node.create_publisher(Float64MultiArray, "voltage_command", 1)
-            assert faults("/voltage_command", probe("stage_state", "voltage_command", "", 0.5))
+            # A busy machine may need longer to discover it.
+            graph.spin_until(lambda: faults("/voltage_command", probe("stage_state", "voltage_command", "", 0.5)), "it")
 
 
 def test_without_a_driver_the_command_fails(capsys):

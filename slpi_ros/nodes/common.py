@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -193,6 +193,21 @@ class Diagnostics:
         self._publisher.publish(array)
 
 
+@runtime_checkable
+class HasDeadlines(Protocol):
+    """A node that has to act at certain times, which change often.
+
+    A timer that is reset often does not serve: if the events executor is late, each reset lets it call every timer that
+    is due once more, which moves the next calls of all of them by a period each.
+    """
+
+    def seconds_to_deadline(self) -> float:
+        """Return the time (s) until the next call of `meet_deadline`; infinite if there is no deadline."""
+
+    def meet_deadline(self) -> None:
+        """Do what is due, if anything; called after each callback of the node, and at the deadline."""
+
+
 # A signal is noticed between two calls of spin_once: this bounds the wait on an idle graph.
 SPIN_TIMEOUT = 0.1
 
@@ -294,13 +309,15 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
     try:
         executor = make_executor(getattr(node, "executor_kind", kind))
         executor.add_node(node)
+        timed = node if isinstance(node, HasDeadlines) else None
         try:
             while ok() and not _stop.requested:
-                try:
-                    executor.spin_once(timeout_sec=SPIN_TIMEOUT)
-                except rclpy_implementation.InvalidHandle:
-                    # A subscription was destroyed while one of its events waited to be taken.
-                    continue
+                timeout = SPIN_TIMEOUT if timed is None else min(timed.seconds_to_deadline(), SPIN_TIMEOUT)
+                # A subscription may be destroyed while one of its events waits to be taken.
+                with suppress(rclpy_implementation.InvalidHandle):
+                    executor.spin_once(timeout_sec=timeout)
+                if timed is not None:
+                    timed.meet_deadline()
         finally:
             executor.remove_node(node)
             executor.shutdown()

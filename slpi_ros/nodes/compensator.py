@@ -1,10 +1,11 @@
 """Node ``compensator``: converts desired displacements into voltages.
 
 The node is an adapter: it decodes messages, calls the `Controller`, and publishes voltages and diagnostics. Motion
-without messages (trajectory points, ramps, the reset of the memory) is executed by one timer, which is set to the next
-deadline of the controller.
+without messages (trajectory points, ramps, the reset of the memory) is executed by `Compensator.meet_deadline`, which
+`slpi_ros.nodes.common.run` calls at the next deadline of the controller.
 """
 
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -54,8 +55,8 @@ from slpi_ros.nodes.parameters import Parameters
 LOG_PERIOD, FILE_LOG_PERIOD = 5.0, 60.0
 # Period of the watchdog check, seconds.
 WATCH_PERIOD = 0.05
-# Polling period of a simulated clock, and shortest period of a timer, nanoseconds.
-SIMULATED_PERIOD_NS, SHORTEST_WAIT_NS = 1_000_000, 1_000
+# Polling period of a simulated clock, seconds.
+SIMULATED_PERIOD = 1e-3
 # History, depth and reliability, by parameters qos_overrides./TOPIC.{publisher,subscription}.POLICY.
 OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 # Time to wait at shutdown for the delivery of the last voltages.
@@ -100,8 +101,6 @@ class Compensator(LifecycleNode):
         self._reading: Reading | None = None
         # The steady clock, as a simulated one may stop while the amplifier moves in real time.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(PERIOD, self._on_timer, clock=steady)
-        self._timer.cancel()
         self._on_simulated = False
         self.create_timer(values["diagnostic_period"], self._on_period, clock=steady)
         self.create_timer(WATCH_PERIOD, self._watch, clock=steady)
@@ -216,7 +215,6 @@ class Compensator(LifecycleNode):
             controller.ramp(safety.voltages, safety.rate, now_ns)
         else:
             controller.hold(now_ns)
-        self._timer.cancel()
         if before is Mode.RESETTING:
             self._answer_reset()
         while controller.ramping and self.context.ok():
@@ -283,7 +281,6 @@ class Compensator(LifecycleNode):
             self._reject("trajectory ", error)
             return
         self._on_simulated = self._simulated
-        self._schedule()
         self.get_logger().info(f"trajectory: {controller.trajectory.remaining} points to come")
         self._report()
 
@@ -325,13 +322,26 @@ class Compensator(LifecycleNode):
     def _simulated(self) -> bool:
         return bool(self.get_clock().ros_time_is_active)
 
-    def _on_timer(self) -> None:
+    def seconds_to_deadline(self) -> float:
+        """Return the time (s) until the next call of `meet_deadline`; infinite if no motion is pending."""
+        # Without pending motion there is no deadline, whatever the time is.
+        if self._controller.next_due_ns(0, 0) is None:
+            return math.inf
+        now_ns, clock_ns = self._clocks()
+        due_ns = self._controller.next_due_ns(now_ns, clock_ns)
+        seconds = max((due_ns or 0) - now_ns, 0) * 1e-9
+        return min(seconds, SIMULATED_PERIOD) if self._simulated else seconds
+
+    def meet_deadline(self) -> None:
+        """Execute what is due of the motion without messages, if anything."""
         controller, before = self._controller, self._controller.mode
+        if controller.next_due_ns(0, 0) is None:
+            return
         now_ns, clock_ns = self._clocks()
         if before is Mode.TRAJECTORY and self._on_simulated != self._simulated:
             controller.cancel(now_ns)
             self.get_logger().error("use_sim_time was changed: trajectory canceled, as its times are no longer valid")
-        # One point per call, so that other callbacks run even if points are due faster than they can be processed.
+        # One point per call, so that callbacks run even if points are due faster than they can be processed.
         deadline_ns = controller.trajectory.next_deadline_ns
         held = controller.counts.points_held
         if controller.advance(now_ns, clock_ns):
@@ -344,18 +354,6 @@ class Compensator(LifecycleNode):
             if before is Mode.RESETTING:
                 self._answer_reset()
             self._report()
-        self._schedule()
-
-    def _schedule(self) -> None:
-        """Set the timer to the next deadline of the controller."""
-        now_ns, clock_ns = self._clocks()
-        due_ns = self._controller.next_due_ns(now_ns, clock_ns)
-        if due_ns is None:
-            self._timer.cancel()
-            return
-        wait_ns = max(due_ns - now_ns, SHORTEST_WAIT_NS)
-        self._timer.timer_period_ns = min(wait_ns, SIMULATED_PERIOD_NS) if self._simulated else wait_ns
-        self._timer.reset()
 
     def _on_period(self) -> None:
         self._report()
@@ -365,7 +363,6 @@ class Compensator(LifecycleNode):
 
     def _watch(self) -> None:
         if self._controller.watch(self._settings.safety, time.monotonic_ns()):
-            self._schedule()
             self._report()
 
     def _report(self) -> None:
@@ -479,7 +476,6 @@ class Compensator(LifecycleNode):
         values, controller = self._settings.values, self._controller
         finals = values["safe_voltage"] if values["reset_to"] == "safe" else list(controller.voltages)
         controller.reset_memory(values["reset_cycles"], values["reset_rate"], finals, time.monotonic_ns())
-        self._schedule()
         self._report()
 
     def _on_reset(self) -> str:

@@ -184,3 +184,13 @@ def test_a_cancelled_trajectory_brakes(xy_file):
         v = np.array(client.answers)[:, 0]
         way = v[-1] - last_at_full_pace(v)
         assert 5.0 < way <= 200.0**2 / 2 / 1000.0 + 1e-6 and (np.diff(v) >= 0.0).all()
+
+
+def test_points_that_come_too_fast_hold_up_no_report(xy_file):
+    path = np.column_stack([4e-6 + 3e-6 * np.sin(np.arange(30_000) / 3000.0)] * 2)
+    with compensator(axes=["x", "y"], model_file=xy_file, diagnostic_period=3.0) as client:
+        client.connect()
+        sender(client).publish(trajectory(["x", "y"], np.arange(len(path)) * 50_000, path))
+        client.report("the end", points_remaining=0, trajectories=1)
+        before = len(client.reports)
+        client.graph.spin_until(lambda: len(client.reports) > before, "a report")

@@ -41,6 +41,8 @@ BETTER = 0.01
 MOST_EFFECTS = 4
 # Largest p-value for a gain to be significant, and for two effects to differ; number of random sign patterns.
 CHANCE, ALIKE = 0.01, 0.05
+# The p-value of an effect that acts in a few blocks only, such as a saturation, is never small: limit for a large gain.
+LARGE_GAIN, CHANCE_OF_LARGE_GAIN = 0.3, 0.05
 SURROGATES = 1999
 # Lower bound of losses, for records without noise (m^2).
 TINY = 1e-30
@@ -140,7 +142,7 @@ def held_out_error(score: Score, *, own: bool) -> float:
 def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[Contender]:
     """Return candidates for the named effects that explain part of the residual, the best one first.
 
-    Of several records, significant effects that are common to all records precede all other candidates.
+    Significant effects precede all others; of several records, those that are common to all records come first.
     """
     taken = {effect.name for effect in now.effects}
     screened = {name: best for name in names if name not in taken and (best := _screened(name, now))}
@@ -158,8 +160,8 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
     sound = [one for one in _refined(tried, now, most) if plausible(one.effect, one.explanation)]
     several = len(now.evidence.parts) > 1
 
-    def rank(one: Contender) -> tuple[bool, float]:
-        return several and (is_own(one.effect) or not one.counts_beside(now)), one.rms
+    def rank(one: Contender) -> tuple[bool, bool, float]:
+        return not one.counts_beside(now), several and is_own(one.effect), one.rms
 
     return sorted(sound, key=rank)
 
@@ -345,7 +347,8 @@ def _ratio_on_records(before: Score, after: Score) -> FloatArray:
 
 def counts(before: Score, after: Score, *, own: bool = True) -> bool:
     """Return whether a gain is large, significant and, unless the effect is separate in each record, carries over."""
-    if not (gain(before, after) >= LEAST_GAIN and chance_of_gain(before, after) <= CHANCE):
+    chance = CHANCE if gain(before, after) < LARGE_GAIN else CHANCE_OF_LARGE_GAIN
+    if not (gain(before, after) >= LEAST_GAIN and chance_of_gain(before, after) <= chance):
         return False
     return own or carries_over(before, after)
 

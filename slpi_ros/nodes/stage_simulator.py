@@ -25,6 +25,8 @@ from slpi_ros.simulation.character import Character, CharacterStage
 from slpi_ros.simulation.stage import Stage, p11_stage
 
 LOG_PERIOD = 5.0
+# Time without a command after which states are published again, seconds: somebody may wait for one before the next.
+QUIET = 2.0
 # Seconds; creep has decayed after this time.
 DAY = 86_400.0
 VOLTAGE = (-10_000.0, 10_000.0)
@@ -76,7 +78,7 @@ DECLARATIONS = (
         read_only=True,
     ),
     Declaration(
-        "rate", 200.0, "States per second without answer_commands, and while nobody commands, hertz.",
+        "rate", 200.0, "States per second without answer_commands, and while no commands come, hertz.",
         read_only=True, between=(1e-3, 1e4), number=True,
     ),
     Declaration(
@@ -106,7 +108,7 @@ class StageSimulator(Node):
     Subscribes to ``voltage_command`` (std_msgs/Float64MultiArray, volts in the order of the axes) and publishes
     ``stage_state`` (sensor_msgs/JointState: measured displacement in metres in ``position``, applied voltage in volts
     in ``effort``) from its start on: once for each command; at the parameter ``rate`` before the first command and
-    while nobody publishes commands.
+    after two seconds without a command, and at once when nobody publishes commands any more.
     Commands beyond the voltage limits are clipped, as the amplifier saturates. Parameters in `DECLARATIONS`.
 
     Without a preset the stage has random hysteresis, drawn from the seed, and the effects of its character. Preset
@@ -147,7 +149,7 @@ class StageSimulator(Node):
                 one.begin_drift(begun)
         self._apply([self._clip(0.0)] * len(axes))
         self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
-        self._answers, self._commanded = values["answer_commands"], False
+        self._answers, self._commanded_at = values["answer_commands"], -math.inf
         period = 1.0 / values["rate"]
         if self._speed == 1.0:
             self.create_timer(period, self._on_timer)
@@ -155,6 +157,10 @@ class StageSimulator(Node):
             self._clock_publisher = self.create_publisher(ClockMsg, "/clock", COMMANDS)
             self.create_timer(period / self._speed, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._commands = self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, COMMANDS)
+        self.get_logger().info(
+            f"stage '{self._state.header.frame_id}', axes {', '.join(axes)}, {self._low:g} to {self._high:g} V: takes "
+            f"{self._commands.topic_name}, publishes {self._publisher.topic_name}"
+        )
 
     def _now_ns(self) -> int:
         """Return the time of the stage (ns), which never decreases, even if the clock of the node is set back."""
@@ -170,7 +176,8 @@ class StageSimulator(Node):
         self._on_timer()
 
     def _on_timer(self) -> None:
-        if not self._answers or not self._commanded or not self.count_publishers(self._commands.topic_name):
+        quiet = time.monotonic() > self._commanded_at + QUIET or not self.count_publishers(self._commands.topic_name)
+        if quiet or not self._answers:
             self._apply(self._state.effort)
             self._publish()
 
@@ -184,7 +191,7 @@ class StageSimulator(Node):
                 throttle_duration_sec=LOG_PERIOD,
             )
             return
-        self._commanded = True
+        self._commanded_at = time.monotonic()
         self._apply([self._clip(v) for v in voltages])
         if self._answers:
             self._publish()

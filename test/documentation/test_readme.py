@@ -19,6 +19,7 @@ NOT_RUN = {
     "source install/setup.bash": "has been run before any test of a node",
     "export PATH": "the tests have a PATH of their own",
     "ros2 launch slpi_ros calibrate.launch.py": "launch has no wheels: test_launch_files.py and test_site.py check it",
+    "ros2 run slpi_ros exciter": "run below by hand, with another seed",
     "ros2 bag record": "rosbag2 has no wheels: the recorder does the same",
 }
 # The stage moves faster than in life, and the clock of the other nodes is its own.

@@ -18,12 +18,18 @@ def faults(topic, found):
     return [check.text for check in check_graph(found) if check.level == MEND and check.text.startswith(topic)]
 
 
+def complete(found):
+    there = found.state_publishers and found.command_publishers and found.command_subscribers and len(found.nodes) > 1
+    return found if there and found.limits and found.stamps.size > 10 else None
+
+
 def test_a_stage_with_one_and_with_two_who_command():
     with on_graph() as graph, started("stage_simulator", {"hardware_id": "s1"}):
         graph.spin_until(lambda: graph.node.count_publishers("stage_state"), "the simulator")
         with started("compensator", {"voltage_max": 90.0}):
             graph.spin_until(lambda: graph.node.count_publishers("voltage_command"), "the compensator")
-            found = probe("stage_state", "voltage_command", "", 1.0)
+            # A busy machine may need longer to discover everything.
+            found = graph.spin_until(lambda: complete(probe("stage_state", "voltage_command", "", 1.0)), "both nodes")
             assert list(found.state_publishers) == ["/stage_simulator"] and found.hardware_id == "s1"
             assert found.command_publishers == ["/compensator"] and found.command_subscribers == ["/stage_simulator"]
             assert found.limits == {"x": (0.0, 90.0)} and {"/stage_simulator", "/compensator"} <= set(found.nodes)
@@ -31,7 +37,6 @@ def test_a_stage_with_one_and_with_two_who_command():
             assert found.stamps.shape == found.arrivals.shape and found.model is None
             assert not faults("/voltage_command", found)
             graph.node.create_publisher(Float64MultiArray, "voltage_command", 1)
-            # A busy machine may need longer to discover it.
             graph.spin_until(lambda: faults("/voltage_command", probe("stage_state", "voltage_command", "", 0.5)), "it")
 
 

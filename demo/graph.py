@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from numpy.typing import NDArray
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -54,9 +55,11 @@ class Operator(Node):
         self.voltage = self.create_publisher(Float64MultiArray, "voltage_command", QOS)
         self.desired = self.create_publisher(JointState, "desired_displacement", QOS)
         self._answers: list[tuple[float, float]] = []
+        self.state = JointState()
         self.create_subscription(JointState, "stage_state", self._keep, QOS)
 
     def _keep(self, state: JointState) -> None:
+        self.state = state
         self._answers.append((state.effort[0], state.position[0]))
 
     def wait_until(self, what: str, condition: Callable[[], bool], timeout: float = 30.0) -> None:
@@ -82,11 +85,14 @@ class Operator(Node):
 
     def follow(self, displacements: Sequence[float], rate: float) -> FloatArray:
         """Wish for displacements (m) one after the other; return as `drive` does."""
-        return self._send([JointState(name=["x"], position=[y]) for y in displacements], self._publish_desired, rate)
-
-    def _publish_desired(self, message: JointState) -> None:
-        message.header.stamp = self.get_clock().now().to_msg()
-        self.desired.publish(message)
+        # The times at which the samples are meant: those at which they are sent are less even.
+        begin = self.get_clock().now()
+        messages = []
+        for k, y in enumerate(displacements):
+            message = JointState(name=["x"], position=[y])
+            message.header.stamp = (begin + Duration(seconds=k / rate)).to_msg()
+            messages.append(message)
+        return self._send(messages, self.desired.publish, rate)
 
     def _send(self, messages: Sequence[object], publish: Callable[[object], None], rate: float) -> FloatArray:
         self._answers = []

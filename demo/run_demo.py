@@ -87,7 +87,10 @@ def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y
         )
         time.sleep(SETTLE)
         stage.reset("/compensator")
-        return plots.Run(name, t, y, stage.follow(y.tolist(), RATE)[:, 1])
+        # To the begin of the path without a jump, from where the reset has left the stage.
+        at = float(stage.state.position[0])
+        approach = at + (y[0] - at) * (1 - np.cos(np.linspace(0.0, np.pi, int(RATE)))) / 2
+        return plots.Run(name, t, y, stage.follow([*approach.tolist(), *y.tolist()], RATE)[-y.size :, 1])
 
 
 def compared(seed: int, models: Mapping[str, Path], stroke: tuple[float, float], duration: float) -> list[plots.Run]:

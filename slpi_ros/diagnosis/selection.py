@@ -142,7 +142,7 @@ def held_out_error(score: Score, *, own: bool) -> float:
 def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[Contender]:
     """Return candidates for the named effects that explain part of the residual, the best one first.
 
-    Significant effects precede all others; of several records, those that are common to all records come first.
+    Of several records, significant effects precede all others, and among them those that are common to all records.
     """
     taken = {effect.name for effect in now.effects}
     screened = {name: best for name in names if name not in taken and (best := _screened(name, now))}
@@ -161,7 +161,7 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
     several = len(now.evidence.parts) > 1
 
     def rank(one: Contender) -> tuple[bool, bool, float]:
-        return not one.counts_beside(now), several and is_own(one.effect), one.rms
+        return several and not one.counts_beside(now), several and is_own(one.effect), one.rms
 
     return sorted(sound, key=rank)
 

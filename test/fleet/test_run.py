@@ -18,6 +18,7 @@ from slpi_ros.fleet import bags, cluster, run
 from slpi_ros.fleet.pages import DOCUMENT, PAGE, report_fleet
 from slpi_ros.fleet.results import TABLE, Results
 from slpi_ros.fleet.sources import Bag, find_bags
+from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.schemas import validate
 
 DAY_NS = 86_400 * 10**9
@@ -119,6 +120,19 @@ def test_given_models_a_date_and_a_list(done, stages, client, tmp_path):
     assert {Path(row.bag).name: row.verdict for row in found.itertuples()} == {
         late.name: bags.PASSED, "missing": bags.REFUSED
     }  # fmt: skip
+
+
+def test_the_cause_of_an_error_that_is_no_change_is_named(stages, client, tmp_path):
+    stages.write(tmp_path / "bags", "a", 0)
+    record = stages.record("a", 5)
+    hum = 60e-9 * np.sin(2 * np.pi * 13.7 * stages.drive.t)
+    write_bag(tmp_path / "bags" / "a-5", replace(record, displacement={"x": record.displacement["x"] + hum}))
+    rows = by_name(run([tmp_path / "bags"], client=client))
+    assert rows["a-0"].diagnosis == "" and len(rows["a-0"].causes) == 0
+    assert rows["a-5"].diagnosis == "named" and rows["a-5"].verdict != bags.CHANGED
+    (cause,) = rows["a-5"].causes
+    assert cause["name"] == "hum" and cause["p_value"] < 0.01 and cause["share_of_residual"] > 0.9
+    assert json.loads(cause["parameters"])["frequency"] == pytest.approx(13.7, abs=0.02)
 
 
 def test_a_bag_of_an_unknown_stage_stands_alone(stages, client, tmp_path):

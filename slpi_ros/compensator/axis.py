@@ -6,6 +6,7 @@ from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, Residua
 from slpi_ros.compensator.model_swap import continue_from, take_over, turning_voltages, voltage_history
 from slpi_ros.compensator.persistence import MemoryConfidence
 from slpi_ros.compensator.ramps import Brake, Ramp
+from slpi_ros.compensator.statistics import TrackingError
 from slpi_ros.compensator.validation import Stamps, implausible
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.io.messages import SECOND_NS
@@ -53,6 +54,8 @@ class Axis:
         Time of the last output voltage.
     point_ns : int or None, nanoseconds
         Deadline of the last sample on the trajectory clock; None if it was not a trajectory point.
+    tracking : TrackingError
+        Statistics of measured - desired displacement.
     """
 
     stream: StreamingInverse
@@ -69,6 +72,7 @@ class Axis:
         self.start_memory: StartMemory | None = None
         self.given_ns = 0
         self.point_ns: int | None = None
+        self.tracking = TrackingError()
         self._loop_settings = loop_settings
         self._feedback: Feedback | None = None
 
@@ -233,6 +237,7 @@ class Axis:
             self.held = self.slewing = False
         self.given_ns = now_ns
         self.start_memory = None
+        self.tracking.desired = y
         return v
 
     def measure(self, displacement: float, now_ns: int) -> bool:
@@ -254,6 +259,7 @@ class Axis:
         assert self._feedback
         self._feedback.measure(displacement, now_ns)
         self._residuals.measure(displacement)
+        self.tracking.measure(displacement)
         return self.confidence is not before
 
     def _choose_memory(self, measured: float) -> None:
@@ -323,7 +329,7 @@ class Axis:
         if not moving:
             # The ramp starts at `now_ns`.
             self.given_ns = now_ns
-        self.ramp, self.point_ns, self.start_memory = ramp, None, None
+        self.ramp, self.point_ns, self.start_memory, self.tracking.desired = ramp, None, None, None
 
     def brake(self, now_ns: int) -> None:
         """Start to decelerate to rest within the acceleration limit; `step_ramp` executes it."""

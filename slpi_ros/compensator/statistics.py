@@ -1,4 +1,4 @@
-"""Message counters and latency statistics of a compensator."""
+"""Message counters, latency and tracking error of a compensator."""
 
 from array import array
 from dataclasses import dataclass, field, replace
@@ -112,3 +112,64 @@ class Timing:
     def restart(self) -> None:
         """Discard the collected times."""
         self._count = 0
+
+
+# Number of measurements in the statistics of the tracking error.
+TRACKED = 500
+
+
+@dataclass(frozen=True)
+class TrackingReport:
+    """Tracking error, measured - desired, over the last `TRACKED` measurements.
+
+    Parameters
+    ----------
+    latest, mean, rms : float, metres
+    maximum : float, metres
+        Largest absolute value.
+    """
+
+    latest: float
+    mean: float
+    rms: float
+    maximum: float
+
+
+class TrackingError:
+    """Collect the tracking error, measured - desired, of one axis.
+
+    Attributes
+    ----------
+    desired : float or None, metres
+        Present setpoint; None while the axis does not follow desired displacements.
+    fresh : bool
+        Whether there was a measurement since the last report.
+    """
+
+    __slots__ = ("_count", "_errors", "desired", "fresh")
+
+    def __init__(self) -> None:
+        self.desired: float | None = None
+        self.fresh = False
+        self._errors = array("d", bytes(8 * TRACKED))
+        self._count = 0
+
+    def measure(self, displacement: float) -> None:
+        """Store the error of a measured displacement (m) if there is a setpoint."""
+        if self.desired is not None:
+            self._errors[self._count % TRACKED] = displacement - self.desired
+            self._count += 1
+            self.fresh = True
+
+    def report(self) -> TrackingReport:
+        """Return the statistics; NaN without any measurement."""
+        self.fresh = False
+        if not self._count:
+            return TrackingReport(np.nan, np.nan, np.nan, np.nan)
+        errors = np.frombuffer(self._errors)[: min(self._count, TRACKED)]
+        return TrackingReport(
+            latest=float(errors[(self._count - 1) % TRACKED]),
+            mean=float(errors.mean()),
+            rms=float(np.sqrt(np.mean(errors**2))),
+            maximum=float(np.abs(errors).max()),
+        )

@@ -35,6 +35,7 @@ from slpi_ros.model.document import load_model
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import (
     COMMANDS,
+    DIAGNOSTICS,
     LATCHED,
     MEASUREMENTS,
     WARN,
@@ -53,7 +54,7 @@ from slpi_ros.nodes.parameters import Parameters
 
 # Minimum time between two log messages of the same kind, seconds.
 LOG_PERIOD, FILE_LOG_PERIOD = 5.0, 60.0
-# Period of the watchdog check, seconds.
+# Period of the watchdog check and of `tracking_error`, seconds.
 WATCH_PERIOD = 0.05
 # Polling period of a simulated clock, seconds.
 SIMULATED_PERIOD = 1e-3
@@ -67,7 +68,7 @@ class Compensator(LifecycleNode):
     """Lifecycle node that publishes the voltages of all axes for every message with desired displacements.
 
     Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement`` and ``stage_model``,
-    publishes ``voltage_command`` and ``/diagnostics``, provides the service ``~/reset_memory``. Message types, units
+    publishes ``voltage_command``, ``tracking_error`` and ``/diagnostics``, provides the service ``~/reset_memory``. Message types, units
     and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
 
     Raises
@@ -148,6 +149,7 @@ class Compensator(LifecycleNode):
         self._publisher = self.create_lifecycle_publisher(
             Float64MultiArray, "voltage_command", COMMANDS, qos_overriding_options=OVERRIDABLE
         )
+        self._error_publisher = self.create_lifecycle_publisher(JointState, "tracking_error", DIAGNOSTICS)
         on_desired: dict[str, tuple[Any, Any]] = {
             "JointState": (JointState, self._on_joint_state),
             "Float64": (Float64, self._on_value),
@@ -230,7 +232,8 @@ class Compensator(LifecycleNode):
     def _leave_topics(self) -> None:
         for subscription in self._subscriptions_of_state:
             self.destroy_subscription(subscription)
-        self.destroy_lifecycle_publisher(self._publisher)
+        for publisher in (self._publisher, self._error_publisher):
+            self.destroy_lifecycle_publisher(publisher)
 
     # Desired and measured displacements
 
@@ -364,6 +367,21 @@ class Compensator(LifecycleNode):
     def _watch(self) -> None:
         if self._controller.watch(self._settings.safety, time.monotonic_ns()):
             self._report()
+        if self._controller.active:
+            self._publish_tracking_errors()
+
+    def _publish_tracking_errors(self) -> None:
+        """Publish the tracking errors of all axes if any axis was measured since the last call."""
+        axes = self._controller.axes
+        if not any(axis.tracking.fresh for axis in axes):
+            return
+        message = JointState()
+        for axis in axes:
+            report = axis.tracking.report()
+            message.name += [axis.name, f"{axis.name}.mean", f"{axis.name}.rms", f"{axis.name}.maximum"]
+            message.position.extend([report.latest, report.mean, report.rms, report.maximum])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._error_publisher.publish(message)
 
     def _report(self) -> None:
         self._reporter.report(self._settings)

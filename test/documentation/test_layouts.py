@@ -16,6 +16,8 @@ CONFIG = ROOT / "config"
 TOPICS = {each["name"]: each for each in json.loads((ROOT / "msg_schemas" / "topics.json").read_text())["topics"]}
 STAGE = yaml.safe_load((CONFIG / "xy.yaml").read_text())["/**"]["ros__parameters"]
 VALUES = set(re.findall(r"`([\w.]+)`", (ROOT / "msg_schemas" / "README.md").read_text()))
+# Names in a message for an axis, beside the axis itself.
+TRACKING = {"/tracking_error": ["mean", "rms", "maximum"]}
 STATUS = "/compensator: compensator"
 
 
@@ -52,8 +54,10 @@ def test_plotjuggler():
             start = f"/diagnostics/{STAGE['hardware_id']}/{STATUS}/"
             assert series.startswith(start)
             assert_value(series.removeprefix(start))
-        elif joint := re.fullmatch(r"(/\w+)/(\w+)/(position|effort)", series):
-            assert joint[2] in STAGE["axes"]
+        elif joint := re.fullmatch(r"(/\w+)/([\w.]+)/(position|effort)", series):
+            axis, _, value = joint[2].partition(".")
+            assert axis in STAGE["axes"]
+            assert value in (TRACKING[joint[1]] if value else ("",))
             assert_field(joint[1], joint[3])
         else:
             topic, field, index = re.fullmatch(r"(/\w+)/(\w+)\[(\d+)\]", series).groups()
@@ -79,7 +83,7 @@ def test_foxglove():
         else:
             topic, field, index = re.fullmatch(r"(/\w+)\.(\w+)\[(\d+)\]", path).groups()
             assert_field(topic, field)
-            assert int(index) < len(STAGE["axes"])
+            assert int(index) < len(STAGE["axes"]) * (1 + len(TRACKING.get(topic, ())))
     assert len(paths) > 15
     summary = document["configById"]["DiagnosticSummary!all"]
     assert summary["topicToRender"] in TOPICS

@@ -76,6 +76,24 @@ def test_feedback_corrects_what_the_model_does_not_know_and_the_drift_is_told(x_
         client.report(**{"x.feedback": "off"})
 
 
+def test_the_tracking_error_is_published_for_each_axis(x_file):
+    with compensator(model_file=x_file) as client:
+        client.connect()
+        stage = DriftedStage(client, 4.0)
+        found = client.graph.record(JointState, "/tracking_error")
+        assert np.abs(stage.follow(PATH)).mean() > 3e-7
+
+        def at_rest():
+            # Until the window holds measurements at rest only, whose errors are equal.
+            (error,) = stage.follow(PATH[-1:])
+            expected = [error, error, abs(error), abs(error)]
+            return found and found[-1].position.tolist() == pytest.approx(expected, rel=1e-9)
+
+        client.graph.spin_until(at_rest, "the statistics at rest")
+        assert found[-1].name == ["x", "x.mean", "x.rms", "x.maximum"]
+        assert found[-1].header.stamp.sec > 0
+
+
 def test_without_measurements_the_feedback_holds_and_says_so(x_file):
     with compensator(model_file=x_file, feedback=True, **GAINS) as client:
         client.connect()

@@ -23,6 +23,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.identification.fit import identify
 from slpi_ros.io.record import Record
 from slpi_ros.model.limits import Limits
+from slpi_ros.model.stage_model import StageModel
 from slpi_ros.simulation.character import CharacterStage
 
 RATE, NOISE, BUDGET, FIXED = 200.0, 8e-9, 300.0, 30.0
@@ -75,14 +76,23 @@ def settings_for(axes: Sequence[str]) -> CalibrationSettings:
     return CalibrationSettings(tuple(axes), (LIMITS,) * count, (0.0,) * count, RATE, BUDGET * count)
 
 
-def reachable(axes: Sequence[str], seed: int, requests: Sequence[Request], axis: str) -> float:
-    """Return the mean error (m) that the true model would leave on the last path: lasting effects and noise."""
+def reachable(axes: Sequence[str], seed: int, requests: Sequence[Request], axis: str, model: StageModel) -> float:
+    """Return the mean error (m) that the true model would leave on the last path.
+
+    It is due to lasting effects, to noise, and to what the inverse of the other effects leaves sample by sample, which
+    is computed with the identified `model` as the stage.
+    """
     true, without = hidden(axes, seed), hidden(axes, seed)
     for one in without.axes.values():
         one.character = replace(one.character, **dict.fromkeys(LASTING, 0.0))
-    place = list(axes).index(axis)
+    place, last = list(axes).index(axis), requests[-1]
+    undone = {
+        name: replace(one, effects=tuple(effect for effect in one.effects if effect.removable == "always"))
+        for name, one in model.axes.items()
+    }
     left = (Bench(true).replayed(requests) - Bench(without).replayed(requests))[:, place]
-    left = left[np.isfinite(requests[-1].desired[axis])]
+    left += replace(model, axes=undone).simulate(last.drive.t, last.drive.voltage)[axis] - last.desired[axis]
+    left = left[np.isfinite(left)]
     noise = np.random.default_rng(0).normal(0.0, NOISE, left.size)
     return float(np.abs(left - np.median(left) + noise).mean())
 
@@ -149,7 +159,8 @@ def rows_of(axes: Sequence[str], seed: int) -> list[Row]:
     return [
         Row(
             seed, axis, effects[axis], tuple(named.name for named in outcome.diagnosis.axes[axis].effects), error,
-            reachable(axes, seed, bench.requests, axis), fixed[axis], outcome.seconds / len(axes), outcome.why,
+            reachable(axes, seed, bench.requests, axis, outcome.model), fixed[axis], outcome.seconds / len(axes),
+            outcome.why,
         )
         for axis, error in outcome.errors.items()
     ]  # fmt: skip

@@ -194,7 +194,8 @@ class RateLaw:
 
     def growth(self, t: FloatArray, v: FloatArray) -> FloatArray:
         """Return the growth, shape (N,), along voltages `v` (V) at times `t` (s), shape (N,) each."""
-        rate = _settled(t, np.abs(np.gradient(v, t)), self.settling)
+        # Between samples the voltage is linear: no stage knows the next sample.
+        rate = _settled(t, np.abs(np.diff(v, prepend=v[:1]) / np.diff(t, prepend=-np.inf)), self.settling)
         if self.exponent:
             return np.asarray(self.strength * (rate / self.reference_rate) ** self.exponent, dtype=np.float64)
         return np.asarray(

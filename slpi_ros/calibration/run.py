@@ -415,7 +415,7 @@ def _follows(axis: str, drive: Drive, record: Record) -> str:
             f"axis '{axis}': the displacement falls by {-slope * applied:.3g} m when the voltage rises by "
             f"{applied:.3g} V; change the sign of the displacement in the driver"
         )
-    return f"axis {axis} follows with {slope * 1e6:.3g} um/V"
+    return f"axis {axis} follows with {slope * 1e6:.3g} µm/V"
 
 
 def tracking_error(recording: Recording, axis: str, model: StageModel, goal: float) -> TrackingError:

@@ -278,7 +278,7 @@ class Axis:
         best = min(START_MEMORIES, key=lambda name: errors[name])
         self.start_memory = None
         if errors[best] > max(noise, FIT_SHARE * (high - low)):
-            tried = ", ".join(f"{name} {error * 1e6:.4g} um" for name, error in errors.items())
+            tried = ", ".join(f"{name} {error * 1e6:.4g} µm" for name, error in errors.items())
             self.confidence = MemoryConfidence(
                 doubt=f"the measurement matches no initial history of the model (errors: {tried}); call ~/reset_memory",
                 contradicted=True,

@@ -12,14 +12,16 @@ FloatArray = NDArray[np.float64]
 
 @compiled
 def settled_rate(t: FloatArray, v: FloatArray, settling: float) -> FloatArray:
-    """Return the rate (V/s) of `v` (V) at times `t` (s), shape (N,) each, low-pass filtered over `settling` (s)."""
-    settled, now, last = np.empty_like(v), 0.0, v.size - 1
-    for k in range(v.size):
-        # The rate before the present sample; the streaming version has no access to the present one.
-        before, after = max(k - 1, 0), min(k + 1, last)
-        dt = t[after] - t[before]
-        rate = abs(v[after] - v[before]) / dt if dt > 0.0 else 0.0
-        now = rate + (now - rate) * (exp((t[before] - t[k]) / settling) if settling else 0.0)
+    """Return the rate (V/s) of `v` (V) at times `t` (s), shape (N,) each, low-pass filtered over `settling` (s).
+
+    It starts at 0. Between samples `v` is linear, so that the rate of a step does not act before the step.
+    """
+    settled, now = np.zeros_like(v), 0.0
+    for k in range(1, v.size):
+        dt = t[k] - t[k - 1]
+        if dt > 0.0:
+            rate = abs(v[k] - v[k - 1]) / dt
+            now = rate + (now - rate) * (exp(-dt / settling) if settling else 0.0)
         settled[k] = now
     return settled
 

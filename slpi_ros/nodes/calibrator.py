@@ -277,7 +277,7 @@ class Calibrator(Node):
 
     def _on_progress(self, progress: Progress) -> None:
         self._progress = progress
-        error = "" if progress.error is None else f", mean error so far {progress.error * 1e6:.4f} um"
+        error = "" if progress.error is None else f", mean error so far {progress.error * 1e6:.4f} µm"
         self.get_logger().info(
             f"step {progress.step}: {progress.doing}; {progress.seconds_left:.0f} s of drives left{error}"
         )

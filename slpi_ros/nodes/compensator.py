@@ -68,8 +68,8 @@ class Compensator(LifecycleNode):
     """Lifecycle node that publishes the voltages of all axes for every message with desired displacements.
 
     Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement`` and ``stage_model``,
-    publishes ``voltage_command``, ``tracking_error`` and ``/diagnostics``, provides the service ``~/reset_memory``. Message types, units
-    and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
+    publishes ``voltage_command``, ``tracking_error`` and ``/diagnostics``, provides the service ``~/reset_memory``.
+    Message types, units and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
 
     Raises
     ------

@@ -485,7 +485,7 @@ def described(model: StageModel) -> str:
         quality, (low, high) = axis.quality, axis.displacement_range
         axes.append(
             f"{name}: {axis.kind}, rms {quality.rms * 1e9:.1f} nm (held out {quality.held_out_rms * 1e9:.1f} nm) "
-            f"of {(high - low) * 1e6:.3g} um from {quality.samples} samples"
+            f"of {(high - low) * 1e6:.3g} µm from {quality.samples} samples"
         )
     return f"identified {'; '.join(axes)}"
 

@@ -300,7 +300,14 @@ class MemoryFile:
         memory = SavedMemory(model_id(model), complete, axes)
         if memory == self._saved:
             return
-        mark = save_memory(memory, self._path)
+        try:
+            mark = save_memory(memory, self._path)
+        except ModelError:
+            if not complete and (self._saved is None or self._saved.complete):
+                # The complete state in the file is no longer the present one, but a crash would make it look so.
+                with suppress(OSError):
+                    os.unlink(self._path)
+            raise
         self._saved = memory
         if self._last and complete:
             self._last.discard()

@@ -316,7 +316,7 @@ class Identify(Node):
         self._asked = settings.request if settings.request.bags else None
         self._watch = BagWatch(settings.watch_directory) if settings.watch_directory else None
         if not self._asked and not self._watch:
-            self.get_logger().warning(NOTHING_TO_DO)
+            self.get_logger().info(NOTHING_TO_DO)
         self._poll_bags()
         self._start_next()
         self._report()

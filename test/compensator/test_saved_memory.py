@@ -12,12 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from strategies import two_axes
 
+from slpi_ros.compensator import persistence
 from slpi_ros.compensator.persistence import (
     ASSUMED,
     CRASHED,
     RESTORED,
     LastVoltages,
     MemoryConfidence,
+    MemoryFile,
     SavedAxis,
     SavedMemory,
     load_memory,
@@ -162,3 +164,35 @@ def test_a_place_that_cannot_be_written_is_said(tmp_path):
         save_memory(SAVED, tmp_path / "no folder" / "memory.json")
     with pytest.raises(ModelError, match=f"^[^\n]*{tmp_path}[^\n]*$"):
         load_memory(tmp_path)
+
+
+@pytest.mark.parametrize("before", [True, False], ids=["ended in order", "crashed"])
+def test_an_old_state_does_not_outlive_a_start_that_cannot_save(tmp_path, monkeypatch, before):
+    path = tmp_path / "memory.json"
+    save_memory(replace(SAVED, complete=before), path)
+    full = MemoryFile(str(path))
+
+    def no_space(memory, path):
+        raise ModelError(os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(persistence, "save_memory", no_space)
+    with pytest.raises(ModelError):
+        full.save(MODEL, SAVED.axes, complete=False)
+    # The next life knows nothing, rather than what was true before this one.
+    assert load_memory(path) is None
+
+
+def test_a_full_disk_does_not_discard_what_this_life_has_saved(tmp_path, monkeypatch):
+    path = tmp_path / "memory.json"
+    memory = MemoryFile(str(path))
+    memory.save(MODEL, SAVED.axes, complete=False)
+    memory.note(as_given(3.0, 4.0))
+
+    def no_space(memory, path):
+        raise ModelError(os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(persistence, "save_memory", no_space)
+    moved = {**SAVED.axes, "y": SavedAxis((5.0,), False)}
+    with pytest.raises(ModelError):
+        memory.save(MODEL, moved, complete=False)
+    assert load_memory(path).axes["x"].reversal_voltages[-1] == 3.0

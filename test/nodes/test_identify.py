@@ -134,7 +134,7 @@ def test_a_bag_becomes_the_model_that_the_library_identifies(bag, tmp_path):
     assert found.simulate(np.arange(300), path) == pytest.approx(model.simulate(np.arange(300), path), abs=1e-12)
     assert without_time(output.read_text()) == without_time(document)
     values = values_of(status)
-    assert status.level == b"\0" and " nm" in status.message and "um" in status.message
+    assert status.level == b"\0" and " nm" in status.message and "µm" in status.message
     assert float(values["x.rms_nm"]) == pytest.approx(model.axes["x"].quality.rms * 1e9, rel=1e-2)
     assert values["x.samples"] == str(model.axes["x"].quality.samples)
 

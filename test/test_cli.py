@@ -181,7 +181,7 @@ def test_an_import_tells_what_it_took_for_what(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines()[1:-1] == [
         "time: column 'Zeit' taken as s",
-        "axis Weg: Spannung 0 to 100.5 V (unit assumed), Weg [nm] -0.5 to 19.8 um",
+        "axis Weg: Spannung 0 to 100.5 V (unit assumed), Weg [nm] -0.5 to 19.8 µm",
     ]
 
 

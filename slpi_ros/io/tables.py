@@ -110,7 +110,7 @@ def _summary(record: Record, choice: ColumnChoice) -> Iterable[str]:
         yield f"time: column '{choice.time.name}' taken as {choice.time.unit}"
     for axis in record.axes:
         voltage = _column_summary(choice.voltage[axis], record.voltage[axis], "V")
-        displacement = _column_summary(choice.displacement[axis], record.displacement[axis] * 1e6, "um")
+        displacement = _column_summary(choice.displacement[axis], record.displacement[axis] * 1e6, "µm")
         yield f"axis {axis}: {voltage}, {displacement}"
 
 

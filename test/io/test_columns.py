@@ -172,15 +172,15 @@ def test_a_column_has_one_role(table):
 def test_an_import_tells_columns_units_and_ranges(table):
     path = table("time_ms,voltage_mV,displacement_nm", "0,0,-500", "1,100000,19800", "2,5,")
     assert import_with_summary(path, ColumnOptions())[1] == (
-        "axis x: voltage_mV 0 to 100 V, displacement_nm -0.5 to 19.8 um",
+        "axis x: voltage_mV 0 to 100 V, displacement_nm -0.5 to 19.8 µm",
     )
     path = table("Time,Voltage,x_V,Position,displacement_y_um", "0,1,2,3,4", "1,5,6,7,8")
     options = ColumnOptions(voltage=("Voltage", "x_V"), displacement=("position", "displacement_y_um"))
     lines = import_with_summary(path, options)[1]
     assert lines == (
         "time: column 'Time' taken as s",
-        "axis x: Voltage 1 to 5 V (unit assumed), Position 3 to 7 um (unit assumed)",
-        "axis y: x_V 2 to 6 V, displacement_y_um 4 to 8 um",
+        "axis x: Voltage 1 to 5 V (unit assumed), Position 3 to 7 µm (unit assumed)",
+        "axis y: x_V 2 to 6 V, displacement_y_um 4 to 8 µm",
     )
     path = table("time_s,voltage_V,displacement", "0,1,", "1,5,nan")
     lines = import_with_summary(path, ColumnOptions(displacement_unit="nm"))[1]

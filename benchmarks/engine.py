@@ -212,6 +212,7 @@ def processor_time(arguments: tuple[str, ...], repeats: int = 5) -> float:
 def cold_start() -> dict[str, float]:
     """Print the processor time that compilation adds to a first run; return it in units of the import of NumPy."""
     code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
         "import engine, numpy as np; y = engine.wishes(engine.loop_family(), np.linspace(0.0, 100.0, 100_000)); "
         "t = np.arange(y.size) * 1e-3; m = engine.axis_model(y); "
         "[engine.replace(m, effects=e).compensate(t, y) for e in engine.EFFECTS.values()]"

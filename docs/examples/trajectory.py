@@ -1,4 +1,4 @@
-"""Send a sine of 5 um amplitude around 10 um, one period in a second, at 1 kHz."""
+"""Send a sine of 5 µm amplitude around 10 µm, one period in a second, at 1 kHz."""
 
 import math
 

@@ -77,8 +77,10 @@ def unrelaxed(crept: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatA
     """Return the displacement, shape (N,), metres, whose sum with its relaxations, as in `relaxed`, is `crept`."""
     moved, last, states = np.empty_like(crept), 0.0, np.zeros(gains.size)
     # `states` are without the part of the present input, which is added with the next sample.
-    step, kept = holds[:, 1] + holds[:, 2] * holds[:, 0], holds[:, 2].copy()
-    direct = 1.0 + gains @ np.ascontiguousarray(holds[:, 0])
+    step, kept, direct = np.empty(gains.size), np.empty(gains.size), 1.0
+    for i in range(gains.size):
+        step[i], kept[i] = holds[i, 1] + holds[i, 2] * holds[i, 0], holds[i, 2]
+        direct += gains[i] * holds[i, 0]
     if crept.size:
         moved[0] = last = crept[0] / direct
     for k in range(1, crept.size):

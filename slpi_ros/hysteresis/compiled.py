@@ -286,6 +286,14 @@ def bypass(gains: FloatArray, v: float, u: float) -> float:
 
 
 @compiled
+def transfer(source: FloatArray, target: FloatArray) -> None:
+    """Copy a piece, shape (2, 4). An assignment of a whole array would take several seconds to compile."""
+    for c in range(2):
+        for k in range(4):
+            target[c, k] = source[c, k]
+
+
+@compiled
 def on_piece(x: float, now: float, s: float, here: int, piece: FloatArray) -> float:
     """Return the other coordinate at `x`, ahead of `now`, on a piece of a branch as in `through`; NaN beyond it."""
     there, u = 1 - here, s * (x - piece[here, 0])
@@ -376,13 +384,13 @@ def through_play(
                             break
                         if moved:
                             s, depth, point[0], point[1] = s_0, depth_0, v_0, y_0
-                            piece[:] = kept
+                            transfer(kept, piece)
                         before = wanted
                         if wanted == y_0:
                             reached = v_0
                             continue
                         moved = True
-                        kept[:] = piece
+                        transfer(piece, kept)
                         reached = on_piece(wanted, y_0, s, 1, piece)
                         if lower <= reached <= upper:
                             point[0], point[1] = reached, wanted
@@ -419,7 +427,7 @@ def through_play(
             if u != point[0]:
                 if moved:
                     s, depth, point[0], point[1] = s_0, depth_0, v_0, y_0
-                    piece[:] = kept
+                    transfer(kept, piece)
                 answer = on_piece(u, v_0, s, 0, piece)
                 if not isnan(answer):
                     point[0], point[1] = u, answer

@@ -101,7 +101,7 @@ class SensorPeriodic:
     def describe(self) -> str:
         """Describe amplitude and period."""
         return (
-            f"the sensor errs by {self.amplitude * 1e9:.3g} nm, again and again with every "
+            f"the sensor has a periodic error of {self.amplitude * 1e9:.3g} nm, with a period of "
             f"{self.period * 1e9:.4g} nm of displacement"
         )
 

@@ -77,24 +77,36 @@ def settings_for(axes: Sequence[str]) -> CalibrationSettings:
 
 
 def reachable(axes: Sequence[str], seed: int, requests: Sequence[Request], axis: str, model: StageModel) -> float:
-    """Return the mean error (m) that the true model would leave on the last path.
+    """Return the mean error (m) that the true model would leave on a path.
 
-    It is due to lasting effects, to noise, and to what the inverse of the other effects leaves sample by sample, which
-    is computed with the identified `model` as the stage.
+    It is due to lasting effects on the last path, to noise, and to what the inverse of the other effects leaves sample
+    by sample, which is computed with the identified `model` as the stage.
     """
     true, without = hidden(axes, seed), hidden(axes, seed)
     for one in without.axes.values():
         one.character = replace(one.character, **dict.fromkeys(LASTING, 0.0))
-    place, last = list(axes).index(axis), requests[-1]
+    place = list(axes).index(axis)
+    lasting = (Bench(true).replayed(requests) - Bench(without).replayed(requests))[:, place]
+    lasting = _centred(lasting[np.isfinite(requests[-1].desired[axis])])
+    inverse = _left_by_inverse(settings_for(axes), model, axis)
+    noise = np.random.default_rng(0).normal(0.0, NOISE, min(lasting.size, inverse.size))
+    return float(np.abs(lasting[: noise.size] + inverse[: noise.size] + noise).mean())
+
+
+def _left_by_inverse(settings: CalibrationSettings, model: StageModel, axis: str) -> NDArray[np.float64]:
+    """Return the errors of the compensation of a path, shape (N,), metres, if the stage were the model."""
     undone = {
         name: replace(one, effects=tuple(effect for effect in one.effects if effect.removable == "always"))
         for name, one in model.axes.items()
     }
-    left = (Bench(true).replayed(requests) - Bench(without).replayed(requests))[:, place]
-    left += replace(model, axes=undone).simulate(last.drive.t, last.drive.voltage)[axis] - last.desired[axis]
-    left = left[np.isfinite(left)]
-    noise = np.random.default_rng(0).normal(0.0, NOISE, left.size)
-    return float(np.abs(left - np.median(left) + noise).mean())
+    stage = replace(model, axes=undone)
+    drive, desired = compensated(settings, stage, 1)
+    errors = stage.simulate(drive.t, drive.voltage)[axis] - desired[axis]
+    return _centred(errors[np.isfinite(errors)])
+
+
+def _centred(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return errors - np.median(errors)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import argparse
 import json
 import math
 import os
+import re
 import shlex
 import sys
 import warnings
@@ -417,6 +418,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complete()
     if not arguments:
         parser("").print_help()
+    for argument in arguments:
+        # argparse reads the first as an empty list, and no file can have the second in its name.
+        if re.fullmatch(r"--[^=]+=--", argument) or "\0" in argument:
+            parser("").error(f"argument {argument!r} has no valid value")
     options = parser(arguments[0] if arguments else "").parse_args(arguments)
     for output in (sys.stdout, sys.stderr):
         # Characters that the terminal encoding lacks are printed as escape sequences.
@@ -712,12 +717,9 @@ def _verify(options: argparse.Namespace) -> Result:
 
 def _excite(options: argparse.Namespace) -> Result:
     from slpi_ros.excitation.drives import excite
-    from slpi_ros.io.input_limits import LONGEST_NAME
     from slpi_ros.io.tables import write_table
 
-    for axis in options.axis:
-        if "," in axis or not axis.strip() or not axis.isprintable() or len(axis) > LONGEST_NAME:
-            raise UsageError(f"--axis {axis!r}: no name of an axis; for two axes write --axis x y")
+    _require_axis_names(options.axis)
     drive = excite(
         options.axis,
         voltage_min=options.voltage_min,
@@ -994,7 +996,20 @@ def _doctor(options: argparse.Namespace) -> Result:
     return Result(lines, doctor_document(checks), next_command, verdict, details, well)
 
 
+def _require_axis_names(axes: Sequence[str]) -> None:
+    """Raise UsageError for something that is no name of a new axis."""
+    from slpi_ros.io.record import is_axis_name
+
+    for axis in axes:
+        if "," in axis or not axis.strip() or not is_axis_name(axis):
+            raise UsageError(f"--axis {axis!r}: no name of an axis; for two axes write --axis x y")
+
+
 def _calibrate(options: argparse.Namespace) -> Result:
+    from slpi_ros.excitation.legs import DriveSpec
+
+    _require_axis_names(options.axis)
+    DriveSpec(options.voltage_min, options.voltage_max, duration=1.0, rate=1.0, slew_limit=options.slew)
     given = {
         "axes": "['" + "', '".join(options.axis) + "']",
         "voltage_min": options.voltage_min,

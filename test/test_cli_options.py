@@ -50,6 +50,20 @@ def test_an_axis_is_named_once(command, capsys, folder):
     assert "--axis" in refused(capsys, folder, *command, "--axis", "x", "y", "x")
 
 
+@pytest.mark.parametrize("argument", ["--axis=--", "--voltage-max=--", "--seed=--", "drive\0.csv"])
+def test_arguments_that_are_no_value(argument, capsys, folder):
+    with pytest.raises(SystemExit) as end:
+        main([*EXCITE, "--voltage-max", "100", argument])
+    assert end.value.code == 2 and capsys.readouterr().err.count("\n") == 1 and not list(folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    "option", [("--voltage-min", "nan"), ("--voltage-max", "0"), ("--slew", "-1"), ("--axis", "a\x1b[2J")]
+)
+def test_a_calibration_that_the_node_would_refuse(option, capsys, folder):
+    refused(capsys, folder, "calibrate", "-o", "d", "--voltage-min", "0", "--voltage-max", "100", *option)
+
+
 @pytest.mark.parametrize("kind", ["slpi", "pi", "mpi", "smpi"])
 def test_loops_at_rest_are_of_one_kind(kind, capsys, folder):
     said = refused(capsys, folder, *IDENTIFY, "--kind", kind, "--loops-at-rest", "--report", "page")

@@ -340,7 +340,43 @@ def lone_outliers(
         first, end = max(start - _RINGING, 0), start + _BLOCK + _RINGING
         here = _outliers_of_block(y[first:end], v[first:end], gain, noise_y, (limit, beyond_kink), jump) + first
         found.append(here[(here >= start) & (here < start + _BLOCK)])
-    return np.concatenate(found)
+    if y.size >= _END_WINDOWS * _WINDOW:
+        still = ~_after_jumps(v[-2 * _RINGING :], jump)
+        at_start = _outliers_at_start(y, v, gain, limit)
+        at_end = _outliers_at_start(y[::-1], v[::-1], gain, limit, follows=False)
+        found += [at_start, np.asarray(y.size - 1 - at_end[still[-1 - at_end]])]
+    return np.unique(np.concatenate(found))
+
+
+def _outliers_at_start(
+    y: FloatArray, v: FloatArray, gain: float, limit: float, follows: bool = True
+) -> NDArray[np.int64]:
+    """Return which of the first two readings deviate from a line through the next five although the voltage does not.
+
+    Parameters
+    ----------
+    y, v, gain
+        As for `lone_outliers`.
+    limit : float, metres
+        Largest deviation of a reading from the mean of four others by noise.
+    follows : bool
+        Whether one signal may jump at the start and the other follow later. Default True.
+    """
+    at, inner = np.arange(2), np.arange(2, 7)
+    off = np.abs(y[at] - np.polyval(np.polyfit(inner, y[inner], 1), at))
+    near = np.arange(_WINDOW)
+    explained = float(np.abs(v[near] - np.polyval(np.polyfit(inner, v[inner], 1), near)).max())
+    if follows:
+        # As long as this signal stays where it is after the jump, any motion of the other one is due to the jump.
+        away = np.abs(y[2 : _END_WINDOWS * _WINDOW] - y[2]) > 0.25 * off.max()
+        until = int(np.argmax(away)) if away.any() else away.size
+        explained = max(explained, float(np.ptp(v[: max(2 + until, _WINDOW)])))
+    # The line does not account for a reversal, a kink or a curve beside it.
+    steps = np.diff(y[2:_WINDOW])
+    bent = 5.0 * np.abs(steps).max() + 10.0 * np.abs(np.diff(steps)).max()
+    # Variance of the distance from the line, relative to that from the mean of four readings.
+    variance = (1.2 + 0.1 * (at - inner.mean()) ** 2) / 1.25
+    return np.asarray(at[off > limit * np.sqrt(variance) + 2.0 * gain * explained + bent])
 
 
 def _outliers_of_block(

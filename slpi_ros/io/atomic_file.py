@@ -30,10 +30,11 @@ def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = Slpi
     SlpiError
         Of the type `failure`, if the file cannot be written.
     """
-    target = Path(path)
-    draft = target.parent / f".{target.name}.{os.getpid()}.partial"
-    if not str(path) or not is_replaceable(target):
+    if not str(path) or not is_replaceable(Path(path)):
         raise failure(f"'{path}': cannot be written: no regular file; choose another place")
+    # What a link leads to is replaced, not the link.
+    target = Path(os.path.realpath(path)) if "\0" not in str(path) else Path(path)
+    draft = target.parent / f".{target.name}.{os.getpid()}.partial"
     try:
         with draft.open("w", encoding="utf-8") as file:
             yield file

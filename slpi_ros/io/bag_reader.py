@@ -184,6 +184,12 @@ class _Bag:
     def _open(self, source: Path, stack: ExitStack) -> None:
         reader = stack.enter_context(Reader(stack.enter_context(unpacked(source))))
         for connection in reader.connections:
+            # They are not checked by the reader of metadata.yaml.
+            for name, value in (("name", connection.topic), ("type", connection.msgtype)):
+                if not isinstance(value, str):
+                    raise TypeError(f"{name} {value!r} of a topic is no text")
+            if not isinstance(connection.msgcount, int) or connection.msgcount < 0:
+                raise TypeError(f"message_count {connection.msgcount!r} of topic {connection.topic} is no count")
             self._topics[connection.topic] = connection.msgtype
             self._counts[connection.topic] += connection.msgcount
         # The reader of a folder has one storage for each file, decompressed if necessary; that of a file is itself one.

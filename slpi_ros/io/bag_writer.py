@@ -70,6 +70,8 @@ class BagWriter:
         if storage not in STORAGES:
             raise UsageError(f"no bag storage '{storage}'; choose {' or '.join(STORAGES)}")
         self.path = Path(path).absolute()
+        if not self.path.name:
+            raise RecordError(f"{path}: no name of a bag; give the name of a new folder")
         self.partial = partial_path(self.path)
         self.message_count = 0
         self._topic = topic

@@ -68,6 +68,11 @@ def first_step_back(times: NDArray[np.int64]) -> int | None:
     return None
 
 
+def is_axis_name(axis: str) -> bool:
+    """Return whether an axis can have this name."""
+    return 0 < len(axis) <= LONGEST_NAME and axis.isprintable()
+
+
 @dataclass(frozen=True)
 class Record:
     """Voltage and displacement of the axes of one stage, with common time stamps.
@@ -111,7 +116,7 @@ class Record:
                 f"{sorted(self.displacement)}; each axis needs both"
             )
         for axis in self.voltage:
-            if not axis or not axis.isprintable() or len(axis) > LONGEST_NAME:
+            if not is_axis_name(axis):
                 raise RecordError(
                     f"{self.source}: {axis[:LONGEST_NAME]!r} is no name of an axis: give it one of 1 to "
                     f"{LONGEST_NAME} printable characters"

@@ -37,8 +37,12 @@ _LINES_TO_SEARCH = 100
 _UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _NO_TEXT = re.compile(r"[\0-\x08\x0e-\x19\x7f]")
 _ENOUGH = 10_000
-# Type of a compressed element in a MATLAB file, and bytes that are unpacked at once.
-_MAT_COMPRESSED, _UNPACKED_AT_ONCE = 15, 2**20
+# Bytes of a MATLAB file that are unpacked at once, and type of a compressed element.
+_UNPACKED_AT_ONCE, _MAT_COMPRESSED = 2**20, 15
+_ENDLESS = 2**64
+# Types of the parts of a matrix: flags, shape, name; numbers. Classes of numeric matrices, and flag of a complex one.
+_MAT_HEADER, _MAT_NUMBERS = ({6}, {5, 6}, {1, 16}), {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}
+_MAT_NUMERIC, _MAT_COMPLEX = range(6, 16), 0x800
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,7 @@ class CsvTable:
     def _number(self, cell: str, line: int, column: str) -> float:
         text = cell if self.separator == "," else cell.replace(",", ".")
         try:
-            return float(text) if text.strip() else np.nan
+            return _to_float(text) if text.strip() else np.nan
         except ValueError:
             raise RecordError(
                 f"{self.path}: line {line}, column '{column}': {cell[:40]!r} is not a number; "
@@ -284,10 +288,17 @@ def _are_numbers(cells: Sequence[str], names: Sequence[str]) -> bool:
 
 def _is_number(text: str) -> bool:
     try:
-        float(text.replace(",", "."))
+        _to_float(text.replace(",", "."))
     except ValueError:
         return False
     return True
+
+
+def _to_float(text: str) -> float:
+    """Return `float` of a cell; ValueError also for the digits of other scripts and for underscores between digits."""
+    if "_" in text or not text.strip().isascii():
+        raise ValueError(text)
+    return float(text)
 
 
 _NUMERIC = {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
@@ -355,7 +366,8 @@ def load_mat(path: Path) -> MatTable:
     columns: list[str] = []
     others = []
     for name, shape, kind in _joined(path):
-        if kind not in _NUMERIC or len(shape) != 2 or 0 in shape or len(columns) + min(shape) > MOST_COLUMNS:
+        plain = name.isidentifier() and kind in _NUMERIC and len(shape) == 2
+        if not plain or 0 in shape or len(columns) + min(shape) > MOST_COLUMNS:
             others.append(f"{name} ({kind}, {'x'.join(map(str, shape))})")
         elif 1 in shape:
             columns.append(name)
@@ -385,10 +397,17 @@ def _joined(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
 
 
 def _require_small(file: BinaryIO) -> None:
-    """Raise LimitError if a MATLAB file unpacks to more than any record, or has too many variables.
+    """Raise an error if SciPy must not read a MATLAB file.
 
     From version 5 on it is a header of 128 bytes and elements: type, size and data, each as a whole compressed or not
     (https://www.mathworks.com/help/pdf_doc/matlab/matfile_format.pdf).
+
+    Raises
+    ------
+    LimitError
+        If it unpacks to more than any record, or has too many variables.
+    ValueError
+        If a part of a numeric matrix has a wrong type.
     """
     size = file.seek(0, 2)
     left = min(ARRAY_BYTES, most_unpacked(size))
@@ -397,11 +416,17 @@ def _require_small(file: BinaryIO) -> None:
     variables, at = 0, 128
     while order and at + 8 <= size:
         file.seek(at)
-        kind, length = struct.unpack(f"{order}II", file.read(8))
+        tag = file.read(8)
+        kind, length = struct.unpack(f"{order}II", tag)
         at += 8 + length
         variables += 1
         require_count(variables, MOST_COLUMNS, "variables")
+        matrix = _Matrix(order)
         if kind != _MAT_COMPRESSED:
+            matrix.check(tag)
+            for begin in range(0, length, _UNPACKED_AT_ONCE):
+                matrix.check(file.read(min(length - begin, _UNPACKED_AT_ONCE)))
+            matrix.finish()
             continue
         decoder, packed = zlib.decompressobj(), file.read(length)
         while packed:
@@ -410,7 +435,62 @@ def _require_small(file: BinaryIO) -> None:
             left -= len(data)
             if left < 0:
                 raise LimitError("unpacks to more than any record")
+            matrix.check(data)
+        matrix.finish()
     file.seek(0)
+
+
+class _Matrix:
+    """Check the parts of a numeric matrix in a MATLAB file: SciPy ends the process at some wrong types.
+
+    A matrix is a sequence of words of 8 bytes: its own type, then type and content of its flags, shape, name, real and
+    imaginary data. The content of a short part is in the word of its type.
+    """
+
+    def __init__(self, order: str) -> None:
+        self._order = order
+        self._words, self._begun, self._skipped, self._parts, self._expected = 0, b"", 0, 0, 0
+
+    def check(self, data: bytes) -> None:
+        """Check the next bytes of the matrix; ValueError for a wrong type."""
+        at = 0
+        while at < len(data):
+            if self._skipped:
+                skipped = min(self._skipped, len(data) - at)
+                self._skipped -= skipped
+                at += skipped
+                continue
+            taken = data[at : at + 8 - len(self._begun)]
+            self._begun += taken
+            at += len(taken)
+            if len(self._begun) == 8:
+                self._read_word(*struct.unpack(f"{self._order}II", self._begun))
+                self._begun = b""
+                self._words += 1
+
+    def finish(self) -> None:
+        """Check that no part is missing; ValueError."""
+        if self._parts < self._expected:
+            raise ValueError(f"{self._parts} of {self._expected} parts of a variable")
+
+    def _read_word(self, kind: int, length: int) -> None:
+        if self._words == 0:
+            return
+        if self._words == 2:
+            # The flags; nothing of other classes is read.
+            numeric, is_complex = kind & 0xFF in _MAT_NUMERIC, bool(kind & _MAT_COMPLEX)
+            self._expected = 4 + is_complex if numeric else 0
+            self._skipped = 0 if numeric else _ENDLESS
+            return
+        known = _MAT_HEADER[self._parts] if self._parts < len(_MAT_HEADER) else _MAT_NUMBERS
+        if kind >> 16:
+            kind &= 0xFFFF
+        elif self._parts:
+            # The content is padded to whole words.
+            self._skipped = -(-length // 8) * 8
+        if kind not in known:
+            raise ValueError(f"part {self._parts + 1} of a variable has the wrong type {kind}")
+        self._parts += 1
 
 
 def _loaded(path: Path, variables: list[str]) -> dict[str, NDArray[np.generic]]:

@@ -199,6 +199,24 @@ def test_outliers_among_the_first_and_last_readings_are_left_out(clean, at):
     assert changed == 0.0 and np.flatnonzero(~samples.fitted).tolist() == at.tolist()
 
 
+@pytest.mark.parametrize("by", [-5.0, 3.0])
+@pytest.mark.parametrize("at", [0, 1, -2, -1])
+@pytest.mark.parametrize("rest", [10, 30])
+def test_a_wrong_voltage_beside_a_rest_at_an_end_is_no_range(at, by, rest):
+    """Fast cycles with a short rest before and after them, in which the stage has just come to rest."""
+    t = np.arange(2600) / 100.0
+    v = 50.0 * (1.0 - np.cos(2.0 * np.pi * 0.5 * np.clip(t - 0.01 * rest, 0.0, 26.0 - 0.02 * rest)))
+    v[-rest:] = v[-rest - 1]
+    y = PreisachStage(StageParameters.random(1), 1).run(t, v)[1]
+    record = slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y})
+    clean = select_samples(record, "x", None, None).v
+    found = select_samples(spoiled(record, "voltage", at, by), "x", None, None).v
+    assert np.abs(found - clean).max() < 0.5
+    found = assess(spoiled(record, "voltage", at, by), "x").voltage
+    assert found.spikes + found.stale == 1
+    assert assess(record, "x").voltage.spikes == 0
+
+
 @pytest.mark.parametrize("rate", [10.0, 200.0, 1000.0])
 def test_digits_of_a_record_without_noise_are_no_outliers(rate):
     t = np.arange(int(60.0 * rate)) / rate

@@ -34,6 +34,14 @@ def test_what_is_no_regular_file_stays(tmp_path):
     assert (tmp_path / "pipe").is_fifo() and [path.name for path in tmp_path.iterdir()] == ["pipe"]
 
 
+def test_a_link_stays_a_link(tmp_path):
+    (tmp_path / "dated").touch()
+    (tmp_path / "latest").symlink_to("dated")
+    with all_or_nothing(tmp_path / "latest") as file:
+        file.write("text")
+    assert (tmp_path / "latest").is_symlink() and (tmp_path / "dated").read_text() == "text"
+
+
 def test_a_folder_for_files_goes_with_the_failure(tmp_path):
     (tmp_path / "there").mkdir()
     for place in ("new/below", "there"):

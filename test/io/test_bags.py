@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -284,6 +285,17 @@ def test_file_of_another_kind(tmp_path, storage):
 def test_broken_metadata(tmp_path, text):
     write_bag(tmp_path / "bag", make_record())
     (tmp_path / "bag" / "metadata.yaml").write_bytes(text.encode("latin-1"))
+    assert holds(refusal(RecordError, read_bag, tmp_path / "bag"), tmp_path / "bag", "metadata.yaml")
+
+
+@pytest.mark.parametrize("value", ["-1", ".nan", "null", "[]", "{a: 1}"])
+@pytest.mark.parametrize("key", ["name", "type", "message_count"])
+def test_metadata_with_a_topic_of_the_wrong_type(tmp_path, key, value):
+    write_bag(tmp_path / "bag", make_record())
+    file = tmp_path / "bag" / "metadata.yaml"
+    broken, count = re.subn(rf"(?<=[ -] {key}: ).*", value, file.read_text())
+    assert count
+    file.write_text(broken)
     assert holds(refusal(RecordError, read_bag, tmp_path / "bag"), tmp_path / "bag", "metadata.yaml")
 
 

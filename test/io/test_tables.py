@@ -233,6 +233,36 @@ def test_bad_matlab_file(mat, variables, data):
     assert holds(refusal(RecordError, import_table, path), path, *data)
 
 
+def test_matlab_file_at_which_scipy_would_end_the_process(tmp_path):
+    """A damaged type of the data, which SciPy looks up without a check; a complex matrix without an imaginary part."""
+    path = tmp_path / "data.mat"
+    savemat(path, {"time_s": T, "x_V": T, "x_um": T}, oned_as="column")
+    whole = path.read_bytes()
+    for at in range(128, 200, 4):
+        for number in (0, 8, 10, 14, 15, 3849, 2**31, 0x00080006, 0x00010E0E):
+            path.write_bytes(whole[:at] + number.to_bytes(4, "little") + whole[at + 4 :])
+            # Some of it is no part of what is read.
+            with suppress(RecordError):
+                import_table(path)
+    for at, number in ((145, 0x08), (184, 14), (184, 8)):
+        path.write_bytes(whole[:at] + bytes([number]) + whole[at + 1 :])
+        assert holds(refusal(RecordError, import_table, path), path, "variable")
+
+
+def test_names_that_no_matlab_variable_has(tmp_path):
+    path = tmp_path / "data.mat"
+    savemat(path, {"time_s": T, "x_V": T, "x_um": T}, oned_as="column")
+    path.write_bytes(path.read_bytes().replace(b"x_um", b"x(um"))
+    assert holds(refusal(RecordError, import_table, path, time="time_s", voltage=["x_V"], displacement=["x(um"]), path)
+
+
+@pytest.mark.parametrize("cell", ["1_0", "१२", "１２"])
+def test_numbers_of_other_notations(tmp_path, cell):
+    path = tmp_path / "data.csv"
+    path.write_text(f"time_s,x_V,x_um\n0,0,0\n1,{cell},1\n2,1,2\n", encoding="utf-8")
+    assert holds(refusal(RecordError, import_table, path), path, "line 3", repr(cell))
+
+
 def test_no_matlab_file(tmp_path, mat):
     assert holds(refusal(RecordError, import_table, tmp_path / "nothing.mat"), tmp_path / "nothing.mat")
     hdf5 = tmp_path / "new.mat"

@@ -120,8 +120,8 @@ def describe_fleet(rows: Sequence[Row]) -> list[str]:
     refused = [row for row in rows if row.verdict == REFUSED]
     count = {health: sum(one.health == health for one in stages) for health in _HEALTH}
     lines = [
-        f"{len({row.bag for row in rows})} bags of {len({one.stage for one in stages})} stages; "
-        + ", ".join(f"{number} {health}" for health, number in count.items()),
+        f"bags: {len({row.bag for row in rows})}, stages: {len({one.stage for one in stages})}; axes "
+        + ", ".join(f"{health}: {number}" for health, number in count.items()),
     ]
     for one in sorted(stages, key=_order):
         told = list(_told(one))

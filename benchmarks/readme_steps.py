@@ -19,7 +19,6 @@ import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
-from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
@@ -227,7 +226,7 @@ def next_day(user: Readme, seed: int, model: slpi_ros.StageModel) -> tuple[Float
 
 
 def moved(user: Readme, seed: int, model: slpi_ros.StageModel, history: str, to: float) -> None:
-    """Print the errors of a stage that was driven through `history` (V) to `to` (V) before one measurement is sent."""
+    """Print the errors of a stage that was driven through `history` (V) to `to` (V) before the compensator measures."""
     stage = user.stage(seed, f"-p initial_history:='{history}'")
     voltages = user.node.create_publisher(Float64MultiArray, "/voltage_command", 100)
     user.until(voltages.get_subscription_count, "the stage")
@@ -236,19 +235,14 @@ def moved(user: Readme, seed: int, model: slpi_ros.StageModel, history: str, to:
     while not user.readings:
         voltages.publish(Float64MultiArray(data=[to]))
         user.spin(0.1)
-    measured = user.node.create_publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
     compensator = user.compensator()
-    user.until(measured.get_subscription_count, "the compensator")
-    user.spin(SETTLE_S)
-    measured.publish(JointState(name=["x"], position=[user.readings[-1]]))
-    user.spin(2 * SETTLE_S)
+    user.spin(3 * SETTLE_S)
     before = user.errors(model)
     user.reset()
     after = user.errors(model)
     user.interrupt(compensator)
     user.interrupt(stage)
     user.node.destroy_publisher(voltages)
-    user.node.destroy_publisher(measured)
     print(f"  driven through {history} V, at {to:g} V: {shown(before)}; after ~/reset_memory {shown(after)}")
     for line in user.warnings():
         print(f"    {line}")

@@ -105,8 +105,8 @@ DECLARATIONS = (
 # Longest step of a drive (in periods of the rate) that follows a late sample.
 MOST_PERIODS = 2.0
 # Time for the last readings of a drive, or of a return to rest, to arrive; period of the held voltage between drives,
-# and of the diagnostics; time for the delivery of the last message; seconds.
-TAIL, HOLD_PERIOD, REPORT_PERIOD, DELIVERY = 0.3, 0.1, 1.0, Duration(seconds=1.0)
+# and of the diagnostics; time for the delivery of the last message; longest wait for a state at rest; seconds.
+TAIL, HOLD_PERIOD, REPORT_PERIOD, DELIVERY, LATEST = 0.3, 0.1, 1.0, Duration(seconds=1.0), 2.0
 # A reported voltage may be outside the limits by this share of the range. A displacement beyond FARTHEST (m) is no
 # reading. The time of stage_state may jump by JUMP (s). A sensor is frozen if FROZEN readings in a row are equal while
 # the voltage moves over FROZEN_MOVE of its range.
@@ -203,6 +203,8 @@ class Calibrator(Node):
         self._timeout, self._patience = float(values["state_timeout"]), float(values["patience"])
         self._limiters = [RateLimiter(limits) for limits in settings.limits]
         self._voltages: list[float] | None = None
+        # Voltages in the last state that arrived.
+        self._reported: Sequence[float] = settings.rest
         self._goals: list[float] = []
         self._job: _Job | None = None
         self._failure: SlpiError | None = None
@@ -381,8 +383,8 @@ class Calibrator(Node):
             self._return_step()
             if not self._at_rest():
                 self._moved = now
-            # States of the return still arrive for a while.
-            self._returning = now - self._moved < TAIL
+            # States of the return still arrive for a while, on a busy machine for longer.
+            self._returning = now - self._moved < (TAIL if self._reports_rest() else LATEST)
         elif self._outcome is not None:
             self._finish()
         elif self._failure is not None:
@@ -466,7 +468,7 @@ class Calibrator(Node):
             self._fail(RecordError(f"calibrator: the stamps of {STATE} jump by {ahead:.3g} s; set the clock, repeat"))
         self._stamp_ns, self._heard, self._count = stamp_ns, time.monotonic(), self._count + 1
         self._arrival_ns = arrival_ns
-        self._hardware_id = hardware_id
+        self._hardware_id, self._reported = hardware_id, v
         for axis, voltage, limits in zip(self._settings.axes, v, self._settings.limits, strict=True):
             slack = READ_BACK * (limits.upper - limits.lower)
             if not limits.lower - slack <= voltage <= limits.upper + slack:
@@ -510,6 +512,13 @@ class Calibrator(Node):
         return self._voltages is None or all(
             abs(v - rest) <= ARRIVED * (limits.upper - limits.lower)
             for v, rest, limits in zip(self._voltages, self._settings.rest, self._settings.limits, strict=True)
+        )
+
+    def _reports_rest(self) -> bool:
+        """Return whether the last state that arrived is one at rest."""
+        return all(
+            abs(v - rest) <= READ_BACK * (limits.upper - limits.lower)
+            for v, rest, limits in zip(self._reported, self._settings.rest, self._settings.limits, strict=True)
         )
 
     def _return_step(self) -> None:

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
@@ -15,7 +16,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from slpi_ros.compensator.persistence import model_id
-from slpi_ros.errors import ModelError, RecordError, SlpiError
+from slpi_ros.errors import ModelError, RecordError, SlpiError, shown
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.input_limits import TOPIC_MODEL_CHARACTERS
 from slpi_ros.io.record import Record
@@ -81,6 +82,8 @@ class WorkerProcess(Generic[Request, Outcome]):
 
 def _run(sender: Connection, work: Callable[[Any], Any], request: Any) -> None:
     """Entry point of the process: send the outcome of a request."""
+    # Like a line of the node's log, without the line of code that warns.
+    warnings.formatwarning = lambda message, *_: f"[WARN] {shown(str(message))}\n"
     sender.send_bytes(json.dumps(asdict(work(request))).encode())
 
 

@@ -104,6 +104,21 @@ def test_a_coupled_axis_is_judged_with_the_motion_of_the_other(model):
     assert not slpi_ros.verify(record, alone, axes=["x"]).passed
 
 
+def test_explained_motion_of_another_axis_is_no_noise(model):
+    """Else the limit, three times the noise floor, would let a bad model pass."""
+    t = np.arange(4000) / RATE
+    v, other = (50.0 - 50.0 * np.cos(2.0 * np.pi * t / period) for period in (1.0, 3.1))
+    y, z = stage(SEED).run(t, v)[1], stage(SEED).run(t, other)[1]
+    alone = judged(record_of(t, v, y), model)
+    record = replace(record_of(t, v, y), voltage={"x": v, "z": other}, displacement={"x": y + 0.01 * z, "z": z})
+    axis = model.axes["x"]
+    effect = slpi_ros.effects.cross_coupling.CrossCoupling({"z": 0.01})
+    coupled = replace(model, axes={"x": replace(axis, effects=(effect,)), "z": axis})
+    found = slpi_ros.verify(record, coupled, axes=["x"]).axes["x"].records[0]
+    assert found.floor_rms == pytest.approx(alone.floor_rms, rel=0.1)
+    assert found.limit == pytest.approx(alone.limit, rel=0.1)
+
+
 def test_what_does_not_go_together_is_refused(model):
     with pytest.raises(UsageError):
         slpi_ros.verify(replace(unseen(), hardware_id="a"), replace(model, hardware_id="b"))

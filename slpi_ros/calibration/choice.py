@@ -18,7 +18,7 @@ UNCOVERED = {
 # A cause that is named is worth this part of its share until the drive for it has been recorded; nothing below
 # LEAST is worth a record. No drive is recorded more often than MOST.
 CONFIRMED, LEAST, MOST = 0.3, 0.05, 2
-# An error up to this multiple of the noise floor has nothing more to tell.
+# An error up to this multiple of the repeatability floor has nothing more to tell.
 AT_FLOOR = 1.5
 
 

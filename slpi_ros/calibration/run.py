@@ -225,7 +225,7 @@ class _Calibration:
         self._steps: list[Step] = []
         self._records: list[Record] = []
         self._drives: list[tuple[str, Sequence[str]]] = []
-        # Noise floor of each axis, metres, best known so far: what a diagnosis explains is no noise.
+        # Repeatability floor of each axis, metres, best known so far: what a diagnosis explains is no noise.
         self._floors: dict[str, float] = {}
         # Model and errors of each verification.
         self._verified: list[tuple[StageModel, dict[str, TrackingError]]] = []
@@ -313,7 +313,7 @@ class _Calibration:
         self._floors = {name: axis.quality.floor_rms for name, axis in model.axes.items()}
         said = "; ".join(
             f"axis {name}: held-out error {axis.quality.held_out_rms * 1e9:.3g} nm rms, "
-            f"noise floor {axis.quality.floor_rms * 1e9:.3g} nm"
+            f"repeatability floor {axis.quality.floor_rms * 1e9:.3g} nm"
             for name, axis in model.axes.items()
         )
         self._steps.append(Step("identify", 0.0, "a first model, of hysteresis alone", said))

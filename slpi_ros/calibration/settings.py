@@ -27,9 +27,9 @@ class CalibrationSettings:
     budget : float, seconds
         Largest sum of the durations of all drives.
     target : float, metres
-        Largest mean error on a path not used for the model; 0 (default): `floors` times the noise floor.
+        Largest mean error on a path not used for the model; 0 (default): `floors` times the repeatability floor.
     floors : float
-        Target in multiples of the noise floor, if `target` is 0. Default 3.
+        Target in multiples of the repeatability floor, if `target` is 0. Default 3.
     seed : int
         Seed of the random parts of all drives. Default 0.
 
@@ -76,5 +76,5 @@ class CalibrationSettings:
         return len(self.axes) * (CALIBRATION + CHECK) + 2 * VERIFICATION
 
     def goal(self, floor_rms: float) -> float:
-        """Return the target (m) of an axis whose noise floor is `floor_rms` (m)."""
+        """Return the target (m) of an axis whose repeatability floor is `floor_rms` (m)."""
         return self.target or self.floors * floor_rms

@@ -172,7 +172,7 @@ def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
 
 
 def _floor(now: Explanation) -> Floor:
-    """Return the largest noise floor of the records, at least the rounding error and at most the held-out error."""
+    """Return the largest repeatability floor of the records, between the rounding error and the held-out error."""
     floors = []
     for part, rows in zip(now.evidence.parts, now.evidence.slices, strict=True):
         residual = np.where(part.used, now.residual[rows], np.nan)

@@ -163,7 +163,7 @@ class AxisDiagnosis:
     summary : str
         Result in a few sentences.
     floor_rms : float, metres
-        Noise floor, which no model can explain.
+        Repeatability floor, which no model can explain.
     floor_source : str
         Data from which the floor was estimated.
     given_rms : float, metres
@@ -307,7 +307,7 @@ def judged(
     ----------
     selection : Selection
     floor : Floor
-        Noise floor of the records.
+        Repeatability floor of the records.
     before_rms : float, metres
         Held-out rms error without effects.
     given : Given

@@ -34,7 +34,7 @@ IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 SCHEMA = "slpi_ros/verification/1"
-# Default tolerance as a multiple of the noise floor.
+# Default tolerance as a multiple of the repeatability floor.
 TIMES_THE_FLOOR = 3.0
 # A delay is accepted if it reduces the difference between model and desired displacement by this factor.
 BETTER = 1.1
@@ -135,7 +135,7 @@ class RecordVerification:
     limit : float, metres
         Largest rms error that passes.
     floor_rms : float, metres
-        Noise floor (repeatability) of the record.
+        Repeatability floor of the record.
     floor_source : str
         Data from which the floor was estimated.
     known_from : float or None, seconds
@@ -312,8 +312,8 @@ def verify(
     model : StageModel
         Model of the same stage.
     tolerance : float, metres, optional
-        Largest rms error that passes; by default three times the record's noise floor, but at least the fraction
-        `RESOLUTION` of the stroke, the best accuracy that a hysteresis model attains.
+        Largest rms error that passes; by default three times the record's repeatability floor, but at least the
+        fraction `RESOLUTION` of the stroke, the best accuracy that a hysteresis model attains.
     axes : sequence of str, optional
         Axes to be verified; by default all that the model and every record contain.
     desired : sequence of mapping of axis name to ndarray, shape (N,), metres, or None, optional
@@ -441,7 +441,7 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
 
 
 def _default_limit(axis: AxisModel, floor: float) -> float:
-    """Return the default limit of the rms error (m) for a noise floor (m)."""
+    """Return the default limit of the rms error (m) for a repeatability floor (m)."""
     low, high = axis.displacement_range
     return max(TIMES_THE_FLOOR * floor, RESOLUTION * (high - low))
 

@@ -1,4 +1,4 @@
-"""The repeatability floor (noise floor) of a record: how much repetitions of the same motion differ."""
+"""The repeatability floor of a record: how much repetitions of the same motion differ."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray |
     usable = np.isfinite(v) & np.isfinite(signal)
     t, v, y, signal = t[usable], v[usable], y[usable], signal[usable]
     if t.size < _FEWEST_READINGS:
-        raise RecordError(f"{t.size} samples have no noise floor; give at least {_FEWEST_READINGS}")
+        raise RecordError(f"{t.size} samples have no repeatability floor; give at least {_FEWEST_READINGS}")
     found = _seen(t, v, signal, alone=residual is not None)
     step = digit(y)
     if found.rms < step / np.sqrt(12.0):

@@ -55,7 +55,7 @@ class Start:
     from_rest: bool = False
 
 
-# An error up to this multiple of the noise floor counts as noise.
+# An error up to this multiple of the repeatability floor counts as noise.
 ABOVE_FLOOR = 1.5
 # Best accuracy of a hysteresis model without noise, as a share of the displacement range.
 RESOLUTION = 2e-4

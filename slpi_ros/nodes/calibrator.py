@@ -82,7 +82,7 @@ DECLARATIONS = (
         read_only=True, between=(0.0, 1e6), number=True,
     ),
     Declaration(
-        "times_the_floor", 3.0, "Target in multiples of the noise floor, if target is 0.",
+        "times_the_floor", 3.0, "Target in multiples of the repeatability floor, if target is 0.",
         read_only=True, between=(0.1, 1e6), number=True,
     ),
     Declaration("output", "", "Folder for bags, model, diagnosis and page; required.", read_only=True),

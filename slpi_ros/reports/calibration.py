@@ -55,7 +55,7 @@ def page_of(outcome: Outcome) -> Page:
             "of the stroke": f"{error.mean / error.stroke:.3%}",
             "maximum": nm(error.maximum),
             "target": nm(error.goal),
-            "noise floor, rms": nm(found.floor_rms),
+            "repeatability floor, rms": nm(found.floor_rms),
         })  # fmt: skip
         page.definitions({named.name: named.evidence for named in found.effects})
         page.chart(

@@ -96,7 +96,7 @@ def _figures(found: AxisDiagnosis) -> dict[str, str]:
         figures["with the identified effects"] = nm(found.after_rms)
         if found.before_rms > 0.0:
             figures["reduction by the effects"] = f"{1.0 - found.after_rms / found.before_rms:.0%}"
-    return figures | {"noise floor, rms": nm(found.floor_rms)}
+    return figures | {"repeatability floor, rms": nm(found.floor_rms)}
 
 
 def _show_causes(page: Page, found: AxisDiagnosis) -> None:
@@ -206,7 +206,7 @@ def _steps(found: AxisDiagnosis) -> tuple[list[list[str]], int, str]:
         rows.append(row("all effects, fitted jointly", found.after_rms))
     best = len(rows) - 1
     caption = f"Free-run errors; all but that of the given model are held out. Floor: {found.floor_source}."
-    return [*rows, row("noise floor", found.floor_rms)], best, caption
+    return [*rows, row("repeatability floor", found.floor_rms)], best, caption
 
 
 def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
@@ -229,7 +229,7 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
         "frequency": views.over_frequency(t, left, parts, motion, found.floor_rms),
     }
     captions = {
-        "time": "Displacement and measured - model over time; the grey band is plus or minus the noise floor.",
+        "time": "Displacement and measured - model over time; the grey band is plus or minus the repeatability floor.",
         "motion": "Measured - model over voltage (lines: means for rising and falling voltage) and over its speed.",
         "frequency": "Measured - model over the time since the last reversal or stop, with means, and its spectrum.",
     }
@@ -266,7 +266,7 @@ def _parts(traces: Traces) -> list[Curve]:
 
 
 def diagnosis_limits(diagnosis: Diagnosis) -> dict[str, str]:
-    """Return what limits the accuracy of the given model on each axis; axes at the noise floor are left out."""
+    """Return what limits the accuracy of the given model on each axis; axes at the repeatability floor are left out."""
     limits = {}
     for name, found in diagnosis.axes.items():
         low, high = diagnosis.extended.axes[name].displacement_range

@@ -140,7 +140,7 @@ def _error(record: RecordVerification) -> str:
     error = record.error
     return (
         f"measured - model is {nm(error.rms)} rms (limit {nm(record.limit)}), maximum {nm(error.maximum)}; "
-        f"noise floor {nm(record.floor_rms)} rms"
+        f"repeatability floor {nm(record.floor_rms)} rms"
     )
 
 
@@ -182,7 +182,7 @@ def _figures(axis: AxisVerification) -> dict[str, str]:
         "measured - model, rms": nm(axis.overall.rms),
         "maximum": nm(axis.overall.maximum),
         "limit of the rms": nm(worst.limit),
-        "noise floor, rms": nm(worst.floor_rms),
+        "repeatability floor, rms": nm(worst.floor_rms),
         "held-out error of the model": nm(axis.resolution),
     }
     tracked = [record.tracking.error.rms for record in axis.records if record.tracking]
@@ -205,8 +205,8 @@ def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence
     ]
     caption = (
         "Measured - model, free-run, without a constant offset for each record. The rms must be within the tolerance, "
-        f"else within {TIMES_THE_FLOOR:g} times the noise floor, but at least the model's held-out error. Floor: "
-        f"{axis.records[0].floor_source}."
+        f"else within {TIMES_THE_FLOOR:g} times the repeatability floor, but at least the model's held-out error. "
+        f"Floor: {axis.records[0].floor_source}."
     )
     return header, rows, None, caption
 

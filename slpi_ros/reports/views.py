@@ -171,7 +171,9 @@ def show_model(
     page.chart(f"{name}-loops", chart, f"{LOOPS} {said}")
     chart, said = over_time(t, y, models, noise, fitted=fitted)
     unused = "" if fitted.all() else f" Shaded: {UNUSED}."
-    page.chart(f"{name}-time", chart, f"Over time; the grey band is plus or minus the noise floor.{unused} {said}")
+    page.chart(
+        f"{name}-time", chart, f"Over time; the grey band is plus or minus the repeatability floor.{unused} {said}"
+    )
     chart, said = over_voltage(v, y - simulated, motion, noise, fitted)
     how = "Measured - model over rising and falling voltage, and the histogram."
     page.chart(f"{name}-residual", chart, f"{how} {said}")
@@ -445,7 +447,7 @@ def over_frequency(
     rate = _rate(t)
     if noise > 0.0 and rate > 0.0:
         ends = np.array([max(rate / t.size, 1e-9), rate / 2.0])
-        chart.line(1, "noise floor", ends, np.full(2, noise * np.sqrt(2.0 / rate)), DESIRED, width=1.0)
+        chart.line(1, "repeatability floor", ends, np.full(2, noise * np.sqrt(2.0 / rate)), DESIRED, width=1.0)
     return chart, focus(chart, (0,), [curve.values for curve in curves])
 
 

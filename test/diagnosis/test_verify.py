@@ -105,7 +105,7 @@ def test_a_coupled_axis_is_judged_with_the_motion_of_the_other(model):
 
 
 def test_explained_motion_of_another_axis_is_no_noise(model):
-    """Else the limit, three times the noise floor, would let a bad model pass."""
+    """Else the limit, three times the repeatability floor, would let a bad model pass."""
     t = np.arange(4000) / RATE
     v, other = (50.0 - 50.0 * np.cos(2.0 * np.pi * t / period) for period in (1.0, 3.1))
     y, z = stage(SEED).run(t, v)[1], stage(SEED).run(t, other)[1]

@@ -105,7 +105,7 @@ def test_a_voltage_that_rests_or_never_turns(v):
 
 
 def test_too_few_samples_are_told():
-    with pytest.raises(RecordError, match="4 samples have no noise floor"):
+    with pytest.raises(RecordError, match="4 samples have no repeatability floor"):
         floor_of(np.arange(6.0), np.arange(6.0), np.array([1.0, 2.0, 3.0, np.nan, 5.0, np.inf]))
 
 

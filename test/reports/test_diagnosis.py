@@ -102,7 +102,7 @@ def test_spectrum_shows_the_line_and_the_floor(written):
     high = frequency > 10.0
     assert np.isclose(frequency[high][np.argmax(density[high])], 50.0, rtol=0.02)
     frequency, density = trace(chart, "with effects", "y2")
-    _, floor = trace(chart, "noise floor", "y2")
+    _, floor = trace(chart, "repeatability floor", "y2")
     assert np.allclose(floor, 5.0 * np.sqrt(2.0 / 500.0), rtol=1e-3)
     assert np.isclose(np.sqrt(np.mean(density[frequency > 5.0] ** 2)), floor[0], rtol=0.2)
 

@@ -212,7 +212,9 @@ class _FreeRun:
 
 def _free_run(model: AxisModel, part: Part) -> _FreeRun:
     """Simulate a model on a record from all candidate initial histories and return the best free run."""
-    errors = [part.y - replace(model, start=start).simulate(part.t, part.v) for start in _starts(model, part)]
+    errors = [
+        part.y - replace(model, start=start).simulate(part.t, part.v, part.others) for start in _starts(model, part)
+    ]
     chosen = _known(part)
     rms = np.array([np.std(each[part.used]) for each in errors])
     as_well = [each for each in errors if np.std(each[chosen]) <= AS_WELL * min(np.std(one[chosen]) for one in errors)]

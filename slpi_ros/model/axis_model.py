@@ -230,12 +230,12 @@ class AxisModel:
         middle = self._middle if self.chain.rate_dependence else None
         return StreamingInverse(memory, self.displacement_range, allowed, self.effects, middle)
 
-    def simulate(self, t: FloatArray, v: FloatArray) -> FloatArray:
+    def simulate(self, t: FloatArray, v: FloatArray, others: Mapping[str, FloatArray] | None = None) -> FloatArray:
         """Return the displacement, shape (N,), metres, for the voltage `v`, shape (N,), volts, at times `t` (s).
 
-        Other axes are at rest. Without effects the time is ignored.
+        Other axes are at rest, but for `others`, as in `seen`. Without effects the time is ignored.
         """
-        return self.seen(t, self.uncoupled_displacement(t, v), {})
+        return self.seen(t, self.uncoupled_displacement(t, v), others or {})
 
     def uncoupled_displacement(self, t: FloatArray, v: FloatArray) -> FloatArray:
         """Return the displacement, shape (N,), metres, for `v`, shape (N,), volts, without cross-coupling."""

@@ -149,7 +149,7 @@ def _notes(record: RecordVerification) -> list[str]:
     start = (
         "the start is unknown: the initial history and the offset are fitted to the record"
         if record.known_from is None
-        else f"the start is unknown: evaluated from {record.known_from:.4g} s on, where only a constant depends on it"
+        else f"evaluated from {record.known_from:.4g} s on, where the unknown history before it only adds a constant"
     )
     notes = [start]
     if record.zero_moved:

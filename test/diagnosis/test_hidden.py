@@ -36,6 +36,16 @@ def test_a_hidden_effect_is_named_first(name, tmp_path):
     assert name in (found.effects[0].effect.name, *found.effects[0].alternatives), found.summary
 
 
+def test_a_coupled_model_is_judged_with_the_motion_of_the_other_axis():
+    hidden = hide(1, ["cross_coupling"], size=LARGE, samples=SAMPLES)
+    (truth,) = hidden.truth
+    first = slpi_ros.diagnose(hidden.record, slpi_ros.identify(hidden.record))
+    again = slpi_ros.diagnose(hidden.record, first.extended).axes[truth.axis]
+    assert again.verdict == "nothing_found", again.summary
+    assert again.given_rms <= 1.2 * again.after_rms
+    assert again.records[0].before_rms <= 1.2 * again.after_rms
+
+
 def test_nothing_is_found_where_nothing_is(tmp_path):
     found = diagnosed(hide(1, samples=SAMPLES), tmp_path)
     assert [axis.verdict for axis in found.axes.values()] == ["nothing_found"] * len(found.axes)

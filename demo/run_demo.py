@@ -140,7 +140,7 @@ def write_page(
     page.chart("linearity", plots.over_desired(runs), "Measured over desired displacement: a straight line is the aim.")
     page.heading("The model")
     page.lines(describe_model(model))
-    page.text("calibration/report.html tells the calibration: what was recorded and why, and what it taught.")
+    page.text("calibration/report.html shows the calibration: what was recorded, why, and what each record showed.")
     page.write(path)
     path.with_name("tracking.png").write_bytes(png(plots.picture(runs)))
 

@@ -120,8 +120,8 @@ class Step:
         Duration of the drive; 0 for a computation.
     why : str
         Why this step.
-    taught : str
-        What it taught.
+    finding : str
+        What the step showed.
     errors : mapping of axis name to TrackingError
         Errors if the step was a verification, else empty.
     """
@@ -129,7 +129,7 @@ class Step:
     name: str
     seconds: float
     why: str
-    taught: str = ""
+    finding: str = ""
     errors: Mapping[str, TrackingError] | None = None
 
 
@@ -288,8 +288,8 @@ class _Calibration:
     def _check(self) -> None:
         drive = checking(self._settings)
         record = self._recorded(CHECK_DRIVE, drive, {}).record
-        taught = [_follows(axis, drive, record) for axis in self._settings.axes]
-        self._steps.append(Step(record.source, float(drive.t[-1]), drive.why, "; ".join(taught)))
+        findings = [_follows(axis, drive, record) for axis in self._settings.axes]
+        self._steps.append(Step(record.source, float(drive.t[-1]), drive.why, "; ".join(findings)))
 
     def _sweep(self) -> None:
         """Sweep all axes, so that those that wait for their turn in the calibration drive rest in a known state."""
@@ -329,9 +329,9 @@ class _Calibration:
         self._begin(f"diagnosing {count} records")
         diagnosis = _diagnosed(self._records, first)
         self._floors = {name: found.floor_rms for name, found in diagnosis.axes.items()}
-        taught = "; ".join(f"axis {name}: {found.summary}" for name, found in diagnosis.axes.items())
+        finding = "; ".join(f"axis {name}: {found.summary}" for name, found in diagnosis.axes.items())
         self._steps.append(
-            Step("diagnose", 0.0, f"causes of the error, judged on each of {count} records held out in turn", taught)
+            Step("diagnose", 0.0, f"causes of the error, judged on each of {count} records held out in turn", finding)
         )
         return diagnosis
 
@@ -342,13 +342,13 @@ class _Calibration:
             axis: tracking_error(recording, axis, model, self._settings.goal(self._floors[axis]))
             for axis in self._settings.axes
         }
-        taught = "; ".join(
+        finding = "; ".join(
             f"axis {axis}: mean error {error.mean * 1e9:.3g} nm ({error.mean / error.stroke:.3%} of the stroke), "
             f"maximum {error.maximum * 1e9:.3g} nm"
             for axis, error in errors.items()
         )
         self._records.append(recording.record)
-        self._steps.append(Step(recording.record.source, float(drive.t[-1]), drive.why, taught, errors))
+        self._steps.append(Step(recording.record.source, float(drive.t[-1]), drive.why, finding, errors))
         self._verified.append((model, errors))
         return errors
 

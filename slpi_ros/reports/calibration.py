@@ -1,4 +1,4 @@
-"""The page and the files of a calibration: what was recorded and why, what it taught, and the verified error."""
+"""The page and the files of a calibration: what was recorded, why, what it showed, and the verified error."""
 
 from pathlib import Path
 
@@ -61,11 +61,11 @@ def page_of(outcome: Outcome) -> Page:
         page.chart(
             f"{axis}-tracking", _chart(outcome, axis), "The last path, and the errors of the first and the last."
         )
-    page.heading("What was recorded and why, and what it taught")
+    page.heading("What was recorded, why, and what it showed")
     rows = [
-        (step.name, f"{step.seconds:.0f} s" if step.seconds else "", step.why, step.taught) for step in outcome.steps
+        (step.name, f"{step.seconds:.0f} s" if step.seconds else "", step.why, step.finding) for step in outcome.steps
     ]
-    page.table(("step", "drive", "why", "what it taught"), rows)
+    page.table(("step", "drive", "why", "what it showed"), rows)
     page.heading("The model")
     page.lines(describe_model(outcome.model))
     return page

@@ -3,14 +3,14 @@
 import hashlib
 import json
 import os
+import stat
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from slpi_ros.errors import ModelError
-from slpi_ros.io.atomic_file import all_or_nothing
+from slpi_ros.io.atomic_file import all_or_nothing, remove_file
 from slpi_ros.io.input_limits import MEMORY_BYTES, open_input, read_input
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
@@ -92,6 +92,9 @@ class LastVoltages:
             )
         except (OSError, ValueError) as error:
             raise ModelError(f"{path}: cannot be written: {error}; choose another path") from None
+        if not stat.S_ISREG(os.fstat(self._file).st_mode):
+            os.close(self._file)
+            raise ModelError(f"{self._path}: cannot be written: no regular file; choose another path")
 
     def note(self, voltages: bytes) -> None:
         """Write the voltages (V) of all axes, each as a double in native byte order.
@@ -111,8 +114,7 @@ class LastVoltages:
     def discard(self) -> None:
         """Close and delete the file."""
         os.close(self._file)
-        with suppress(OSError):
-            os.unlink(self._path)
+        remove_file(self._path)
 
 
 def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tuple[float, ...] | None:
@@ -305,8 +307,7 @@ class MemoryFile:
         except ModelError:
             if not complete and (self._saved is None or self._saved.complete):
                 # The complete state in the file is no longer the present one, but a crash would make it look so.
-                with suppress(OSError):
-                    os.unlink(self._path)
+                remove_file(self._path)
             raise
         self._saved = memory
         if self._last and complete:

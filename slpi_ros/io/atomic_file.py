@@ -57,6 +57,13 @@ def is_replaceable(path: Path) -> bool:
         return True
 
 
+def remove_file(path: str | os.PathLike[str]) -> None:
+    """Delete a regular file if there is one and it can be deleted; a device, a pipe or a folder stays."""
+    with suppress(OSError, ValueError):
+        if Path(path).is_file():
+            os.unlink(path)
+
+
 @contextmanager
 def output_folder(path: str | os.PathLike[str], *names: str) -> Iterator[Path]:
     """Create an output folder, see `make_folder`; new folders are removed if the ``with`` block raises an error."""

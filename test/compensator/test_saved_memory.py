@@ -55,6 +55,22 @@ def test_it_belongs_to_one_model_its_axes_and_its_limits():
         SAVED.require_fit(MODEL, ["x", "y"], [Limits(0.0, 1.0)] * 2)
 
 
+def test_a_place_that_takes_no_file_stays_as_it_is(tmp_path):
+    """A device of the machine must outlive a saved memory that was sent there."""
+    place = tmp_path / "pipe"
+    os.mkfifo(place)
+    memory = MemoryFile(str(place))
+    with pytest.raises(ModelError):
+        memory.save(MODEL, SAVED.axes, complete=False)
+    assert place.is_fifo()
+    os.mkfifo(tmp_path / "memory.json.last")
+    reader = os.open(tmp_path / "memory.json.last", os.O_RDONLY | os.O_NONBLOCK)
+    with pytest.raises(ModelError):
+        MemoryFile(str(tmp_path / "memory.json")).save(MODEL, SAVED.axes, complete=False)
+    os.close(reader)
+    assert (tmp_path / "memory.json.last").is_fifo()
+
+
 def as_given(*voltages: float) -> bytes:
     return struct.pack(f"{len(voltages)}d", *voltages)
 

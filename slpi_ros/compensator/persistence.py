@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing, remove_file
-from slpi_ros.io.input_limits import MEMORY_BYTES, open_input, read_input
+from slpi_ros.io.input_limits import MEMORY_BYTES, MODEL_BYTES, open_input, read_input
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
 from slpi_ros.model.limits import Limits
@@ -295,13 +295,15 @@ class MemoryFile:
         Raises
         ------
         ModelError
-            If the file cannot be written.
+            If the file cannot be written, or is another document.
         """
         if not self._path or model is None:
             return
         memory = SavedMemory(model_id(model), complete, axes)
         if memory == self._saved:
             return
+        if self._saved is None:
+            _require_no_other(self._path)
         try:
             mark = save_memory(memory, self._path)
         except ModelError:
@@ -328,6 +330,16 @@ class MemoryFile:
         """
         if self._last:
             self._last.note(voltages)
+
+
+def _require_no_other(path: str) -> None:
+    """Raise ModelError if the file is another document, such as a model; a damaged memory is replaced."""
+    try:
+        schema = json.loads(read_input(path, MODEL_BYTES))["schema"]
+    except (OSError, ValueError, RecursionError, LookupError, TypeError):
+        return
+    if not str(schema).startswith(SCHEMA.rpartition("/")[0]):
+        raise ModelError(f"{path}: cannot be written: it is a document of schema {schema!r}; choose another path")
 
 
 def _mark(text: str) -> int:

@@ -90,7 +90,8 @@ def validated(declarations: Sequence[Declaration], values: Values) -> dict[str, 
     UsageError
         If a value is not valid, or the parameter ``axes`` is empty or holds a name twice.
     """
-    axes = values.get("axes", ())
+    # An empty list is given as None.
+    axes = values.get("axes") or ()
     if "axes" in values and not (axes and all(axes) and len(set(axes)) == len(axes)):
         raise UsageError(f"parameter axes is {list(axes)!r}; name at least one axis, and each once")
     return {entry.name: entry.read(values, axes) for entry in declarations}

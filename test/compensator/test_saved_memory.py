@@ -28,6 +28,7 @@ from slpi_ros.compensator.persistence import (
     save_memory,
 )
 from slpi_ros.errors import ModelError
+from slpi_ros.model.document import save_model
 from slpi_ros.model.limits import Limits
 
 MODEL = two_axes()
@@ -69,6 +70,22 @@ def test_a_place_that_takes_no_file_stays_as_it_is(tmp_path):
         MemoryFile(str(tmp_path / "memory.json")).save(MODEL, SAVED.axes, complete=False)
     os.close(reader)
     assert (tmp_path / "memory.json.last").is_fifo()
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_another_document_is_not_overwritten(tmp_path, complete):
+    """A memory file that is by mistake the model file."""
+    path = tmp_path / "model.json"
+    save_model(MODEL, path)
+    before = path.read_bytes()
+    for _ in range(2):
+        with pytest.raises(ModelError, match="slpi_ros/model/1"):
+            MemoryFile(str(path)).save(MODEL, SAVED.axes, complete)
+    assert path.read_bytes() == before and not (tmp_path / "model.json.last").exists()
+    for damaged in ("", "{", '{"schema": "slpi_ros/saved_memory/1"}', "[]", "\0" * 400):
+        path.write_text(damaged)
+        MemoryFile(str(path)).save(MODEL, SAVED.axes, complete=True)
+        assert load_memory(path) == SAVED
 
 
 def as_given(*voltages: float) -> bytes:

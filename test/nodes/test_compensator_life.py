@@ -102,6 +102,7 @@ def test_a_signal_ends_it_in_order(number, executor):
 WRONG = [
     ({"axes": ["x", "x"]}, "axes"),
     ({"axes": [""]}, "axes"),
+    ({"axes": []}, "axes"),
     ({"axes": "x"}, "axes"),
     ({"voltage_min": 100}, "voltage_max"),
     ({"axes": ["x", "y"], "voltage_min": [0.0, 90.0], "voltage_max": [100, 80]}, "axis 'y'"),

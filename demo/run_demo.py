@@ -1,4 +1,4 @@
-"""The whole line as real processes over DDS: a stage with hidden effects calibrates itself and follows a new path.
+"""Real processes over DDS: the calibrator calibrates a stage with hidden effects, which then follows a new path.
 
 A simulated stage stands in for yours; it is no model of the compensator. Run it with ``make demo``; ``SEED=`` repeats
 one.
@@ -34,7 +34,7 @@ from slpi_ros.simulation.character import CharacterStage  # noqa: E402
 
 RATE = 100.0
 V_MIN, V_MAX, SLEW = 0.0, 100.0, 1000.0
-# The stage calibrates itself faster than in life; the comparison is in real time, on the next day of the stage.
+# The calibration runs faster than in life; the comparison is in real time, on the next day of the stage.
 SPEED = 4.0
 NOISE = 8e-9
 # The graph shows a node a moment before its topics are connected, seconds.
@@ -54,13 +54,13 @@ def stage_simulator(seed: int, speed: float) -> AbstractContextManager[object]:
 
 
 def calibrate_itself(seed: int, folder: Path) -> None:
-    """Let the stage calibrate itself into a folder."""
+    """Let the calibrator calibrate the stage into a folder."""
     given = {"voltage_min": V_MIN, "voltage_max": V_MAX, "slew_limit": SLEW, "rate": RATE, "output": str(folder)}
     with stage_simulator(seed, SPEED), executable("calibrator", log="info", use_sim_time=True, **given) as calibrator:
         calibrator.wait()
     # 1 says that the target was missed, and why; there is a model nevertheless.
     if not (folder / "model.json").exists():
-        raise SystemExit("demo: the stage did not calibrate itself; the line above says why")
+        raise SystemExit("demo: the calibration failed; the line above says why")
 
 
 def identify(bag: Path, model: Path, kind: str) -> None:
@@ -161,7 +161,7 @@ def main() -> int:
     options = parser.parse_args()
     began = time.monotonic()
     seed = secrets.randbelow(10_000) if options.seed is None else options.seed
-    print(f"stage {seed} (SEED={seed} repeats it) calibrates itself, {SPEED:g} times as fast as in life", flush=True)
+    print(f"stage {seed} (SEED={seed} repeats it) is calibrated, {SPEED:g} times as fast as in life", flush=True)
     calibration = options.output / "calibration"
     shutil.rmtree(calibration, ignore_errors=True)
     calibrate_itself(seed, calibration)

@@ -15,13 +15,13 @@ DOCS = ROOT / "docs"
 README = ROOT / "README.md"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)
 PROGRAMS = ROOT / "install" / "slpi_ros" / "lib" / "slpi_ros"
-BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$|^% (\w[\w ]*): ([^\n]+)$", re.DOTALL | re.MULTILINE)
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$|^<!-- (?!generated)(\w[\w ]*): ([^\n]+) -->$", re.DOTALL | re.MULTILINE)
 PATIENCE_S = 120.0
 
 
 @dataclass(frozen=True)
 class Step:
-    """A block of a page with its language, or a remark to the test (`% WHAT: TEXT`, which no reader sees)."""
+    """A block of a page with its language, or a remark to the test (`<!-- WHAT: TEXT -->`, which no reader sees)."""
 
     what: str
     text: str

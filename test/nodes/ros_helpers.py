@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import SetParametersAtomically
+from lifecycle_msgs.srv import GetState
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
@@ -28,6 +29,9 @@ RELIABLE = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Only what hangs takes as long.
 PATIENCE_S = 60.0
+# Services that change nothing, and after how long one of them is asked again.
+QUESTIONS = (DescribeParameters, GetParameters, GetState)
+REPEAT_S = 5.0
 
 
 class NodeProcess:
@@ -143,13 +147,23 @@ class Graph:
         return publisher
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
-        """Return the answer of a service."""
+        """Return the answer of a service; a question that changes nothing is repeated.
+
+        Fast DDS drops the answer to a client whose reader the service has not discovered within 100 ms
+        (ros2/rmw_fastrtps, issue 842).
+        """
         client = self.node.create_client(kind, name)
+        repeated = REPEAT_S if kind in QUESTIONS else PATIENCE_S
+        asked: list[tuple[float, Any]] = []
+
+        def answered() -> Any:
+            if not asked or time.monotonic() - asked[-1][0] > repeated:
+                asked.append((time.monotonic(), client.call_async(request)))
+            return next((future for _, future in asked if future.done()), None)
+
         try:
             self.spin_until(client.service_is_ready, f"the service {name}")
-            future = client.call_async(request)
-            self.spin_until(future.done, f"an answer of {name}")
-            return future.result()
+            return self.spin_until(answered, f"an answer of {name}").result()
         finally:
             self.node.destroy_client(client)
 

@@ -5,7 +5,7 @@ import control
 import numpy as np
 import pytest
 from effects.cases import ABOUT_MOTION, BY_NAME, EVERY, creeps, effects_and_records, records, sensors
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.signal import lsim
 
@@ -53,7 +53,12 @@ def test_inverses_that_are_damped(drawn):
     """On smooth paths, up to 3 Hz at 500 samples per second or more, they are good to a thousandth of the motion."""
     effect, record = drawn
     there = effect.apply(effect.invert(record.signal, record.around), record.around)
-    slow = (3 / effect.frequency) ** 2 if isinstance(effect, Resonance) else 0.0
+    slow = 0.0
+    if isinstance(effect, Resonance):
+        slow = (3 / effect.frequency) ** 2
+        cycles = effect.frequency * record.around.t[1]
+        # At a multiple of the sampling rate the corners of the sampled path itself excite the mode.
+        assume(cycles < 0.5 or abs(cycles - round(cycles)) > 0.03)
     np.testing.assert_allclose(there, record.signal, rtol=0, atol=(1e-3 + slow) * record.span)
 
 

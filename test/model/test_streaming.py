@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from strategies import FAMILY_CASE, Case, cases, fractions, paths
 
 from slpi_ros.errors import UnreachableError, UsageError
+from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.limits import Limits, RateLimiter
@@ -50,7 +51,19 @@ def test_without_slew_limit_the_stream_is_the_inverse_within_limits(drawn):
         assert limits.lower <= v <= limits.upper
 
 
+# At the lower limit, where the inverse of the displacement at rest is that limit but for its last digits.
+LOW = 2.4e-5
+EVERETT = np.array([[0.0, 0.0, 0.0], [1.5e-6, 0.0, 0.0], [3e-6, 1.5e-6, 0.0]])
+RAMP = LoopFamily(np.array([LOW, 15.000024, 30.000024]), EVERETT, np.array([0.0, 1.5e-6, 3e-6]), 1e-7)
+AT_THE_LIMIT = (
+    Case(RAMP, (LOW, 9e-7), True, (LOW, 30.000024), (LOW, 15.000024, 30.000024)),
+    Limits(LOW, 30.000024, 1.0),
+    [(0.0, -3e-7), (0.5, 5.099999999999999e-06), (0.5, 9e-7)],
+)
+
+
 @given(streams(fractions(1, 1000)))
+@example(AT_THE_LIMIT)
 def test_with_a_slew_limit_the_voltage_keeps_to_it_and_the_memory_to_the_voltage(drawn):
     case, limits, samples = drawn
     stream, twin = stream_of(case, limits, everywhere(case)), case.memory()
@@ -66,7 +79,7 @@ def test_with_a_slew_limit_the_voltage_keeps_to_it_and_the_memory_to_the_voltage
     # Given time, it gets where it would have been told to go at once.
     t += 100 * case.width / limits.slew
     there = stream.step(t, y)
-    assert stream.step(t + 1, y) == there
+    assert stream.step(t + 1, y) == pytest.approx(there, abs=1e-9 * case.width)
     assert there == pytest.approx(twin.inverse(y, limits.lower, limits.upper), abs=1e-9 * case.width)
 
 

@@ -26,5 +26,7 @@ RUN source /opt/ros/jazzy/setup.bash \
     && colcon build --packages-select slpi_ros \
     && sed -i 's|^exec|source /workspace/install/setup.bash\nexec|' /ros_entrypoint.sh
 
+# For the command slpi.
+ENV PATH="${PATH}:/workspace/install/slpi_ros/lib/slpi_ros"
 WORKDIR /data
 CMD ["ros2", "pkg", "executables", "slpi_ros"]

@@ -3,18 +3,35 @@
 PYTHON ?=
 export PYTHON
 
-VENV   := .venv/bin/python
+# Other versions of the dependencies: jazzy, minimum or newest (tools/make_venv.sh), each in folders of its own.
+ENVIRONMENT ?=
+SUFFIX := $(if $(ENVIRONMENT),-$(ENVIRONMENT))
+INSTALL := install$(SUFFIX)
+# where tests, demo and benchmarks find the installed programs
+export SLPI_INSTALL := $(INSTALL)
+ifneq ($(ENVIRONMENT),)
+# Numba keeps its machine code beside the sources, for one version of Numba at a time.
+export NUMBA_CACHE_DIR := $(CURDIR)/.venv$(SUFFIX)/numba_cache
+endif
+
+VENV   := .venv$(SUFFIX)/bin/python
 # hundreds of processes are started: each would compile the sources anew without the files that Python keeps of them
 COMPILED := env -u PYTHONDONTWRITEBYTECODE
 COLCON := $(COMPILED) $(VENV) -c 'import sys; from colcon_core.command import main; sys.exit(main())'
 # every command that starts nodes needs the workspace in its environment
-IN_WORKSPACE := . install/setup.sh &&
+IN_WORKSPACE := . $(INSTALL)/setup.sh &&
 
-VENV_STAMP  := .venv/.stamp
-BUILD_STAMP := install/.stamp
+VENV_STAMP  := .venv$(SUFFIX)/.stamp
+BUILD_STAMP := $(INSTALL)/.stamp
+
+PYTEST := $(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 3 --dist worksteal
 
 # What .venv has to be made for: a copied checkout, another Python or a newly sourced ROS needs another one.
 WANTED := $(CURDIR) ROS_DISTRO=$(ROS_DISTRO) $(if $(PYTHON),PYTHON=$(PYTHON))
+ifeq ($(ENVIRONMENT),newest)
+# the newest of today
+$(VENV_STAMP): FORCE
+endif
 ifneq ($(filter-out $(shell cat $(VENV_STAMP) 2>/dev/null),$(WANTED)),)
 $(VENV_STAMP): FORCE
 endif
@@ -22,11 +39,13 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-soak bench-trajectory bench-xy bench-readme bench-faults audit docs package bench-calibrator bench-fleet clean distclean FORCE
+.PHONY: help build test test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs package bench-lies bench-calibrator bench-fleet clean distclean bench-restarts FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
 	@echo 'make test       build, lint, types, docstrings, tests'
+	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: all tests but the long lives of nodes'
+	@echo 'make test-newest   the same tests with the newest versions of today; make test-minimum with the oldest allowed'
 	@echo 'make docs       build, then the documentation site: docs/_build/html/index.html'
 	@echo 'make package    source distribution and wheel, installed and tried in a fresh environment without ROS'
 	@echo 'make demo       build, then a simulated stage is calibrated and follows a path; SEED= repeats one'
@@ -37,34 +56,47 @@ help:
 	@echo 'make bench-next-record   an advised second record, and pairs judged on a third; an hour or two'
 	@echo 'make bench-start-memory  100 memories at the start of a record: is a change told where there is one only'
 	@echo 'make bench-latency  round trip through the compensator beside a bare echo node, 4 minutes'
+	@echo 'make bench-platforms  RECORD=table.csv: the ten commands with the versions of Ubuntu 24.04: the same figures?'
+	@echo 'make bench-restarts   a compensator that is killed and started again: time to its first answer, 10 minutes'
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'
 	@echo 'make bench-trajectory  a trajectory of a million points: acceptance and deadlines'
 	@echo 'make bench-xy       the five segments of the MPI paper through the nodes, with and without feedback'
 	@echo 'make bench-readme   the commands of README on five simulated stages, and on the next day, 10 minutes'
+	@echo 'make bench-steps    largest step, slew and acceleration that leave a compensator, 10,000 episodes and 100 lives; 40 minutes'
 	@echo 'make bench-faults   mutated files, node lives under faults, half an hour at 1 kHz, a day at accelerated time; 90 minutes'
 	@echo 'make audit      known vulnerabilities of the pinned dependencies, by pip-audit'
+	@echo 'make bench-lies     eight kinds of sensors that lie, and honest ones: time driven, false alarms; ten minutes'
 	@echo 'make bench-calibrator  the calibrator on 20 hidden stages, and 30 faults; an hour'
 	@echo 'make bench-fleet    300 bags of 30 stages on Dask: changes found, one worker beside two, 20 minutes'
 	@echo 'make clean      remove what was built and all caches'
-	@echo 'make distclean  the same, and .venv'
+	@echo 'make distclean  the same, and the environments'
 	@echo 'PYTHON=/path/to/python3.12 chooses the Python; 3.11 and 3.12 work'
 
 build: $(BUILD_STAMP)
 
-$(VENV_STAMP): setup.py tools/make_venv.sh $(wildcard requirements/*.txt)
-	@tools/make_venv.sh
+$(VENV_STAMP): setup.py tools/make_venv.sh tools/find_python.sh $(wildcard requirements/*.txt)
+	@tools/make_venv.sh $(ENVIRONMENT)
 	@echo '$(WANTED)' >$@
 
 $(BUILD_STAMP): $(VENV_STAMP) $(INSTALLED)
-	@rm -rf build install
-	@$(COLCON) build --symlink-install --event-handlers console_start_end- summary-
+	@rm -rf build$(SUFFIX) $(INSTALL)
+	@$(COLCON) --log-base log$(SUFFIX) build --build-base build$(SUFFIX) --install-base $(INSTALL) --symlink-install \
+		--event-handlers console_start_end- summary-
 	@touch $@
 
 test: build
 	$(VENV) -m ruff check .
 	$(VENV) -m ruff format --check .
 	$(VENV) -m mypy
-	$(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 3 --dist worksteal
+	$(PYTEST)
+
+# Everything but the few tests of nodes that take a minute or more each: tutorials, README, a calibration, a measured path.
+test-jazzy test-newest test-minimum:
+	@$(MAKE) --no-print-directory ENVIRONMENT=$(@:test-%=%) test-environment
+
+test-environment: build
+	$(VENV) tools/list_versions.py
+	$(PYTEST) -m 'not ros or not minutes'
 
 docs: build
 	$(VENV) -m sphinx -E -W --keep-going -q docs docs/_build/html
@@ -93,8 +125,16 @@ bench-next-record: build
 bench-start-memory: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/start_memory.py
 
+# Both environments on one record, say RECORD=afm_double_sine_x.csv
+bench-platforms: build
+	@$(MAKE) --no-print-directory ENVIRONMENT=jazzy build
+	$(VENV) benchmarks/platforms.py $(RECORD) .venv .venv-jazzy
+
 bench-latency: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/latency.py
+
+bench-restarts: build
+	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/restarts.py
 
 bench-soak: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/soak.py
@@ -108,6 +148,9 @@ bench-xy: build
 bench-readme: build
 	$(IN_WORKSPACE) $(VENV) benchmarks/readme_steps.py
 
+bench-steps: build
+	$(IN_WORKSPACE) PYTHONPATH=.:test ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) -m benchmarks.steps $(STEPS)
+
 bench-faults: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/faults.py $(FAULTS)
 
@@ -117,6 +160,9 @@ audit:
 	@test -x .audit/bin/pip-audit || { $(or $(PYTHON),python3) -m venv .audit && .audit/bin/pip install -q pip-audit; }
 	.audit/bin/pip-audit --strict --disable-pip --no-deps -r requirements/lock.txt
 
+bench-lies: build
+	$(VENV) benchmarks/sensor_lies.py
+
 bench-calibrator: build
 	$(IN_WORKSPACE) OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/calibrator.py
 
@@ -124,8 +170,8 @@ bench-fleet: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/fleet.py
 
 clean:
-	rm -rf build install log dist docs/_build .hypothesis .mypy_cache .pytest_cache .ruff_cache
-	find . -path ./.venv -prune -o -name __pycache__ -prune -exec rm -rf {} +
+	rm -rf build build-* install install-* log log-* dist docs/_build .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -path './.venv*' -prune -o -name __pycache__ -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv .audit slpi_ros.egg-info
+	rm -rf .venv .venv-* .audit slpi_ros.egg-info

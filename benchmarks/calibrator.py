@@ -96,8 +96,8 @@ def reachable(axes: Sequence[str], seed: int, requests: Sequence[Request], axis:
 def _left_by_inverse(settings: CalibrationSettings, model: StageModel, axis: str) -> NDArray[np.float64]:
     """Return the errors of the compensation of a path, shape (N,), metres, if the stage were the model."""
     undone = {
-        name: replace(one, effects=tuple(effect for effect in one.effects if effect.removable == "always"))
-        for name, one in model.axes.items()
+        name: replace(one, effects=tuple(each for each in one.effects if each.name not in ("delay", "saturation")))
+        for name, one in model.stage_only.axes.items()
     }
     stage = replace(model, axes=undone)
     drive, desired = compensated(settings, stage, 1)

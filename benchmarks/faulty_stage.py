@@ -11,7 +11,7 @@ from std_msgs.msg import Float64MultiArray
 
 QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 # "silent": no states. The others falsify reading, voltage or stamp.
-FAULTS = ("silent", "nan", "absurd", "frozen", "wild", "clock")
+FAULTS = ("silent", "nan", "absurd", "frozen", "flipped", "moved", "wild", "effort 0", "clock")
 # Without a command for this time it reports by itself, as a driver does, seconds. Voltage before the first command.
 QUIET, AT_FIRST = 0.05, 20.0
 
@@ -55,8 +55,9 @@ class FaultyStage:
         if self.fault == "silent":
             return
         y = 0.2e-6 * v + self._rng.normal(0.0, 5e-9)
-        y = {"nan": math.nan, "absurd": 3.0, "frozen": 1e-6}.get(self.fault, y)
-        state = JointState(name=["x"], position=[y], effort=[500.0 if self.fault == "wild" else v])
+        y = {"nan": math.nan, "absurd": 3.0, "frozen": 1e-6, "flipped": -y, "moved": y + 1e-3}.get(self.fault, y)
+        reported = {"wild": 500.0, "effort 0": 0.0}.get(self.fault, v)
+        state = JointState(name=["x"], position=[y], effort=[reported])
         state.header.stamp = self._node.get_clock().now().to_msg()
         state.header.stamp.sec += 3600 if self.fault == "clock" else 0
         self._publisher.publish(state)

@@ -16,17 +16,22 @@ from round_trip import Client, Trip, compensator, echo, identified_stage
 from slpi_ros.model.stage_model import StageModel
 
 BLOCK_S = 0.25
+# A rate limit would add voltages between the desired displacements, and answers must be one for each.
+UNLIMITED = {"slew_limit": 0.0}
 # Number of process starts: the latency depends on the memory and cores that a process happens to receive.
 STARTS = 5
 
 
-def measure(model: StageModel, executor: str, seconds: float, rate: float) -> None:
-    """Print the lines of the table for one executor."""
+def measure(model: StageModel, executor: str, seconds: float, rate: float, beside: str = "") -> None:
+    """Print the lines of the table for one executor; `beside` is the Python of another environment, if any."""
     cases = {
         "echo": lambda name: echo(name, "echo", executor),
-        "compensator": lambda name: compensator(name, model, executor),
+        "compensator": lambda name: compensator(name, model, executor, **UNLIMITED),
         "bytes_echo": lambda name: echo(name, "bytes", executor),
     }
+    if beside:
+        cases["echo_beside"] = lambda name: echo(name, "echo", executor, beside)
+        cases["compensator_beside"] = lambda name: compensator(name, model, executor, python=beside, **UNLIMITED)
     trips = {name: Trip() for name in cases}
     for _ in range(STARTS):
         with ExitStack() as stack:
@@ -46,15 +51,15 @@ def measure(model: StageModel, executor: str, seconds: float, rate: float) -> No
         )
 
 
-def main(seconds: float = 8.0, rate: float = 1000.0) -> None:
-    """Print the table."""
+def main(seconds: float = 8.0, rate: float = 1000.0, beside: str = "") -> None:
+    """Print the table, with nodes of the Python `beside` too."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     print(f"{STARTS} starts of all nodes, {seconds:g} s at {rate:g} Hz each, in blocks of {BLOCK_S:g} s in turn")
     print(f"two axes, reliable, depth 100; load of the machine before: {os.getloadavg()[0]:.2f}")
     print(f"{'':<32} {'p50 us':>8} {'p99 us':>8} {'of echo':>12} {'lost':>6} {'CPU':>6}")
     model = identified_stage()
     for executor in ("events", "default"):
-        measure(model, executor, seconds, rate)
+        measure(model, executor, seconds, rate, beside)
     rclpy.try_shutdown()
 
 
@@ -62,5 +67,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--rate", type=float, default=1000.0)
+    parser.add_argument("--beside", default="", metavar="PYTHON", help="nodes of another environment in the same run")
     options = parser.parse_args()
-    main(options.seconds, options.rate)
+    main(options.seconds, options.rate, options.beside)

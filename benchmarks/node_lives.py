@@ -1,8 +1,8 @@
 """Lives of compensator processes under random faults, and a long run at 1 kHz, each judged against fixed promises.
 
-In every life: no voltage leaves its limits, no step exceeds the slew rate or the acceleration, every accepted message
-is answered, every message that was sent is counted as accepted or rejected, the answers are those of a twin without ROS
-that has seen the accepted samples only, and what the memory file holds afterwards is the memory of that twin.
+In every life: no voltage leaves its limits, every accepted message is answered, every message that was sent is counted
+as accepted or rejected, the answers are those of a twin without ROS that has seen the accepted samples only, and what
+the memory file holds afterwards is the memory of that twin.
 """
 
 import copy
@@ -16,7 +16,6 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
 from math import inf
 from multiprocessing import get_context
 from pathlib import Path
@@ -32,11 +31,11 @@ from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.document import format_model, parse_model, save_model
-from slpi_ros.model.limits import MAX_DT, Limits
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 
 AXES = ["x", "y"]
-LOW, HIGH, SLEW = 2.0, 98.0, 3000.0
+LOW, HIGH = 2.0, 98.0
 START_NS, MS = 1_700_000_000_000_000_000, 1_000_000
 NAN, INF = float("nan"), inf
 # What a second publisher of voltage_command says: no voltage of the node, so that the two can be told apart.
@@ -91,44 +90,20 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     return bytes(found)
 
 
-@dataclass
-class Promises:
-    """Check the voltages of accepted samples against limits, slew rate and acceleration.
-
-    Written from the definitions of the parameters and not with the rate limiter of the package, which is what it
-    checks.
-    """
-
-    limits: Limits
-    voltages: list[float]
-    rates: list[float] = field(default_factory=lambda: [0.0] * len(AXES))
-    last_ns: int | None = None
-
-    def check(self, stamp_ns: int, voltages: Sequence[float]) -> None:
-        """Take the voltages (V) of the next accepted sample; AssertionError if they break a promise."""
-        elapsed = 0.0 if self.last_ns is None else (stamp_ns - self.last_ns) * 1e-9
-        if elapsed > MAX_DT:
-            self.rates = [0.0] * len(AXES)
-        dt = min(max(elapsed, 0.0), MAX_DT)
-        for k, (v, before) in enumerate(zip(voltages, self.voltages, strict=True)):
-            assert self.limits.lower <= v <= self.limits.upper, f"{v} V outside of the limits"
-            assert abs(v - before) <= self.limits.slew * dt + 1e-9, f"{v - before} V in {dt} s"
-            if dt > 0.0:
-                change = (v - before) / dt - self.rates[k]
-                assert abs(change) <= self.limits.acceleration * dt + 1e-5, f"rate changed by {change} V/s in {dt} s"
-                self.rates[k] += change
-        self.voltages, self.last_ns = list(voltages), stamp_ns
+def require_limits(voltages: Sequence[float]) -> None:
+    """Raise AssertionError if a voltage (V) is outside of the limits. Steps and rates: `benchmarks/steps.py`."""
+    for v in voltages:
+        assert LOW <= v <= HIGH, f"{v} V outside of the limits"
 
 
 class Twin:
     """What a compensator must answer: a controller without ROS that sees what the node accepts."""
 
-    def __init__(self, model: StageModel, acceleration: float = inf, saved: dict[str, SavedAxis] | None = None) -> None:
-        limits = Limits(LOW, HIGH, SLEW, acceleration)
-        self.controller = Controller(AXES, [limits] * 2)
+    def __init__(self, model: StageModel, saved: dict[str, SavedAxis] | None = None) -> None:
+        # Without rate limits the answers do not depend on when they are given.
+        self.controller = Controller(AXES, [Limits(LOW, HIGH)] * 2)
         self.controller.activate(0)
         self.controller.use_model(model, saved)
-        self.promises = Promises(limits, list(self.controller.voltages))
         self.answers: list[list[float]] = []
 
     def desire(self, names: Sequence[str], row: Sequence[float], stamp_ns: int) -> bool:
@@ -138,7 +113,7 @@ class Twin:
         except RejectedError:
             return False
         answer = list(self.controller.voltages)
-        self.promises.check(stamp_ns, answer)
+        require_limits(answer)
         self.answers.append(answer)
         return True
 
@@ -231,13 +206,12 @@ class Life:
     def __init__(self, rng: random.Random, folder: Path, namespace: str, ends: ExitStack) -> None:
         self.rng, self.namespace = rng, namespace
         self.counts: Counter[tuple[str, str]] = Counter()
-        self.acceleration = rng.choice((INF, 1e5, 1e6))
         self.disk = Disk(rng.choice(Disk.KINDS), folder, ends)
         self.model, self.now = stage(), START_NS
         save_model(self.model, folder / "model.json")
         self.given: dict[str, object] = {
             "axes": AXES, "model_file": str(folder / "model.json"), "voltage_min": LOW, "voltage_max": HIGH,
-            "slew_limit": SLEW, "acceleration_limit": 0.0 if self.acceleration == INF else self.acceleration,
+            "slew_limit": 0.0,
         }  # fmt: skip
         if self.disk.path:
             self.given["memory_file"] = self.disk.path
@@ -255,8 +229,8 @@ class Life:
         number = rng.choice(list(ENDS))
         saved = None
         with suppress(SlpiError):
-            saved = MemoryFile(self.disk.path).find(self.model, AXES, [Limits(LOW, HIGH, SLEW, self.acceleration)] * 2)
-        self.twin = Twin(self.model, self.acceleration, dict(saved) if saved else None)
+            saved = MemoryFile(self.disk.path).find(self.model, AXES)
+        self.twin = Twin(self.model, dict(saved) if saved else None)
         if self.disk.kind in ("no folder", "/proc", "/dev/full", "broken file"):
             self.note(f"memory file: {self.disk.kind}")
         elif self.disk.kind in ("full", "read-only") and rng.random() < 0.6:
@@ -445,19 +419,14 @@ class Life:
         answers = self.answers
         known = common(answers, self.twin.answers)
         assert known >= len(before.answers), "answers are lost or wrong"
-        braking = answers[known:]
-        assert not braking or (number != signal.SIGKILL and self.acceleration < INF), f"unknown answers {braking[:3]}"
+        assert not answers[known:], f"unknown answers {answers[known:][:3]}"
         last = answers[known - 1]
-        for row in braking:
-            for v, v_before in zip(row, last, strict=True):
-                assert LOW <= v <= HIGH and abs(v - v_before) <= SLEW * MAX_DT + 1e-9, f"{v_before} V, then {v} V"
-            last = row
         for message in burst[: known - len(before.answers)]:
             assert before.desire(*message)
         if self.disk.writable:
-            self._check_memory(number, before, known, last, bool(braking))
+            self._check_memory(number, before, known, last)
 
-    def _check_memory(self, number: int, accepted: Twin, known: int, last: list[float], braked: bool) -> None:
+    def _check_memory(self, number: int, accepted: Twin, known: int, last: list[float]) -> None:
         """Compare the memory file with the memory of the twin that has seen the first `known` accepted samples."""
         memory = load_memory(self.disk.path)
         assert memory and memory.model == model_id(self.model), "the memory file belongs to another model"
@@ -468,9 +437,8 @@ class Life:
             assert voltages in self.twin.answers[max(known - 2, 0) :], "the last voltage is not in the memory file"
             return
         assert memory.complete and voltages == last, f"the memory file ends at {voltages} V, the answers at {last} V"
-        if not braked:
-            found = {axis: memory.axes[axis].reversal_voltages for axis in AXES}
-            assert found == accepted.memory, "the memory file is not the memory of the twin"
+        found = {axis: memory.axes[axis].reversal_voltages for axis in AXES}
+        assert found == accepted.memory, "the memory file is not the memory of the twin"
 
 
 def live(seed: int, number: int) -> tuple[int, str, Counter[tuple[str, str]]]:

@@ -27,7 +27,7 @@ import slpi_ros
 
 FloatArray = NDArray[np.float64]
 CHECKOUT = Path(__file__).resolve().parents[1]
-PROGRAMS = CHECKOUT / "install" / "slpi_ros" / "lib" / "slpi_ros"
+PROGRAMS = CHECKOUT / os.environ.get("SLPI_INSTALL", "install") / "slpi_ros" / "lib" / "slpi_ros"
 SECTION = re.compile(r"^## No stage yet.*^## Calibrate a real stage.*?(?=^## )", re.DOTALL | re.MULTILINE)
 BLOCK = re.compile(r"^```bash\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 # Set points after that of the README, as fractions of the identified range.
@@ -174,9 +174,14 @@ class Readme:
         timer, found = self.node.create_timer(1.0 / float(rate), send), []
         for point in points:
             # Answers to earlier messages may still arrive, and a stage reports its rest until it is driven.
-            new = len(sent) + 2
+            # What the slew limit holds back comes between the answers.
+            new = len(sent) + 20
             self.until(
-                lambda new=new: len(answers) >= new and self.turns[-1] == answers[-1].data[0],
+                lambda new=new: (
+                    len(sent) >= new
+                    and len({each.data[0] for each in answers[-5:]}) == 1
+                    and self.turns[-1] == answers[-1].data[0]
+                ),
                 f"the voltage for {point} m",
             )
             self.readings.clear()

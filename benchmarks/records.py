@@ -33,16 +33,15 @@ def free_run(model: AxisModel, record: Record, axis: str) -> float:
     """Return the error, % of the stroke, for the best of the possible initial histories (such as never moved)."""
     v, y = record.voltage[axis], record.displacement[axis]
     known = np.isfinite(y)
-    shared = replace(model, effects=tuple(effect for effect in model.effects if effect.removable != "record"))
     # Creep that continues from before a record is specific to the record, like its initial history.
     settled = replace(
-        shared,
-        effects=tuple(replace(one, initial=0.0) if isinstance(one, Creep) else one for one in shared.effects),
+        model,
+        effects=tuple(replace(one, initial=0.0) if isinstance(one, Creep) else one for one in model.effects),
     )
     errors = [
         replace(each, start=Start(float(v[0]), 0.0, history)).simulate(record.t, v)[known] - y[known]
         for history in {(), (float(v[0]),), model.start.history}
-        for each in (shared, settled)
+        for each in (model, settled)
     ]
     return 100.0 * min(float(np.std(error)) for error in errors) / float(np.ptp(y[known]))
 

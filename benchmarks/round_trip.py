@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,11 +47,11 @@ def identified_stage() -> StageModel:
 
 
 @contextmanager
-def node(namespace: str, *command: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a node in a separate session; terminate it at the end of the ``with`` block."""
+def node(namespace: str, *command: str, python: str = sys.executable) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a node with a Python in a separate session; terminate it at the end of the ``with`` block."""
     options = [] if "--ros-args" in command else ["--ros-args"]
     remapping = ["-r", f"__ns:=/{namespace}"]
-    process = subprocess.Popen([sys.executable, *command, *options, *remapping], start_new_session=True)
+    process = subprocess.Popen([python, *command, *options, *remapping], start_new_session=True)
     try:
         yield process
     finally:
@@ -64,7 +65,12 @@ def node(namespace: str, *command: str) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextmanager
 def compensator(
-    namespace: str, model: StageModel, executor: str = "events", remap: Sequence[str] = (), **parameters: object
+    namespace: str,
+    model: StageModel,
+    executor: str = "events",
+    remap: Sequence[str] = (),
+    python: str = sys.executable,
+    **parameters: object,
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run the compensator with a model of both axes; remap topics as in ``from:=to``."""
     with tempfile.TemporaryDirectory() as folder:
@@ -73,14 +79,16 @@ def compensator(
         given = {"axes": list(AXES), "model_file": str(path), "executor": executor, **parameters}
         options = [part for name, value in given.items() for part in ("-p", f"{name}:={json.dumps(value)}")]
         options += [part for rule in remap for part in ("-r", rule)]
-        with node(namespace, "-m", "slpi_ros.nodes.compensator", "--ros-args", *options) as process:
+        with node(namespace, "-m", "slpi_ros.nodes.compensator", "--ros-args", *options, python=python) as process:
             yield process
 
 
 @contextmanager
-def echo(namespace: str, kind: str = "echo", executor: str = "events") -> Iterator[subprocess.Popen[bytes]]:
+def echo(
+    namespace: str, kind: str = "echo", executor: str = "events", python: str = sys.executable
+) -> Iterator[subprocess.Popen[bytes]]:
     """Run an echo node."""
-    with node(namespace, str(HERE / "echo_node.py"), kind, executor) as process:
+    with node(namespace, str(HERE / "echo_node.py"), kind, executor, python=python) as process:
         yield process
 
 
@@ -134,12 +142,16 @@ class Client:
         self._executor = make_executor("events")
         self._executor.add_node(self._node)
         self._publishers = {}
+        # The times of the answers of each node: one node may still answer while another one is asked.
+        self._answers: dict[str, list[int]] = {}
         for namespace in namespaces:
             topic = f"/{namespace}/desired_displacement"
             self._publishers[namespace] = self._node.create_publisher(JointState, topic, DEEP)
             answers = f"/{namespace}/voltage_command"
-            self._node.create_subscription(Float64MultiArray, answers, self._on_answer, DEEP, raw=True)
-        self._received: list[int] = []
+            own: list[int] = []
+            self._answers[namespace] = own
+            receive = partial(_note_time, own)
+            self._node.create_subscription(Float64MultiArray, answers, receive, DEEP, raw=True)
         t, y = scan_path(2e-6, 18e-6, duration=20.0, rate=1000.0, seed=5)
         self._path = y.tolist()
         marks = (1.2345, 5.4321)
@@ -162,26 +174,24 @@ class Client:
                     raise RuntimeError(f"the node {namespace} did not show up")
                 self._executor.spin_once(timeout_sec=0.1)
         time.sleep(0.5)
-        for namespace in self._publishers:
-            self._received.clear()
-            self._drain(len(self._send_for(namespace, 1000.0, 1.0, [])))
+        for namespace, answers_of in self._answers.items():
+            answers_of.clear()
+            self._drain(answers_of, len(self._send_for(namespace, 1000.0, 1.0, [])))
 
     def run(self, namespace: str, process: subprocess.Popen[bytes], rate: float, seconds: float, trip: Trip) -> None:
         """Send messages for some `seconds` at `rate` (Hz) to a node running in `process`; add the results to `trip`."""
-        self._received.clear()
+        received = self._answers[namespace]
+        received.clear()
         busy, began = _cpu_seconds(process.pid), time.monotonic()
         sent = self._send_for(namespace, rate, seconds, trip.resident, process.pid)
-        self._drain(len(sent))
+        self._drain(received, len(sent))
         trip.took += time.monotonic() - began
         trip.busy += _cpu_seconds(process.pid) - busy
         trip.sent += len(sent)
-        trip.answered += len(self._received)
+        trip.answered += len(received)
         # Answers do not identify the message that they answer: after a loss they cannot be matched.
-        if len(self._received) == len(sent):
-            trip.latency.append((np.array(self._received) - np.array(sent)) * 1e-9)
-
-    def _on_answer(self, _: bytes) -> None:
-        self._received.append(time.perf_counter_ns())
+        if len(received) == len(sent):
+            trip.latency.append((np.array(received) - np.array(sent)) * 1e-9)
 
     def _send_for(
         self, namespace: str, rate: float, seconds: float, resident: list[int], pid: int | None = None
@@ -209,10 +219,14 @@ class Client:
         struct.pack_into("=2d", self._message, self._positions_at, y, y)
         return bytes(self._message)
 
-    def _drain(self, count: int) -> None:
+    def _drain(self, received: list[int], count: int) -> None:
         deadline = time.monotonic() + LAST_ANSWERS_S
-        while time.monotonic() < deadline and len(self._received) < count:
+        while time.monotonic() < deadline and len(received) < count:
             self._executor.spin_once(timeout_sec=0.05)
+
+
+def _note_time(received: list[int], _: bytes) -> None:
+    received.append(time.perf_counter_ns())
 
 
 def _cpu_seconds(pid: int) -> float:

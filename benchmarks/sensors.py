@@ -7,7 +7,7 @@ and by the extended model; errors are relative to the true displacement, without
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from accuracy import V_MAX, FloatArray, fresh, record_of
@@ -130,8 +130,7 @@ def outcome(kind: str, number: int) -> Outcome:
     true, _ = fresh(number).run(t, np.interp(t - draw.delay, t, v))
     errors = []
     for one in (model.axes["x"], diagnosis.extended.axes["x"]):
-        shared = replace(one, effects=tuple(effect for effect in one.effects if effect.removable != "record"))
-        errors.append(100.0 * float(np.std((shared.simulate(t, v) - true)[1:]) / np.ptp(true)))
+        errors.append(100.0 * float(np.std((one.stage_only.simulate(t, v) - true)[1:]) / np.ptp(true)))
     causes = tuple(named.name for named in found.effects)
     end = [100.0 * named.effect.gains[-1] for named in found.effects if isinstance(named.effect, GainDrift)]
     said = found.summary.split(" % of the readings")[0].split()[-1] if " % of the readings" in found.summary else "0"

@@ -25,7 +25,9 @@ FloatArray = NDArray[np.float64]
 # Samples sent but not yet answered: fewer than the compensator's queue holds.
 AHEAD = 50
 QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-EXECUTABLES = Path(__file__).resolve().parents[1] / "install" / "slpi_ros" / "lib" / "slpi_ros"
+EXECUTABLES = (
+    Path(__file__).resolve().parents[1] / os.environ.get("SLPI_INSTALL", "install") / "slpi_ros" / "lib" / "slpi_ros"
+)
 
 
 @contextmanager

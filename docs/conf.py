@@ -32,20 +32,20 @@ html_show_sourcelink = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 
-SOURCES = "https://github.com/slpi-ros/slpi_ros/blob/main/"
 MARKER = re.compile(r"^<!-- generated: ([\w-]+)(?: (.+?))? -->$", re.MULTILINE)
-UPWARDS = re.compile(r"\]\((\.\./[\w./-]+)(#[\w-]+)?\)")
+UPWARDS = re.compile(r"\[([^\]]*)\]\((\.\./[\w./-]+)(#[\w-]+)?\)")
 
 
 def expand(_app, docname, source):
-    """Replace markers by what the code and the schemas say, and links out of docs/ by links to the repository."""
+    """Replace markers by what the code and the schemas say, and links out of docs/ by file names."""
     text = MARKER.sub(lambda found: GENERATORS[found[1]](*filter(None, [found[2]])), source[0])
 
     def link(found):
-        path = ((DOCS / docname).parent / found[1]).resolve()
+        path = ((DOCS / docname).parent / found[2]).resolve()
         if path.is_relative_to(DOCS):
             return found[0]
-        return f"]({SOURCES}{path.relative_to(DOCS.parent)}{found[2] or ''})"
+        name = str(path.relative_to(DOCS.parent))
+        return found[1] if name in found[1] else f"{found[1]} (`{name}`)"
 
     source[0] = UPWARDS.sub(link, text)
 

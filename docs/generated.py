@@ -87,7 +87,7 @@ def _document(path):
     definitions = schema.get("$defs", {})
     name = path.name.split(".")[0].replace("_", " ")
     about = f"{schema['title']}. {schema.get('description', '')}"
-    parts = [f"## {name.capitalize()}\n\n{about} Schema: `{path.name}`, `{schema['$id']}`."]
+    parts = [f"## {name.capitalize()}\n\n{about} Schema: `{path.name}`, `{schema['properties']['schema']['const']}`."]
     parts.append(_fields(schema, definitions))
     for part_name, part in definitions.items():
         if fields := _fields(part, definitions):

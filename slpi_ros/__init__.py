@@ -6,6 +6,8 @@ SLPI is the Separated Level-loop Prandtl-Ishlinskii model. The names exported he
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from slpi_ros.dependencies import dependencies_needed
+
 if TYPE_CHECKING:
     from slpi_ros.diagnosis.diagnose import diagnose
     from slpi_ros.diagnosis.verify import verify
@@ -61,7 +63,8 @@ def __getattr__(name: str) -> Any:
         return import_module(f"{__name__}.fleet")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    with dependencies_needed():
+        found = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     globals()[name] = found
     return found
 

@@ -21,6 +21,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from slpi_ros.dependencies import DependencyError, dependencies_needed
 from slpi_ros.errors import LONGEST_SHOWN, ModelError, RecordError, SlpiError, UsageError, shown
 from slpi_ros.identification.progress import report_progress, shown_on
 
@@ -182,7 +183,7 @@ def _import_options(command: Any) -> None:
         "table", metavar="DATA.csv|DATA.mat",
         help="columns separated by comma, semicolon or tab; names include the unit: x_nm, x (nm), x [nm] or x in nm",
     )  # fmt: skip
-    command.add_argument("-o", "--output", metavar="BAG", required=True, help="folder of the new bag")
+    _output(command, "BAG", "folder of the new bag")
     command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
     command.add_argument(
         "--voltage", metavar="COLUMN", nargs="+", default=(),
@@ -208,7 +209,7 @@ def _identify_options(command: Any) -> None:
     from slpi_ros.identification.fit import KINDS
 
     command.add_argument("bags", metavar="BAG", nargs="+", help="rosbag2 folder, or a single mcap or sqlite3 file")
-    command.add_argument("-o", "--output", metavar="MODEL.json", required=True, help="model document to write")
+    _output(command, "MODEL.json", "model document to write")
     command.add_argument("--kind", choices=KINDS, default="slpi", help="kind of model; default: slpi")
     command.add_argument(
         "--loops-at-rest",
@@ -218,6 +219,7 @@ def _identify_options(command: Any) -> None:
     _topic_options(command)
     _axes(command, help="default: every axis of the bag")
     _span(command)
+    _sensor(command, "0")
     command.add_argument(
         "--report", metavar="DIR", help="also write a report with plots of the first bag; default: none"
     )
@@ -232,13 +234,11 @@ def _diagnose_options(command: Any) -> None:
         help="rosbag2 folder, or a single mcap or sqlite3 file; several records allow cross-validation of each cause",
     )  # fmt: skip
     command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
-    command.add_argument(
-        "-o", "--output", metavar="DIR", required=True,
-        help="folder of diagnosis.json, extended_model.json and report.html",
-    )  # fmt: skip
+    _output(command, "DIR", "folder of diagnosis.json, extended_model.json and report.html")
     _topic_options(command)
     _axes(command, help="default: every axis that bag and model share")
     _span(command)
+    _sensor(command)
 
 
 def _verify_options(command: Any) -> None:
@@ -251,15 +251,21 @@ def _verify_options(command: Any) -> None:
         help="largest rms error that passes, micrometres; default: three times the repeatability floor of the record, "
         "at least 0.02 %% of the stroke",
     )  # fmt: skip
-    command.add_argument(
-        "-o", "--output", metavar="DIR", help="folder of verification.json and report.html; default: none"
-    )
+    _output(command, "DIR", "folder of verification.json and report.html; default: none", required=False)
     command.add_argument(
         "--desired-topic", metavar="TOPIC",
         help=f"also evaluate the tracking error against this topic; default: {DESIRED}, if present in the bag",
     )  # fmt: skip
     _topic_options(command)
     _axes(command, help="default: every axis that bags and model share")
+    _sensor(command)
+
+
+def _output(command: Any, metavar: str, text: str, *, required: bool = True) -> None:
+    command.add_argument("-o", "--output", metavar=metavar, required=required, help=text)
+    command.add_argument(
+        "--overwrite", action="store_true", help="replace outputs that slpi did not write; default: refuse to"
+    )
 
 
 def _axes(command: Any, **options: Any) -> None:
@@ -275,11 +281,37 @@ def _span(command: Any) -> None:
     )
 
 
+def _sensor(command: Any, default: str = "that of the model") -> None:
+    command.add_argument(
+        "--sensor-delay", metavar="S", type=_sensor_seconds,
+        help=f"known delay of the sensor, s, taken out of its readings; default: {default}",
+    )  # fmt: skip
+    command.add_argument(
+        "--sensor-lag", metavar="S", type=_sensor_seconds,
+        help=f"known time constant of the sensor's low-pass filter, s, taken out of its readings; default: {default}",
+    )  # fmt: skip
+
+
+def _sensor_seconds(text: str) -> float:
+    """Return a delay or lag of a sensor, seconds."""
+    from slpi_ros.model.sensor import LONGEST
+
+    seconds = _seconds(text)
+    if not 0.0 <= seconds <= LONGEST:
+        raise argparse.ArgumentTypeError(f"{text} s; give seconds from 0 to {LONGEST:g}, such as 0.002 for 2 ms")
+    return seconds
+
+
 def _seconds(text: str) -> float:
     """Return a finite number of seconds."""
-    seconds = float(text)
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
     if not math.isfinite(seconds):
-        raise argparse.ArgumentTypeError(f"{text} is no time; give a finite number of seconds, or leave the option out")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no time; give a finite number of seconds, or leave the option out"
+        )
     return seconds
 
 
@@ -301,11 +333,14 @@ def _topic_options(command: Any) -> None:
 def _excite_options(command: Any) -> None:
     from slpi_ros.excitation.drives import DRIVES
 
-    command.add_argument("-o", "--output", metavar="DRIVE.csv", required=True, help="columns time_s, <axis>_V")
+    _output(command, "DRIVE.csv", "columns time_s, <axis>_V")
     _axes(command, default=("x",), help="axes to excite, one after the other; default: x")
     command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="lowest voltage")
     command.add_argument("--voltage-max", metavar="V", type=float, required=True, help="highest voltage")
-    command.add_argument("--slew", metavar="V/S", type=float, default=0.0, help="rate limit; 0 (default): no limit")
+    command.add_argument(
+        "--slew", metavar="V/S", type=float,
+        help="slew limit, of which the drive uses 80 %%; default: the voltage range in 0.1 s; 0: no limit",
+    )  # fmt: skip
     command.add_argument("--duration", metavar="S", type=float, default=30.0, help="duration; default: 30 s")
     command.add_argument("--rate", metavar="HZ", type=float, default=200.0, help="sample rate; default: 200 Hz")
     command.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the random sequence; default: 0")
@@ -318,10 +353,11 @@ def _excite_options(command: Any) -> None:
 def _refit_options(command: Any) -> None:
     command.add_argument("model", metavar="MODEL.json", help="model to be corrected")
     command.add_argument("bags", metavar="BAG", nargs="+", help="in any order; the oldest record is used first")
-    command.add_argument("-o", "--output", metavar="MODEL.json", required=True, help="may be the input model file")
+    _output(command, "MODEL.json", "may be the input model file")
     command.add_argument("--topic", default=TOPIC, help=f"topic with voltage and displacement; default: {TOPIC}")
     _axes(command, help="default: every axis that bag and model share")
     _span(command)
+    _sensor(command)
     command.add_argument(
         "--report", metavar="DIR", help="also write a report with plots of the last bag; default: none"
     )
@@ -330,7 +366,7 @@ def _refit_options(command: Any) -> None:
 def _simulate_options(command: Any) -> None:
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
     command.add_argument("table", metavar="VOLTAGE.csv", help="columns time_s, <axis>_V")
-    command.add_argument("-o", "--output", metavar="DISPLACEMENT.csv", required=True, help="columns time_s, <axis>_m")
+    _output(command, "DISPLACEMENT.csv", "columns time_s, <axis>_m")
 
 
 def _compensate_options(command: Any) -> None:
@@ -338,7 +374,7 @@ def _compensate_options(command: Any) -> None:
 
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
     command.add_argument("table", metavar="DESIRED.csv", help="columns time_s, <axis>_m")
-    command.add_argument("-o", "--output", metavar="VOLTAGE.csv", required=True, help="columns time_s, <axis>_V")
+    _output(command, "VOLTAGE.csv", "columns time_s, <axis>_V")
     command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
     command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
     command.add_argument(
@@ -356,10 +392,7 @@ def _fleet_options(command: Any) -> None:
     command.add_argument(
         "sources", metavar="SOURCE", nargs="+", help="bag, folder of bags (recursively), or CSV list of bag and stage"
     )
-    command.add_argument(
-        "-o", "--output", metavar="DIR", required=True,
-        help="folder of results.parquet, index.html and models; an interrupted run is continued there",
-    )  # fmt: skip
+    _output(command, "DIR", "folder of results.parquet, index.html and models; an interrupted run is continued there")
     command.add_argument("--models", metavar="DIR", help="reference models; default: of the first bag of each stage")
     where = command.add_mutually_exclusive_group()
     where.add_argument(
@@ -376,7 +409,7 @@ def _fleet_options(command: Any) -> None:
 
 
 def _experiments_options(command: Any) -> None:
-    command.add_argument("-o", "--output", metavar="DIR", required=True, help="folder of index.html")
+    _output(command, "DIR", "folder of index.html")
     command.add_argument(
         "--data", metavar="DIR", help="folder of measured records to include in the comparison; default: none"
     )
@@ -387,7 +420,9 @@ def _calibrate_options(command: Any) -> None:
     command.add_argument("--axis", metavar="NAME", nargs="+", default=("x",), action=_UniqueNames, help="default: x")
     command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="lowest voltage")
     command.add_argument("--voltage-max", metavar="V", type=float, required=True, help="highest voltage")
-    command.add_argument("--slew", metavar="V/S", type=float, default=0.0, help="slew limit; default: none")
+    command.add_argument(
+        "--slew", metavar="V/S", type=float, help="slew limit; default: the voltage range in 0.1 s; 0: no limit"
+    )
 
 
 def _doctor_options(command: Any) -> None:
@@ -422,7 +457,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # argparse reads the first as an empty list, and no file can have the second in its name.
         if re.fullmatch(r"--[^=]+=--", argument) or "\0" in argument:
             parser("").error(f"argument {argument!r} has no valid value")
-    options = parser(arguments[0] if arguments else "").parse_args(arguments)
+    try:
+        with dependencies_needed():
+            options = parser(arguments[0] if arguments else "").parse_args(arguments)
+    except DependencyError as error:
+        print(f"{' '.join(['slpi', *arguments[:1]])}: {error}", file=sys.stderr)
+        return error.exit_code
     for output in (sys.stdout, sys.stderr):
         # Characters that the terminal encoding lacks are printed as escape sequences.
         if isinstance(output, TextIOWrapper):
@@ -431,7 +471,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.remarks = []
     warnings.showwarning = lambda message, *_: options.remarks.append(str(message))
     try:
-        with shown_on(sys.stderr):
+        with shown_on(sys.stderr), dependencies_needed():
             report_progress(options.command)
             result = COMMANDS[options.command].run(options)
         result.show(as_document=options.json, verbose=options.verbose)
@@ -466,6 +506,7 @@ def _say(*lines: str, most: int = LONGEST_SHOWN) -> None:
 def _import(options: argparse.Namespace) -> Result:
     from slpi_ros.io.bag_writer import write_bag
     from slpi_ros.io.columns import ColumnOptions
+    from slpi_ros.io.outputs import allow_bag
     from slpi_ros.io.tables import import_with_summary
 
     columns = ColumnOptions(
@@ -475,9 +516,12 @@ def _import(options: argparse.Namespace) -> Result:
         displacement_unit=options.displacement_unit,
         axes=tuple(options.axes),
     )
+    options.remarks += allow_bag(options.output, overwrite=options.overwrite)
     record, lines = import_with_summary(options.table, columns)
     record = replace(record, hardware_id=options.hardware_id)
-    write_bag(options.output, record, storage=options.storage)
+    # What a link leads to is replaced, not the link.
+    place = os.path.realpath(options.output) if options.overwrite else options.output
+    write_bag(place, record, storage=options.storage, replace=options.overwrite)
     return Result(
         [f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s", *lines],
         {"bag": options.output, "samples": len(record), "axes": list(record.axes), "seconds": float(record.t[-1])},
@@ -492,24 +536,29 @@ def _identify(options: argparse.Namespace) -> Result:
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.bag_reader import read_bags
     from slpi_ros.model.document import format_model, save_model
+    from slpi_ros.model.sensor import Sensor, corrected
     from slpi_ros.reports.text import describe_model, model_limits, verdict
 
     topics = _topics(options)
+    sensor = Sensor(options.sensor_delay or 0.0, options.sensor_lag or 0.0)
     fit_of(options.kind, loops_at_rest=options.loops_at_rest)
-    _require_another_file(options.output, *options.bags)
-    if options.report:
-        _require_another_file(str(Path(options.report) / "report.html"), *options.bags)
-    target = Path(options.output)
-    if target.is_dir() or not target.parent.is_dir():
-        raise ModelError(f"{target}: cannot be written: it is a folder, or its parent is missing; choose another place")
+    _allow_model_and_report(options)
     if options.uncertainty:
         require_known_uncertainty(options.kind)
     lines = []
     part = {"start": options.start, "stop": options.stop}
     with output_folder(options.report) if options.report else nullcontext() as folder:
-        records = read_bags(options.bags, topics, axes=options.axis)
-        found = [_assess_record(record, options) for record in records]
-        model = identify(records, options.kind, loops_at_rest=options.loops_at_rest, **part)
+        read = read_bags(options.bags, topics, axes=options.axis)
+        records = [corrected(record, dict.fromkeys(record.axes, sensor.undo)) for record in read] if sensor else read
+        found = [_assess_record(_told(record, sensor.delay), options) for record in records]
+        model = identify(
+            read,
+            options.kind,
+            loops_at_rest=options.loops_at_rest,
+            sensor_delay=sensor.delay,
+            sensor_lag=sensor.lag,
+            **part,
+        )
         save_model(model, options.output)
         if folder:
             from slpi_ros.reports.identification import write_report
@@ -518,7 +567,7 @@ def _identify(options: argparse.Namespace) -> Result:
                 axis: cross_validate(records, axis, options.kind, loops_at_rest=options.loops_at_rest, **part)
                 for axis in model.axes
             }
-            write_report(folder, records[0], model, held_out=truth, found=found[0], **part)
+            write_report(folder, read[0], model, held_out=truth, found=found[0], **part)
             lines += [f"axis {axis}: {line}" for axis, held_out in truth.items() for line in held_out.lines()]
     if options.uncertainty:
         for axis in model.axes:
@@ -541,10 +590,32 @@ def _identify(options: argparse.Namespace) -> Result:
     )
 
 
+def _allow_model_and_report(options: argparse.Namespace) -> None:
+    """Check that ``-o`` and ``--report`` may be written."""
+    from slpi_ros.io.outputs import allow_document
+
+    _require_another_file(options.output, *options.bags)
+    options.remarks += allow_document(options.output, "model", overwrite=options.overwrite)
+    if options.report:
+        _allow_folder(options, options.report, "report.html")
+
+
+def _allow_folder(options: argparse.Namespace, folder: str, *names: str, inputs: Sequence[str] = ()) -> None:
+    """Check that these files may be written into a folder, and that none of them is a bag or one of the inputs."""
+    from slpi_ros.io.outputs import allow_folder
+
+    for name in names:
+        _require_another_file(str(Path(folder) / name), *options.bags, *inputs)
+    options.remarks += allow_folder(folder, *names, overwrite=options.overwrite)
+
+
 def _same_record(options: argparse.Namespace) -> list[str]:
     """Return the options that select topics, axes and a part of a record, as they were given."""
     words = []
-    for name in ("topic", "voltage_topic", "displacement_topic", "clock", "start", "stop"):
+    names = ["topic", "voltage_topic", "displacement_topic", "clock", "start", "stop"]
+    # The model of `slpi identify` keeps what is known of the sensor.
+    names += [] if options.command == "identify" else ["sensor_delay", "sensor_lag"]
+    for name in names:
         value = getattr(options, name, None)
         if value is not None and (name, value) != ("topic", TOPIC):
             words.append(f"--{name.replace('_', '-')}={value}")
@@ -553,6 +624,20 @@ def _same_record(options: argparse.Namespace) -> list[str]:
     if options.axis:
         words += ["--axis", *options.axis]
     return words
+
+
+def _with_sensor(model: "StageModel", options: argparse.Namespace) -> "StageModel":
+    """Return the model with the delay and lag of the sensor that the options give; remark where these are others."""
+    axes = [axis for axis in options.axis or model.axes if axis in model.axes]
+    known = model.with_sensor(delay=options.sensor_delay, lag=options.sensor_lag, axes=axes)
+    told = [
+        f"axis '{axis}': {one.sensor.describe()} given, {model.axes[axis].sensor.describe()} in the model"
+        for axis, one in known.axes.items()
+        if one.sensor != model.axes[axis].sensor
+    ]
+    if told:
+        options.remarks.append(f"the given timing of the sensor is used: {'; '.join(told)}")
+    return known
 
 
 def _topics(options: argparse.Namespace) -> "str | SeparateTopics":
@@ -570,6 +655,12 @@ def _topics(options: argparse.Namespace) -> "str | SeparateTopics":
     if options.clock or options.voltage_measured:
         raise UsageError("--clock and --voltage-measured require --voltage-topic and --displacement-topic; give both")
     return TOPIC if options.topic is None else str(options.topic)
+
+
+def _told(record: "Record", delay: float) -> "Record":
+    """Return the record without its last `delay` (s), of which a late sensor had not yet told: that is no gap."""
+    ends_ns = record.time_ns[-1:] - round(delay * 1e9)
+    return record.part(slice(int((record.time_ns <= ends_ns).sum())))
 
 
 def _assess_record(record: "Record", options: argparse.Namespace) -> "dict[str, list[Finding]]":
@@ -609,10 +700,9 @@ def _diagnose(options: argparse.Namespace) -> Result:
 
     topics = _topics(options)
     require_different(options.bags)
-    model = load_model(options.model)
-    for name in FILES:
-        # The model is not checked: an extended model may be extended again.
-        _require_another_file(str(Path(options.output) / name), *options.bags)
+    model = _with_sensor(load_model(options.model), options)
+    # The model is not checked: an extended model may be extended again.
+    _allow_folder(options, options.output, *FILES)
     with output_folder(options.output, *FILES) as folder:
         records = [_read_all_axes(bag, options, topics) for bag in options.bags]
         require_one_stage(records)
@@ -680,10 +770,9 @@ def _verify(options: argparse.Namespace) -> Result:
     topics = _topics(options)
     if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
         raise UsageError(f"--tolerance {options.tolerance:g}: give a positive number of micrometres")
-    model = load_model(options.model)
+    model = _with_sensor(load_model(options.model), options)
     if options.output is not None:
-        for name in FILES:
-            _require_another_file(str(Path(options.output) / name), options.model, *options.bags)
+        _allow_folder(options, options.output, *FILES, inputs=[options.model])
     # Read all axes because of cross-coupling; separate topics may not name their axes, so the options name them.
     axes = options.axis if isinstance(topics, SeparateTopics) else None
     with nullcontext() if options.output is None else output_folder(options.output, *FILES) as folder:
@@ -716,15 +805,20 @@ def _verify(options: argparse.Namespace) -> Result:
 
 
 def _excite(options: argparse.Namespace) -> Result:
-    from slpi_ros.excitation.drives import excite
-    from slpi_ros.io.tables import write_table
+    from slpi_ros.excitation.drives import SLEW_USED, excite, slew_limits
+    from slpi_ros.io.outputs import allow_table
+    from slpi_ros.io.tables import table_header, write_table
 
     _require_axis_names(options.axis)
+    options.remarks += allow_table(options.output, table_header(options.axis, "V"), overwrite=options.overwrite)
+    (slew,) = slew_limits(
+        None if options.slew is None else (options.slew,), (options.voltage_min,), (options.voltage_max,)
+    )
     drive = excite(
         options.axis,
         voltage_min=options.voltage_min,
         voltage_max=options.voltage_max,
-        slew_limit=options.slew,
+        slew_limit=SLEW_USED * slew,
         duration=options.duration,
         rate=options.rate,
         seed=options.seed,
@@ -745,10 +839,8 @@ def _refit(options: argparse.Namespace) -> Result:
     from slpi_ros.model.document import load_model, save_model
     from slpi_ros.reports.text import change_limits, describe_change, verdict
 
-    _require_another_file(options.output, *options.bags)
-    if options.report:
-        _require_another_file(str(Path(options.report) / "report.html"), *options.bags)
-    model, lines, document = load_model(options.model), [], []
+    _allow_model_and_report(options)
+    model, lines, document = _with_sensor(load_model(options.model), options), [], []
     last: dict[str, AxisChange] = {}
     part = {"start": options.start, "stop": options.stop}
     # Each record corrects the model that the earlier ones have given.
@@ -791,13 +883,15 @@ def _numbers(change: "AxisChange") -> dict[str, float | bool | None]:
 
 
 def _simulate(options: argparse.Namespace) -> Result:
-    from slpi_ros.io.tables import read_table, write_table
+    from slpi_ros.io.outputs import allow_table
+    from slpi_ros.io.tables import read_table, table_header, write_table
     from slpi_ros.model.document import load_model
 
     _require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
     t, voltage = read_table(options.table, "V")
     known = _model_columns(voltage, model, options.table)
+    options.remarks += allow_table(options.output, table_header(known, "m"), overwrite=options.overwrite)
     reached = model.simulate(t, known)
     write_table(options.output, t, reached, "m")
     for axis, v in known.items():
@@ -819,7 +913,8 @@ def _simulate(options: argparse.Namespace) -> Result:
 def _compensate(options: argparse.Namespace) -> Result:
     import numpy as np
 
-    from slpi_ros.io.tables import read_table, write_table
+    from slpi_ros.io.outputs import allow_table
+    from slpi_ros.io.tables import read_table, table_header, write_table
     from slpi_ros.model.document import load_model
     from slpi_ros.model.limits import MAX_DT, Limits
     from slpi_ros.model.stage_model import check_time, held_message
@@ -830,6 +925,7 @@ def _compensate(options: argparse.Namespace) -> Result:
     t, desired = read_table(options.table, "m")
     check_time(t)
     known = _model_columns(desired, model, options.table)
+    options.remarks += allow_table(options.output, table_header(known, "V"), overwrite=options.overwrite)
     if options.slew < 0.0 or math.isnan(options.slew):
         raise UsageError(f"--slew {options.slew:g}: give a positive number of V/s, or 0 for no limit")
     limits = Limits(options.voltage_min, options.voltage_max, options.slew or math.inf)
@@ -887,8 +983,14 @@ def _model_columns(columns: "dict[str, FloatArray]", model: "StageModel", table:
 
 
 def _fleet(options: argparse.Namespace) -> Result:
-    from slpi_ros.fleet.pages import report_fleet
+    from slpi_ros.fleet.pages import DOCUMENT, PAGE, report_fleet
+    from slpi_ros.fleet.results import JOURNAL, TABLE
+    from slpi_ros.io.outputs import allow_folder
 
+    for source in [*options.sources, *filter(None, [options.models])]:
+        if os.path.realpath(source) == os.path.realpath(options.output):
+            raise UsageError(f"{options.output}: is also read from; give another output (-o)")
+    options.remarks += allow_folder(options.output, PAGE, DOCUMENT, TABLE, JOURNAL, overwrite=options.overwrite)
     lines, usable = report_fleet(
         options.sources,
         options.output,
@@ -907,11 +1009,13 @@ def _fleet(options: argparse.Namespace) -> Result:
 
 
 def _experiments(options: argparse.Namespace) -> Result:
-    from slpi_ros.papers.page import write_experiments
+    from slpi_ros.io.outputs import allow_folder
+    from slpi_ros.papers.page import COLUMNS, PAGE, TABLE, write_experiments
 
     data = Path(options.data) if options.data else None
     if data and not data.is_dir():
         raise UsageError(f"{data}: no such folder; give the folder of the measured records, or leave --data out")
+    options.remarks += allow_folder(options.output, PAGE, tables={TABLE: COLUMNS}, overwrite=options.overwrite)
     page = write_experiments(Path(options.output), data)
     return Result([f"{page}: the tables and figures"], {"page": str(page)}, f"open {page} in a browser")
 
@@ -1006,15 +1110,19 @@ def _require_axis_names(axes: Sequence[str]) -> None:
 
 
 def _calibrate(options: argparse.Namespace) -> Result:
+    from slpi_ros.excitation.drives import slew_limits
     from slpi_ros.excitation.legs import DriveSpec
 
     _require_axis_names(options.axis)
-    DriveSpec(options.voltage_min, options.voltage_max, duration=1.0, rate=1.0, slew_limit=options.slew)
+    (slew,) = slew_limits(
+        None if options.slew is None else (options.slew,), (options.voltage_min,), (options.voltage_max,)
+    )
+    DriveSpec(options.voltage_min, options.voltage_max, duration=1.0, rate=1.0, slew_limit=slew)
     given = {
         "axes": "['" + "', '".join(options.axis) + "']",
         "voltage_min": options.voltage_min,
         "voltage_max": options.voltage_max,
-        "slew_limit": options.slew,
+        "slew_limit": slew,
         "output": Path(options.output).absolute(),
     }
     command = "ros2 run slpi_ros calibrator --ros-args " + " ".join(

@@ -96,7 +96,7 @@ def installed() -> Callable[[str], Path]:
     """Return a function from a program's name to its path, the one that ``ros2 run slpi_ros NAME`` starts."""
 
     def path_of(name: str) -> Path:
-        path = CHECKOUT / "install" / "slpi_ros" / "lib" / "slpi_ros" / name
+        path = CHECKOUT / os.environ.get("SLPI_INSTALL", "install") / "slpi_ros" / "lib" / "slpi_ros" / name
         if not path.exists():
             pytest.fail(f"{path} is not there: run 'make build'")
         return path

@@ -23,6 +23,7 @@ LAYERS = (
     {"model"},
     {"effects"},
     {"hysteresis", "io", "simulation", "excitation"},
+    {"dependencies"},
     {"errors"},
 )
 

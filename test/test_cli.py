@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -315,7 +316,7 @@ def simulate_over_its_table(folder, tmp_path):
 
 def existing_bag(folder, tmp_path):
     (tmp_path / "d.csv").write_text("time_s,voltage_V,displacement_um\n0,1,2\n1,2,3\n")
-    return ("import", tmp_path / "d.csv", "-o", folder / "bag"), 1, "bag"
+    return ("import", tmp_path / "d.csv", "-o", folder / "bag"), 2, "bag"
 
 
 def unwritable_model(folder, tmp_path):
@@ -376,3 +377,27 @@ def test_the_shell_is_told_completions(line, wanted, tmp_path):
     command = [sys.executable, "-m", "slpi_ros.cli"]
     subprocess.run(command, env=os.environ | asked, capture_output=True, check=True, timeout=120)
     assert wanted in (tmp_path / "told").read_text()
+
+
+def test_what_is_known_of_the_sensor_is_kept_used_and_said(folder, tmp_path):
+    record = slpi_ros.read_bag(folder / "bag")
+    # Four samples late.
+    late = {"x": np.append(np.repeat(record.displacement["x"][0], 4), record.displacement["x"][:-4])}
+    write_bag(tmp_path / "late", replace(record, displacement=late))
+    done = slpi("identify", tmp_path / "late", "-o", tmp_path / "model.json", "--sensor-delay", "0.02")
+    assert done.returncode == 0 and not done.stderr and "warn" not in done.stdout
+    shown = slpi("show", tmp_path / "model.json").stdout
+    assert any(holds(line, "sensor", 20, 0) for line in shown.splitlines() if "axis x: sensor:" in line)
+    model = slpi_ros.load_model(tmp_path / "model.json")
+    assert (model.axes["x"].sensor.delay, model.axes["x"].sensor.lag) == (0.02, 0.0)
+    verify = ("verify", tmp_path / "late", "--model", tmp_path / "model.json")
+    silent, same = slpi(*verify), slpi(*verify, "--sensor-delay", "0.02")
+    assert silent.returncode == same.returncode == 0 and not silent.stderr and not same.stderr
+    assert silent.stdout == same.stdout
+    refit = ("refit", tmp_path / "model.json", tmp_path / "late", "-o", tmp_path / "new.json")
+    diagnose = ("diagnose", tmp_path / "late", "--model", tmp_path / "model.json", "-o", tmp_path / "diagnosis")
+    for command, code in ((verify, 1), (refit, 0), (diagnose, 0)):
+        other = slpi(*command, "--sensor-lag=0.001", "--sensor-delay=0")
+        assert holds(one_line(other, code), "'x'", 20, 0, 1)
+    assert slpi_ros.load_model(tmp_path / "new.json").axes["x"].sensor.lag == 0.001
+    assert "--sensor-lag=0.001" in slpi(*verify, "--sensor-lag=0.001", "--sensor-delay=0").stdout.splitlines()[-1]

@@ -50,6 +50,16 @@ def test_an_axis_is_named_once(command, capsys, folder):
     assert "--axis" in refused(capsys, folder, *command, "--axis", "x", "y", "x")
 
 
+@pytest.mark.parametrize("option", ["--sensor-delay", "--sensor-lag"])
+@pytest.mark.parametrize("value", ["nan", "inf", "-0.001", "1.5", "2ms", ""])
+@pytest.mark.parametrize(
+    "command", [IDENTIFY, DIAGNOSE, ("verify", BAG, "--model", "m.json"), ("refit", "m.json", BAG, "-o", "n.json")]
+)
+def test_a_sensor_that_no_stage_has(command, value, option, capsys, folder):
+    said = refused(capsys, folder, *command, f"{option}={value}")
+    assert option in said and "_s" not in said.replace("--sensor", "")
+
+
 @pytest.mark.parametrize("argument", ["--axis=--", "--voltage-max=--", "--seed=--", "drive\0.csv"])
 def test_arguments_that_are_no_value(argument, capsys, folder):
     with pytest.raises(SystemExit) as end:

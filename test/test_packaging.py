@@ -1,5 +1,6 @@
 """What is installed elsewhere: source distribution, wheel, container, and what package.xml names."""
 
+import os
 import re
 import subprocess
 import sys
@@ -67,3 +68,80 @@ def test_versions_agree():
     version = ElementTree.parse(ROOT / "package.xml").getroot().find("version").text
     assert f'version="{version}"' in (ROOT / "setup.py").read_text()
     assert f"\n{version} (" in (ROOT / "CHANGELOG.rst").read_text()
+
+
+def minima():
+    """Return the lower bound of each package that setup.py names one for."""
+    found = re.findall(r'"([\w-]+)(?:\[\w+\])?>=([\w.]+)', (ROOT / "setup.py").read_text())
+    assert len(found) >= 20
+    return dict(found)
+
+
+def pins(name):
+    """Return the versions in one of the files of requirements/."""
+    return dict(re.findall(r"^([\w-]+)==([\w.]+)", (ROOT / "requirements" / f"{name}.txt").read_text(), re.MULTILINE))
+
+
+def test_the_tests_run_with_every_lower_bound_and_with_nothing_older():
+    run = [pins(name) for name in ("lock", "jazzy", "minimum")]
+    for name, least in minima().items():
+        versions = {each[name] for each in run if name in each}
+        assert least == min(versions, key=lambda version: tuple(map(int, re.findall(r"\d+", version)))), name
+
+
+def test_every_pin_that_replaces_one_has_something_to_replace_or_is_needed():
+    known = pins("lock").keys() | {"pyrsistent", "pytz", "six", "wheel"}
+    assert pins("jazzy").keys() <= known
+    assert pins("minimum").keys() <= pins("jazzy").keys() | pins("lock").keys()
+
+
+def run_script(*command, **environment):
+    environment = {**{name: value for name, value in os.environ.items() if name != "PYTHON"}, **environment}
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+
+
+def python_in(folder, version, name="python3"):
+    """Make a program that answers as a Python of another version does; return its path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    program = folder / name
+    program.write_text(
+        f'#!/bin/sh\ncase "$2" in *realpath*) echo {program} ;; *version_info*) echo {version} ;; esac\n'
+    )
+    program.chmod(0o755)
+    return program
+
+
+def test_a_python_is_found_where_it_is_not_the_one_in_use(tmp_path):
+    of_pyenv = tmp_path / "pyenv" / "versions" / "3.12.9" / "bin"
+    wanted, other = python_in(of_pyenv, "3.12", "python3.12"), python_in(tmp_path / "bin", "3.10")
+    # What pyenv puts into PATH for a version that is not active.
+    (tmp_path / "bin" / "python3.12").write_text(
+        "#!/bin/sh\necho 'pyenv: python3.12: command not found' >&2\nexit 127\n"
+    )
+    (tmp_path / "bin" / "python3.12").chmod(0o755)
+    environment = {
+        "PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin",
+        "PYENV_ROOT": str(tmp_path / "pyenv"),
+        "UV_PYTHON_INSTALL_DIR": str(tmp_path / "uv"),
+        "HOME": str(tmp_path),
+    }
+    found = run_script("tools/find_python.sh", "3.12", "venv", **environment)
+    assert (found.returncode, found.stdout) == (0, f"{wanted}\n")
+    found = run_script("tools/find_python.sh", "3.10 3.12", "venv", **environment)
+    assert found.stdout == f"{other}\n"
+    named = python_in(tmp_path / "named", "3.12")
+    assert run_script("tools/find_python.sh", "3.12", "venv", **environment, PYTHON=str(named)).stdout == f"{named}\n"
+    found = run_script("tools/find_python.sh", "3.9", "venv", **environment)
+    assert (found.returncode, found.stdout) == (1, "")
+
+
+@pytest.mark.parametrize("ci", ["", "true"])
+def test_ci_says_loudly_that_there_is_no_python_of_ubuntu(tmp_path, ci):
+    python_in(tmp_path, "3.11")
+    for name in ("chromium", "make", "python3.12"):
+        (tmp_path / name).write_text(f'#!/bin/sh\n[ {name} != python3.12 ] || exit 127\necho {name} "$@"\n')
+        (tmp_path / name).chmod(0o755)
+    environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "PYENV_ROOT": str(tmp_path), "HOME": str(tmp_path), "CI": ci}
+    done = run_script(".ci/run", **environment, UV_PYTHON_INSTALL_DIR=str(tmp_path))
+    assert done.returncode == (1 if ci else 0)
+    assert done.stdout == "make test\n" and "NOT TESTED" in done.stderr

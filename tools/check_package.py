@@ -50,7 +50,8 @@ def run_build(tree: Path, what: str, target: Path) -> Path:
 
 def copy_of_checkout(target: Path) -> Path:
     """Copy the checkout without what builds have left behind; return the copy."""
-    left_behind = shutil.ignore_patterns(".*", "build", "install", "log", "dist", "_build", "*.egg-info", "__pycache__")
+    made = ("build", "build-*", "install", "install-*", "log", "log-*", "dist", "_build", "*.egg-info", "__pycache__")
+    left_behind = shutil.ignore_patterns(".*", *made)
     return Path(shutil.copytree(ROOT, target, symlinks=True, ignore=left_behind))
 
 

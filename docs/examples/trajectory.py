@@ -1,4 +1,4 @@
-"""Send a sine of 5 µm amplitude around 10 µm, one period in a second, at 1 kHz."""
+"""Send a sine of 5 µm amplitude around 10 µm, one period in a second, at 1 kHz; the stage has 0.2 s to get there."""
 
 import math
 
@@ -6,7 +6,7 @@ import rclpy
 from rclpy.duration import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-RATE_HZ, SAMPLES = 1000, 1001
+RATE_HZ, SAMPLES, LEAD_NS = 1000, 1001, 200_000_000
 
 rclpy.init()
 node = rclpy.create_node("planner")
@@ -16,7 +16,7 @@ while not publisher.get_subscription_count():
 trajectory = JointTrajectory(joint_names=["x"])  # stamp 0: start at once
 for i in range(SAMPLES):
     position = 10e-6 - 5e-6 * math.cos(2 * math.pi * i / RATE_HZ)
-    due = Duration(nanoseconds=i * 1_000_000_000 // RATE_HZ).to_msg()
+    due = Duration(nanoseconds=LEAD_NS + i * 1_000_000_000 // RATE_HZ).to_msg()
     trajectory.points.append(JointTrajectoryPoint(positions=[position], time_from_start=due))
 publisher.publish(trajectory)
 publisher.wait_for_all_acked(Duration(seconds=5))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from slpi_ros.calibration.settings import CHECK, VERIFICATION, CalibrationSettings
 from slpi_ros.compensator.controller import Controller
 from slpi_ros.errors import UsageError
-from slpi_ros.excitation.drives import SWEEP, Drive, excite
+from slpi_ros.excitation.drives import SLEW_USED, SWEEP, Drive, excite
 from slpi_ros.excitation.legs import DriveSpec, Path
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, RateLimiter
@@ -18,9 +18,8 @@ from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
-# Share of the voltage range that the check moves, and share of the slew limit that drives use: a late sample is
-# followed by an early one.
-CHECK_MOVE, SLEW_USED = 0.1, 0.8
+# Share of the voltage range that the check moves.
+CHECK_MOVE = 0.1
 # The verification stays within these shares of the displacement range, at mean speeds between these, ranges/s.
 INNER, SPEEDS = (0.04, 0.94), (0.15, 0.8)
 # Steepest slope of the inverse relative to its mean slope, for the speed of a path under a slew limit.
@@ -128,7 +127,7 @@ def compensated(settings: CalibrationSettings, model: StageModel, seed: int) -> 
     """
     sweep = exciting(settings, SWEEP, _sweep_seconds(settings), settings.axes, seed)
     swept = np.column_stack(list(sweep.voltage.values()))
-    controller = Controller(settings.axes, settings.limits)
+    controller = Controller(settings.axes, settings.limits, period=1.0 / settings.rate)
     controller.use_model(model, start_memory="wiped")
     dt = 1.0 / settings.rate
     for row in swept.tolist():
@@ -255,12 +254,10 @@ def _limited(v: FloatArray, limits: Limits, rate: float) -> FloatArray:
     """Return the voltages (V) within slew and acceleration limits; longer if the end is reached late."""
     if not np.isfinite(limits.acceleration):
         return np.clip(v, limits.lower, limits.upper)
-    limiter, dt = RateLimiter(limits), 1.0 / rate
     goals = [*v.tolist(), *[float(v[-1])] * int(PATIENCE * v.size)]
-    out, before = [goals[0]], goals[0]
+    limiter, out = RateLimiter(limits, 1.0 / rate, goals[0]), [goals[0]]
     for index, goal in enumerate(goals[1:], 1):
         if index >= v.size and abs(goal - out[-1]) <= CLOSE * (limits.upper - limits.lower):
             break
-        out.append(limiter.step(out[-1], goal, dt, before))
-        before = goal
+        out.append(limiter.step(goal, round(index * SECOND_NS / rate)))
     return np.array(out)

@@ -5,6 +5,7 @@ same records it takes the same decisions, so a calibration that was interrupted 
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, exciting
+from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, VERIFICATION, CalibrationSettings
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.diagnosis.result import AxisDiagnosis, Diagnosis
@@ -28,9 +30,8 @@ from slpi_ros.model.stage_model import StageModel
 FloatArray = NDArray[np.float64]
 
 CHECK_DRIVE, VERIFICATION_DRIVE = "check", "verification"
-# A voltage follows if the applied range is the commanded one within this share; a displacement if it moves by this
-# multiple of its noise.
-FOLLOWS, MOVES = 0.2, 10.0
+# A displacement follows if it moves by this multiple of its noise.
+MOVES = 10.0
 # Effects that follow time and not the voltage, or that come before it: no compensation without feedback undoes them.
 NOT_UNDONE = ("delay", "thermal_drift", "gain_drift", "hum")
 # Rest before the first move of an axis that is diagnosed with it, seconds.
@@ -48,10 +49,13 @@ class Recording:
     record : Record
     desired : mapping of axis name to ndarray, shape (N,), metres
         Desired displacement at the samples of the record, NaN where there was none; empty without compensator.
+    kept : bool
+        Whether it is a recording of an earlier run; default False.
     """
 
     record: Record
     desired: Mapping[str, FloatArray]
+    kept: bool = False
 
 
 @dataclass(frozen=True)
@@ -224,6 +228,8 @@ class _Calibration:
         self._settings, self._record, self._report = settings, record, report
         self._steps: list[Step] = []
         self._records: list[Record] = []
+        # Record of the check.
+        self._first: Record | None = None
         self._drives: list[tuple[str, Sequence[str]]] = []
         # Repeatability floor of each axis, metres, best known so far: what a diagnosis explains is no noise.
         self._floors: dict[str, float] = {}
@@ -283,12 +289,18 @@ class _Calibration:
         name = f"{len(self._steps) + 1:02d}_{kind}"
         self._begin(f"recording {name}")
         recording = self._record(Request(name, drive, desired))
+        if recording.kept:
+            fitted = kind not in (CHECK_DRIVE, SWEEP)
+            require_kept(recording.record, drive, self._settings, self._first, fitted=fitted)
         return recording
 
     def _check(self) -> None:
         drive = checking(self._settings)
-        record = self._recorded(CHECK_DRIVE, drive, {}).record
-        findings = [_follows(axis, drive, record) for axis in self._settings.axes]
+        recording = self._recorded(CHECK_DRIVE, drive, {})
+        record = recording.record
+        with naming(record) if recording.kept else nullcontext():
+            findings = [_follows(axis, drive, record) for axis in self._settings.axes]
+        self._first = record
         self._steps.append(Step(record.source, float(drive.t[-1]), drive.why, "; ".join(findings)))
 
     def _sweep(self) -> None:
@@ -372,10 +384,7 @@ def _from_first_move(record: Record, axis: str) -> Record:
     v = record.voltage[axis]
     first = int(np.flatnonzero(np.abs(v - v[0]) > 0.0)[0])
     begin = max(int(np.searchsorted(record.t, record.t[first] - REST_BEFORE)), 0)
-    voltage, displacement = (
-        {name: x[begin:] for name, x in signals.items()} for signals in (record.voltage, record.displacement)
-    )
-    return replace(record, time_ns=record.time_ns[begin:], voltage=voltage, displacement=displacement)
+    return record.part(slice(begin, None))
 
 
 def _left_at(model: StageModel, last: Record) -> StageModel:
@@ -405,7 +414,7 @@ def _follows(axis: str, drive: Drive, record: Record) -> str:
         )
     by_chance = noise(y)
     slope = float(np.cov(v, y)[0, 1] / np.var(v))
-    if abs(slope) * applied < MOVES * by_chance:
+    if abs(slope) * applied <= MOVES * by_chance:
         raise RecordError(
             f"axis '{axis}': the displacement moved by {abs(slope) * applied:.3g} m for {applied:.3g} V, with noise of "
             f"{by_chance:.3g} m; check the sensor and the order of the axes"
@@ -427,7 +436,7 @@ def tracking_error(recording: Recording, axis: str, model: StageModel, goal: flo
         With desired displacements.
     axis : str
     model : StageModel
-        Model that the compensator used.
+        Model that the compensator used; what it knows of the sensor is taken out of the readings.
     goal : float, metres
         Largest mean error that meets the target.
 
@@ -437,7 +446,7 @@ def tracking_error(recording: Recording, axis: str, model: StageModel, goal: flo
         If there are no readings along the path.
     """
     record, desired = recording.record, recording.desired[axis]
-    error = record.displacement[axis] - desired
+    error = model.axis(axis).correct(record.t, record.displacement[axis]) - desired
     along = np.isfinite(error)
     if not along.any():
         raise RecordError(f"{record.source}: axis '{axis}': no readings along the path; check stage_state")

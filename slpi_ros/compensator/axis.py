@@ -1,29 +1,44 @@
 """Run-time state of one axis: time stamps, limits, model and memory, feedback, ramps."""
 
+from collections import deque
 from collections.abc import Sequence
+from itertools import pairwise
+from math import inf
+from statistics import median
 
+from slpi_ros.compensator.amplifier import BAND_NS, LAGS, Amplifier
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
-from slpi_ros.compensator.model_swap import continue_from, take_over, turning_voltages, voltage_history
-from slpi_ros.compensator.persistence import MemoryConfidence
+from slpi_ros.compensator.model_swap import continue_from, require_near, take_over, turning_voltages, voltage_history
+from slpi_ros.compensator.persistence import RESETTING, MemoryConfidence
 from slpi_ros.compensator.ramps import Brake, Ramp
+from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
 from slpi_ros.compensator.statistics import TrackingError
 from slpi_ros.compensator.validation import Stamps, implausible
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.lag import Lag
+from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import START_MEMORIES, AxisModel, StartMemory
-from slpi_ros.model.limits import MAX_DT, Limits
+from slpi_ros.model.limits import MAX_DT, PERIOD, Limits, RateLimiter
+from slpi_ros.model.sensor import Sensed, StreamingSensor
 from slpi_ros.model.streaming import StreamingInverse
 
-MAX_DT_NS = int(MAX_DT * SECOND_NS)
-# An initial history matches the first measurement if its error is at most this fraction of the identified displacement
+# An initial history matches the first measurements if its error is at most this fraction of the identified displacement
 # range, or this multiple of the held-out error: more than overnight drift, less than the error of a wrong history.
 FIT_SHARE, FIT_SIGMAS = 0.005, 4.0
+# The median of this many measurements of at most this age decides on the initial history.
+FIRST_READINGS, FIRST_AGE_NS = 5, SECOND_NS // 5
+# A hold begins after this many intervals between samples, and after times between these.
+HOLD_INTERVALS, SOONEST_HOLD_NS, LATEST_HOLD_NS = 3, SECOND_NS // 50, 3 * SECOND_NS
+# A held voltage is at rest if it changes by less than this share of the range per second over this time; it is then
+# looked at once in this time.
+REST_SHARE, REST_NS, RESTING_NS = 1e-5, SECOND_NS // 10, SECOND_NS
 
 
 class Axis:
     """Inverse hysteresis compensation, with optional feedback, of one axis.
 
-    All times are nanoseconds on a monotonic clock unless stated otherwise.
+    All times are nanoseconds on the steady clock of the process unless stated otherwise.
 
     Parameters
     ----------
@@ -34,6 +49,8 @@ class Axis:
         Voltage limits. A loaded model cannot relax these limits.
     loop_settings : LoopSettings
         Settings of the feedback.
+    period : float, seconds
+        Output period; default 1 ms.
 
     Attributes
     ----------
@@ -41,6 +58,10 @@ class Axis:
     stream : StreamingInverse
         Feedforward; available once a model is loaded. Its memory follows the setpoint, not the corrected voltage, so
         that sensor noise causes no reversals.
+    output : RateLimiter
+        The last place before publishing: the present voltage, and where it may go next.
+    amplifier : Amplifier
+        What is reported of the voltage.
     confidence : MemoryConfidence
     driven : bool
         Whether a model has ever been loaded; before that, the voltage is unknown.
@@ -51,37 +72,59 @@ class Axis:
     start_memory : str or None
         Assumed initial history; None after the first output voltage or when the memory was restored.
     given_ns : int, nanoseconds
-        Time of the last output voltage.
+        Time of the last sample or step.
+    due_ns : int or None, nanoseconds
+        Time of the next `tick`; None if nothing follows.
     point_ns : int or None, nanoseconds
         Deadline of the last sample on the trajectory clock; None if it was not a trajectory point.
     tracking : TrackingError
         Statistics of measured - desired displacement.
+    fault : Fault or None
+        Fault of the sensor for which the feedback was switched off.
     """
 
     stream: StreamingInverse
     _applied: StreamingInverse
     _residuals: ResidualWindow
+    _sensor: StreamingSensor
 
-    def __init__(self, name: str, place: int, limits: Limits, loop_settings: LoopSettings) -> None:
+    def __init__(
+        self, name: str, place: int, limits: Limits, loop_settings: LoopSettings, period: float = PERIOD
+    ) -> None:
         self.name, self.place, self.limits = name, place, limits
         self.stamps = Stamps()
+        self.output = RateLimiter(limits, period, limits.clip(0.0))
+        self.amplifier = Amplifier(limits.upper - limits.lower)
         self.model: AxisModel | None = None
         self.confidence = MemoryConfidence()
         self.held = self.slewing = self.driven = False
         self.ramp: Ramp | Brake | None = None
         self.start_memory: StartMemory | None = None
         self.given_ns = 0
+        self.due_ns: int | None = None
         self.point_ns: int | None = None
         self.tracking = TrackingError()
+        self.fault: Fault | None = None
         self._loop_settings = loop_settings
         self._feedback: Feedback | None = None
+        self._sensor_watch = SensorWatch(1.0)
+        self._first_readings: deque[tuple[int, float]] = deque(maxlen=FIRST_READINGS)
+        # Arrival of the last samples; whether the displacement is held, and since when the voltage is nearly at rest.
+        self._arrivals: tuple[int, ...] = ()
+        self._holding = False
+        self._rest: tuple[int, float, float] | None = None
+        # Time (s) for which ticks have moved the effects on since the last sample.
+        self._ticked = 0.0
+        # Setpoint and displacement of the model as a sensor with delay or lag tells them; None without these.
+        self._setpoint: Sensed | None = None
+        self._expected: Sensed | None = None
 
     # State
 
     @property
     def voltage(self) -> float:
         """Present voltage, volts."""
-        return self._applied.voltage if self._feedback else self.stream.voltage
+        return self.output.voltage
 
     @property
     def correction(self) -> float:
@@ -90,10 +133,18 @@ class Axis:
 
     @property
     def feedback_state(self) -> str:
-        """State of the feedback: "off", "on", or "holding" if the last sample had no recent measurement."""
+        """State of the feedback.
+
+        "off", "on", "saturated" at the correction limit, "holding" if the last sample had no recent measurement, or
+        "fault" if it was switched off because of the sensor.
+        """
         if not self._loop_settings.enabled:
             return "off"
-        return "on" if self._feedback and self._feedback.acting else "holding"
+        if self.fault:
+            return "fault"
+        if not (self._feedback and self._feedback.acting):
+            return "holding"
+        return "saturated" if self._feedback.saturated else "on"
 
     @property
     def drift(self) -> Drift | None:
@@ -103,13 +154,17 @@ class Axis:
     @property
     def reversal_voltages(self) -> tuple[float, ...]:
         """Voltages (V) of the remembered reversals, oldest first, followed by the present voltage."""
-        return voltage_history(self._applied if self._feedback else self.stream)
+        turns = voltage_history(self._applied if self._feedback else self.stream)
+        return turns if turns[-1] == self.voltage else (*turns, self.voltage)
 
-    def in_motion(self, now_ns: int) -> bool:
-        """Whether the voltage changes so fast that the acceleration limit prevents a stop at the next sample."""
-        if not self.driven or now_ns - self.given_ns > MAX_DT_NS:
-            return False
-        return (self._feedback if self._feedback and not self.ramp else self.stream).pace.in_motion
+    @property
+    def in_motion(self) -> bool:
+        """Whether the voltage has to brake before it rests, because of the acceleration limit."""
+        return self.output.in_motion
+
+    @property
+    def _period_ns(self) -> int:
+        return round(self.output.period * SECOND_NS)
 
     # Model, limits, settings
 
@@ -129,24 +184,57 @@ class Axis:
         Raises
         ------
         SlpiError
-            If the model cannot be used within the limits, see `take_over`.
+            If the model cannot be used within the limits, see `take_over`, or at the present voltage.
         """
         if reversal_voltages is None:
             reversal_voltages = turning_voltages(self.stream.memory) if self.driven else ()
+            if self.driven:
+                require_near(self.voltage, self.limits.within(model.voltage_range))
         return take_over(model, self.limits, reversal_voltages, start_memory)
 
     def use(self, model: AxisModel, stream: StreamingInverse) -> None:
         """Replace the model by `model` with its streaming inverse from `prepare`; the voltage is unchanged."""
+        allowed = stream.limits
         if self.driven:
             stream.resume(self.stream)
+        else:
+            self.output.start(stream.voltage)
+        planned = self.stream.pace if self._feedback and not self.ramp else self.output
         self.model, self.stream, self.driven = model, stream, True
+        stream.pace = planned
+        self._set_limits(allowed)
         self.confidence = self.confidence.over(model.hysteresis_range)
+        times = {effect.name: effect for effect in model.effects}
+        lag, delay = times.get(Lag.name), times.get(Delay.name)
+        seconds = (LAGS * lag.time_constant if isinstance(lag, Lag) else 0.0) + (
+            abs(delay.seconds) if isinstance(delay, Delay) else 0.0
+        )
+        self.amplifier.window_ns = BAND_NS + int(seconds * SECOND_NS)
+        low, high = model.displacement_range
+        self._sensor_watch.span, self._sensor_watch.noise = high - low, model.quality.floor_rms
+        self._sensor = model.streaming_sensor()
+        self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if self._sensor.late else None
         if self._feedback:
-            self._applied = continue_from(model, stream.limits, self._applied)
-            self._feedback.limits = stream.limits
-            self._residuals.forget(self._applied.uncoupled_displacement)
+            self._applied = continue_from(model, allowed, self._applied)
+            self._forget_residuals()
         elif self._loop_settings.enabled:
             self._close_loop()
+
+    def locate(self, voltage: float) -> None:
+        """Continue from a voltage (V) at which the amplifier was found; a move to it that is no noise is remembered."""
+        if abs(voltage - self.stream.voltage) > self.amplifier.tolerance:
+            self._leave_feedback()
+            self.stream.drive(voltage)
+            state = self.confidence.state
+            if state != RESETTING:
+                self.confidence = MemoryConfidence(
+                    doubt=f"moved to {voltage:.4g} V by something else since its memory was known"
+                )
+        if voltage != self.output.voltage:
+            self.output.start(voltage)
+        self.stream.pace = self.output
+        if self._feedback:
+            self._restart_feedback()
 
     def check_limits(self, limits: Limits) -> Limits:
         """Return new limits, restricted to the identified voltages of the model.
@@ -154,19 +242,12 @@ class Axis:
         Raises
         ------
         UsageError
-            If the present voltage is outside the limits, or the model was identified entirely outside them.
+            If the model was identified entirely outside the limits.
         """
-        if not self.driven:
-            return limits
-        if not limits.lower <= self.voltage <= limits.upper:
-            raise UsageError(
-                f"axis '{self.name}' has {self.voltage:g} V, outside the new limits {limits.lower:g}.."
-                f"{limits.upper:g} V; move it inside first"
-            )
         return limits.within(self.model.voltage_range) if self.model else limits
 
-    def use_limits(self, limits: Limits) -> None:
-        """Replace the limits; hysteresis memory and voltage are unchanged.
+    def use_limits(self, limits: Limits, period: float) -> None:
+        """Replace limits and output period (s); hysteresis memory and voltage are unchanged.
 
         Raises
         ------
@@ -175,19 +256,32 @@ class Axis:
         """
         allowed = self.check_limits(limits)
         self.limits = limits
+        self.amplifier.span = limits.upper - limits.lower
+        self._set_limits(allowed, period)
+
+    def return_inside(self, now_ns: int) -> None:
+        """Go to the nearest voltage limit of the node if the voltage is outside of them."""
+        if self.driven and self.ramp is None and not self.limits.lower <= self.voltage <= self.limits.upper:
+            self.start_ramp(Ramp([self.limits.clip(self.voltage)], inf), now_ns)
+
+    def _set_limits(self, allowed: Limits, period: float | None = None) -> None:
         if self.driven:
-            self.stream.limits = allowed
-            if self._feedback:
-                self._feedback.limits = allowed
+            self.stream.limits = allowed = self.stream.restricted(allowed)
+            self.stream.pace.change(allowed, period)
+        self.output.change(allowed, period)
 
     def retune(self, settings: LoopSettings) -> None:
-        """Replace the feedback settings without a voltage step."""
-        self._loop_settings = settings
+        """Replace the feedback settings without a voltage step; feedback that was switched off for a fault resumes."""
+        if self.fault:
+            # What the sensor told before does not count any more.
+            self._sensor_watch.begin(self.given_ns)
+        self._loop_settings, self.fault = settings, None
         feedback = self._feedback
         if feedback is None:
             if settings.enabled and self.driven:
                 self._close_loop()
             return
+        feedback.correction_limit = settings.correction_limit
         try:
             feedback.retune(settings.gains)
         except SlpiError:
@@ -213,23 +307,36 @@ class Axis:
         if not low <= y <= high:
             raise implausible(y, (low, high), kind)
 
-    def update(self, ahead: float, y: float, now_ns: int) -> float:
+    def update(self, ahead: float | None, y: float, now_ns: int) -> float:
         """Return the voltage (V) for the desired displacement `y`, `ahead` after the last sample.
 
         Parameters
         ----------
-        ahead : float, seconds
-            Zero or negative counts as no elapsed time. The slew limit takes at most `MAX_DT` into account.
+        ahead : float or None, seconds
+            Time since the last sample by their stamps, of which the ticks since then have used up a part: a sample that
+            is not later counts as one output period later. None: the time on the steady clock since the last step.
         y : float, metres
         now_ns : int, nanoseconds
         """
+        if ahead is None:
+            dt = max((now_ns - self.given_ns) * 1e-9, 0.0)
+        else:
+            dt = ahead - self._ticked
+            if dt <= 0.0:
+                dt = self.output.period if self._arrivals else 0.0
+        self._ticked = 0.0
+        self._arrivals = (*self._arrivals[-3:], now_ns)
+        self.tracking.desired = y
+        v = self._sample(dt, y, now_ns)
+        self._follow_later(now_ns)
+        return v
+
+    def _sample(self, dt: float, y: float, now_ns: int) -> float:
+        """Output and return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last step."""
         stream = self.stream
-        dt = stream.pace.clamp_dt(ahead)
-        if ahead > dt:
-            stream.wait(ahead - dt)
-        v = stream.move(dt, y)
+        v = stream.move(dt, y, now_ns)
         if self._feedback is not None:
-            v = self._correct(ahead, dt, y, v, now_ns)
+            v = self._correct(dt, y, v, now_ns)
         if stream.missed:
             self.held = stream.held
             self.slewing = not self.held
@@ -237,11 +344,124 @@ class Axis:
             self.held = self.slewing = False
         self.given_ns = now_ns
         self.start_memory = None
-        self.tracking.desired = y
+        self.amplifier.output(v, now_ns)
+        if self._setpoint:
+            self._setpoint.hold(y, now_ns)
         return v
 
-    def measure(self, displacement: float, now_ns: int) -> bool:
-        """Store a measured displacement (m); return whether it has changed the assumed hysteresis memory.
+    def _follow_later(self, now_ns: int) -> None:
+        """Plan the next tick: at once for what the limits hold back, later for a hold."""
+        self._holding, self._rest = False, None
+        if self.slewing or self.in_motion:
+            self.due_ns = now_ns + self._period_ns
+        else:
+            self.due_ns = now_ns + SOONEST_HOLD_NS if self.holds else None
+
+    @property
+    def holds(self) -> bool:
+        """Whether the voltage of a constant displacement changes: because of effects, other axes, or feedback."""
+        return self._feedback is not None and self._loop_settings.enabled or not self.stream.timeless
+
+    @property
+    def holding(self) -> bool:
+        """Whether the displacement is held, because no sample came for some intervals."""
+        return self._holding
+
+    def tick(self, now_ns: int) -> bool:
+        """Do what is due without a sample: a step of a ramp, what the limits held back, or a hold.
+
+        Returns
+        -------
+        bool
+            Whether the voltage, or its rate, has changed.
+        """
+        before, rate = self.voltage, self.output.rate
+        if self.ramp:
+            self.step_ramp(now_ns)
+        elif self._holding:
+            self._hold(now_ns)
+        elif self.slewing or self.in_motion:
+            self._approach(now_ns)
+        else:
+            self._begin_hold(now_ns)
+        return self.voltage != before or (self.output.rate != rate and self.output.limits.acceleration < inf)
+
+    def wake(self, now_ns: int) -> None:
+        """Look at a held voltage again soon, because another axis moves."""
+        if self._holding:
+            self._rest, self.due_ns = None, now_ns + self._period_ns
+
+    def drop_goal(self) -> None:
+        """Stay at the present voltage: nothing follows."""
+        self.due_ns, self.ramp, self.point_ns, self._holding = None, None, None, False
+        self.slewing = self.held = False
+        self.tracking.desired = None
+        self.stamps.restart()
+
+    def _approach(self, now_ns: int) -> None:
+        """Go on towards the voltage of the last sample."""
+        dt = self._passed(now_ns)
+        stream, feedback = self.stream, self._feedback
+        if feedback is None:
+            v = stream.approach(dt, now_ns)
+        else:
+            desired = self.tracking.desired
+            v = stream.approach(dt, now_ns)
+            v = self._correct(dt, stream.desired if desired is None else desired, v, now_ns)
+        self.slewing = stream.missed and not stream.held
+        self.held = stream.held
+        self.amplifier.output(v, now_ns)
+        self.due_ns = now_ns + self._period_ns
+        if not (self.slewing or self.in_motion):
+            self.due_ns = now_ns + SOONEST_HOLD_NS if self.holds else None
+
+    def _begin_hold(self, now_ns: int) -> None:
+        """Begin to hold the displacement, if no sample has come for long enough."""
+        if self.tracking.desired is None or not self.holds:
+            self.due_ns = None
+            return
+        steps = sorted(later - earlier for earlier, later in pairwise(self._arrivals))
+        usual_ns = steps[len(steps) // 2] if steps else 0
+        begin_ns = self._arrivals[-1] + min(max(HOLD_INTERVALS * usual_ns, SOONEST_HOLD_NS), LATEST_HOLD_NS)
+        if now_ns < begin_ns:
+            self.due_ns = begin_ns
+            return
+        self._holding, self._rest = True, None
+        self._hold(now_ns)
+
+    def _hold(self, now_ns: int) -> None:
+        """Output the voltage that holds the last desired displacement now."""
+        desired = self.tracking.desired
+        assert desired is not None
+        v = self._sample(self._passed(now_ns), desired, now_ns)
+        low, high = self.output.limits.lower, self.output.limits.upper
+        since_ns, lowest, highest = self._rest or (now_ns, v, v)
+        lowest, highest = min(lowest, v), max(highest, v)
+        still_ns = now_ns - since_ns
+        self._rest = since_ns, lowest, highest
+        if (highest - lowest) > REST_SHARE * (high - low) * max(still_ns, REST_NS) * 1e-9:
+            self._rest = now_ns, v, v
+            still_ns = 0
+        self.due_ns = now_ns + (RESTING_NS if still_ns >= REST_NS else self._period_ns)
+
+    def _passed(self, now_ns: int) -> float:
+        """Return the time (s) since the last step, and count it for the next sample."""
+        dt = max((now_ns - self.given_ns) * 1e-9, 0.0)
+        self.given_ns = now_ns
+        self._ticked += dt
+        return dt
+
+    def measure(self, displacement: float, now_ns: int, fresh: bool = True) -> None:
+        """Store a measured displacement (m).
+
+        Parameters
+        ----------
+        displacement : float, metres
+        now_ns : int, nanoseconds
+        fresh : bool
+            Whether its stamp is that of the present; others do not count for the initial history. Default True.
+
+        What the model knows of the sensor is taken out first; all that follows refers to the displacement of the stage.
 
         Raises
         ------
@@ -249,90 +469,141 @@ class Axis:
             As `check`; the measurement is not used.
         """
         if not self.driven:
-            return False
+            return
         self.check(displacement, "measured")
-        before = self.confidence
+        x = self._sensor.correct(displacement)
         if self.start_memory:
-            self._choose_memory(displacement)
+            if fresh:
+                self._first_readings.append((now_ns, x))
+            return
         if self._feedback is None:
             self._close_loop()
         assert self._feedback
-        self._feedback.measure(displacement, now_ns)
-        self._residuals.measure(displacement)
-        self.tracking.measure(displacement)
-        return self.confidence is not before
+        expected = self._expected.span(now_ns) if self._expected else ()
+        for each in expected:
+            self._residuals.expect(each)
+        if expected or not self._expected:
+            self._residuals.measure(x)
+        if self.ramp is None:
+            told = expected[-1] if expected else self._applied.uncoupled_displacement + self.stream.coupled
+            self._sensor_watch.read(told, x, now_ns)
+        desired = self._setpoint.at(now_ns) if self._setpoint else None
+        if desired is not None or not self._setpoint:
+            if not self.fault:
+                self._feedback.measure(x, now_ns, desired)
+            self.tracking.measure(x, desired)
 
-    def _choose_memory(self, measured: float) -> None:
-        """Choose the initial history that matches a displacement (m) measured before the first output voltage.
+    def choose_memory(self, now_ns: int) -> None:
+        """Choose the initial history that matches the first measurements; the voltage is unchanged.
 
-        The assumed initial history is kept unless another one matches better by more than the noise.
+        The assumed one is kept unless another one matches better by more than the noise, and without enough recent
+        measurements that agree.
         """
-        assert self.model and self.start_memory
-        quality, (low, high) = self.model.quality, self.model.displacement_range
+        recent = [y for t, y in self._first_readings if now_ns - t <= FIRST_AGE_NS]
+        if not self.start_memory or len(recent) < FIRST_READINGS:
+            return
+        assert self.model
+        measured, quality, (low, high) = median(recent), self.model.quality, self.model.displacement_range
         noise = FIT_SIGMAS * max(quality.held_out_rms, quality.floor_rms)
+        allowed = max(noise, FIT_SHARE * (high - low))
+        if max(recent) - min(recent) > 2.0 * allowed:
+            return
         assumed, streams, errors = self.start_memory, {}, {}
+        present = self.stream.voltage
         for name in START_MEMORIES:
             streams[name] = stream = take_over(self.model, self.limits, (), name)
             stream.coupled = self.stream.coupled
-            errors[name] = abs(measured - stream.drive(stream.voltage))
+            errors[name] = abs(measured - stream.drive(present))
         best = min(START_MEMORIES, key=lambda name: errors[name])
         self.start_memory = None
-        if errors[best] > max(noise, FIT_SHARE * (high - low)):
+        self._first_readings.clear()
+        if errors[best] > allowed:
             tried = ", ".join(f"{name} {error * 1e6:.4g} µm" for name, error in errors.items())
             self.confidence = MemoryConfidence(
                 doubt=f"the measurement matches no initial history of the model (errors: {tried}); call ~/reset_memory",
                 contradicted=True,
             )
         elif errors[assumed] > errors[best] + noise:
-            self.stream = streams[best]
+            stream = streams[best]
+            stream.pace = self.stream.pace
+            stream.limits = self.output.limits
+            self.stream = stream
             if self._feedback:
                 self._close_loop()
             self.confidence = MemoryConfidence(doubt=f"chosen by measurement: start_memory '{best}', not '{assumed}'")
 
-    def _correct(self, ahead: float, dt: float, y: float, v: float, now_ns: int) -> float:
+    def watch_sensor(self, fault_time: float, now_ns: int) -> Fault | None:
+        """Switch the feedback off if its sensor has been faulty for `fault_time` (s); return a new fault."""
+        feedback = self._feedback
+        if not (self._loop_settings.enabled and feedback and fault_time) or self.fault or self.ramp:
+            return None
+        self.fault = self._sensor_watch.judge(now_ns, fault_time)
+        if self.fault:
+            feedback.disable()
+        return self.fault
+
+    def _correct(self, dt: float, y: float, v: float, now_ns: int) -> float:
         """Return the total voltage (V), feedforward `v` (V) and correction, for the desired displacement `y` (m)."""
         feedback, applied = self._feedback, self._applied
         assert feedback
         applied.coupled = self.stream.coupled
-        if ahead > dt:
-            applied.wait(ahead - dt)
-            feedback.pace.rest()
+        if dt > MAX_DT:
+            applied.wait(dt - MAX_DT)
+            dt = MAX_DT
         v = feedback.step(dt, y, v, now_ns, self._loop_settings.timeout)
-        self._residuals.expect(applied.drive(v, dt))
+        self._expect(applied.drive(v, dt), now_ns)
         return v
+
+    def _expect(self, displacement: float, now_ns: int) -> None:
+        """Set the displacement of the model (m) with which measurements are compared from `now_ns` (ns) on."""
+        if self._expected:
+            self._expected.hold(displacement, now_ns)
+        else:
+            self._residuals.expect(displacement)
+
+    def _forget_residuals(self) -> None:
+        """Discard the residuals, as the model or the state of its hysteresis has changed."""
+        displacement = self._applied.uncoupled_displacement
+        self._residuals.forget(displacement)
+        self._expected = Sensed(self._sensor, displacement + self._applied.coupled) if self._sensor.late else None
 
     def _close_loop(self) -> None:
         """Start the feedback; a second streaming inverse follows the total voltage."""
         self._applied = self.stream.copy()
         self._residuals = ResidualWindow(self._applied.uncoupled_displacement)
+        self._forget_residuals()
         self._restart_feedback()
 
     def _restart_feedback(self) -> None:
         """Restart the feedback at the present voltage and rate, without a correction."""
-        settings, voltage = self._loop_settings, self._applied.voltage
-        self._feedback = feedback = Feedback(settings.gains, self.stream.limits, voltage)
-        feedback.hold(0.0, voltage)
-        feedback.pace.go_on(self.stream.pace)
-        if settings.enabled:
+        settings, output = self._loop_settings, self.output
+        self._feedback = feedback = Feedback(
+            settings.gains, output.limits, output.voltage, correction_limit=settings.correction_limit
+        )
+        feedback.hold(0.0, output.voltage)
+        # The feedforward has a rate limiter of its own, beside that of the total voltage.
+        feedback.pace, self.stream.pace = output, output.copy()
+        self._sensor_watch.begin(self.given_ns)
+        if settings.enabled and not self.fault:
             feedback.enable()
+
+    def _leave_feedback(self) -> None:
+        """Let the feedforward continue from the total voltage."""
+        if self._feedback and not self.ramp:
+            self.stream.restore(self._applied.snapshot())
+        self.stream.pace = self.output
 
     # Ramps
 
     def start_ramp(self, ramp: Ramp | Brake, now_ns: int) -> None:
-        """Start a ramp from the present voltage at `now_ns` (ns); `step_ramp` executes it."""
-        moving = self.in_motion(now_ns)
-        if not self.ramp and self._feedback:
-            self.stream.restore(self._applied.snapshot())
-            self.stream.pace.go_on(self._feedback.pace)
-        if now_ns - self.given_ns > MAX_DT_NS:
-            self.rest()
-        if not moving:
-            # The ramp starts at `now_ns`.
-            self.given_ns = now_ns
+        """Start a ramp from the present voltage at `now_ns` (ns); ticks execute it."""
+        self._leave_feedback()
         self.ramp, self.point_ns, self.start_memory, self.tracking.desired = ramp, None, None, None
+        self._holding = self.held = self.slewing = False
+        self.due_ns = now_ns + self._period_ns
 
     def brake(self, now_ns: int) -> None:
-        """Start to decelerate to rest within the acceleration limit; `step_ramp` executes it."""
+        """Start to decelerate to rest within the acceleration limit; ticks execute it."""
         if not isinstance(self.ramp, Brake):
             self.start_ramp(Brake(), now_ns)
 
@@ -340,29 +611,22 @@ class Axis:
         """Execute one step of the active ramp, if any."""
         if self.ramp is None or self.ramp.done:
             return
-        dt, stream = (now_ns - self.given_ns) * 1e-9, self.stream
-        v = self.ramp.step(stream.voltage, dt, stream.pace)
+        dt, stream = self._passed(now_ns), self.stream
+        v = self.ramp.step(self.output, now_ns)
         stream.drive(v, dt)
         if self._feedback:
-            self._residuals.expect(self._applied.drive(v, dt))
-        self.given_ns = now_ns
-        if self.ramp.done:
-            stream.pace.rest()
+            self._expect(self._applied.drive(v, dt), now_ns)
+        self.amplifier.output(v, now_ns)
+        self.due_ns = now_ns + self._period_ns
 
-    def stop_ramp(self, now_ns: int) -> None:
+    def stop_ramp(self) -> None:
         """End the active ramp, if any; desired displacements continue from the present voltage and rate."""
         if not self.ramp:
             return
-        self.ramp = None
+        self.ramp, self.due_ns = None, None
         if self._feedback:
             self._restart_feedback()
-            self._residuals.forget(self._applied.uncoupled_displacement)
-        # For a voltage in motion, the time since its last output counts.
-        self.stamps.restart((now_ns - self.given_ns) * 1e-9 if self.in_motion(now_ns) else 0.0)
-
-    def rest(self) -> None:
-        """Set the rate of the voltage to zero, so that the next sample starts from rest."""
-        if self.driven:
-            self.stream.pace.rest()
-        if self._feedback:
-            self._feedback.pace.rest()
+            self._forget_residuals()
+        if self._setpoint:
+            self._setpoint.restart(self.stream.uncoupled_displacement + self.stream.coupled)
+        self.stamps.restart()

@@ -1,37 +1,43 @@
 """Compensation of all axes, independent of ROS: converts desired displacements into voltages.
 
 `Controller.update` validates a message as a whole and then moves every axis named in it. `Controller.advance` executes
-the trajectory points that are due, and motion without desired displacements: ramps to the safe voltages, the reset of
-the hysteresis memory, and the deceleration of an axis to rest. `Controller.mode` is the operating mode of the stage.
+the samples of trajectories that are due, what the limits have held back, holds, ramps to the safe voltages, the reset
+of the hysteresis memory, and the deceleration of an axis to rest. `Controller.mode` is the operating mode of the stage.
+The first voltage starts from where the amplifiers are (`Controller.locate`), and their reports are held against what
+was output since (`Controller.report`).
 
-All times `now_ns` are nanoseconds on a monotonic clock. All times `clock_ns` are nanoseconds on the trajectory clock,
-which is the monotonic clock or, in a simulation, the simulated clock.
+All times `now_ns` are nanoseconds on the steady clock of the process. All times `clock_ns` are nanoseconds on the
+trajectory clock, which is the steady clock or, in a simulation, the simulated clock.
 """
 
 from array import array
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from enum import Enum
 
 from numpy.typing import ArrayLike
 
 from slpi_ros.compensator import validation as rejection
+from slpi_ros.compensator.amplifier import REARM_NS, STEADY_NS
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.compensator.ownership import Ownership
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESETTING, MemoryConfidence, SavedAxis
-from slpi_ros.compensator.ramps import PERIOD, Ramp, Safety
+from slpi_ros.compensator.ramps import Ramp, Safety
+from slpi_ros.compensator.sensor_watch import Fault
 from slpi_ros.compensator.statistics import Counts
-from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor
+from slpi_ros.compensator.trajectory import CHECKED_FIRST, CHECKED_LATER, PaceCheck, Trajectory, TrajectoryExecutor
 from slpi_ros.compensator.validation import RejectedError, TimestampRules, require_names
+from slpi_ros.compensator.watchdog import CommandWatchdog
 from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import StartMemory
-from slpi_ros.model.limits import MAX_DT, Limits, decaying_turns
+from slpi_ros.model.limits import PERIOD, Limits, decaying_turns
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.model.streaming import StageStream
 
 OPEN_LOOP = LoopSettings(False, PidGains(0.0), 0.1)
-PERIOD_NS, MAX_DT_NS = int(PERIOD * SECOND_NS), int(MAX_DT * SECOND_NS)
 
 
 class Mode(Enum):
@@ -49,55 +55,6 @@ class Mode(Enum):
     RESETTING = "resetting"
 
 
-class CommandWatchdog:
-    """Detect that no command has arrived within the command timeout.
-
-    Attributes
-    ----------
-    commanded : bool
-        Whether a command has been executed since the activation. Before the first command, a timeout moves no axis.
-    expired : bool
-        Whether the timeout had elapsed at the last call of `update`.
-    safe_voltages : tuple of float, length of axes, volts, or None
-        Target voltages of the ramp started at expiry; None if the voltages are held.
-    """
-
-    def __init__(self) -> None:
-        self.start(0)
-
-    def start(self, now_ns: int) -> None:
-        """Restart the timeout at `now_ns` (ns) and clear all flags."""
-        self.commanded = self.expired = False
-        self.safe_voltages: tuple[float, ...] | None = None
-        self._heard_ns = now_ns
-
-    def feed(self, now_ns: int) -> None:
-        """Restart the timeout at `now_ns` (ns) because a command has arrived."""
-        self._heard_ns = now_ns
-        self.expired, self.safe_voltages = False, None
-
-    def update(self, safety: Safety, now_ns: int, waiting: bool) -> bool:
-        """Update `expired`; return True at expiry, and again if the reaction in `safety` changes afterwards.
-
-        Parameters
-        ----------
-        safety : Safety
-            Command timeout, and the reaction to it.
-        now_ns : int, nanoseconds
-        waiting : bool
-            Whether commands are expected; if False, the watchdog does not expire.
-        """
-        before = self.expired, self.safe_voltages
-        self.expired = waiting and 0.0 < safety.command_timeout < self.silence(now_ns)
-        moves = self.expired and self.commanded and safety.ramps_on_timeout
-        self.safe_voltages = safety.voltages if moves else None
-        return self.expired and (self.expired, self.safe_voltages) != before
-
-    def silence(self, now_ns: int) -> float:
-        """Return the time (s) from the last command, or from `start`, to `now_ns` (ns)."""
-        return (now_ns - self._heard_ns) * 1e-9
-
-
 class Controller:
     """Inverse hysteresis compensation, with optional feedback, for all axes of a stage.
 
@@ -113,6 +70,10 @@ class Controller:
         Rules for message time stamps; default `TimestampRules()`.
     loops : sequence of LoopSettings, optional
         Feedback settings of each axis; default: feedback is disabled.
+    period : float, seconds
+        Output period; default 1 ms.
+    starts : sequence of str or float, optional
+        Where the voltage of each axis starts: `AUTO` (default), `MEASURED`, `SAVED`, or a voltage (V).
 
     Attributes
     ----------
@@ -125,6 +86,10 @@ class Controller:
         Model in use; None before the first one.
     trajectory : TrajectoryExecutor
     watchdog : CommandWatchdog
+    ownership : Ownership
+        Whether this controller may output voltages.
+    too_fast : str
+        What is said of the first point of the present trajectory that will be late; "" if none is known to be.
     """
 
     def __init__(
@@ -134,15 +99,20 @@ class Controller:
         hardware_id: str = "",
         time: TimestampRules | None = None,
         loops: Sequence[LoopSettings] = (),
+        period: float = PERIOD,
+        starts: Sequence[str | float] = (),
     ) -> None:
         self.names = list(axes)
         loops = loops or [OPEN_LOOP] * len(self.names)
-        self.axes = [Axis(name, place, limits[place], loops[place]) for place, name in enumerate(self.names)]
+        self.axes = [Axis(name, place, limits[place], loops[place], period) for place, name in enumerate(self.names)]
+        self.ownership = Ownership(self.axes, starts)
+        self._checks: list[PaceCheck] = []
+        self.too_fast = ""
         self.voltages = array("d", [0.0] * len(self.axes))
         self.mode = Mode.UNCONFIGURED
         self.counts = Counts()
         self.model: StageModel | None = None
-        self.trajectory = TrajectoryExecutor()
+        self.trajectory = TrajectoryExecutor(period, self._place)
         self.watchdog = CommandWatchdog()
         self._stage: StageStream | None = None
         self._hardware_id = hardware_id
@@ -151,7 +121,6 @@ class Controller:
         self._last_axes: list[Axis] = []
         # Lowest and highest voltage (V) of each axis during a reset.
         self._spans: list[tuple[float, float]] = []
-        self._next_step_ns = 0
         # Offset of the trajectory clock from the monotonic clock at the last call, nanoseconds.
         self._clock_ahead_ns = 0
         self.use_time(time or TimestampRules())
@@ -181,15 +150,22 @@ class Controller:
         self.mode = Mode.STREAMING
         self.watchdog.start(now_ns)
         self._rest_all(now_ns)
+        self.ownership.await_start(now_ns)
 
     def deactivate(self, now_ns: int) -> None:
         """Stop processing messages at `now_ns` (ns); the voltages are held."""
         self.hold(now_ns)
         self._rest_all(now_ns)
+        for axis in self.axes:
+            axis.amplifier.forget_output()
         self.mode = Mode.INACTIVE
 
     def use_model(
-        self, model: StageModel, saved: Mapping[str, SavedAxis] | None = None, start_memory: StartMemory = "end"
+        self,
+        model: StageModel,
+        saved: Mapping[str, SavedAxis] | None = None,
+        start_memory: StartMemory = "end",
+        last_voltages: Mapping[str, float] | None = None,
     ) -> None:
         """Replace the model in use; the voltages are unchanged.
 
@@ -200,6 +176,8 @@ class Controller:
             Hysteresis state saved at the last shutdown; only used with the first model. Default: no saved state.
         start_memory : str
             Initial history of an axis without saved state, see `AxisModel.initial`; default "end".
+        last_voltages : mapping of axis name to float, volts, optional
+            Last output voltages of an axis whose saved state belongs to another model; only used with the first model.
 
         Raises
         ------
@@ -211,22 +189,88 @@ class Controller:
                 f"the model has hardware id '{model.hardware_id}', this stage has '{self._hardware_id}'; "
                 "use a model of this stage, or correct hardware_id"
             )
+        turns = {name: each.reversal_voltages for name, each in (saved or {}).items()}
         prepared = []
         for axis in self.axes:
             one = model.axis(axis.name)
             try:
-                turns = saved[axis.name].reversal_voltages if saved else None
-                prepared.append((axis, one, axis.prepare(one, turns, start_memory)))
+                prepared.append((axis, one, axis.prepare(one, turns.get(axis.name), start_memory)))
             except SlpiError as error:
                 raise type(error)(f"axis '{axis.name}': {error}") from None
         for axis, one, stream in prepared:
-            if not axis.driven:
+            first = not axis.driven
+            if first:
                 axis.start_memory = None if saved else start_memory
             axis.use(one, stream)
             if saved:
                 axis.confidence = saved[axis.name].confidence(one.hysteresis_range)
+            elif first and last_voltages and axis.name in last_voltages:
+                axis.locate(last_voltages[axis.name])
         self.model = model
         self._couple()
+
+    # Where the amplifiers are
+
+    def report(self, names: Sequence[str], voltages: Sequence[float], now_ns: int) -> bool:
+        """Take the voltages (V) that the amplifiers report at `now_ns` (ns); names of other joints are ignored.
+
+        Returns
+        -------
+        bool
+            Whether the reports now show that somebody else moves an axis: nothing is output until `arm`.
+        """
+        for name, voltage in zip(names, voltages, strict=False):
+            axis = self._by_name.get(name)
+            if axis:
+                axis.amplifier.report(voltage, now_ns)
+        if not self.ownership.lost():
+            return False
+        self._end_reset()
+        if self.mode is Mode.TRAJECTORY:
+            self._end_trajectory()
+        for axis in self.axes:
+            axis.stop_ramp()
+            axis.drop_goal()
+        if self.active:
+            self.mode = Mode.STREAMING
+        return True
+
+    def locate(self, now_ns: int) -> None:
+        """Find the voltages at which the axes start, unless a voltage has been output already."""
+        if self.model is not None and self.active and not self.ownership.started:
+            self.ownership.locate(now_ns)
+            self._read_voltages()
+
+    def arm(self, now_ns: int, steady_ns: int = STEADY_NS) -> str:
+        """Continue from where somebody else has moved the stage; return the reason if that is not possible, else "".
+
+        The steady voltage that the amplifiers report counts as the last output and enters the memory as one move.
+        """
+        if self.ownership.armed:
+            return ""
+        why = self.ownership.arm(now_ns, steady_ns)
+        if not why:
+            self._read_voltages()
+            self.watchdog.start(now_ns)
+        return why
+
+    def rearm(self, now_ns: int) -> bool:
+        """Arm if the reports have been steady for long enough; return whether it did."""
+        return not self.ownership.armed and not self.arm(now_ns, REARM_NS)
+
+    def _begin_output(self, now_ns: int) -> None:
+        """Require that voltages may be output, from where the amplifiers are; RejectedError with the reason if not."""
+        self.ownership.begin_output(now_ns)
+        self._read_voltages()
+
+    def _read_voltages(self) -> None:
+        for axis in self.axes:
+            self.voltages[axis.place] = axis.voltage
+
+    def _place(self, name: str) -> float:
+        """Return the displacement (m) of an axis according to its model."""
+        stream = self._by_name[name].stream
+        return stream.uncoupled_displacement + stream.coupled
 
     # Settings
 
@@ -235,17 +279,22 @@ class Controller:
         for axis, new in zip(self.axes, limits, strict=True):
             axis.check_limits(new)
 
-    def use_limits(self, limits: Sequence[Limits]) -> None:
-        """Replace the voltage limits of all axes; hysteresis memory and voltages are unchanged.
+    def use_limits(self, limits: Sequence[Limits], now_ns: int, period: float = PERIOD) -> None:
+        """Replace the voltage limits of all axes and the output period (s); memory and voltages are unchanged.
+
+        A voltage outside the new limits goes to the nearest one at the slew limit.
 
         Raises
         ------
         UsageError
-            If a present voltage is outside the new limits, or the model was identified entirely outside them.
+            If the model was identified entirely outside the new limits.
         """
         self.check_limits(limits)
         for axis, new in zip(self.axes, limits, strict=True):
-            axis.use_limits(new)
+            axis.use_limits(new, period)
+            if self.ownership.owned:
+                axis.return_inside(now_ns)
+        self.trajectory.period = period
 
     def use_loops(self, loops: Sequence[LoopSettings]) -> None:
         """Replace the feedback settings of all axes without a voltage step."""
@@ -296,12 +345,14 @@ class Controller:
         try:
             axes = self._axes_of(names, len(displacements), now_ns)
             self._check(axes, stamp_ns, displacements, arrival_ns)
+            if not self.ownership.owned:
+                self._begin_output(now_ns)
         except RejectedError as error:
             counts.by_cause[error.cause] += 1
             raise
-        if self.ramping:
-            self._release(axes, now_ns)
-            self.mode = Mode.STREAMING
+        self.mode = Mode.STREAMING
+        for axis in axes:
+            axis.stop_ramp()
         aheads = [axis.stamps.accept(stamp_ns) if stamp_ns else axis.stamps.arrive(arrival_ns) for axis in axes]
         held, slewing = self._move(axes, names, displacements, aheads, now_ns)
         counts.accepted += 1
@@ -309,19 +360,23 @@ class Controller:
             counts.held_at_limit += held
             counts.slew_limited += slewing
         for ahead in aheads:
-            if not 0.0 <= ahead <= self._jump:
-                counts.gaps += max(aheads) > self._jump
-                counts.time_jumps += min(aheads) < 0.0
+            if ahead is not None and not 0.0 <= ahead <= self._jump:
+                known = [each for each in aheads if each is not None]
+                counts.gaps += max(known) > self._jump
+                counts.time_jumps += min(known) < 0.0
                 break
         return held
 
-    def measure(self, names: Sequence[str], displacements: Sequence[float], now_ns: int) -> list[Axis]:
+    def measure(self, names: Sequence[str], displacements: Sequence[float], now_ns: int, fresh: bool = True) -> None:
         """Store measured displacements (m) at `now_ns` (ns); names of other joints are ignored.
 
-        Returns
-        -------
-        list of Axis
-            Axes whose assumed hysteresis memory has changed due to the measurement, see `Axis.measure`.
+        Parameters
+        ----------
+        names : sequence of str
+        displacements : sequence of float, metres
+        now_ns : int, nanoseconds
+        fresh : bool
+            Whether the stamp is that of the present. Default True.
 
         Raises
         ------
@@ -329,25 +384,25 @@ class Controller:
             If a displacement is not finite or out of range; it is counted but not used, the other axes are processed.
         """
         rejected: RejectedError | None = None
-        changed = []
         for name, y in zip(names, displacements, strict=False):
             axis = self._by_name.get(name)
             if axis:
                 try:
-                    if axis.measure(y, now_ns):
-                        changed.append(axis)
+                    axis.measure(y, now_ns, fresh)
                 except RejectedError as error:
                     self.counts.measured_by_cause[error.cause] += 1
                     rejected = RejectedError(error.cause, f"axis '{name}': {error}")
-        if changed:
-            self._couple()
         if rejected:
             raise rejected
-        return changed
+
+    def watch_sensors(self, fault_time: float, now_ns: int) -> list[tuple[Axis, Fault]]:
+        """Switch off the feedback of axes whose sensor is faulty for `fault_time` (s); return the new faults."""
+        found = [(axis, axis.watch_sensor(fault_time, now_ns)) for axis in self.axes] if self.ownership.owned else []
+        return [(axis, fault) for axis, fault in found if fault]
 
     def _axes_of(self, names: Sequence[str], count: int, now_ns: int) -> list[Axis]:
         """Return the named axes; RejectedError unless they can accept `count` desired displacements now."""
-        if self.mode is not Mode.STREAMING or self.model is None:
+        if self.mode is not Mode.STREAMING or self.model is None or not self.ownership.owned:
             self._require_ready()
             if self.mode is Mode.TRAJECTORY:
                 raise RejectedError(
@@ -398,12 +453,14 @@ class Controller:
         axes: Sequence[Axis],
         names: Sequence[str],
         displacements: Sequence[float],
-        aheads: Sequence[float],
+        aheads: Sequence[float | None],
         now_ns: int,
     ) -> tuple[bool, bool]:
         """Move each axis to its displacement (m), `aheads` (s) after its last sample; return (held, slew limited)."""
         if self._stage:
             self._stage.decouple(dict(zip(names, displacements, strict=True)))
+            for axis in self.axes:
+                axis.wake(now_ns)
         held = slewing = began = False
         for axis, y, ahead in zip(axes, displacements, aheads, strict=True):
             was_held = axis.held
@@ -453,16 +510,28 @@ class Controller:
             self._require_ready()
             path = Trajectory.of(names, time_from_start_ns, positions, start_ns, axes=self.names)
             path.check_reach({axis.name: axis.stream.accepted for axis in self.axes})
+            self._begin_output(now_ns)
             delays = {axis.name: axis.model.chain.delay for axis in self.axes if axis.model}
             self.trajectory.start(path, clock_ns, delays)
         except RejectedError:
             self.counts.trajectories_rejected += 1
             raise
+        self.too_fast = ""
         self.mode, self._clock_ahead_ns = Mode.TRAJECTORY, clock_ns - now_ns
         self.watchdog.feed(now_ns)
-        soon = (self.trajectory.next_deadline_ns or 0) - clock_ns <= MAX_DT_NS
-        going = self.trajectory.names if soon or self.trajectory.begun else ()
-        self._release([axis for axis in self.axes if axis.name in going], now_ns)
+        wait = (start_ns - clock_ns) * 1e-9 if start_ns else 0.0
+        self._checks = [
+            PaceCheck(axis.name, axis.stream, path, wait, axis.output.period)
+            for axis in self.axes
+            if axis.name in path.names
+        ]
+        self.check_pace(CHECKED_FIRST)
+
+    def check_pace(self, points: int = CHECKED_LATER) -> None:
+        """Look at the next points of the trajectory: whether the slew limit will make one late (`too_fast`)."""
+        for check in self._checks:
+            self.too_fast = self.too_fast or check.look(points)
+        self._checks = [check for check in self._checks if not check.done]
 
     def activity(self, now_ns: int) -> str:
         """Return a text that describes the present activity."""
@@ -485,6 +554,7 @@ class Controller:
 
     def _end_trajectory(self) -> None:
         self.trajectory.cancel()
+        self._checks = []
         self.mode = Mode.STREAMING
         for axis in self.axes:
             axis.stamps.restart()
@@ -492,28 +562,23 @@ class Controller:
 
     def _step_trajectory(self, now_ns: int, clock_ns: int) -> bool:
         """Execute the trajectory point that is due, if any; return whether there was one."""
-        tracks = self.trajectory.tracks
         point = self.trajectory.due(clock_ns)
         if point is None:
             return False
         axes = self._named(point.names)
-        aheads = []
+        aheads: list[float | None] = []
         for axis in axes:
-            if axis.ramp:
-                axis.stop_ramp(now_ns)
-            since = axis.point_ns if axis.point_ns is not None else clock_ns - (now_ns - axis.given_ns)
-            aheads.append((point.deadline_ns - since) * 1e-9)
+            axis.stop_ramp()
+            since = axis.point_ns
+            aheads.append((point.deadline_ns - since) * 1e-9 if since is not None else None)
             axis.point_ns = point.deadline_ns
         held, slewing = self._move(axes, point.names, point.displacements, aheads, now_ns)
-        self.counts.points_held += held
-        self.counts.points_slewing += slewing
+        if not point.between:
+            self.counts.points_held += held
+            self.counts.points_slewing += slewing
+        self.check_pace()
         if not self.trajectory.on:
             self._end_trajectory()
-            self._release((), now_ns)
-        elif self.trajectory.tracks < tracks:
-            # The next trajectory may not include all axes that are in motion.
-            going = self.trajectory.names
-            self._release([axis for axis in self.axes if axis.name in going], now_ns)
         return True
 
     # Motion without desired displacements
@@ -527,20 +592,31 @@ class Controller:
         return False
 
     def next_due_ns(self, now_ns: int, clock_ns: int) -> int | None:
-        """Return the time (ns, monotonic) of the next required call of `advance`; None if no motion is pending."""
-        step = self._next_step_ns if self.ramping else None
+        """Return the time (ns, monotonic) of the next required call of `advance`; None if nothing follows."""
+        due: int | None = None
+        if self.ownership.owned:
+            for axis in self.axes:
+                if axis.due_ns is not None and (due is None or axis.due_ns < due):
+                    due = axis.due_ns
         point = self.trajectory.next_deadline_ns
-        if point is None:
-            return step
-        point += now_ns - clock_ns
-        return point if step is None else min(point, step)
+        if point is not None:
+            point += now_ns - clock_ns
+            due = point if due is None else min(point, due)
+        return due
 
     def advance(self, now_ns: int, clock_ns: int) -> bool:
-        """Execute the ramp step and one trajectory point, if due; return whether there are new `voltages` to output."""
+        """Do what is due without messages; return whether there are new `voltages` to output."""
         new, self._clock_ahead_ns = False, clock_ns - now_ns
-        if self.ramping and now_ns >= self._next_step_ns:
-            self._step_ramps(now_ns)
-            new = True
+        if not self.ownership.owned:
+            return False
+        following = self.trajectory.moving if self.mode is Mode.TRAJECTORY else ()
+        due = [axis for axis in self.axes if axis.due_ns is not None and axis.due_ns <= now_ns]
+        if due:
+            new = self._tick([axis for axis in due if axis.ramp or axis.name not in following], now_ns)
+            for axis in due:
+                # The samples of its trajectory move the axis on.
+                if axis.due_ns is not None and axis.due_ns <= now_ns:
+                    axis.due_ns = None
         if self.mode is Mode.TRAJECTORY:
             new = self._step_trajectory(now_ns, clock_ns) or new
         return new
@@ -553,10 +629,24 @@ class Controller:
             self.mode = Mode.STREAMING
 
     def ramp(self, voltages: Sequence[float], rate: float, now_ns: int) -> None:
-        """Start a ramp to `voltages` (V, one per axis, clipped to the limits) at `rate` (V/s)."""
+        """Start a ramp to `voltages` (V, one per axis, clipped to the limits) at `rate` (V/s).
+
+        Raises
+        ------
+        RejectedError
+            If the present voltages are not known, or somebody else moves the stage.
+        """
+        self._begin_output(now_ns)
         self._start_ramps([Ramp([voltage], rate) for voltage in voltages], Mode.RAMPING, now_ns)
 
-    def reset_memory(self, cycles: int, rate: float, finals: Sequence[float], now_ns: int) -> None:
+    def reset_memory(
+        self,
+        cycles: int,
+        rate: float,
+        finals: Sequence[float],
+        now_ns: int,
+        spans: Sequence[tuple[float, float]] = (),
+    ) -> None:
         """Start the decaying voltage oscillation that resets the hysteresis memory of all axes.
 
         Parameters
@@ -566,15 +656,32 @@ class Controller:
         finals : sequence of float, length of axes, volts
             Final voltage of each axis, clipped to its limits.
         now_ns : int, nanoseconds
+        spans : sequence of (float, float), volts
+            Lowest and highest voltage of the oscillation of each axis; default: the limits.
+
+        Raises
+        ------
+        RejectedError
+            If the present voltages are not known, or somebody else moves the stage.
         """
+        self._begin_output(now_ns)
         ramps = []
-        for axis, final in zip(self.axes, finals, strict=True):
-            limits = axis.stream.limits
+        for final, limits in zip(finals, self.reset_limits(spans), strict=True):
             ramps.append(Ramp(decaying_turns(limits, limits.clip(final), cycles), rate))
         self._start_ramps(ramps, Mode.RESETTING, now_ns)
         for axis in self.axes:
             axis.confidence = MemoryConfidence(RESETTING)
         self._spans = [(axis.stream.voltage,) * 2 for axis in self.axes]
+
+    def reset_limits(self, spans: Sequence[tuple[float, float]] = ()) -> list[Limits]:
+        """Return the limits of the oscillation of `reset_memory` for each axis."""
+        every = [axis.stream.limits for axis in self.axes]
+        if not spans:
+            return every
+        return [
+            replace(limits, lower=limits.clip(low), upper=limits.clip(high))
+            for limits, (low, high) in zip(every, spans, strict=True)
+        ]
 
     def watch(self, safety: Safety, now_ns: int) -> bool:
         """Check the command watchdog: on expiry, hold or ramp to the safe voltages; return whether the state changed.
@@ -585,7 +692,7 @@ class Controller:
         before = self.watchdog.safe_voltages
         news = self.watchdog.update(safety, now_ns, waiting)
         if news and self.watchdog.safe_voltages != before:
-            if self.watchdog.safe_voltages:
+            if self.watchdog.safe_voltages and self.ownership.owned:
                 self.ramp(safety.voltages, safety.rate, now_ns)
             else:
                 self._release((), now_ns)
@@ -598,23 +705,35 @@ class Controller:
         self._end_reset()
         for axis, ramp in zip(self.axes, ramps, strict=True):
             axis.start_ramp(ramp, now_ns)
-        self.mode, self._next_step_ns = mode, now_ns + PERIOD_NS
+        self.mode = mode
 
-    def _step_ramps(self, now_ns: int) -> None:
-        self._next_step_ns = now_ns + PERIOD_NS
-        for axis in self.axes:
-            axis.step_ramp(now_ns)
-            if axis.ramp:
+    def _tick(self, axes: Sequence[Axis], now_ns: int) -> bool:
+        """Let each axis do what is due; return whether a voltage has changed."""
+        if self._stage:
+            holding = {axis.name: axis.tracking.desired for axis in axes if axis.holding}
+            self._stage.decouple({name: y for name, y in holding.items() if y is not None})
+        new, ramping = False, self.ramping
+        for axis in axes:
+            was_held = axis.held
+            if axis.tick(now_ns):
                 self.voltages[axis.place] = axis.voltage
+                new = True
+            if axis.held and not was_held:
+                # What the slew limit held back of a message is out of reach.
+                self.counts.held_at_limit += 1
+                self.counts.excursions += 1
+        if not ramping:
+            return new
         if self.mode is Mode.RESETTING:
-            reached = [axis.stream.voltage for axis in self.axes]
+            reached = [axis.voltage for axis in self.axes]
             self._spans = [(min(low, v), max(high, v)) for (low, high), v in zip(self._spans, reached, strict=True)]
         if all(axis.ramp is None or axis.ramp.done for axis in self.axes):
             self._end_reset()
             for axis in self.axes:
-                axis.stop_ramp(now_ns)
+                axis.stop_ramp()
             if self.mode in (Mode.RAMPING, Mode.RESETTING):
                 self._end_ramping(now_ns)
+        return new
 
     def _end_ramping(self, now_ns: int) -> None:
         if self.mode is Mode.RESETTING:
@@ -634,24 +753,25 @@ class Controller:
     def _release(self, but: Collection[Axis], now_ns: int) -> None:
         """End all ramps; axes in `but` follow new commands, the others decelerate to rest if in motion, then hold."""
         self._end_reset()
-        ramped = self.ramping
         for axis in self.axes:
-            if axis not in but and axis.in_motion(now_ns):
-                axis.brake(now_ns)
-                continue
-            axis.stop_ramp(now_ns)
             if axis not in but:
-                axis.rest()
-        if not ramped:
-            self._next_step_ns = now_ns + PERIOD_NS
+                if axis.in_motion:
+                    axis.brake(now_ns)
+                    continue
+                axis.stop_ramp()
+                axis.drop_goal()
+                if self.ownership.owned:
+                    axis.return_inside(now_ns)
+            else:
+                axis.stop_ramp()
         if self.mode is Mode.RESETTING:
             self._end_ramping(now_ns)
 
     def _rest_all(self, now_ns: int) -> None:
         for axis in self.axes:
-            axis.stamps.restart()
-            axis.rest()
-            axis.given_ns, axis.point_ns, axis.ramp = now_ns, None, None
+            axis.stop_ramp()
+            axis.drop_goal()
+            axis.given_ns = now_ns
 
     def _couple(self) -> None:
         """Set up the compensation of cross-coupling between the axes and update `voltages`."""

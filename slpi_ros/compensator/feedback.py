@@ -5,7 +5,8 @@ from dataclasses import dataclass, fields
 from math import exp, expm1, inf, isfinite, sqrt
 
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
+from slpi_ros.model.streaming import nanoseconds
 
 # Number of measurements in the residual window.
 WINDOW = 500
@@ -55,7 +56,8 @@ class Feedback:
     back-calculation, this keeps the integral while the voltage is slew limited on the way to a distant feedforward.
 
     `step` calls `correct` with the last measurement stored by `measure`, or `hold` if that was used before or is too
-    old. The error refers to the setpoint at the time of the measurement, not to the present setpoint.
+    old. The error refers to the setpoint at the time of the measurement, not to the present setpoint, and for a sensor
+    with a known delay or lag to the setpoint as that sensor would tell it, see `slpi_ros.model.sensor.Sensed`.
 
     Parameters
     ----------
@@ -69,13 +71,17 @@ class Feedback:
         Time constant of the decay of the offset, and of the correction after disabling; inf keeps both. Default 0.1.
     longest_gap : float, seconds
         Longer intervals between samples count as this long in the integration and in the decay; default 0.1.
+    correction_limit : float, volts
+        Largest correction in each direction; default: no limit.
 
     Attributes
     ----------
     pace : RateLimiter
-        Rate limiter of the total voltage.
+        Rate limiter of the total voltage; alone, in the time of the samples, of which at most `MAX_DT` counts. A
+        compensator gives it that of its output, on the steady clock.
     acting : bool
-        Whether the last `step` used a measurement.
+        Whether a measurement within the timeout corrected the last `step`.
+    correction_limit : float, volts
 
     Raises
     ------
@@ -91,6 +97,7 @@ class Feedback:
         *,
         release_time: float = 0.1,
         longest_gap: float = 0.1,
+        correction_limit: float = inf,
     ) -> None:
         if not isfinite(voltage):
             raise UsageError(f"voltage at the start is {voltage} V; give the present voltage")
@@ -98,15 +105,15 @@ class Feedback:
             raise UsageError(f"release_time is {release_time} s; give a positive value")
         if not 0.0 < longest_gap < inf:
             raise UsageError(f"longest_gap is {longest_gap} s; give a positive, finite value")
-        self.pace = RateLimiter(limits)
+        self.pace = RateLimiter(limits, MAX_DT / 2, voltage)
         self.acting = False
+        self.correction_limit = correction_limit
         self._gains = gains
         self._release_time = release_time
         self._longest_gap = longest_gap
         self._enabled = False
         self._taking_over = False
         self._t = -inf
-        self._voltage = self._goal = voltage
         self._correction = 0.0
         self._integral = 0.0
         self._offset = 0.0
@@ -116,6 +123,8 @@ class Feedback:
         self._rate = 0.0
         # Last measurement (m), its time (ns), and the setpoint (m) at that time.
         self._latest: tuple[float, int, float | None] | None = None
+        # Time of the last measurement that was used, nanoseconds.
+        self._latest_ns: int | None = None
         self._desired: float | None = None
 
     @property
@@ -140,12 +149,17 @@ class Feedback:
     @property
     def voltage(self) -> float:
         """Present voltage, volts."""
-        return self._voltage
+        return self.pace.voltage
 
     @property
     def correction(self) -> float:
-        """Correction added to the feedforward voltage, volts, after clipping to the voltage limits."""
+        """Correction added to the feedforward voltage, volts, after clipping to its limit and the voltage limits."""
         return self._correction
+
+    @property
+    def saturated(self) -> bool:
+        """Whether the correction is at its limit."""
+        return abs(self._correction) >= self.correction_limit
 
     def enable(self) -> None:
         """Enable the PID without a voltage step at the next measurement; no effect if it is enabled already."""
@@ -176,7 +190,9 @@ class Feedback:
             raise UsageError(f"{gains} give no finite voltage; check their units")
         self._gains, self._offset = gains, offset
 
-    def correct(self, t: float, desired: float, measured: float, feedforward: float) -> float:
+    def correct(
+        self, t: float, desired: float, measured: float, feedforward: float, now_ns: int | None = None
+    ) -> float:
         """Return the voltage for a sample with a measurement.
 
         Parameters
@@ -186,6 +202,8 @@ class Feedback:
         desired, measured : float, metres
         feedforward : float, volts
             Voltage of the inverse model for `desired`.
+        now_ns : int, nanoseconds, optional
+            Time on the clock of `pace`; default: `t`.
 
         Returns
         -------
@@ -197,25 +215,27 @@ class Feedback:
         UsageError
             If time runs backwards, or a value is not finite; the state is unchanged, and `hold` may be called instead.
         """
-        self._check(t, feedforward)
+        now_ns = self._check(t, feedforward, now_ns)
         elapsed = t - self._measured_at
         error, rate = desired - measured, self._next_rate(elapsed, measured)
         direct = self._direct(self._gains, error, rate)
         if not isfinite(direct):
             raise UsageError(f"desired {desired} m, measured {measured} m gives no finite voltage; hold the sample")
         if self._enabled:
-            reach = self.pace.reach(self._voltage, self._dt(t))
+            low, high = self.pace.reach(now_ns)
+            most = self.correction_limit
+            reach = max(low, min(feedforward - most, high)), min(high, max(feedforward + most, low))
             integral, offset = self._next_integral_and_offset(elapsed, error, direct, feedforward, reach)
-            self._output(t, feedforward, direct + offset + integral)
+            self._output(t, feedforward, direct + offset + integral, now_ns)
             self._integral, self._offset, self._taking_over = integral, offset, False
         else:
-            self._output(t, feedforward, self._without_measurement(t))
+            self._output(t, feedforward, self._without_measurement(t), now_ns)
         self._error, self._rate = error, rate
         if elapsed > 0.0:
             self._measured_at, self._measured = t, measured
-        return self._voltage
+        return self.voltage
 
-    def hold(self, t: float, feedforward: float) -> float:
+    def hold(self, t: float, feedforward: float, now_ns: int | None = None) -> float:
         """Return the voltage (V) for a sample without measurement: the correction is kept, or decays if disabled.
 
         Raises
@@ -223,13 +243,16 @@ class Feedback:
         UsageError
             If time (s) runs backwards, or a value is not finite; the state is unchanged.
         """
-        self._check(t, feedforward)
-        self._output(t, feedforward, self._without_measurement(t))
-        return self._voltage
+        now_ns = self._check(t, feedforward, now_ns)
+        self._output(t, feedforward, self._without_measurement(t), now_ns)
+        return self.voltage
 
-    def measure(self, displacement: float, now_ns: int) -> None:
-        """Store a measured displacement (m) received at `now_ns` (ns, monotonic) for the next `step`."""
-        self._latest = displacement, now_ns, self._desired
+    def measure(self, displacement: float, now_ns: int, desired: float | None = None) -> None:
+        """Store a measured displacement (m) received at `now_ns` (ns, monotonic) for the next `step`.
+
+        `desired` (m) is the setpoint that it refers to, as the sensor would tell it; default: that of the last `step`.
+        """
+        self._latest = displacement, now_ns, self._desired if desired is None else desired
 
     def step(self, dt: float, desired: float, feedforward: float, now_ns: int, timeout: float) -> float:
         """Return the voltage (V) for a sample, corrected by the last measurement if it is recent enough.
@@ -241,28 +264,37 @@ class Feedback:
         desired : float, metres
         feedforward : float, volts
         now_ns : int, nanoseconds
-            Time of the sample on the clock of `measure`.
+            Time of the sample on the clock of `measure` and of `pace`.
         timeout : float, seconds
             Measurements older than this are ignored; the correction is then held.
         """
         t = self._t + dt if self._t > -inf else 0.0
         latest, self._latest = self._latest, None
-        self.acting = latest is not None and (now_ns - latest[1]) * 1e-9 <= timeout
+        if latest is not None:
+            self._latest_ns = latest[1]
+        # Between two measurements the correction is held.
+        self.acting = self._latest_ns is not None and (now_ns - self._latest_ns) * 1e-9 <= timeout
         self._desired = desired
         if latest and self.acting:
             aim = desired if latest[2] is None else latest[2]
             try:
-                return self.correct(t, aim, latest[0], feedforward)
+                return self.correct(t, aim, latest[0], feedforward, now_ns)
             except SlpiError:
                 # A measurement that gives no finite voltage is ignored.
-                self.acting = False
-        return self.hold(t, feedforward)
+                self._latest_ns, self.acting = None, False
+        return self.hold(t, feedforward, now_ns)
 
-    def _check(self, t: float, feedforward: float) -> None:
+    def _check(self, t: float, feedforward: float, now_ns: int | None) -> int:
+        """Return the time (ns) on the clock of `pace`; raise UsageError if the sample is not valid."""
         if not (isfinite(t) and isfinite(feedforward)):
             raise UsageError(f"sample t = {t} s, feedforward = {feedforward} V is not finite; omit the sample")
         if t < self._t:
             raise UsageError(f"time runs backwards: {t:.9g} s after {self._t:.9g} s; send samples in order")
+        if now_ns is None:
+            # Rate limits count from the last sample, whether the voltage changed or not; before the first, no time.
+            now_ns = nanoseconds(t)
+            self.pace.begin(now_ns if self._t == -inf else nanoseconds(self._t))
+        return now_ns
 
     def _next_rate(self, elapsed: float, measured: float) -> float:
         """Return the low-pass filtered rate (m/s) of the measured displacement, exact for any sampling period."""
@@ -297,19 +329,15 @@ class Feedback:
             return self._correction
         return self._correction * exp(-min(t - self._t, self._longest_gap) / self._release_time)
 
-    def _dt(self, t: float) -> float:
-        """Return the time (s) since the last sample; 0 for the first sample."""
-        return t - self._t if self._t > -inf else 0.0
-
-    def _output(self, t: float, feedforward: float, correction: float) -> None:
-        """Move to `feedforward` + `correction` (V) as far as the voltage limits and the rate limiter allow."""
+    def _output(self, t: float, feedforward: float, correction: float, now_ns: int) -> None:
+        """Move to `feedforward` + `correction` (V) as far as all limits allow."""
+        correction = min(max(correction, -self.correction_limit), self.correction_limit)
         wanted = feedforward + correction
         if not isfinite(wanted):
             raise UsageError(f"feedforward {feedforward} V, correction {correction} V is not finite; check the gains")
         limits = self.pace.limits
-        goal = limits.clip(wanted)
-        self._voltage = self.pace.step(self._voltage, goal, self._dt(t), self._goal)
-        self._t, self._goal = t, goal
+        self.pace.step(limits.clip(wanted), now_ns)
+        self._t = t
         # A correction beyond the voltage limits is discarded, so that it does not have to decay later.
         self._correction = part_within(correction, limits.lower - feedforward, limits.upper - feedforward)
 
@@ -399,8 +427,11 @@ class LoopSettings:
     gains : PidGains
     timeout : float, seconds
         Measurements older than this are ignored.
+    correction_limit : float, volts
+        Largest correction; default: no limit.
     """
 
     enabled: bool
     gains: PidGains
     timeout: float
+    correction_limit: float = inf

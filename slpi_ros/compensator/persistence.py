@@ -14,7 +14,6 @@ from slpi_ros.io.atomic_file import all_or_nothing, remove_file
 from slpi_ros.io.input_limits import MEMORY_BYTES, MODEL_BYTES, open_input, read_input
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
-from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 
 # States of the memory: taken from the model and not verified; being reset; reset; restored after a restart.
@@ -187,19 +186,18 @@ class SavedMemory:
     complete: bool
     axes: Mapping[str, SavedAxis]
 
-    def require_fit(self, model: StageModel, names: Sequence[str], limits: Sequence[Limits]) -> None:
-        """Raise ModelError unless the state belongs to `model` and every axis has a voltage within its limits."""
+    def require_fit(self, model: StageModel, names: Sequence[str]) -> None:
+        """Raise ModelError unless the state belongs to `model` and holds every axis."""
         if self.model != model_id(model):
-            raise ModelError("the saved memory belongs to another model; it is ignored")
-        for name, allowed in zip(names, limits, strict=True):
+            raise ModelError("the saved memory belongs to another model; only its last voltages are used")
+        for name in names:
             if name not in self.axes:
-                raise ModelError(f"the saved memory has no axis '{name}'; it is ignored")
-            voltage = self.axes[name].reversal_voltages[-1]
-            if not allowed.lower <= voltage <= allowed.upper:
-                raise ModelError(
-                    f"the saved memory has {voltage:g} V for axis '{name}', outside {allowed.lower:g}.."
-                    f"{allowed.upper:g} V; it is ignored"
-                )
+                raise ModelError(f"the saved memory has no axis '{name}'; only its last voltages are used")
+
+    @property
+    def last_voltages(self) -> dict[str, float]:
+        """Last output voltage of each axis, volts."""
+        return {name: axis.reversal_voltages[-1] for name, axis in self.axes.items()}
 
 
 def model_id(model: StageModel) -> str:
@@ -268,25 +266,32 @@ class MemoryFile:
     ----------
     path : str
         File of the memory; the voltages go to `path`.last. With an empty string all methods do nothing.
+
+    Attributes
+    ----------
+    last_voltages : dict of axis name to float, volts
+        Last output voltages that `find` has read, also where the rest of the file was not usable.
     """
 
     def __init__(self, path: str) -> None:
         self._path = path
+        self.last_voltages: dict[str, float] = {}
         self._saved: SavedMemory | None = None
         self._last: LastVoltages | None = None
 
-    def find(self, model: StageModel, names: Sequence[str], limits: Sequence[Limits]) -> Mapping[str, SavedAxis] | None:
+    def find(self, model: StageModel, names: Sequence[str]) -> Mapping[str, SavedAxis] | None:
         """Return the saved hysteresis state of each axis, or None if no file exists.
 
         Raises
         ------
         ModelError
-            If the file cannot be read, or does not match `model`, the axes `names`, or `limits`.
+            If the file cannot be read, or does not match `model` or the axes `names`.
         """
         saved = load_memory(self._path) if self._path else None
         if saved is None:
             return None
-        saved.require_fit(model, names, limits)
+        self.last_voltages = saved.last_voltages
+        saved.require_fit(model, names)
         return saved.axes
 
     def save(self, model: StageModel | None, axes: Mapping[str, SavedAxis], complete: bool) -> None:

@@ -1,16 +1,16 @@
 """Motion of an axis without desired displacements: voltage ramps, and deceleration to rest."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 
 from slpi_ros.errors import UsageError
 from slpi_ros.model.limits import RateLimiter
 
-# Sample period of a ramp, seconds.
-PERIOD = 0.004
 # Distance at which a target voltage counts as reached, volts: covers rounding, and the slow end of a deceleration.
 NEAR = 1e-9
+# Share of the slew limit that planned motion uses, so that a late step can be made up.
+PLANNED_SHARE = 0.8
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Ramp:
     ----------
     goals : iterable of float, volts
     rate : float, V/s
-        Maximum rate of change, further limited by the slew limit.
+        Maximum rate of change, further limited to `PLANNED_SHARE` of the slew limit; inf: at the slew limit.
 
     Raises
     ------
@@ -62,18 +62,12 @@ class Ramp:
         """Whether the last target voltage has been reached."""
         return not self._goals
 
-    def step(self, present: float, dt: float, pace: RateLimiter) -> float:
-        """Return the voltage (V) `dt` (s, at most `MAX_DT`) after `present` (V), as the rate limiter `pace` allows."""
+    def step(self, pace: RateLimiter, now_ns: int) -> float:
+        """Return the next voltage (V) at `now_ns` (ns), as the rate limiter `pace` allows."""
         if self.done:
-            return present
-        limits, dt = pace.limits, pace.clamp_dt(dt)
-        goal = limits.clip(self._goals[-1])
-        # An axis that moves faster than the ramp is decelerated within its acceleration limit.
-        fastest = max(self._rate, abs(pace.rate) - limits.acceleration * dt) if dt else inf
-        slowed = RateLimiter(replace(limits, slew=min(limits.slew, fastest)))
-        slowed.go_on(pace)
-        v = slowed.step(present, goal, dt)
-        pace.go_on(slowed)
+            return pace.voltage
+        goal = pace.limits.clip(self._goals[-1])
+        v = pace.step(goal, now_ns, min(self._rate, PLANNED_SHARE * pace.limits.slew) if self._rate < inf else inf)
         if abs(v - goal) <= NEAR:
             self._goals.pop()
         return v
@@ -91,8 +85,8 @@ class Brake:
     def __init__(self) -> None:
         self.done = False
 
-    def step(self, present: float, dt: float, pace: RateLimiter) -> float:
-        """Return the voltage (V) `dt` (s) after `present` (V), as the rate limiter `pace` allows."""
-        v = pace.step(present, present, pace.clamp_dt(dt))
+    def step(self, pace: RateLimiter, now_ns: int) -> float:
+        """Return the next voltage (V) at `now_ns` (ns), as the rate limiter `pace` allows."""
+        v = pace.brake(now_ns)
         self.done = not pace.in_motion
         return v

@@ -154,10 +154,13 @@ class TrackingError:
         self._errors = array("d", bytes(8 * TRACKED))
         self._count = 0
 
-    def measure(self, displacement: float) -> None:
-        """Store the error of a measured displacement (m) if there is a setpoint."""
+    def measure(self, displacement: float, desired: float | None = None) -> None:
+        """Store the error of a measured displacement (m) if there is a setpoint.
+
+        `desired` (m) is the setpoint that it refers to; default: the present one.
+        """
         if self.desired is not None:
-            self._errors[self._count % TRACKED] = displacement - self.desired
+            self._errors[self._count % TRACKED] = displacement - (self.desired if desired is None else desired)
             self._count += 1
             self.fresh = True
 

@@ -1,15 +1,14 @@
-"""Trajectories: validated as a whole on arrival, then executed point by point at their deadlines.
+"""Trajectories: validated as a whole on arrival, then output at the output rate.
 
-Every point is one sample of desired displacements, compensated at its deadline in the same way as a command. There is
-no interpolation, neither between points nor from the present displacement to the first one (in
-joint_trajectory_controller: interpolation method ``none``): if a point is farther away than the slew limit allows, the
-voltage approaches it at the slew limit.
+The displacement is interpolated linearly between the points, and from the present displacement to the first point
+(in joint_trajectory_controller: interpolation without velocities). Each point is reached at its time, if the limits
+allow it; `PaceCheck` finds the first point that will be late.
 
 A `delay` in the model of an axis advances the deadlines of its points by that time.
 """
 
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -19,7 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.validation import RejectedError, require_names
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.streaming import refusal
+from slpi_ros.model.limits import PERIOD, Limits, RateLimiter
+from slpi_ros.model.streaming import StreamingInverse, refusal
 
 FloatArray = NDArray[np.float64]
 TimeArray = NDArray[np.int64]
@@ -150,19 +150,22 @@ def _check_times(times: NDArray[Any], start_ns: int) -> None:
 
 
 class Point(NamedTuple):
-    """The trajectory point to execute now.
+    """The sample of a trajectory to output now.
 
     Parameters
     ----------
     names : tuple of str, length K
     displacements : list of float, length K, metres
     deadline_ns : int, nanoseconds
-        Time at which the point was due.
+        Time at which the sample was due.
+    between : bool
+        Whether it is interpolated; False (default): it is a point of the trajectory.
     """
 
     names: tuple[str, ...]
     displacements: list[float]
     deadline_ns: int
+    between: bool = False
 
 
 class _Track:
@@ -177,12 +180,30 @@ class _Track:
         Index of the first point to execute.
     counted : bool
         Whether `TrajectoryExecutor.remaining` counts the points: only one track of each trajectory is counted.
+    begin_ns : int, nanoseconds
+        Time at which the way to the first point begins.
+    period_ns : int, nanoseconds
+        Output period.
+    place : callable, optional
+        As in `TrajectoryExecutor`.
     """
 
     def __init__(
-        self, names: tuple[str, ...], positions: FloatArray, deadlines_ns: TimeArray, first: int, counted: bool
+        self,
+        names: tuple[str, ...],
+        positions: FloatArray,
+        deadlines_ns: TimeArray,
+        first: int,
+        counted: bool,
+        begin_ns: int,
+        period_ns: int,
+        place: Callable[[str], float] | None,
     ) -> None:
         self.names, self.counted, self.begun = names, counted, False
+        self._period_ns, self._place = period_ns, place
+        # The last sample, from which the next point is approached; its place is not known before the begin.
+        self._since_ns = begin_ns
+        self._since: list[float] | None = None
         # The points ``next:stop`` are pending.
         self.next, self.stop = first, deadlines_ns.size
         self._positions, self._deadlines_ns = positions, deadlines_ns
@@ -194,9 +215,20 @@ class _Track:
         self._times, self._rows = self._deadlines_ns[block].tolist(), self._positions[block].tolist()
 
     @property
-    def next_ns(self) -> int:
-        """Deadline of the next point, nanoseconds."""
+    def _deadline_ns(self) -> int:
         return int(self._times[self.next - self._from])
+
+    def _pieces(self, deadline_ns: int) -> int:
+        """Return the number of output periods from the last sample to the next point; at least 1."""
+        if self._since is None and self._place is None:
+            return 1
+        return max(round((deadline_ns - self._since_ns) / self._period_ns), 1)
+
+    @property
+    def next_ns(self) -> int:
+        """Deadline of the next sample, nanoseconds."""
+        deadline = self._deadline_ns
+        return self._since_ns + (deadline - self._since_ns) // self._pieces(deadline)
 
     def until(self, time_ns: int) -> int:
         """Return the index of the first pending point that is due at `time_ns` or later."""
@@ -206,7 +238,9 @@ class _Track:
         return self.next + int(np.searchsorted(self._deadlines_ns[self.next : self.stop], time_ns))
 
     def take(self, now_ns: int) -> tuple[Point, int]:
-        """Return the latest point that is due, and the number of earlier pending points, which are skipped."""
+        """Return the latest sample that is due, and the number of earlier pending points, which are skipped."""
+        if now_ns < self._deadline_ns:
+            return self._between(now_ns), 0
         first, self.next = self.next, self.until(now_ns + 1)
         at, self.begun = self.next - 1 - self._from, True
         if at < len(self._rows):
@@ -216,24 +250,55 @@ class _Track:
             point = Point(self.names, self._positions[last].tolist(), int(self._deadlines_ns[last]))
         if self.next < self.stop and self.next - self._from >= len(self._times):
             self._load()
+        self._since_ns, self._since = point.deadline_ns, point.displacements
         return point, self.next - 1 - first
+
+    def _between(self, now_ns: int) -> Point:
+        """Return the latest interpolated sample that is due before the next point."""
+        deadline, since_ns = self._deadline_ns, self._since_ns
+        goal = self._rows[self.next - self._from]
+        since = self._since
+        if since is None:
+            assert self._place
+            since = [self._place(name) for name in self.names]
+        pieces = self._pieces(deadline)
+        at_ns = (
+            since_ns + (deadline - since_ns) * max((now_ns - since_ns) * pieces // (deadline - since_ns), 1) // pieces
+        )
+        share = (at_ns - since_ns) / (deadline - since_ns)
+        point = Point(
+            self.names, [y + share * (end - y) for y, end in zip(since, goal, strict=True)], at_ns, between=True
+        )
+        self._since_ns, self._since, self.begun = at_ns, point.displacements, True
+        return point
 
 
 class TrajectoryExecutor:
-    """Return trajectory points at absolute deadlines: a late call does not delay the following points.
+    """Return the samples of trajectories at absolute deadlines: a late call does not delay the following ones.
 
-    A new trajectory replaces the current points as in joint_trajectory_controller: at once, or, if it starts in the
-    future, from its first deadline on. Any number of trajectories may be pending.
+    Points that are further apart than the output period are interpolated. A new trajectory replaces the current points
+    as in joint_trajectory_controller: at once, or, if it starts in the future, from its start on. Any number of
+    trajectories may be pending.
 
     All times are nanoseconds on the same clock, which the caller chooses.
 
+    Parameters
+    ----------
+    period : float, seconds
+        Output period; default 1 ms.
+    place : callable, optional
+        Returns the present displacement (m) of an axis, from which the first point is approached. Default: an axis
+        stays until the first point.
+
     Attributes
     ----------
+    period : float, seconds
     skipped : int
         Number of points skipped so far because a later point was already due.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, period: float = PERIOD, place: Callable[[str], float] | None = None) -> None:
+        self.period, self._place = period, place
         self.skipped = 0
         self._tracks: list[_Track] = []
 
@@ -254,7 +319,7 @@ class TrajectoryExecutor:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Deadline of the next point, nanoseconds; None if no point is pending."""
+        """Deadline of the next sample, nanoseconds; None if no point is pending."""
         tracks = self._tracks
         return tracks[0].next_ns if len(tracks) == 1 else min((track.next_ns for track in tracks), default=None)
 
@@ -264,8 +329,13 @@ class TrajectoryExecutor:
         return len(self._tracks)
 
     @property
+    def moving(self) -> set[str]:
+        """Names of the axes that are on their way along a trajectory."""
+        return {name for track in self._tracks if track.begun for name in track.names}
+
+    @property
     def begun(self) -> bool:
-        """Whether a pending trajectory has already executed a point."""
+        """Whether a pending trajectory has already output a sample."""
         return any(track.begun for track in self._tracks)
 
     def start(self, trajectory: Trajectory, now_ns: int, delays: Mapping[str, float] | None = None) -> None:
@@ -294,7 +364,9 @@ class TrajectoryExecutor:
             first = min(int(np.searchsorted(deadlines, now_ns)), due.size - 1)
             positions = useful.positions if len(columns) == len(useful.names) else useful.positions[:, columns]
             names = tuple(useful.names[i] for i in columns)
-            tracks.append(_Track(names, positions, deadlines, first, counted=not tracks))
+            begin_ns = max(trajectory.start_ns - shift, now_ns) if trajectory.start_ns else now_ns
+            period_ns = round(self.period * SECOND_NS)
+            tracks.append(_Track(names, positions, deadlines, first, not tracks, begin_ns, period_ns, self._place))
         begin_ns = min(track.next_ns for track in tracks)
         kept = self._tracks if trajectory.start_ns else []
         for track in kept:
@@ -320,3 +392,58 @@ class TrajectoryExecutor:
         if track.next == track.stop:
             self._tracks.remove(track)
         return point
+
+
+# Points of a trajectory that are looked at before it begins, and with each sample of it: some microseconds each.
+CHECKED_FIRST, CHECKED_LATER = 500, 50
+
+
+class PaceCheck:
+    """Find the first point of a trajectory that the slew limit makes late; the stage is not moved.
+
+    Parameters
+    ----------
+    axis : str
+    stream : StreamingInverse
+        In the state at the begin of the trajectory; it is copied.
+    trajectory : Trajectory
+    wait : float, seconds
+        Time from the present to the start of the trajectory.
+    period : float, seconds
+        Output period: a point is late by more than that.
+
+    Attributes
+    ----------
+    done : bool
+        Whether all points have been looked at, or a late one was found.
+    """
+
+    def __init__(self, axis: str, stream: StreamingInverse, trajectory: Trajectory, wait: float, period: float) -> None:
+        self._axis, self._period = axis, period
+        self._positions = trajectory.positions[:, trajectory.names.index(axis)]
+        self._times, self._cut, self._next = trajectory.time_from_start_ns, trajectory.cut, 0
+        self._stream, limits = stream.copy(), stream.limits
+        self._slew, self._voltage, self._last_ns = limits.slew, stream.voltage, -round(max(wait, 0.0) * SECOND_NS)
+        self._stream.pace = RateLimiter(Limits(limits.lower, limits.upper), period, stream.voltage)
+        self.done = not np.isfinite(self._slew)
+
+    def look(self, points: int) -> str:
+        """Look at the next points; return what is said of the first late one, "" if there is none among them."""
+        end = min(self._next + points, len(self._times))
+        times, positions = self._times[self._next : end].tolist(), self._positions[self._next : end].tolist()
+        for number, (time_ns, y) in enumerate(zip(times, positions, strict=True), self._next):
+            dt = (time_ns - self._last_ns) * 1e-9
+            self._last_ns = time_ns
+            goal = self._stream.move(dt, y, time_ns)
+            way = self._slew * dt
+            self._voltage += min(max(goal - self._voltage, -way), way)
+            late = abs(goal - self._voltage) / self._slew
+            if late > 2.0 * self._period:
+                self.done = True
+                return (
+                    f"too fast for slew_limit {self._slew:g} V/s: axis '{self._axis}', point {self._cut + number} at "
+                    f"{time_ns / SECOND_NS:.6g} s will be late by {late:.3g} s"
+                )
+        self._next = end
+        self.done = self.done or end == len(self._times)
+        return ""

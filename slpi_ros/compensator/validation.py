@@ -14,6 +14,8 @@ from slpi_ros.model.streaming import refusal
 
 NO_MODEL = "no_model"
 INACTIVE = "inactive"
+STARTING = "starting"
+NOT_ARMED = "not_armed"
 RESETTING = "resetting"
 FOLLOWING = "following"
 EMPTY = "empty"
@@ -26,8 +28,8 @@ TIME_BACKWARDS = "time_backwards"
 STALE = "stale"
 OUT_OF_RANGE = "out_of_range"
 CAUSES = (
-    NO_MODEL, INACTIVE, RESETTING, FOLLOWING, EMPTY, LENGTH, DUPLICATE_AXIS, UNKNOWN_AXIS, NOT_FINITE, DUPLICATE,
-    TIME_BACKWARDS, STALE, OUT_OF_RANGE,
+    NO_MODEL, INACTIVE, STARTING, NOT_ARMED, RESETTING, FOLLOWING, EMPTY, LENGTH, DUPLICATE_AXIS, UNKNOWN_AXIS,
+    NOT_FINITE, DUPLICATE, TIME_BACKWARDS, STALE, OUT_OF_RANGE,
 )  # fmt: skip
 # Causes for measured displacements.
 MEASURED_CAUSES = (NOT_FINITE, OUT_OF_RANGE)
@@ -102,8 +104,8 @@ class Stamps:
     def __init__(self, jump_ns: int = SECOND_NS) -> None:
         self.jump_ns = jump_ns
         self._last_ns: int | None = None
-        # Elapsed time (s) set by `restart` for the next stamp; None if the last output had a stamp.
-        self._restarted: float | None = None
+        # Whether the axis has moved without stamps since the last one.
+        self._restarted = False
 
     def check(self, stamp_ns: int) -> None:
         """Reject a stamp (ns) that is not newer than the last one, unless the clock was set back.
@@ -121,26 +123,24 @@ class Stamps:
         back = f"{(last - stamp_ns) * 1e-9:.9g} s"
         raise RejectedError(TIME_BACKWARDS, f"time runs {back} backwards; send samples in order")
 
-    def accept(self, stamp_ns: int) -> float:
+    def accept(self, stamp_ns: int) -> float | None:
         """Store a stamp (ns) accepted by `check`; return the time (s) since the last stamp.
 
-        It is 0 for the first stamp, `elapsed` for the first one after `restart`, negative if the clock was set back.
+        It is 0 for the first stamp, negative if the clock was set back, None for the first one after `restart`.
         """
         last, self._last_ns = self._last_ns, stamp_ns
-        elapsed = self._restarted
-        if elapsed is None and last is not None:
-            return (stamp_ns - last) * 1e-9
-        self._restarted = None
-        ahead = (stamp_ns - last) * 1e-9 if last is not None else 0.0
-        return min(ahead, 0.0) or elapsed or 0.0
+        if self._restarted:
+            self._restarted = False
+            return None
+        return (stamp_ns - last) * 1e-9 if last is not None else 0.0
 
-    def arrive(self, now_ns: int) -> float:
+    def arrive(self, now_ns: int) -> float | None:
         """Accept a sample without stamp that arrived at `now_ns` (ns); return the time (s) since the last stamp."""
         last = self._last_ns
         if last is not None and last - self.jump_ns <= now_ns < last:
             now_ns = last
         return self.accept(now_ns)
 
-    def restart(self, elapsed: float = 0.0) -> None:
-        """Make `accept` return `elapsed` (s) for the next stamp; stamps older than the last one are still late."""
-        self._restarted = elapsed
+    def restart(self) -> None:
+        """Count no time by stamps up to the next one: the axis moved meanwhile; older stamps are still late."""
+        self._restarted = self._last_ns is not None

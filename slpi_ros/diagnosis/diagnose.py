@@ -12,7 +12,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, Selection, counts, in_phase, select
+from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, Selection, counts, in_phase, is_own, select
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.gain_drift import GainDrift
@@ -25,6 +25,7 @@ from slpi_ros.identification.repeatability_floor import Floor, floor_of
 from slpi_ros.identification.samples import Samples
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.sensor import IDEAL, corrected
 from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
@@ -57,7 +58,7 @@ def diagnose(
         Records of one stage. Hysteresis and effects are common to all records; initial history, offset, drift and hum
         are fitted to each record. Each of several records is held out once.
     model : StageModel
-        Model of the same stage.
+        Model of the same stage. The known delay and lag of its sensor are taken out of the readings first.
     axes : sequence of str, optional
         Axes to be diagnosed; by default all that the model and every record contain.
     start, stop : float, seconds, optional
@@ -78,6 +79,8 @@ def diagnose(
     records = [record] if isinstance(record, Record) else list(record)
     common_stage(records, model.hardware_id)
     _require_different(records)
+    undone = {name: axis.sensor.undo for name, axis in model.axes.items() if axis.sensor}
+    records = [corrected(each, undone) for each in records]
     source = ", ".join(each.source for each in records)
     common = [axis for axis in records[0].axes if all(axis in each.axes for each in records)]
     chosen = list(axes) if axes else [axis for axis in model.axes if axis in common]
@@ -89,7 +92,9 @@ def diagnose(
     for axis in chosen:
         try:
             with threadpool_limits(1):
-                found[axis], extended[axis] = _diagnose_axis(records, axis, model.axis(axis), start, stop)
+                known = model.axis(axis)
+                found[axis], new = _diagnose_axis(records, axis, replace(known, sensor=IDEAL), start, stop)
+                extended[axis] = replace(new, sensor=known.sensor)
         except SlpiError as error:
             where = f"{source}: axis '{axis}': "
             raise type(error)(where + str(error).removeprefix(where)) from None
@@ -114,8 +119,8 @@ def _diagnose_axis(
     report_progress(f"axis {axis}: fitting the hysteresis")
     evidence = evidence_of(records, axis, model, start, stop)
     same = len(records) == 1 and model.quality.source == records[0].source
-    # Effects that belong to one record (drift, hum) do not apply to another.
-    shared = [effect for effect in model.effects if same or effect.removable != "record"]
+    # Effects that belong to one record (drift, hum, the knots of a gain drift) do not apply to another.
+    shared = [effect for effect in model.effects if same or not is_own(effect)]
     base = Explanation(evidence, shared)
     known = [effect for effect in shared if in_phase(effect, base)]
     if len(known) < len(shared):
@@ -124,7 +129,7 @@ def _diagnose_axis(
     fitted = model.kind in REFITTED
     family = evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None
     selection = _selected(base, family) if fitted else select(base, None)
-    runs = [_free_run(model, part) for part in selection.now.evidence.parts]
+    runs = [_free_run(model, part, of_record=same) for part in selection.now.evidence.parts]
     before = base.held_out.rms_of_records if fitted else _rms(runs)
     if not fitted and before > WRONG_KIND * base.held_out.rms:
         selection = replace(selection, structures=(BIAS, *selection.structures))
@@ -210,10 +215,11 @@ class _FreeRun:
         return 0.0 if self.offsets[0] <= 0.0 <= self.offsets[1] else self.offset
 
 
-def _free_run(model: AxisModel, part: Part) -> _FreeRun:
+def _free_run(model: AxisModel, part: Part, *, of_record: bool) -> _FreeRun:
     """Simulate a model on a record from all candidate initial histories and return the best free run."""
     errors = [
-        part.y - replace(model, start=start).simulate(part.t, part.v, part.others) for start in _starts(model, part)
+        part.y - replace(model, start=start).simulate(part.t, part.v, part.others, of_record=of_record)
+        for start in _starts(model, part)
     ]
     chosen = _known(part)
     rms = np.array([np.std(each[part.used]) for each in errors])
@@ -262,7 +268,7 @@ def _given(model: AxisModel, runs: Sequence[_FreeRun], selection: Selection) -> 
         steady = selection.now.without(GainDrift.name)
         compared = [_since(own, one) for one in (selection.base, steady)]
     else:
-        compared = [_compared(replace(model, effects=()), one) for one in (selection.base, selection.now)]
+        compared = [_compared(model.hysteresis_only, one) for one in (selection.base, selection.now)]
     # Records of the same name may be different ones; then the error differs from the stored one.
     own_rms = model.quality.rms if own.all() and len(sources) == own.size else 0.0
     compared = [replace(one, rms=rms, motion=motion, own_rms=own_rms) for one in compared]

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import Candidate, Effect, EffectContext, Removable, ResidualView, Side, usual_step
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, ResidualView, Side, Signal, usual_step
 from slpi_ros.effects.creep import FASTEST, LAW_FEWEST, Creep, plausible
 from slpi_ros.effects.rate_dependence import RateDependence
 
@@ -65,7 +65,7 @@ LARGEST_STEP = 0.7
 
 def _free_fields(effect: Effect) -> tuple[str, ...]:
     if isinstance(effect, RateDependence):
-        if effect.side == "voltage":
+        if effect.acts_on == "voltage":
             return COERCIVE
         if not effect.backlash:
             return WIDENING
@@ -83,8 +83,8 @@ class EachRecord:
     """
 
     parts: tuple[Effect, ...]
-    removable: ClassVar[Removable] = "record"
-    side: ClassVar[Side] = "displacement"
+    side: ClassVar[Side] = "record"
+    acts_on: ClassVar[Signal] = "displacement"
 
     @property
     def name(self) -> str:
@@ -168,7 +168,7 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
     for name in _free_fields(effect):
         value = getattr(effect, name)
         least = LEAST.get(name, 0.0 if effect.name in NOT_NEGATIVE else -np.inf)
-        keys = (name, f"{effect.name}.{name}", f"{effect.side}.{name}")
+        keys = (name, f"{effect.name}.{name}", f"{effect.acts_on}.{name}")
         most = longest if name == "time_constants" else min(MOST.get(key, np.inf) for key in keys)
         if isinstance(value, Mapping):
             changed[name] = {key: min(max(left.pop(0), least), most) for key in value}

@@ -484,7 +484,7 @@ class Explanation:
         self._before = np.column_stack([starting, evidence.beside])
         self._starting = range(starting.shape[1])
         beside = self.joint.columns(self._before)
-        behind = any(effect.side == "displacement" for effect in self.effects)
+        behind = any(effect.acts_on == "displacement" for effect in self.effects)
         self.added = self._aside
         if not behind or not like:
             self._fit(beside)
@@ -567,7 +567,7 @@ class Explanation:
         """Return the displacement, shape (N,), metres, after effects have been applied to the hysteresis output `h`."""
         around = self._around(u)
         for effect in effects:
-            if effect.side == "displacement":
+            if effect.acts_on == "displacement":
                 h = effect.apply(h, around)
         return h
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,9 +130,10 @@ class Contender:
         return counts(now.held_out, self.score, own=is_own(self.effect))
 
 
-def is_own(effect: Effect) -> bool:
-    """Return whether an effect has separate parameters in each record, such as drift or hum."""
-    return effect.removable == "record"
+def is_own(effect: Effect | type[Any]) -> bool:
+    """Return whether an effect, or each of its kind, has separate parameters in each record, such as drift or hum."""
+    # The knots of a gain drift belong to their record.
+    return effect.side == "record" or effect.name == GainDrift.name
 
 
 def held_out_error(score: Score, *, own: bool) -> float:
@@ -269,7 +271,7 @@ def in_phase(effect: Effect, now: Explanation) -> bool:
 
 def _forms(name: str, now: Explanation) -> Iterator[Candidate | Effect]:
     """Yield the forms of an effect: with common parameters, with separate ones in each record, or both."""
-    records, own = len(now.evidence.parts), EFFECTS[name].removable == "record"
+    records, own = len(now.evidence.parts), is_own(EFFECTS[name])
     if not own or records == 1:
         yield from EFFECTS[name].fit(now)
     if records == 1 or not (own or name in MAY_BE_OWN):

@@ -161,6 +161,8 @@ class RecordVerification:
         Mask of the evaluated samples.
     tracking : Tracking or None
         Tracking error; None if the desired displacement is not known.
+    corrected : str
+        What was taken out of the readings, as known of the sensor; "" if nothing.
     """
 
     error: ErrorPart
@@ -182,6 +184,7 @@ class RecordVerification:
     model: FloatArray
     judged: Mask
     tracking: Tracking | None = None
+    corrected: str = ""
 
     @property
     def passed(self) -> bool:
@@ -310,7 +313,8 @@ def verify(
     ----------
     records : Record or sequence of Record
     model : StageModel
-        Model of the same stage.
+        Model of the same stage. What it knows of the sensor is taken out of the readings first: all errors are those of
+        the stage.
     tolerance : float, metres, optional
         Largest rms error that passes; by default three times the record's repeatability floor, but at least the
         fraction `RESOLUTION` of the stroke, the best accuracy that a hysteresis model attains.
@@ -343,7 +347,8 @@ def verify(
     paths = desired or [None] * len(records)
     found: dict[str, list[RecordVerification]] = {name: [] for name in names}
     for record, path in zip(records, paths, strict=True):
-        runs = _free_run(record, model, names)
+        # Errors are those of the stage, not those of its sensor.
+        runs = _free_run(model.correct(record), model.stage_only, names)
         for name in names:
             axis, run = model.axis(name), runs[name]
             one = _judge(run, axis, record.source, tolerance)
@@ -413,8 +418,6 @@ def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[s
 
 def _run(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
     """Simulate an axis on a record from the initial history that best explains it."""
-    # Effects that belong to one record (drift, hum) do not apply to another.
-    axis = replace(axis, effects=tuple(effect for effect in axis.effects if effect.removable != "record"))
     found = match(axis, samples, t)
     simulated = replace(axis, start=found.start).simulate(t, samples.v)
     # The outliers that `identify` leaves out are no error of the model.
@@ -472,6 +475,7 @@ def _judge(run: _Run, axis: AxisModel, source: str, tolerance: float | None) -> 
         measured=np.where(samples.fitted, samples.y, np.nan),
         model=run.simulated,
         judged=judged,
+        corrected=axis.describe_correction(),
     )
 
 

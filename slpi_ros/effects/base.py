@@ -14,9 +14,10 @@ from slpi_ros.errors import ModelError
 
 FloatArray = NDArray[np.float64]
 
-Side = Literal["voltage", "displacement"]
-# When an effect can be inverted: sample by sample; with the whole path known; on the record's clock only; never.
-Removable = Literal["always", "path", "record", "never"]
+Signal = Literal["voltage", "displacement"]
+# What an effect belongs to. Stage: the compensator inverts it. Sensor: it is taken out of measurements and never
+# inverted into the stage, which would follow the error of its sensor. Record: it is taken out of the fit of its record.
+Side = Literal["stage", "sensor", "record"]
 # Number of spectral bins on either side of a peak that are attributed to the peak.
 LINE_WIDTH = 12
 
@@ -111,10 +112,10 @@ class Effect(Protocol):
     """One effect: a frozen dataclass whose fields are its parameters in SI units and their `uncertainty`."""
 
     name: ClassVar[str]
-    removable: ClassVar[Removable]
+    side: ClassVar[Side]
 
     @property
-    def side(self) -> Side:
+    def acts_on(self) -> Signal:
         """Signal on which the effect acts: voltage or displacement."""
 
     @property

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.effects.saturation import Saturation
@@ -33,22 +34,28 @@ class Chain:
     own : tuple of Effect
         Effects on the displacement before the contributions of other axes.
     shared : tuple of Effect
-        Coupling to other axes, and the effects that act after it.
+        Coupling to other axes, and the effects of the stage that act after it.
+    measured : tuple of Effect
+        Effects of the sensor and of the record, between the displacement of the stage and the reading. No inverse for
+        the stage contains them.
     """
 
     before: tuple[Effect, ...]
     own: tuple[Effect, ...]
     shared: tuple[Effect, ...]
+    measured: tuple[Effect, ...] = ()
 
     @classmethod
     def of(cls, effects: tuple[Effect, ...]) -> "Chain":
         """Return the chain of the effects of an axis, given in any order."""
         ordered = in_order(effects)
-        behind = [effect for effect in ordered if effect.side == "displacement"]
+        inside = [effect for effect in ordered if effect.side == "stage"]
+        behind = [effect for effect in inside if effect.acts_on == "displacement"]
         return cls(
-            tuple(effect for effect in ordered if effect.side == "voltage"),
+            tuple(effect for effect in inside if effect.acts_on == "voltage"),
             tuple(effect for effect in behind if _PLACES.index(effect.name) < _COUPLING),
             tuple(effect for effect in behind if _PLACES.index(effect.name) >= _COUPLING),
+            tuple(effect for effect in ordered if effect.side != "stage"),
         )
 
     @property
@@ -112,11 +119,17 @@ class Chain:
         return h, u
 
 
+def lasting(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Return the effects that outlast their record: no drift and no hum; a gain drift keeps its last value."""
+    kept = (effect for effect in effects if effect.side != "record")
+    return tuple(effect.last if isinstance(effect, GainDrift) else effect for effect in kept)
+
+
 def reaching(effects: Sequence[Effect], v: FloatArray, around: EffectContext) -> tuple[FloatArray, FloatArray]:
     """Return the voltage (V) of the hysteresis and the reversible displacement (m) parallel to it, shape (N,) each."""
     u, reversible_bypass = v, np.zeros_like(v)
     for effect in effects:
-        if effect.side == "voltage":
+        if effect.acts_on == "voltage":
             before, u = u, effect.apply(u, around)
             if isinstance(effect, RateDependence):
                 reversible_bypass = effect.reversible_bypass(before, u)

@@ -12,9 +12,9 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectContext,
     FloatArray,
-    Removable,
     ResidualView,
     Side,
+    Signal,
     by_record,
     longest,
     require,
@@ -55,8 +55,8 @@ class Creep:
     """
 
     name: ClassVar[str] = "creep"
-    side: ClassVar[Side] = "displacement"
-    removable: ClassVar[Removable] = "always"
+    acts_on: ClassVar[Signal] = "displacement"
+    side: ClassVar[Side] = "stage"
 
     time_constants: tuple[float, ...]
     gains: tuple[float, ...]

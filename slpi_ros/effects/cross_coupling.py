@@ -7,7 +7,7 @@ from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
+from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, ResidualView, Side, Signal, require
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class CrossCoupling:
     """
 
     name: ClassVar[str] = "cross_coupling"
-    side: ClassVar[Side] = "displacement"
-    removable: ClassVar[Removable] = "always"
+    acts_on: ClassVar[Signal] = "displacement"
+    side: ClassVar[Side] = "stage"
 
     gains: Mapping[str, float]
     uncertainty: Mapping[str, float] = field(default_factory=dict)

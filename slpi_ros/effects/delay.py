@@ -11,9 +11,9 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectContext,
     FloatArray,
-    Removable,
     ResidualView,
     Side,
+    Signal,
     by_record,
     require,
     usual_step,
@@ -32,8 +32,8 @@ class Delay:
     """
 
     name: ClassVar[str] = "delay"
-    side: ClassVar[Side] = "voltage"
-    removable: ClassVar[Removable] = "path"
+    acts_on: ClassVar[Signal] = "voltage"
+    side: ClassVar[Side] = "stage"
 
     seconds: float
     uncertainty: Mapping[str, float] = field(default_factory=dict)

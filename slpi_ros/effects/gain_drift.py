@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
+from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, ResidualView, Side, Signal, require
 
 # Numbers of uniform knots of the candidates. The first interval has more knots, spaced logarithmically (number per
 # decade), as piezo ageing is logarithmic in time; the first lies after one loop and at least this many readings.
@@ -18,8 +18,8 @@ UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
 class GainDrift:
     """A time-dependent factor on the displacement, ``y = origin + (1 + g(t)) (x - origin)``.
 
-    ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. `apply` and `invert` use
-    the record's clock; `streaming` uses the value at the end of the record.
+    ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
+    record; after it the sensitivity stays at its last value, see `last`.
 
     The factor acts after hysteresis, creep and resonance, and scales all three. It acts before the cross coupling, so
     that other axes receive the scaled motion.
@@ -27,7 +27,7 @@ class GainDrift:
     Parameters
     ----------
     times : tuple of float, length K >= 1, seconds
-        Knots from the record's start, more than 0, strictly increasing.
+        Knots from the record's start, more than 0, strictly increasing; 0 alone: a constant sensitivity.
     gains : tuple of float, length K
         Relative change of sensitivity ``g`` at the knots.
     origin : float, metres
@@ -37,8 +37,8 @@ class GainDrift:
     """
 
     name: ClassVar[str] = "gain_drift"
-    side: ClassVar[Side] = "displacement"
-    removable: ClassVar[Removable] = "record"
+    acts_on: ClassVar[Signal] = "displacement"
+    side: ClassVar[Side] = "stage"
 
     times: tuple[float, ...]
     gains: tuple[float, ...]
@@ -47,7 +47,7 @@ class GainDrift:
 
     def __post_init__(self) -> None:
         """Validate the parameters."""
-        rising = all(a < b for a, b in zip((0.0, *self.times), self.times, strict=False))
+        rising = self.times == (0.0,) or all(a < b for a, b in zip((0.0, *self.times), self.times, strict=False))
         require(
             self,
             ("times", 1 <= len(self.times) <= 10000 and rising, "1 to 10000 numbers, more than 0, strictly increasing"),
@@ -59,7 +59,14 @@ class GainDrift:
 
     def factor(self, t: FloatArray) -> FloatArray:
         """Return ``1 + g``, shape (N,), at times `t`, shape (N,), seconds from the record's start."""
+        if self.times[0] == 0.0:
+            return np.full(t.shape, 1.0 + self.gains[-1])
         return 1.0 + np.interp(t, (0.0, *self.times), (0.0, *self.gains))
+
+    @property
+    def last(self) -> "GainDrift":
+        """The sensitivity at the end of the record, constant."""
+        return GainDrift((0.0,), self.gains[-1:], self.origin)
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with the changed sensitivity, shape (N,), metres."""
@@ -101,6 +108,9 @@ class GainDrift:
 
     def describe(self) -> str:
         """Describe the magnitude, the duration and the half time."""
+        if self.times[0] == 0.0:
+            way = "lower" if self.gains[-1] < 0 else "higher"
+            return f"the sensitivity is {abs(self.gains[-1]) * 100:.2g} % {way} than that of the hysteresis"
         t = np.linspace(0.0, self.times[-1], 1001)
         change = self.factor(t) - 1.0
         largest = change[int(np.argmax(np.abs(change)))]

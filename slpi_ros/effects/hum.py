@@ -12,9 +12,9 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectContext,
     FloatArray,
-    Removable,
     ResidualView,
     Side,
+    Signal,
     amplitude_and_phase,
     require,
     rhythms,
@@ -39,8 +39,8 @@ class Hum:
     """
 
     name: ClassVar[str] = "hum"
-    side: ClassVar[Side] = "displacement"
-    removable: ClassVar[Removable] = "record"
+    acts_on: ClassVar[Signal] = "displacement"
+    side: ClassVar[Side] = "record"
 
     frequency: float
     amplitude: float

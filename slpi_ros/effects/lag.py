@@ -11,9 +11,9 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectContext,
     FloatArray,
-    Removable,
     ResidualView,
     Side,
+    Signal,
     by_record,
     require,
     usual_step,
@@ -36,8 +36,8 @@ class Lag:
     """
 
     name: ClassVar[str] = "lag"
-    side: ClassVar[Side] = "voltage"
-    removable: ClassVar[Removable] = "always"
+    acts_on: ClassVar[Signal] = "voltage"
+    side: ClassVar[Side] = "stage"
 
     time_constant: float
     uncertainty: Mapping[str, float] = field(default_factory=dict)

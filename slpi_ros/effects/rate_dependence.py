@@ -16,9 +16,9 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectContext,
     FloatArray,
-    Removable,
     ResidualView,
     Side,
+    Signal,
     by_record,
     require,
 )
@@ -298,7 +298,7 @@ class RateDependence:
     """
 
     name: ClassVar[str] = "rate_dependence"
-    removable: ClassVar[Removable] = "always"
+    side: ClassVar[Side] = "stage"
 
     widening: float
     backlash: float
@@ -328,7 +328,7 @@ class RateDependence:
         )
 
     @property
-    def side(self) -> Side:
+    def acts_on(self) -> Signal:
         """Signal on which the effect acts: the voltage in the coercivity form, else the displacement."""
         return "voltage" if self.coercivity else "displacement"
 

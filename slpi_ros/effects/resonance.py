@@ -13,9 +13,9 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectContext,
     FloatArray,
-    Removable,
     ResidualView,
     Side,
+    Signal,
     by_record,
     require,
     rhythms,
@@ -163,8 +163,8 @@ class Resonance:
     """
 
     name: ClassVar[str] = "resonance"
-    side: ClassVar[Side] = "displacement"
-    removable: ClassVar[Removable] = "always"
+    acts_on: ClassVar[Signal] = "displacement"
+    side: ClassVar[Side] = "stage"
 
     frequency: float
     damping: float

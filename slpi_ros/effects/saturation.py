@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import EffectContext, FloatArray, Removable, ResidualView, Side, require_rules
+from slpi_ros.effects.base import EffectContext, FloatArray, ResidualView, Side, Signal, require_rules
 
 # Number of voltage bins; a bin is clipped if its gain is below this share of the median gain.
 BINS, STILL = 200, 0.35
@@ -26,8 +26,8 @@ class Saturation:
     """
 
     name: ClassVar[str] = "saturation"
-    side: ClassVar[Side] = "voltage"
-    removable: ClassVar[Removable] = "never"
+    acts_on: ClassVar[Signal] = "voltage"
+    side: ClassVar[Side] = "stage"
 
     lower: float = -inf
     upper: float = inf

@@ -12,9 +12,9 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectContext,
     FloatArray,
-    Removable,
     ResidualView,
     Side,
+    Signal,
     amplitude_and_phase,
     require,
     strongest_lines,
@@ -44,8 +44,8 @@ class SensorPeriodic:
     """
 
     name: ClassVar[str] = "sensor_periodic"
-    side: ClassVar[Side] = "displacement"
-    removable: ClassVar[Removable] = "always"
+    acts_on: ClassVar[Signal] = "displacement"
+    side: ClassVar[Side] = "sensor"
 
     period: float
     amplitude: float

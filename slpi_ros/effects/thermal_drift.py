@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, Removable, ResidualView, Side, require
+from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, ResidualView, Side, Signal, require
 
 # Numbers of knots of the candidates.
 KNOTS = (2, 3, 5, 8, 13)
@@ -26,8 +26,8 @@ class ThermalDrift:
     """
 
     name: ClassVar[str] = "thermal_drift"
-    side: ClassVar[Side] = "displacement"
-    removable: ClassVar[Removable] = "record"
+    acts_on: ClassVar[Signal] = "displacement"
+    side: ClassVar[Side] = "record"
 
     times: tuple[float, ...]
     values: tuple[float, ...]

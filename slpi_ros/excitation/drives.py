@@ -11,6 +11,9 @@ from slpi_ros.excitation.effects import EFFECTS, for_effect
 from slpi_ros.excitation.legs import FEWEST_STEPS, DriveSpec, FloatArray, Path
 
 CALIBRATION, SWEEP = "calibration", "sweep"
+# Default slew limit: the voltage range in this time, seconds. Share of a slew limit that drives use: a late sample is
+# followed by an early one.
+CROSSING, SLEW_USED = 0.1, 0.8
 DRIVES = (CALIBRATION, SWEEP, *EFFECTS)
 # Purpose of the drives that are not specific to an effect.
 _WHY = {
@@ -117,6 +120,17 @@ def excite(
         voltage[axis] = np.full(steps + 1, rest)
         voltage[axis][begin : end + 1] = _turn(turn, rest, drive, _generator(seed, number))
     return Drive(np.arange(steps + 1) / rate, voltage, specs, _why(drive))
+
+
+def slew_limits(
+    given: Sequence[float] | None, voltage_min: Sequence[float], voltage_max: Sequence[float]
+) -> tuple[float, ...]:
+    """Return the slew limit (V/s) of each axis, 0 for none: as given, or by default the voltage range in 0.1 s."""
+    if given is not None:
+        return tuple(given)
+    return tuple(
+        (high - low) / CROSSING if high > low else 0.0 for low, high in zip(voltage_min, voltage_max, strict=True)
+    )
 
 
 def calibration_drive(

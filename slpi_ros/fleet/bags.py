@@ -47,6 +47,8 @@ REFUSED, IDENTIFIED, PASSED, CHANGED, FOREIGN, FAILED = (
 MUCH_BETTER = 0.5
 # Number of models of other stages, those with the most similar loops, that are compared with a record.
 CANDIDATES = 5
+# Longest name of a stage as a file name, characters; file systems take 255 with the suffix.
+_LONGEST_PLAIN = 200
 
 
 @dataclass(frozen=True)
@@ -331,8 +333,12 @@ def model_name(one: Examined) -> str:
 
 
 def plain_name(stage: str) -> str:
-    """Return the name of a stage as a file name; different names differ."""
-    return quote(stage, safe=" ").replace(".", "%2E")[:200] or "unnamed"
+    """Return the name of a stage as a file name; different names differ, also where they are too long for a file."""
+    name = quote(stage, safe=" ").replace(".", "%2E")
+    if len(name) > _LONGEST_PLAIN:
+        digest = hashlib.sha256(name.encode()).hexdigest()[:16]
+        name = f"{name[: _LONGEST_PLAIN - len(digest) - 1]}-{digest}"
+    return name or "unnamed"
 
 
 def _of_stage(record: Record, stage: str) -> Record:
@@ -393,7 +399,7 @@ def _outermost_loop(model: AxisModel) -> tuple[float, float]:
     low, high = model.voltage_range
     ramp = np.linspace(low, high, 101)
     path = np.concatenate([[high], ramp, ramp[::-1]])
-    y = replace(model, effects=()).simulate(np.zeros(path.size), path)[1:]
+    y = model.hysteresis_only.simulate(np.zeros(path.size), path)[1:]
     rise, fall = y[: ramp.size], y[ramp.size :][::-1]
     return float(rise[-1] - rise[0]), float((fall - rise)[ramp.size // 2])
 

@@ -1,17 +1,21 @@
 """Processing of the bags of a fleet as tasks of a Dask cluster."""
 
 import os
+import socket
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from slpi_ros.dependencies import dependencies_needed
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.fleet import bags
 from slpi_ros.fleet.bags import Examined, Judged
@@ -107,15 +111,19 @@ def run(
     Raises
     ------
     UsageError
-        If the options contradict each other.
+        If the options contradict each other, or `scheduler` is no address.
     SlpiError
         If the sources, the folder or the cluster cannot be used.
     """
-    _require_extra()
+    with dependencies_needed():
+        for name in ("distributed", "pyarrow", "pandas"):
+            import_module(name)
     if sum(given is not None for given in (client, scheduler, workers)) > 1:
         raise UsageError("client, scheduler and workers exclude each other; give at most one")
     if workers is not None and workers < 1:
         raise UsageError(f"workers is {workers}; give at least 1")
+    if scheduler is not None:
+        _require_address(scheduler)
     options = {"topic": topic, "diagnose": diagnose}
     earliest = _nanoseconds(since)
     given = load_models(models)
@@ -395,8 +403,8 @@ def _connected(
             while True:
                 try:
                     return Client(scheduler, timeout=5, set_as_default=False)
-                except (OSError, ValueError) as error:
-                    if time.monotonic() > end or isinstance(error, ValueError):
+                except OSError as error:
+                    if time.monotonic() > end:
                         raise SlpiError(
                             f"no scheduler at {scheduler}: {error}; start one with `dask scheduler`; finished rows "
                             "are kept"
@@ -424,6 +432,22 @@ def _connected(
         yield _Cluster(own, None)
 
 
+def _require_address(scheduler: str) -> None:
+    """Raise an error unless this is an address whose host is known: a client would try it for a minute."""
+    from distributed.comm import resolve_address
+
+    example = "give one such as tcp://host:8786"
+    try:
+        with warnings.catch_warnings(action="error"):
+            resolve_address(scheduler)
+    except socket.gaierror as error:
+        # A server of names that does not answer now may do so in a moment.
+        if error.errno != socket.EAI_AGAIN:
+            raise SlpiError(f"no scheduler at {scheduler}: {error.strerror}; {example}") from None
+    except (ValueError, ImportError, Warning) as error:
+        raise UsageError(f"{scheduler} is no address of a scheduler: {error}; {example}") from None
+
+
 def _keep_given(results: Results, stage: str, model: StageModel) -> None:
     """Make a given model the reference of a stage; UsageError if the stage has another one."""
     name = f"models/{bags.plain_name(stage)}/given.json"
@@ -449,14 +473,6 @@ def _nanoseconds(since: str | None) -> int | None:
         return int(np.datetime64(since, "ns").astype(np.int64))
     except ValueError:
         raise UsageError(f"'{since}' is no date; give one such as 2026-01-31 or 2026-01-31T12:00") from None
-
-
-def _require_extra() -> None:
-    from importlib.util import find_spec
-
-    missing = [name for name in ("distributed", "pyarrow", "pandas") if find_spec(name) is None]
-    if missing:
-        raise UsageError(f"{', '.join(missing)} is not installed; run: pip install 'slpi_ros[fleet]'")
 
 
 def _silent(_: str) -> None:

@@ -68,7 +68,7 @@ class Results:
     """
 
     def __init__(self, folder: str | os.PathLike[str], options: Mapping[str, Any]) -> None:
-        self.folder, self.state = Path(folder).resolve(), State()
+        self.folder, self.state = Path(os.path.realpath(folder)), State()
         make_folder(self.folder, TABLE, JOURNAL, LOCK)
         self._lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         self._file, self._synced = -1, 0.0

@@ -8,8 +8,6 @@ from math import exp, inf, isnan, nan
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
-from numba import njit
-from numba.core import event
 from numpy.typing import NDArray
 
 from slpi_ros.hysteresis import compilation
@@ -20,32 +18,21 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """Return a function that is compiled by Numba at its first call.
+    """Return a function that is compiled by Numba at its first call, or the function itself where Numba is missing.
 
     The machine code is cached beside the source, or in ``NUMBA_CACHE_DIR`` or the user's cache folder; if none of these
     is writable, every process compiles the function. Only changes of the function's own file invalidate the cache:
     compiled functions that call each other must be in one file.
     """
+    njit = compilation.compiler()
+    if njit is None:
+        return function
     for kept in (True, False):
         try:
             return cast(Function, njit(cache=kept, nogil=True)(function))
         except RuntimeError:
             continue
     return function
-
-
-class _Announcer(event.Listener):
-    """Listener of Numba's compilations; functions loaded from the cache are none."""
-
-    def on_start(self, event: event.Event) -> None:
-        """Announce a compilation."""
-        compilation.announce()
-
-    def on_end(self, event: event.Event) -> None:
-        """Do nothing."""
-
-
-event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
 
 
 @compiled

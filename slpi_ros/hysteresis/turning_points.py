@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import UsageError
+from slpi_ros.hysteresis.compilation import compiler
 from slpi_ros.hysteresis.reversals import require_finite
 
 if TYPE_CHECKING:
@@ -420,4 +421,4 @@ class Memory:
 def worth_compiling(samples: int) -> bool:
     """Return whether the compiled engine is faster than the Python loop for this number of samples."""
     loaded = "slpi_ros.hysteresis.compiled" in sys.modules
-    return samples >= (COMPILED_FROM if loaded else LOADED_FROM)
+    return samples >= (COMPILED_FROM if loaded else LOADED_FROM) and compiler() is not None

@@ -1,5 +1,6 @@
 """Bases of the models that are linear in their parameters: branch increments, roughness, monotonicity constraints."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -23,6 +24,12 @@ RISE_TIE = 0.1
 END_SHARE = 0.1
 # Number of vertices for which roughness is scaled, so that a weight has the same effect on every grid.
 REFERENCE_VERTICES = 41
+
+
+def banded(band: Sequence[float], rows: int, columns: int) -> sp.csr_array:
+    """Return the matrix, shape (rows, columns), each row of which holds `band` from the diagonal on."""
+    diagonals = np.repeat(np.array(band)[:, None], columns, axis=1)
+    return sp.csr_array(sp.dia_array((diagonals, np.arange(len(band))), shape=(rows, columns)))
 
 
 class Basis(Protocol):
@@ -139,8 +146,8 @@ class SurfaceBasis:
             self._differences([(i, j - k, w) for k, w in enumerate((-1.0, 3.0, -3.0, 1.0))]),
         ]
         across = self._differences([(i + k, j + k, w) for k, w in enumerate((1.0, -2.0, 1.0))])
-        bend = sp.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(n - 2, n))
-        step = sp.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(n - 1, n))
+        bend = banded((1.0, -2.0, 1.0), n - 2, n)
+        step = banded((-1.0, 1.0), n - 1, n)
         low_end = sp.csr_array((np.ones(n - 1), (np.arange(1, n), column[1:, 0])), shape=(n, self.size))
         as_rise = sp.csr_array((np.ones(n), (np.arange(n), rise)), shape=(n, self.size))
         first = sp.csr_array(([1.0], ([0], [rise[0]])), shape=(1, self.size))
@@ -214,7 +221,7 @@ class OperatorWeights:
         """Return the constraints of non-negative weights and a positive weight at the lowest threshold."""
         bound = np.zeros(self.size)
         bound[0] = LEAST_GAIN * gain
-        return sp.csr_array(sp.eye_array(self.size, self.size + 1)), bound
+        return banded((1.0,), self.size, self.size + 1), bound
 
     def covered(self, branch_part: sp.csr_array) -> float:
         """Return the share of operators that move within the samples of a `branch_part`, 0..1."""

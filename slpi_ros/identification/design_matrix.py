@@ -201,7 +201,8 @@ class Rows:
         """Return ``A' W A``, shape (p, p), for `weights`, shape (n,); 1 by default."""
         local, pick = self.local.T, self.pick.T
         if weights is not None:
-            local, pick = local @ sp.diags_array(weights), pick @ sp.diags_array(weights)
+            diagonal = sp.dia_array((weights[None], [0]), shape=(weights.size, weights.size))
+            local, pick = local @ diagonal, pick @ diagonal
         mixed = (local @ self.pick) @ self.at_turns
         whole = local @ self.local + mixed + mixed.T + self.at_turns.T @ ((pick @ self.pick) @ self.at_turns)
         result: FloatArray = whole.toarray()

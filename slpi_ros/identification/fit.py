@@ -17,6 +17,7 @@ from slpi_ros.identification.published_kinds import fit_amplitude_scaled, fit_at
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_thinned
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.sensor import Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
@@ -41,6 +42,8 @@ def identify(
     stop: float | None = None,
     axes: Sequence[str] | None = None,
     loops_at_rest: bool = False,
+    sensor_delay: float = 0.0,
+    sensor_lag: float = 0.0,
 ) -> StageModel:
     """Identify the model of a stage from one record, or from several in one fit.
 
@@ -61,6 +64,8 @@ def identify(
         Fit only samples with ``start <= t < stop``, where t counts from the first stamp; by default all samples.
     axes : sequence of str, optional
         Axes to identify; by default all axes of the first record.
+    sensor_delay, sensor_lag : float, seconds
+        Known delay and time constant of the sensors, taken out of the readings; the model keeps them. Default 0.
 
     Returns
     -------
@@ -70,12 +75,14 @@ def identify(
     Raises
     ------
     UsageError
-        If the kind or an axis is unknown.
+        If the kind or an axis is unknown, or the timing of the sensors is not possible.
     RecordError, IdentificationError
         If the record does not allow a fit; the message names the cause.
     """
-    fit = fit_of(kind, loops_at_rest=loops_at_rest)
+    fit, sensor = fit_of(kind, loops_at_rest=loops_at_rest), Sensor(sensor_delay, sensor_lag)
     records = [record] if isinstance(record, Record) else list(record)
+    if sensor:
+        records = [corrected(part, dict.fromkeys(axes or part.axes, sensor.undo)) for part in records]
     hardware_id = common_stage(records)
     source = ", ".join(part.source for part in records)
     last = max(range(len(records)), key=lambda number: int(records[number].time_ns.max(initial=0)))
@@ -104,7 +111,7 @@ def identify(
                     if stop is not None:
                         whole, _ = select_thinned(records[last], axis, None, None, FIT_SAMPLES)
                     model = replace(model, end=replace(model, start=fitted.starts[last]).after(whole.v))
-                models[axis] = model
+                models[axis] = replace(model, sensor=sensor)
         except SlpiError as error:
             raise type(error)(f"{source}: axis '{axis}': {error}") from None
     return StageModel(models, hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))

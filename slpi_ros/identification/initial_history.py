@@ -12,9 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import Effect
 from slpi_ros.effects.chain import loop_middle
-from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.identification.samples import FEWEST, Samples
 from slpi_ros.model.axis_model import AxisModel, Start
 
@@ -225,7 +223,7 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Mat
     Parameters
     ----------
     axis : AxisModel
-        Model of the axis; effects that belong to one record (drift, hum) are ignored.
+        Model of the axis, from voltage to displacement of the stage.
     samples : Samples
         Record without an initial history.
     t : ndarray, shape (N,), seconds, optional
@@ -237,7 +235,6 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Mat
         Offset, changes of gain and width, and their uncertainties.
     """
     time = np.arange(float(samples.v.size)) if t is None else t
-    axis = replace(axis, effects=lasting_effects(axis))
     starts = _possible_starts(axis, float(samples.v[0]))
     predictions = [replace(axis, start=start).simulate(time, samples.v) for start in starts]
     fitted = samples.fitted
@@ -272,18 +269,6 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Mat
         known=known,
         residual=residual + zero,
     )
-
-
-def lasting_effects(axis: AxisModel) -> tuple[Effect, ...]:
-    """Return the effects of an axis that hold for other records: no drift or hum; a gain drift keeps its final gain."""
-    lasting: list[Effect] = []
-    for effect in axis.effects:
-        if isinstance(effect, GainDrift):
-            # Constant at the final gain.
-            lasting.append(replace(effect, times=(1e-9,), gains=effect.gains[-1:], uncertainty={}))
-        elif effect.removable != "record":
-            lasting.append(effect)
-    return tuple(lasting)
 
 
 def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
@@ -351,8 +336,7 @@ def _changes(
     """Return changes of gain and width, their standard deviations, and the rms errors (m) before and after the fit."""
     if np.count_nonzero(known) < FEWEST:
         return np.zeros(2), np.full(2, np.inf), axis.quality.held_out_rms, axis.quality.held_out_rms
-    bare = replace(axis, effects=())
-    voltages, centre = loop_middle(lambda v: bare.simulate(np.zeros(v.size), v), *axis.voltage_range)
+    voltages, centre = loop_middle(lambda v: axis.hysteresis_only.simulate(np.zeros(v.size), v), *axis.voltage_range)
     middle = np.interp(samples.v, voltages, centre)
     # A lag or delay, and a slow drift, change neither gain nor width.
     speed = np.gradient(predicted, np.maximum.accumulate(t + 1e-9 * np.arange(t.size)))

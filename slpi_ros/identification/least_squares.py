@@ -107,7 +107,7 @@ def solve_qp(
     )  # fmt: skip
     solver.warm_start(x=free)
     result = solver.solve(raise_error=False)
-    if result.info.status_val != osqp.SolverStatus.OSQP_SOLVED:
+    if result.info.status != "solved":
         raise IdentificationError(
             f"the quadratic program did not converge (OSQP: {result.info.status}); check the record for gross errors"
         )

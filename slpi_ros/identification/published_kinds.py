@@ -29,7 +29,7 @@ from slpi_ros.hysteresis.slpi_published import (
     at_vertex,
     separate,
 )
-from slpi_ros.identification.bases import LEAST_GAIN, OperatorWeights
+from slpi_ros.identification.bases import LEAST_GAIN, OperatorWeights, banded
 from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, RIDGE, Fitted, Problem, held_out_errors, solve_qp
 from slpi_ros.identification.samples import FEWEST, NEVER_TURNS, Samples, only_one
@@ -234,7 +234,7 @@ def fit_plays(
     matrix[np.diag_indices_from(matrix)] += RIDGE * float(np.trace(matrix))
     bound = np.zeros(thresholds.size)
     bound[0] = LEAST_GAIN / float(np.ptp(drive))
-    not_negative = sp.csr_array(sp.eye_array(bound.size, matrix.shape[0]))
+    not_negative = banded((1.0,), bound.size, matrix.shape[0])
     vector = design.T @ y[used] / scale
     x = scale * solve_qp(matrix, vector, not_negative, bound, least_iterations=iterations)
     weights = np.maximum(x[: bound.size], 0.0)

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.effects.base import EffectContext
-from slpi_ros.effects.chain import forward
+from slpi_ros.effects.chain import forward, lasting
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
-from slpi_ros.identification.initial_history import Match, lasting_effects, match
+from slpi_ros.identification.initial_history import Match, match
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
@@ -90,7 +90,8 @@ def refit(
     Parameters
     ----------
     model : StageModel
-        Model with axes of kind ``slpi`` or ``pi``. Its effects are kept, and subtracted from the record before the fit.
+        Model with axes of kind ``slpi`` or ``pi``. Its effects are kept, and removed from the record before the fit;
+        those that belong to its own record are neither. What it knows of the sensor is taken out of the readings first.
     record : Record
         Record within the voltage range of the model. Axes that are not in the record are kept unchanged.
     axes : sequence of str, optional
@@ -119,35 +120,32 @@ def refit(
     shared = [axis for axis in model.axes if axis in (axes or record.axes)]
     if not shared:
         raise UsageError(f"{record.source} holds none of the model's axes {', '.join(model.axes)}")
-    record = _without_effects(model, record, shared)
+    record = _without_effects(model.stage_only, model.correct(record), shared)
     updated, changes = dict(model.axes), {}
     for name in shared:
         where = f"{record.source}: axis '{name}': "
         try:
             samples = select_samples(record, name, start, stop)
             with threadpool_limits(1):
-                bare = replace(model.axes[name], effects=())
-                new, changes[name] = _refit_axis(bare, samples, record.source)
-            updated[name] = replace(new, effects=model.axes[name].effects)
+                old = model.axes[name]
+                new, changes[name] = _refit_axis(old.hysteresis_only, samples, record.source)
+            updated[name] = replace(new, effects=lasting(old.effects), sensor=old.sensor)
         except SlpiError as error:
             raise type(error)(where + str(error).removeprefix(where)) from None
     return replace(model, axes=updated, created=datetime.now(UTC).isoformat(timespec="seconds")), changes
 
 
 def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -> Record:
-    """Return the record with the contribution of the model's effects removed."""
+    """Return the record with the contribution of the model's effects of the stage removed."""
     if not any(model.axes[axis].effects for axis in shared):
         return record
-    # Drift and hum of the old record do not apply to the new one.
-    axes = {name: replace(axis, effects=lasting_effects(axis)) for name, axis in model.axes.items()}
-    model = replace(model, axes=axes)
     t, voltage, displacement = record.t, dict(record.voltage), dict(record.displacement)
     known = {axis: _held(record.voltage[axis]) for axis in shared}
     simulated = model.simulate(t, known)
     for axis in shared:
         own = model.axes[axis]
         u = forward(own.chain.before, known[axis], EffectContext(t))
-        displacement[axis] = record.displacement[axis] - (simulated[axis] - replace(own, effects=()).simulate(t, u))
+        displacement[axis] = record.displacement[axis] - (simulated[axis] - own.hysteresis_only.simulate(t, u))
         voltage[axis] = np.where(np.isfinite(record.voltage[axis]), u, np.nan)
     return replace(record, voltage=voltage, displacement=displacement)
 

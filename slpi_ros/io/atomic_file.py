@@ -102,6 +102,11 @@ def make_folder(path: str | os.PathLike[str], *names: str) -> None:
         reason = str(error.strerror if isinstance(error, OSError) else error)
     if reason:
         raise SlpiError(f"{path}: no folder to write into: {reason}; choose another place") from None
-    for place in (Path(path) / name for name in names):
+    require_no_folder(*(Path(path) / name for name in names))
+
+
+def require_no_folder(*places: Path) -> None:
+    """Raise SlpiError if one of the files to be written is a folder."""
+    for place in places:
         if place.is_dir():
             raise SlpiError(f"{place}: cannot be written: a folder has that name; choose another place")

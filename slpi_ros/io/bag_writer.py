@@ -42,6 +42,8 @@ class BagWriter:
     topic : str, optional
         Topic of type ``sensor_msgs/JointState`` to which ``write`` writes by default; None if all topics
         are added with ``add_topic``.
+    replace : bool
+        Whether a folder at this path is deleted once the new bag is complete. Default False: an error.
 
     Attributes
     ----------
@@ -66,6 +68,7 @@ class BagWriter:
         *,
         storage: str = "mcap",
         topic: str | None = "/stage_state",
+        replace: bool = False,
     ) -> None:
         if storage not in STORAGES:
             raise UsageError(f"no bag storage '{storage}'; choose {' or '.join(STORAGES)}")
@@ -74,9 +77,9 @@ class BagWriter:
             raise RecordError(f"{path}: no name of a bag; give the name of a new folder")
         self.partial = partial_path(self.path)
         self.message_count = 0
-        self._topic = topic
+        self._topic, self._replace = topic, replace
         self._connections: dict[str, Any] = {}
-        if os.path.lexists(self.path):
+        if os.path.lexists(self.path) and not replace:
             raise RecordError(f"{path}: exists already; choose another name, or remove it first")
         if self.partial.exists():
             raise RecordError(
@@ -148,7 +151,11 @@ class BagWriter:
         """
         try:
             self._writer.close()
+            before = self.partial / f"{self.path.name}.replaced"
+            if self._replace and self.path.exists():
+                self.path.rename(before)
             (self.partial / self.path.name).rename(self.path)
+            shutil.rmtree(before, ignore_errors=True)
             self.partial.rmdir()
         except _WRITE_ERRORS as error:
             raise self._failure(error) from error
@@ -184,7 +191,12 @@ class BagWriter:
 
 
 def write_bag(
-    path: str | os.PathLike[str], record: Record, *, storage: str = "mcap", topic: str = "/stage_state"
+    path: str | os.PathLike[str],
+    record: Record,
+    *,
+    storage: str = "mcap",
+    topic: str = "/stage_state",
+    replace: bool = False,
 ) -> None:
     """Write a record as a new rosbag2 folder that `slpi_ros.read_bag` reads back without loss.
 
@@ -198,6 +210,8 @@ def write_bag(
         File format.
     topic : str
         Name of the topic.
+    replace : bool
+        Whether a folder at this path is replaced. Default False: an error.
 
     Raises
     ------
@@ -209,7 +223,7 @@ def write_bag(
     messages = encode_joint_states(record.time_ns, displacement, voltage, record.axes, record.hardware_id)
     # Readers sort by log time, which must not decrease: so the order of the record is kept where its stamps decrease.
     logged = np.maximum.accumulate(record.time_ns)
-    with BagWriter(path, storage=storage, topic=topic) as bag:
+    with BagWriter(path, storage=storage, topic=topic, replace=replace) as bag:
         for stamp, message in zip(logged.tolist(), messages, strict=True):
             bag.write(stamp, message)
 

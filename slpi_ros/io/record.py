@@ -4,7 +4,7 @@ import mmap
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from weakref import WeakSet
 
@@ -133,6 +133,13 @@ class Record:
     def t(self) -> FloatArray:
         """Time since the first stamp, shape (N,), seconds."""
         return (self.time_ns - self.time_ns[0]) * 1e-9 if self.time_ns.size else np.empty(0)
+
+    def part(self, rows: slice) -> "Record":
+        """Return the record of some samples."""
+        voltage, displacement = (
+            {axis: signal[rows] for axis, signal in signals.items()} for signals in (self.voltage, self.displacement)
+        )
+        return replace(self, time_ns=self.time_ns[rows], voltage=voltage, displacement=displacement)
 
     def __len__(self) -> int:
         """Return the number of samples."""

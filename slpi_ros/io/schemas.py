@@ -8,6 +8,7 @@ from importlib.resources import files
 from itertools import islice
 from typing import Any
 
+from slpi_ros.dependencies import dependencies_needed
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.io.input_limits import LONGEST_NAME, MOST_AXES, MOST_ERRORS
 
@@ -73,7 +74,8 @@ def validate(document: object, name: str, source: str) -> None:
     if _conforms(document, schema, schema):
         return
     # Loading jsonschema takes longer than everything else in `slpi show`.
-    from jsonschema.exceptions import best_match
+    with dependencies_needed():
+        from jsonschema.exceptions import best_match
 
     error = best_match(islice(_validator(name).iter_errors(document), MOST_ERRORS))
     if error is not None:
@@ -101,7 +103,7 @@ _schema = cache(load_schema)
 _TYPES = {"object": (dict,), "array": (list,), "string": (str,), "number": (float, int), "null": (type(None),)}
 _TYPES |= {"integer": (int,), "boolean": (bool,)}
 # Keywords that restrict nothing, or that are evaluated with another one.
-_NEUTRAL = frozenset(("description", "title", "$schema", "$id", "$defs", "then"))
+_NEUTRAL = frozenset(("description", "title", "$schema", "$defs", "then"))
 _SIZES = {"minItems": list, "maxItems": list, "minProperties": dict, "maxProperties": dict, "maxLength": str}
 
 
@@ -169,8 +171,9 @@ def _extremes(values: list[Any]) -> list[Any]:
 
 @cache
 def _validator(name: str) -> Any:
-    from jsonschema import Draft202012Validator
-    from jsonschema.validators import extend
+    with dependencies_needed():
+        from jsonschema import Draft202012Validator
+        from jsonschema.validators import extend
 
     def items(validator: Any, schema: Any, values: Any, parent: Any) -> Iterator[Any]:
         """Check all items of an array of floats only if its minimum or maximum is invalid."""

@@ -3,6 +3,7 @@
 import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -193,8 +194,15 @@ def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[st
     texts: list[Iterable[str]] = [(f"{second:.9f}" for second in np.asarray(t, float).tolist())]
     texts += [map(repr, np.asarray(values, float).tolist()) for values in columns.values()]
     with all_or_nothing(path, RecordError) as file:
-        csv.writer(file, lineterminator="\n").writerow(["time_s", *(f"{axis}{_ending(suffix)}" for axis in columns)])
+        file.write(f"{table_header(columns, suffix)}\n")
         file.writelines(f"{','.join(row)}\n" for row in zip(*texts, strict=True))
+
+
+def table_header(axes: Iterable[str], suffix: str) -> str:
+    """Return the line of column names that `write_table` writes for these axes and this unit."""
+    line = StringIO()
+    csv.writer(line, lineterminator="").writerow(["time_s", *(f"{axis}{_ending(suffix)}" for axis in axes)])
+    return line.getvalue()
 
 
 def _ending(suffix: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.effects.base import Effect, EffectContext
-from slpi_ros.effects.chain import Chain, Middle, backward, forward, loop_middle, reaching
+from slpi_ros.effects.chain import Chain, Middle, backward, forward, lasting, loop_middle, reaching
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import UnreachableError, UsageError
@@ -21,6 +21,7 @@ from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.reversals import require_finite
 from slpi_ros.hysteresis.turning_points import FAR, Memory
 from slpi_ros.model.limits import MAX_DT, Limits, decaying_turns
+from slpi_ros.model.sensor import IDEAL, Sensor, StreamingSensor
 from slpi_ros.model.streaming import ROUNDING, StreamingInverse, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]
@@ -106,10 +107,13 @@ class AxisModel:
         Ranges covered by the record. `compensate` returns only voltages within the voltage range.
     quality : FitQuality
     effects : tuple of Effect
-        Effects besides the hysteresis, in the order in which the effects act; default: none.
+        Effects besides the hysteresis, in the order in which the effects act; default: none. Those of the stage are
+        inverted; those of the sensor are taken out of measurements; those of the record hold for that record only.
     end : Start, optional
         State of the hysteresis at the end of the (last) record. None (default): unknown, as in older documents and for
         kinds that are not causal.
+    sensor : Sensor
+        Known delay and lag of the sensor, taken out of measurements; default: none.
 
     Raises
     ------
@@ -125,6 +129,7 @@ class AxisModel:
     quality: FitQuality
     effects: tuple[Effect, ...] = ()
     end: Start | None = None
+    sensor: Sensor = IDEAL
 
     def __post_init__(self) -> None:
         """Put the effects in order."""
@@ -230,28 +235,35 @@ class AxisModel:
         middle = self._middle if self.chain.rate_dependence else None
         return StreamingInverse(memory, self.displacement_range, allowed, self.effects, middle)
 
-    def simulate(self, t: FloatArray, v: FloatArray, others: Mapping[str, FloatArray] | None = None) -> FloatArray:
-        """Return the displacement, shape (N,), metres, for the voltage `v`, shape (N,), volts, at times `t` (s).
+    def simulate(
+        self, t: FloatArray, v: FloatArray, others: Mapping[str, FloatArray] | None = None, *, of_record: bool = False
+    ) -> FloatArray:
+        """Return what the sensor will say, shape (N,), metres, for a voltage `v`, shape (N,), volts, at times `t` (s).
 
-        Other axes are at rest, but for `others`, as in `seen`. Without effects the time is ignored.
+        Other axes are at rest, but for `others`, as in `seen`. Without effects the time is ignored. With `of_record`
+        also those effects act that belong to the record of the identification, on its clock.
         """
-        return self.seen(t, self.uncoupled_displacement(t, v), others or {})
+        chain = Chain.of(self.effects) if of_record else self.chain
+        return self._seen(chain, t, self._uncoupled_displacement(chain, t, v), others or {})
 
     def uncoupled_displacement(self, t: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the displacement, shape (N,), metres, for `v`, shape (N,), volts, without cross-coupling."""
+        """Return the stage's displacement, shape (N,), metres, for `v`, shape (N,), volts, without cross-coupling."""
+        return self._uncoupled_displacement(self.chain, t, v)
+
+    def _uncoupled_displacement(self, chain: Chain, t: FloatArray, v: FloatArray) -> FloatArray:
         if not self.effects:
             return self._forward_array(v)
         around = EffectContext(t - t[:1])
-        u, reversible_bypass = reaching(self.chain.before, v, around)
-        middle = self._middle if self.chain.rate_dependence else None
+        u, reversible_bypass = reaching(chain.before, v, around)
+        middle = self._middle if chain.rate_dependence else None
         return forward(
-            self.chain.own,
+            chain.own,
             self._forward_array(u) + reversible_bypass,
             replace(around, u=u, middle=middle),
         )
 
     def seen(self, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
-        """Return the displacement as measured by the sensor, shape (N,), metres.
+        """Return what the sensor says, shape (N,), metres.
 
         Parameters
         ----------
@@ -261,15 +273,55 @@ class AxisModel:
         others : mapping of axis name to ndarray, shape (N,), metres
             Motion of each other axis from its start, without cross-coupling.
         """
-        return forward(self.chain.shared, own, EffectContext(t - t[:1], others=others)) if self.effects else own
+        return self._seen(self.chain, t, own, others)
+
+    def _seen(self, chain: Chain, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
+        around = EffectContext(t - t[:1], others=others)
+        return self.sensor.apply(t, forward((*chain.shared, *chain.measured), own, around))
+
+    @property
+    def corrects(self) -> bool:
+        """Whether `correct` changes readings."""
+        return bool(self.sensor or self.chain.measured)
+
+    def describe_correction(self) -> str:
+        """Describe what `correct` takes out of the readings; "" if nothing."""
+        timing = [self.sensor.describe()] if self.sensor else []
+        return "; ".join([*(effect.describe() for effect in self.chain.measured), *timing])
+
+    def measure(self, t: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the readings of the sensor, shape (N,), metres, for the displacement `x` (m) at times `t` (s)."""
+        return self.sensor.apply(t, forward(self.chain.measured, x, EffectContext(t - t[:1])))
+
+    def correct(self, t: FloatArray, y: FloatArray) -> FloatArray:
+        """Return where the stage was, shape (N,), metres, for the readings `y` (m) of its sensor at times `t` (s).
+
+        The inverse of `measure`: delay and lag of the sensor are taken out first, then its periodic error. NaN where
+        there is no reading, or not yet, see `Sensor.undo`.
+        """
+        return backward(self.chain.measured, self.sensor.undo(t, y), EffectContext(t - t[:1]))
+
+    def streaming_sensor(self) -> StreamingSensor:
+        """Return the sensor for readings that come one by one."""
+        return StreamingSensor(self.sensor, self.chain.measured)
+
+    @cached_property
+    def stage_only(self) -> "AxisModel":
+        """The model from the voltage to where the stage is: without the effects of sensor and record."""
+        return replace(self, effects=tuple(one for one in lasting(self.effects) if one.side == "stage"), sensor=IDEAL)
+
+    @cached_property
+    def hysteresis_only(self) -> "AxisModel":
+        """The model without effects and sensor."""
+        return replace(self, effects=(), sensor=IDEAL)
 
     def compensate(
         self, t: FloatArray, y: FloatArray, limits: Limits | None = None, start_memory: StartMemory = "end"
     ) -> tuple[FloatArray, Mask]:
-        """Return the voltage for a desired displacement `y`, shape (N,), metres, and where it is held at a limit.
+        """Return the voltage to bring the stage to `y`, shape (N,), metres, and where it is held at a limit.
 
-        Other axes are at rest. Time `t`, shape (N,), seconds, is ignored without effects. The initial history is
-        `initial(start_memory)`.
+        Effects of the sensor and of the record are not inverted. Other axes are at rest. Time `t`, shape (N,), seconds,
+        is ignored without effects. The initial history is `initial(start_memory)`.
 
         Raises
         ------
@@ -278,10 +330,11 @@ class AxisModel:
         UsageError
             If a displacement is not finite.
         """
-        return self.command(t, self.remove_sensor_effects(t, y), limits, start_memory)
+        self.require_reachable(y)
+        return self.command(t, y, limits, start_memory)
 
-    def remove_sensor_effects(self, t: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the displacement without sensor effects, shape (N,), metres, for a desired one; other axes at rest.
+    def require_reachable(self, y: FloatArray) -> None:
+        """Raise an error unless the desired displacements, shape (N,), metres, are finite and in the identified range.
 
         Raises
         ------
@@ -294,12 +347,11 @@ class AxisModel:
         if far.any():
             at = int(np.argmax(far))
             raise UnreachableError(f"sample {at}: {refusal(float(y[at]), accepted)}")
-        return backward(self.chain.shared, y, EffectContext(t - t[:1])) if self.effects else y
 
     def command(
         self, t: FloatArray, own: FloatArray, limits: Limits | None = None, start_memory: StartMemory = "end"
     ) -> tuple[FloatArray, Mask]:
-        """Return the voltage for a displacement without sensor effects (m), (N,), and where it is held at a limit."""
+        """Return the voltage for a displacement (m), (N,), without cross-coupling, and where it is held at a limit."""
         if start_memory != "start":
             return replace(self, start=self.initial(start_memory)).command(t, own, limits, "start")
         allowed = self._allowed(limits)
@@ -335,8 +387,8 @@ class AxisModel:
 
     @cached_property
     def chain(self) -> Chain:
-        """The chain of effects around the hysteresis."""
-        return Chain.of(self.effects)
+        """The chain of the effects that outlast their record."""
+        return Chain.of(lasting(self.effects))
 
     @cached_property
     def hysteresis_range(self) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 import json
 import os
 import textwrap
+from dataclasses import asdict
 from math import isfinite
 from typing import Any
 
@@ -13,6 +14,7 @@ from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.input_limits import MODEL_BYTES, read_input
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.sensor import Sensor
 from slpi_ros.model.stage_model import StageModel
 
 SCHEMA = "slpi_ros/model/1"
@@ -136,6 +138,7 @@ def _axis_from(axis: dict[str, Any]) -> AxisModel:
             quality["samples"], quality["covered"], quality["source"],
         ),
         effects=tuple(map(registry.from_document, axis.get("effects", []))),
+        sensor=Sensor(**axis.get("sensor", {})),
     )  # fmt: skip
 
 
@@ -163,6 +166,7 @@ def _axis_document(axis: AxisModel) -> dict[str, Any]:
         **({"end": _start_document(axis.end)} if axis.end else {}),
         "hysteresis": kinds.to_document(axis.hysteresis),
         "effects": [registry.to_document(effect) for effect in axis.effects],
+        **({"sensor": asdict(axis.sensor)} if axis.sensor else {}),
         "quality": {
             "rms_m": quality.rms,
             "maximum_m": quality.maximum,

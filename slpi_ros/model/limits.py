@@ -1,12 +1,15 @@
 """Voltage limits and the rate limiter of an axis."""
 
+from copy import copy
 from dataclasses import dataclass, replace
 from math import inf, sqrt
 
 from slpi_ros.errors import UsageError
 
-# Longest time between two samples that counts for the rate limiter, seconds.
+# Longest time between two samples that counts for effects and for the rate of a path, seconds.
 MAX_DT = 0.1
+# Default output period of a node that publishes voltages, seconds.
+PERIOD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -56,48 +59,97 @@ class Limits:
 
 
 class RateLimiter:
-    """Limit the voltage change from one sample to the next by slew rate and acceleration.
+    """Voltage of one axis at the output: the last limits before publishing, by the steady clock of the process.
 
-    With an acceleration limit every step leaves enough distance to stop at the voltage limits, and at the goal unless
-    the goal itself reverses faster than the acceleration limit allows.
+    The voltage changes by at most the slew limit times the time since its last change, of which at most two output
+    periods count: a late step is made up, a pause is not. With an acceleration limit every step leaves enough distance
+    to stop at the voltage limits and at the goal; a step after a pause starts from rest and counts one output period.
+
+    All times `now_ns` are nanoseconds on the steady clock, never ROS time and never stamps.
 
     Parameters
     ----------
     limits : Limits
-        May be replaced at any time; a voltage outside new limits returns within the slew and acceleration limits.
+        May be replaced at any time, see `change`.
+    period : float, seconds
+        Output period; default 1 ms.
+    voltage : float, volts
+        Voltage that the amplifier has; default 0.
 
     Attributes
     ----------
+    period : float, seconds
+    voltage : float, volts
+        Last output, or the voltage found at the amplifier.
     rate : float, V/s
         Rate of the last step.
     """
 
-    __slots__ = ("_dt", "limits", "rate")
+    __slots__ = ("_changed_ns", "_goal", "_limits", "_pending", "period", "rate", "voltage")
 
-    def __init__(self, limits: Limits) -> None:
-        self.limits = limits
-        self.rate = self._dt = 0.0
+    def __init__(self, limits: Limits, period: float = PERIOD, voltage: float = 0.0) -> None:
+        self._limits, self.period = limits, period
+        self._pending: tuple[Limits, float] | None = None
+        self.start(voltage)
+
+    def start(self, voltage: float) -> None:
+        """Continue from a voltage (V) that was found at the amplifier, at rest."""
+        self.voltage, self.rate = voltage, 0.0
+        self._changed_ns: int | None = None
+        self._goal: float | None = None
+        self._apply_pending()
+
+    @property
+    def limits(self) -> Limits:
+        """Limits in force. An axis that is moving within an acceleration limit stops within the old ones first."""
+        return self._limits
+
+    @limits.setter
+    def limits(self, limits: Limits) -> None:
+        self.change(limits)
+
+    def change(self, limits: Limits, period: float | None = None) -> None:
+        """Replace limits and output period (s; None: unchanged), at once or as soon as the axis has stopped."""
+        self._pending = limits, period or (self._pending[1] if self._pending else self.period)
+        if not self.in_motion:
+            # Without acceleration limit so far, the axis stops at once.
+            self.rate = 0.0
+            self._apply_pending()
+        else:
+            # Steps that come less often from now on are no pause.
+            self.period = max(self.period, self._pending[1])
 
     @property
     def in_motion(self) -> bool:
-        """Whether the acceleration limit prevents the voltage from stopping at the next sample."""
-        return abs(self.rate) > self.limits.acceleration * self._dt
+        """Whether the voltage moves within an acceleration limit, and so has to brake before it rests."""
+        return self.rate != 0.0 and self._limits.acceleration < inf
 
-    def clamp_dt(self, elapsed: float) -> float:
-        """Return the elapsed time (s) limited to 0..`MAX_DT`; after a longer pause, reset the rate to zero."""
-        if elapsed > MAX_DT:
-            self.rest()
-            return MAX_DT
-        return max(elapsed, 0.0)
+    def elapsed(self, now_ns: int) -> float:
+        """Return the time (s) since the last change that counts for a step at `now_ns`."""
+        if self._changed_ns is not None:
+            elapsed = (now_ns - self._changed_ns) * 1e-9
+            if elapsed <= 2.0 * self.period:
+                return max(elapsed, 0.0)
+        return self.period if self._limits.acceleration < inf else 2.0 * self.period
 
-    def reach(self, present: float, dt: float) -> tuple[float, float]:
-        """Return the lowest and highest voltage (V) reachable from `present` (V) within `dt` (s)."""
-        limits = self.limits
+    def reach(self, now_ns: int, fastest: float = inf) -> tuple[float, float]:
+        """Return the lowest and highest voltage (V) that can be output at `now_ns`.
+
+        Parameters
+        ----------
+        now_ns : int, nanoseconds
+        fastest : float, V/s
+            Rate below the slew limit that is not to be exceeded; default: none.
+        """
+        if self._pending is not None and not (self.in_motion and self._recent(now_ns)):
+            self._apply_pending()
+        limits, present = self._limits, self.voltage
         lower, upper = limits.lower, limits.upper
+        fastest = min(limits.slew, fastest)
         if limits.acceleration < inf:
-            down, up = self._ways(present, dt)
-        elif limits.slew < inf:
-            up = limits.slew * dt
+            down, up = self._ways(now_ns, fastest)
+        elif fastest < inf:
+            up = fastest * self.elapsed(now_ns)
             down = -up
         else:
             return lower, upper
@@ -106,61 +158,88 @@ class RateLimiter:
         lowest = max(lowest, min(lower, highest))
         return lowest, min(highest, max(upper, lowest))
 
-    def toward(self, present: float, goal: float, goal_before: float, dt: float) -> tuple[float, float]:
-        """Return the interval of `reach`, restricted so that the voltage need not overshoot a goal of constant rate.
+    def limit(self, goal: float, now_ns: int, fastest: float = inf) -> float:
+        """Return the voltage (V) that a step towards `goal` (V) at `now_ns` would output; nothing changes."""
+        lowest, highest = self.reach(now_ns, fastest)
+        if self._limits.acceleration < inf and lowest < highest:
+            # No overshoot: of a goal at rest, or of one that moves on as in the last step.
+            dt, present = self.elapsed(now_ns), self.voltage
+            before = self._goal if self._goal is not None and self._recent(now_ns) else goal
+            behind, along = before - present, present + (goal - before)
+            low, high = along - self._braking_way(-behind, dt), along + self._braking_way(behind, dt)
+            lowest, highest = min(max(low, lowest), highest), min(max(high, lowest), highest)
+        return min(max(goal, lowest), highest)
 
-        Parameters
-        ----------
-        present, goal, goal_before : float, volts
-            Present voltage, goal now, and goal at the previous sample.
-        dt : float, seconds
-            Time since the previous sample.
-        """
-        lowest, highest = self.reach(present, dt)
-        if self.limits.acceleration == inf:
-            return lowest, highest
-        behind, along = goal_before - present, present + (goal - goal_before)
-        low, high = along - self._braking_way(-behind, dt), along + self._braking_way(behind, dt)
-        return min(max(low, lowest), highest), min(max(high, lowest), highest)
-
-    def step(self, present: float, goal: float, dt: float, goal_before: float | None = None) -> float:
-        """Return the next voltage (V) from `present` (V) towards `goal` (V) after `dt` (s)."""
-        lowest, highest = self.toward(present, goal, goal if goal_before is None else goal_before, dt)
-        v = min(max(goal, lowest), highest)
-        self.moved(v - present, dt)
+    def step(self, goal: float, now_ns: int, fastest: float = inf) -> float:
+        """Move towards `goal` (V) at `now_ns`; return the voltage (V) to output."""
+        v = self.limit(goal, now_ns, fastest)
+        self._moved(v, now_ns, goal)
         return v
 
-    def moved(self, way: float, dt: float) -> None:
-        """Store the rate of the last step: a change of `way` (V) in `dt` (s)."""
-        if dt > 0.0:
-            self.rate, self._dt = way / dt, dt
+    def move(self, voltage: float, now_ns: int) -> float:
+        """Move to `voltage` (V) as far as `reach` allows; return the voltage (V) to output."""
+        lowest, highest = self.reach(now_ns)
+        v = min(max(voltage, lowest), highest)
+        self._moved(v, now_ns, voltage)
+        return v
 
-    def rest(self) -> None:
-        """Reset the rate to zero."""
-        self.rate = 0.0
+    def brake(self, now_ns: int) -> float:
+        """Slow down as fast as the acceleration limit allows; return the voltage (V) to output."""
+        return self.move(self.voltage, now_ns)
 
-    def go_on(self, before: "RateLimiter") -> None:
-        """Take over the rate of another rate limiter."""
-        self.rate, self._dt = before.rate, before._dt
+    def begin(self, now_ns: int) -> None:
+        """Count the time of the next step from `now_ns` on, as if the voltage had just changed."""
+        self._changed_ns = now_ns
 
-    def _ways(self, present: float, dt: float) -> tuple[float, float]:
+    def copy(self) -> "RateLimiter":
+        """Return an independent copy."""
+        return copy(self)
+
+    def _moved(self, v: float, now_ns: int, goal: float) -> None:
+        if not self._recent(now_ns):
+            self.rate = 0.0
+        if v != self.voltage or self.in_motion:
+            dt = self.elapsed(now_ns)
+            if dt > 0.0:
+                self.rate, self._changed_ns = (v - self.voltage) / dt, now_ns
+            elif self._changed_ns is None or now_ns > self._changed_ns:
+                self._changed_ns = now_ns
+            self.voltage = v
+        self._goal = goal
+        if self._pending is not None and not self.in_motion:
+            self._apply_pending()
+
+    def _recent(self, now_ns: int) -> bool:
+        """Return whether the last change is so recent that the axis is in motion with `rate`."""
+        return self._changed_ns is not None and (now_ns - self._changed_ns) * 1e-9 <= 2.0 * self.period
+
+    def _apply_pending(self) -> None:
+        if self._pending is not None:
+            (self._limits, self.period), self._pending = self._pending, None
+
+    def _ways(self, now_ns: int, fastest: float) -> tuple[float, float]:
         """Return the largest steps (V) down and up that slew rate, acceleration and stopping distance allow."""
-        limits = self.limits
-        change, fastest = limits.acceleration * dt, limits.slew
-        down = max(self.rate - change, -fastest) * dt
-        up = min(self.rate + change, fastest) * dt
+        limits, present, dt = self._limits, self.voltage, self.elapsed(now_ns)
+        rate = self.rate if self._recent(now_ns) else 0.0
+        slowest, quickest = rate - limits.acceleration * dt, rate + limits.acceleration * dt
+        if self._pending is not None:
+            # New limits wait until the axis has stopped within the old ones.
+            braking = min(max(0.0, slowest), quickest) * dt
+            return braking, braking
+        # The acceleration limit precedes a slew limit that has been lowered.
+        down, up = max(slowest, min(-fastest, quickest)) * dt, min(quickest, max(fastest, slowest)) * dt
         to_lower, to_upper = present - limits.lower, limits.upper - present
         if to_upper >= 0.0:
-            up = min(up, self._braking_way(to_upper, dt))
+            up = max(min(up, self._braking_way(to_upper, dt)), slowest * dt)
         if to_lower >= 0.0:
-            down = max(down, -self._braking_way(to_lower, dt))
+            down = min(max(down, -self._braking_way(to_lower, dt)), quickest * dt)
         return min(down, up), max(down, up)
 
     def _braking_way(self, distance: float, dt: float) -> float:
         """Return the longest step (V) in `dt` after which the voltage can still stop within `distance` (V)."""
         if distance <= 0.0:
             return 0.0
-        acceleration = self.limits.acceleration
+        acceleration = self._limits.acceleration
         return min(acceleration * dt * (sqrt(dt * dt + 2.0 * distance / acceleration) - dt), distance)
 
 

@@ -2,9 +2,9 @@
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,8 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import RecordError, SlpiError, UsageError
+from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, Mask, StartMemory
 from slpi_ros.model.limits import Limits
+from slpi_ros.model.sensor import Sensor, corrected
 from slpi_ros.model.streaming import StageStream, StreamingInverse
 
 FloatArray = NDArray[np.float64]
@@ -49,7 +51,9 @@ class StageModel:
         return self.axes[name]
 
     def simulate(self, t: ArrayLike, v: Signal) -> Any:
-        """Return the displacement for a voltage signal, free-run from the initial history of the record.
+        """Return what the sensors will say for a voltage signal, free-run from the initial history of the record.
+
+        Effects of the stage and of its sensors act; drift and hum of the record do not.
 
         Parameters
         ----------
@@ -78,13 +82,16 @@ class StageModel:
         return seen if isinstance(v, Mapping) else next(iter(seen.values()))
 
     def compensate(self, t: ArrayLike, y: Signal, start_memory: StartMemory = "end") -> Any:
-        """Return the voltage for a desired displacement: the inverse of `simulate` from the same initial history.
+        """Return the voltage for a desired displacement of the stage, from an assumed initial history.
+
+        Only effects of the stage are inverted. Without effects of sensor and record, this is the inverse of `simulate`.
 
         Parameters
         ----------
         t : array_like, shape (N,), seconds
             Not decreasing.
         y : array_like, shape (N,), or mapping of axis name to array_like, shape (N,), metres
+            Where the stage shall be.
         start_memory : str
             Assumed initial history: ``end`` (default) or ``start`` of the record, or ``wiped``; see
             `AxisModel.initial`.
@@ -137,7 +144,8 @@ class StageModel:
         own: dict[str, FloatArray] = {}
         for name, signal in desired.items():
             with _naming(name, "displacement"):
-                own[name] = self.axis(name).remove_sensor_effects(time, signal)
+                self.axis(name).require_reachable(signal)
+                own[name] = signal
         if self.coupling.on:
             starts = {name: self.axes[name].start.displacement for name in own}
             apart = self.coupling.decouple({name: z - starts[name] for name, z in own.items()}, {})
@@ -163,6 +171,42 @@ class StageModel:
             for name, (v, held) in answers.items():
                 v[number], held[number] = step[name], streams[name].held
         return answers
+
+    def correct(self, record: Record) -> Record:
+        """Return a record with the displacements of the stage instead of the readings of its sensors.
+
+        See `AxisModel.correct`; axes that are not in the model, or not in the record, are unchanged.
+        """
+        return corrected(record, {name: axis.correct for name, axis in self.axes.items() if axis.corrects})
+
+    @cached_property
+    def stage_only(self) -> "StageModel":
+        """The model from the voltages to where the stage is: without the effects of sensors and record."""
+        return replace(self, axes={name: axis.stage_only for name, axis in self.axes.items()})
+
+    def with_sensor(
+        self, *, delay: float | None = None, lag: float | None = None, axes: Sequence[str] | None = None
+    ) -> "StageModel":
+        """Return the model with another known timing of the sensor.
+
+        Parameters
+        ----------
+        delay, lag : float, seconds, optional
+            See `slpi_ros.model.sensor.Sensor`; default: those of the model.
+        axes : sequence of str, optional
+            Axes with this sensor; default: all.
+
+        Raises
+        ------
+        UsageError
+            If a time is not possible, or there is no such axis.
+        """
+        changed = dict(self.axes)
+        for name in self.axes if axes is None else axes:
+            own = self.axis(name).sensor
+            sensor = Sensor(own.delay if delay is None else delay, own.lag if lag is None else lag)
+            changed[name] = replace(self.axis(name), sensor=sensor)
+        return replace(self, axes=changed)
 
     def stream(self, axis: str, start_memory: StartMemory = "end") -> StreamingInverse:
         """Return a causal compensator of one axis: ``step(t, y) -> v``, seconds and metres to volts.

@@ -17,6 +17,7 @@ from slpi_ros.effects.rate_dependence import TRIALS, RateDependence, StreamingCo
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
 from slpi_ros.hysteresis.turning_points import Memory, MemoryState
+from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 
 FloatArray = NDArray[np.float64]
@@ -38,7 +39,6 @@ class StreamState:
     memory : MemoryState
     voltage, goal : float, volts
         Present command, and the voltage required by the last desired displacement.
-    rate : float, V/s
     desired, displacement : float, metres
         Last setpoint of the hysteresis, and displacement of the axis without cross-coupling.
     effects : mapping of effect name to its state
@@ -47,7 +47,6 @@ class StreamState:
     memory: MemoryState
     voltage: float
     goal: float
-    rate: float
     desired: float
     displacement: float
     effects: Mapping[str, Any] = field(default_factory=dict)
@@ -56,9 +55,9 @@ class StreamState:
 class StreamingInverse:
     """Causal compensation of one axis: ``v = step(t, y)``.
 
-    A desired displacement is inverted through the effects after the hysteresis, the hysteresis, and the effects before
-    it. The resulting voltage is limited and then propagated forward, so that the hysteresis memory and the effects
-    follow the voltage that is really applied.
+    The desired displacement of the stage is inverted through the effects after the hysteresis, the hysteresis, and the
+    effects before it. The resulting voltage is limited and then propagated forward, so that the hysteresis memory and
+    the effects follow the voltage that is really applied.
 
     Parameters
     ----------
@@ -69,7 +68,7 @@ class StreamingInverse:
     limits : Limits
         Limits of the command; further restricted by a `Saturation` effect.
     effects : tuple of Effect
-        Effects besides the hysteresis; default: none.
+        Effects besides the hysteresis; those of sensor and record are ignored. Default: none.
     middle : callable, optional
         Returns the mid-line of the largest loop (m) for voltages (V), shape (N,); for rate dependence. Default None.
 
@@ -77,6 +76,10 @@ class StreamingInverse:
     ----------
     memory : Memory
     pace : RateLimiter
+        Limits of voltage, slew rate and acceleration; alone, in the time of the samples, of which at most `MAX_DT`
+        counts. A compensator gives it that of its output, on the steady clock.
+    goal : float, volts
+        Voltage that the last sample asked for, before slew rate and acceleration limits.
     accepted : (float, float), metres
         Smallest and largest accepted displacement.
     desired : float, metres
@@ -94,27 +97,29 @@ class StreamingInverse:
         middle: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         chain = Chain.of(effects)
-        self.memory, self._clipped, self._without_effects = memory, chain.clipped, not effects
+        self.memory, self._clipped = memory, chain.clipped
+        self._without_effects = not (chain.before or chain.own or chain.shared)
         self.accepted = self._lowest, self._highest = accepted_range(displacement_range)
         self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
         self._t = -inf
         self.coupled = 0.0
         # Saturation restricts the limits and needs no streaming effect.
         self._before = _streaming(effect for effect in chain.before if not isinstance(effect, Saturation))
-        self._behind, self._shared = _streaming(chain.own), _streaming(chain.shared)
+        self._behind = _streaming(chain.own)
         self._find()
-        self.pace = RateLimiter(limits)
+        self.pace = RateLimiter(limits, MAX_DT / 2)
         self.limits = limits
         # The axis may start outside its limits; the first output voltage is inside.
         memory.forward(self.limits.clip(memory.voltage))
+        self.pace.start(memory.voltage)
         for streaming in self._before.values():
             streaming.start(memory.voltage)
-        for streaming in (*self._behind.values(), *self._shared.values()):
+        for streaming in self._behind.values():
             streaming.start(memory.displacement)
         if self._driven and middle:
             self._driven.attach(lambda u: float(middle(np.array(u))))
             self._driven.drive(0.0, memory.voltage)
-        self._command = self._goal = memory.voltage
+        self._command = self.goal = memory.voltage
         self.desired = memory.displacement
         # Shortfall of the last sample: of the hysteresis or the voltage (m or V), and of the axis as a whole (m).
         self._missing = self._short = 0.0
@@ -122,7 +127,7 @@ class StreamingInverse:
 
     def _find(self) -> None:
         """Find the streaming effects that need more input than the displacement."""
-        self._streaming: StreamingEffects = {**self._before, **self._behind, **self._shared}
+        self._streaming: StreamingEffects = {**self._before, **self._behind}
         rate = self._streaming.get(RateDependence.name)
         self._play = rate if isinstance(rate, StreamingCoercivity) else None
         self._driven = None if self._play else cast(DrivenStreamingEffect | None, rate)
@@ -134,11 +139,15 @@ class StreamingInverse:
 
     @limits.setter
     def limits(self, limits: Limits) -> None:
-        lower = min(max(limits.lower, self._clipped[0]), limits.upper)
-        self.pace.limits = limits = replace(limits, lower=lower, upper=max(min(limits.upper, self._clipped[1]), lower))
+        self.pace.limits = limits = self.restricted(limits)
         self._v_min, self._v_max = limits.lower, limits.upper
         # Only the inverse of the hysteresis is required.
         self._bare = self._without_effects and limits.slew == limits.acceleration == inf
+
+    def restricted(self, limits: Limits) -> Limits:
+        """Return limits, restricted to the voltages that a `Saturation` lets through."""
+        lower = min(max(limits.lower, self._clipped[0]), limits.upper)
+        return replace(limits, lower=lower, upper=max(min(limits.upper, self._clipped[1]), lower))
 
     @property
     def timeless(self) -> bool:
@@ -174,12 +183,6 @@ class StreamingInverse:
             return v >= limits.upper - ROUNDING * (1.0 + abs(limits.upper))
         return max(missing, short) < 0.0 and v <= limits.lower + ROUNDING * (1.0 + abs(limits.lower))
 
-    def remove_sensor_effects(self, y: float) -> float:
-        """Return the stage displacement (m) for which the sensor reads `y` (m)."""
-        for streaming in self._shared.values():
-            y = streaming.inverse(0.0, y)
-        return y
-
     def check(self, t: float, y: float) -> None:
         """Raise the error that `step` would raise, without a change of state.
 
@@ -211,15 +214,19 @@ class StreamingInverse:
             v = self.memory.inverse(y, self._v_min, self._v_max)
             self.desired = y
         else:
-            # At the first sample no time has passed: a rate limit holds the voltage until the next one.
-            v = self.move(t - self._t if self._t > -inf else 0.0, y)
+            now_ns, before = nanoseconds(t), t if self._t == -inf else self._t
+            # Rate limits count from the last sample, whether the voltage changed or not; before the first, no time.
+            self.pace.begin(nanoseconds(before))
+            v = self.move(t - before, y, now_ns)
         self._t = t
         return v
 
     __call__ = step
 
-    def move(self, dt: float, y: float) -> float:
+    def move(self, dt: float, y: float, now_ns: int) -> float:
         """Return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last sample, without checks.
+
+        `now_ns` (ns) is the time on the clock of `pace`.
 
         Raises
         ------
@@ -228,7 +235,7 @@ class StreamingInverse:
         """
         if not self._streaming:
             h = y - self.coupled
-            v = self._move(dt, dt, h)
+            v = self._move(dt, h, now_ns)
             self.desired = h
             return v
         counted = dt
@@ -236,25 +243,39 @@ class StreamingInverse:
             # The voltage was held during the pause; only its last part counts for the new voltage.
             counted = MAX_DT
             self.wait(dt - counted)
-        h = displacement = self.remove_sensor_effects(y) - self.coupled
+        h = displacement = y - self.coupled
         for streaming in reversed(self._behind.values()):
             h = streaming.inverse(counted, h)
-        v = self._move(dt, counted, h)
+        v = self._move(counted, h, now_ns)
         self.desired, self._command = h, v
         self._follow(counted)
         self._short = displacement - self._displacement
         return v
 
+    def approach(self, dt: float, now_ns: int) -> float:
+        """Go on towards `goal`, `dt` (s) after the last sample, as `pace` allows at `now_ns` (ns); return the voltage.
+
+        For what a slew or acceleration limit has held back of the last sample.
+        """
+        if not self._streaming:
+            return self._move(dt, self.desired, now_ns)
+        desired, goal = self.desired, self.goal
+        v = self.pace.step(goal, now_ns)
+        self.drive(v, dt)
+        self.desired, self.goal = desired, goal
+        if abs(goal - v) > ROUNDING * (1.0 + abs(goal)):
+            self._missing = goal - v
+        return v
+
     def drive(self, voltage: float, dt: float = 0.0) -> float:
-        """Apply a voltage (V), `dt` (s) after the last sample, without a setpoint; return the displacement (m)."""
-        self._command = self._goal = voltage
+        """Apply a voltage (V), `dt` (s) after the last sample, without a setpoint; return where the stage is (m)."""
+        if voltage != self.pace.voltage:
+            self.pace.start(voltage)
+        self._command = self.goal = voltage
         self.memory.forward(self._reaching(dt, voltage))
         self.desired, self._missing = self.memory.displacement, 0.0
         self._follow(dt)
-        y = self.uncoupled_displacement + self.coupled
-        for streaming in self._shared.values():
-            y = streaming.forward(0.0, y)
-        return y
+        return self.uncoupled_displacement + self.coupled
 
     def wait(self, duration: float) -> None:
         """Advance the effects by `duration` (s) at the present voltage."""
@@ -266,8 +287,7 @@ class StreamingInverse:
         return StreamState(
             self.memory.snapshot(),
             self.voltage,
-            self._goal,
-            self.pace.rate,
+            self.goal,
             self.desired,
             self.uncoupled_displacement,
             {name: each.snapshot() for name, each in self._streaming.items()},
@@ -276,15 +296,16 @@ class StreamingInverse:
     def restore(self, state: StreamState) -> None:
         """Restore a state from `snapshot`."""
         self.memory.restore(state.memory)
-        self._command, self._goal, self.pace.rate = state.voltage, state.goal, state.rate
+        self._command, self.goal = state.voltage, state.goal
         self.desired, self._displacement = state.desired, state.displacement
         for name, streaming in self._streaming.items():
             streaming.restore(state.effects[name])
+        if state.voltage != self.pace.voltage:
+            self.pace.start(state.voltage)
 
     def resume(self, before: "StreamingInverse") -> None:
-        """Continue from the inverse of another model: same voltage, rate, coercivity and creep state."""
-        self.pace.go_on(before.pace)
-        self._command = self._goal = before.voltage
+        """Continue from the inverse of another model: same voltage, coercivity and creep state."""
+        self._command = self.goal = before.voltage
         if self._play and before._play:
             self._play.restore(before._play.snapshot())
         # The command is set without elapsed time.
@@ -299,35 +320,35 @@ class StreamingInverse:
     def copy(self) -> "StreamingInverse":
         """Return an independent copy in the same state."""
         other = copy(self)
-        other.memory, other.pace = copy(self.memory), copy(self.pace)
+        other.memory, other.pace = copy(self.memory), self.pace.copy()
         other.memory.restore(self.memory.snapshot())
-        other._before, other._behind, other._shared = deepcopy((self._before, self._behind, self._shared))
+        other._before, other._behind = deepcopy((self._before, self._behind))
         other._find()
         return other
 
-    def _move(self, dt: float, counted: float, h: float) -> float:
+    def _move(self, dt: float, h: float, now_ns: int) -> float:
         """Move command and memory towards a displacement of the hysteresis (m); return the command (V).
 
-        `counted` (s) is the part of `dt` (s) that counts for the effects.
+        `dt` (s) is the time for the effects, `now_ns` (ns) that for the rate limits.
         """
         memory, pace = self.memory, self.pace
         if not self._before and pace.limits.acceleration == inf:
-            v = memory.inverse(h, *pace.reach(memory.voltage, dt))
+            v = self.goal = pace.move(memory.inverse(h, *pace.reach(now_ns)), now_ns)
             if self._streaming:
                 self._missing = self._beyond_rounding(h)
             return v
-        state, present = memory.snapshot(), self.voltage
+        state = memory.snapshot()
         goal, reversible_bypass = self._played(h)
         u = memory.voltage
         self._missing = self._beyond_rounding(h - reversible_bypass)
         for streaming in reversed(self._before.values()):
             if streaming is not self._play:
-                goal = streaming.inverse(counted, goal)
-        v = pace.step(present, goal, dt, self._goal)
+                goal = streaming.inverse(dt, goal)
+        v = pace.step(goal, now_ns)
         if not self._missing and abs(goal - v) > ROUNDING * (1.0 + abs(goal)):
             self._missing = goal - v
-        self._goal = goal
-        reached = self._reaching(counted, v)
+        self.goal = goal
+        reached = self._reaching(dt, v)
         if reached != u:
             memory.restore(state)
             memory.forward(reached)
@@ -371,6 +392,12 @@ class StreamingInverse:
         for streaming in self._behind.values():
             y = streaming.forward(dt, y)
         self._displacement = y
+
+
+def nanoseconds(t: float) -> int:
+    """Return a time `t` (s) in whole nanoseconds, on the clock of a rate limiter."""
+    whole = int(t)
+    return whole * SECOND_NS + round((t - whole) * SECOND_NS)
 
 
 def _streaming(effects: Iterable[Effect]) -> StreamingEffects:
@@ -441,11 +468,11 @@ class StageStream:
         if not self._coupling.on:
             return
         streams, origins = self.streams, self._origins
-        moving = {name: streams[name].remove_sensor_effects(desired) - origins[name] for name, desired in y.items()}
+        moving = {name: desired - origins[name] for name, desired in y.items()}
         resting = {
             name: each.uncoupled_displacement - origins[name] for name, each in streams.items() if name not in moving
         }
-        motions = self._coupling.decouple(moving, resting)
+        motions = self._coupling.decouple(moving, resting) if moving else {}
         motions.update(resting)
         for name, stream in streams.items():
             stream.coupled = float(self._coupling.part(name, motions))

@@ -15,18 +15,20 @@ from typing import Any
 from numpy.typing import ArrayLike
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
+from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from slpi_ros.compensator.amplifier import Calibration
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, Mode
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis, model_id
-from slpi_ros.compensator.ramps import PERIOD
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import ModelError, SlpiError, shown
 from slpi_ros.io.cdr import multiarray_header
@@ -60,6 +62,16 @@ WATCH_PERIOD = 0.05
 SIMULATED_PERIOD = 1e-3
 # History, depth and reliability, by parameters qos_overrides./TOPIC.{publisher,subscription}.POLICY.
 OVERRIDABLE = QoSOverridingOptions.with_default_policies()
+# A measurement whose stamp is older than this, or further in the future, does not count at the start.
+OLDEST_NS, EARLIEST_NS = SECOND_NS // 5, SECOND_NS // 20
+# Reports of the amplifiers are no longer expected this long after the start of the node.
+TELL_NS = 2 * SECOND_NS
+# While voltages are output, reports of the amplifiers are looked at once in this time.
+REPORT_NS = SECOND_NS // 200
+# Time from the start of the node within which publishers of stage_state are discovered; polling period, seconds.
+DISCOVERY_NS, DISCOVERY_POLL = SECOND_NS, 0.005
+# Desired messages that are answered at once if they wait.
+BACKLOG = 200
 # Time to wait at shutdown for the delivery of the last voltages.
 PATIENCE = Duration(seconds=1.0)
 
@@ -67,8 +79,9 @@ PATIENCE = Duration(seconds=1.0)
 class Compensator(LifecycleNode):
     """Lifecycle node that publishes the voltages of all axes for every message with desired displacements.
 
-    Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement`` and ``stage_model``,
-    publishes ``voltage_command``, ``tracking_error`` and ``/diagnostics``, provides the service ``~/reset_memory``.
+    Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement``, ``stage_state`` and
+    ``stage_model``, publishes ``voltage_command``, ``tracking_error`` and ``/diagnostics``, provides the services
+    ``~/reset_memory`` and ``~/arm``.
     Message types, units and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
 
     Raises
@@ -86,17 +99,31 @@ class Compensator(LifecycleNode):
         self._parameter_set = Parameters(self, DECLARATIONS, CompensatorSettings.of)
         told = self._settings
         values = told.values
-        self._controller = Controller(values["axes"], told.limits, values["hardware_id"], told.time, told.loops)
+        self._controller = Controller(
+            values["axes"], told.limits, values["hardware_id"], told.time, told.loops, told.period, told.starts
+        )
         self._parameter_set.follow(self._use_settings, check=self._check_settings)
         self._desired, self._measured = JointStates(), JointStates()
         self._voltage_header = multiarray_header(len(values["axes"]))
         self._failure: SlpiError | None = None
         self._excursions = 0
+        self._too_fast = ""
         self._assumption = ""
         self._memory_file = MemoryFile(values["memory_file"])
         self._keeps_memory = values["memory_file"] != ""
         self._reporter = Reporter(self, self._controller)
         self._reset_service = DeferredService(self, "~/reset_memory", self._on_reset)
+        self.create_service(Trigger, "~/arm", self._on_arm)
+        self._doubts: dict[str, str] = {}
+        self._noted: set[str] = set()
+        self._calibrations: dict[str, Calibration] = {}
+        # The age of one command for each report: reading the clock takes as long as compensating an axis.
+        self._measures_age = True
+        self._state_topic = self.resolve_topic_name("stage_state")
+        self._state_subscription = self.create_subscription(
+            JointState, "stage_state", self._on_state, MEASUREMENTS, raw=True
+        )
+        self._begun_ns, self._reported_ns = time.monotonic_ns(), 0
         self._model_topic = self.resolve_topic_name("stage_model")
         self._model_reader = ThreadPoolExecutor(1, "stage_model")
         self._reading: Reading | None = None
@@ -128,7 +155,7 @@ class Compensator(LifecycleNode):
         self._controller.check_limits(new.limits)
 
     def _use_settings(self, new: CompensatorSettings) -> None:
-        self._controller.use_limits(new.limits)
+        self._controller.use_limits(new.limits, time.monotonic_ns(), new.period)
         self._controller.use_loops(new.loops)
         self._controller.use_time(new.time)
 
@@ -146,6 +173,7 @@ class Compensator(LifecycleNode):
             # During autostart the error ends the process and is printed there.
             self._refuse_model(error, logged=not self._starting)
             return TransitionCallbackReturn.FAILURE
+        self._wait_for_discovery()
         self._publisher = self.create_lifecycle_publisher(
             Float64MultiArray, "voltage_command", COMMANDS, qos_overriding_options=OVERRIDABLE
         )
@@ -167,12 +195,36 @@ class Compensator(LifecycleNode):
         return super().on_configure(state)
 
     def _subscribe(self, kind: Any, topic: str, callback: Any, qos: QoSProfile, raw: bool = False) -> Any:
-        return self.create_subscription(kind, topic, callback, qos, qos_overriding_options=OVERRIDABLE, raw=raw)
+        options: dict[str, Any] = {"qos_overriding_options": OVERRIDABLE, "raw": raw}
+        try:
+            lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
+            return self.create_subscription(kind, topic, callback, qos, event_callbacks=lost, **options)
+        except UnsupportedEventTypeError:
+            return self.create_subscription(kind, topic, callback, qos, **options)
+
+    def _on_lost(self, event: Any) -> None:
+        self._reporter.lost += event.total_count_change
+        self._report_at_least(WARN)
+
+    def _work_off(self) -> None:
+        """Answer the desired messages that wait: after a stall the executor takes one for each that comes, no more."""
+        subscription = self._subscriptions_of_state[0]
+        count = 0
+        while count < BACKLOG:
+            with subscription.handle:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                break
+            subscription.callback(taken[0])
+            count += 1
+        self._reporter.worked_off += count
+        self._reporter.largest_backlog = max(self._reporter.largest_backlog, count)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start processing messages, from the present voltages."""
         self._save_memory(complete=False)
         self._controller.activate(time.monotonic_ns())
+        self._locate()
         result = super().on_activate(state)
         self._begin_memory()
         self._report()
@@ -213,14 +265,14 @@ class Compensator(LifecycleNode):
         if not controller.active:
             return
         before = controller.mode
-        if safety.ramps_on_deactivate and controller.model:
+        if safety.ramps_on_deactivate and controller.ownership.owned:
             controller.ramp(safety.voltages, safety.rate, now_ns)
         else:
             controller.hold(now_ns)
         if before is Mode.RESETTING:
             self._answer_reset()
-        while controller.ramping and self.context.ok():
-            time.sleep(PERIOD)
+        while controller.ramping and controller.ownership.owned and self.context.ok():
+            time.sleep(self._settings.period)
             now_ns = time.monotonic_ns()
             if controller.advance(now_ns, now_ns):
                 self._publish()
@@ -257,21 +309,98 @@ class Compensator(LifecycleNode):
             self._reject("", error)
             return
         self._publish()
+        if stamp_ns and self._measures_age:
+            self._measures_age = False
+            self._reporter.age = (self.get_clock().now().nanoseconds - stamp_ns) * 1e-9
         self._reporter.timing.note(now_ns, time.monotonic_ns())
         if held:
             self._warn_held()
 
     def _on_measured(self, data: bytes) -> None:
-        _, names, displacements = self._measured.read(data) or as_rclpy_reads(data)
+        stamp_ns, names, displacements = self._measured.read(data) or as_rclpy_reads(data)
+        fresh = not stamp_ns or -EARLIEST_NS <= self.get_clock().now().nanoseconds - stamp_ns <= OLDEST_NS
         try:
-            changed = self._controller.measure(names, displacements, time.monotonic_ns())
+            self._controller.measure(names, displacements, time.monotonic_ns(), fresh)
         except RejectedError as error:
             self._reject("measurement ", error)
+
+    def _on_state(self, data: bytes) -> None:
+        """Take the voltages that the amplifiers report."""
+        controller, now_ns = self._controller, time.monotonic_ns()
+        if controller.ownership.started and now_ns - self._reported_ns < REPORT_NS:
             return
-        for axis in changed:
-            self.get_logger().warning(f"axis '{axis.name}': {axis.confidence.doubt}")
-        if changed:
+        self._reported_ns, before = now_ns, controller.mode
+        try:
+            state = deserialize_message(data, JointState)
+        except RuntimeError:
+            return
+        if controller.report(state.name, state.effort, now_ns) and controller.ownership.obstacle:
+            self.get_logger().error(f"nothing more is published: {controller.ownership.obstacle[1]}")
+            if before is Mode.RESETTING:
+                self._answer_reset()
             self._report()
+
+    def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Go on from where somebody else has moved the stage."""
+        controller = self._controller
+        was_armed = controller.ownership.armed
+        why = controller.arm(time.monotonic_ns())
+        volts = ", ".join(f"{v:.6g}" for v in controller.voltages)
+        response.success = not why
+        response.message = why or (f"already armed, at {volts} V" if was_armed else f"armed at {volts} V")
+        if not was_armed:
+            self.get_logger().info(f"~/arm: {response.message}")
+            self._tell_doubts()
+            self._report()
+        return response
+
+    def _wait_for_discovery(self) -> None:
+        """Wait until this node may know whether stage_state has a publisher: commands are not taken before that."""
+        while not self._reports_expected and time.monotonic_ns() - self._begun_ns < DISCOVERY_NS and self.context.ok():
+            time.sleep(DISCOVERY_POLL)
+
+    @property
+    def _reports_expected(self) -> bool:
+        return bool(self.count_publishers(self._state_topic))
+
+    def _locate(self) -> None:
+        """Find the voltages at the start, until one has been output."""
+        ownership, before = self._controller.ownership, self._controller.ownership.obstacle
+        if not ownership.started:
+            ownership.reporting = self._reports_expected
+            self._controller.locate(time.monotonic_ns())
+            self._tell_doubts()
+            if before and not ownership.obstacle:
+                self._begin_memory()
+                self._report()
+
+    def _tell_notes(self) -> None:
+        """Log once what is not certain about the voltages at the start, when reports can no longer be expected."""
+        notes = {name: note for name, note in self._controller.ownership.notes.items() if note}
+        told = self._controller.ownership.started or time.monotonic_ns() - self._begun_ns > TELL_NS
+        if told and not self._controller.ownership.obstacle and notes and notes.keys() != self._noted:
+            self._noted = set(notes)
+            for name, note in notes.items():
+                self.get_logger().warning(f"axis '{name}': {note}")
+
+    def _tell_calibrations(self) -> None:
+        """Log once that the reported voltages differ by a constant gain or offset, which is not followed."""
+        for axis in self._controller.axes:
+            found = axis.amplifier.calibration
+            if found != self._calibrations.get(axis.name, Calibration()):
+                self._calibrations[axis.name] = found
+                self.get_logger().warning(
+                    f"axis '{axis.name}': stage_state reports {found.gain:.4g} times the output {found.offset:+.4g} V "
+                    "(effort): a matter of calibration, it is not followed"
+                )
+
+    def _tell_doubts(self) -> None:
+        """Log once what has become doubtful about the memory of an axis."""
+        for axis in self._controller.axes:
+            doubt = axis.confidence.doubt
+            if doubt and doubt != self._doubts.get(axis.name):
+                self.get_logger().warning(f"axis '{axis.name}': {doubt}", throttle_duration_sec=LOG_PERIOD)
+            self._doubts[axis.name] = doubt
 
     def _on_trajectory(self, data: bytes) -> None:
         controller = self._controller
@@ -285,7 +414,16 @@ class Compensator(LifecycleNode):
             return
         self._on_simulated = self._simulated
         self.get_logger().info(f"trajectory: {controller.trajectory.remaining} points to come")
+        self._too_fast = ""
+        self._tell_too_fast()
         self._report()
+
+    def _tell_too_fast(self) -> None:
+        """Log once that a trajectory is too fast for the slew limit."""
+        said = self._controller.too_fast
+        if said and said != self._too_fast:
+            self._too_fast = said
+            self.get_logger().warning(f"trajectory {said}; send it more slowly, or raise slew_limit")
 
     def _reject(self, what: str, error: RejectedError) -> None:
         """Log and report the rejection of a message, which the controller has counted already."""
@@ -349,10 +487,12 @@ class Compensator(LifecycleNode):
         held = controller.counts.points_held
         if controller.advance(now_ns, clock_ns):
             self._publish()
-            if deadline_ns is not None and deadline_ns <= clock_ns:
+            if before is Mode.TRAJECTORY and deadline_ns is not None and deadline_ns <= clock_ns:
                 self._reporter.lateness.note(deadline_ns, clock_ns)
-            if controller.counts.points_held > held:
+            if controller.counts.points_held > held or controller.counts.excursions > self._excursions:
                 self._warn_held()
+            if controller.too_fast:
+                self._tell_too_fast()
         if controller.mode is not before:
             if before is Mode.RESETTING:
                 self._answer_reset()
@@ -365,10 +505,25 @@ class Compensator(LifecycleNode):
             self._save_memory(complete=False)
 
     def _watch(self) -> None:
-        if self._controller.watch(self._settings.safety, time.monotonic_ns()):
+        controller, values, now_ns = self._controller, self._settings.values, time.monotonic_ns()
+        if not controller.active:
+            return
+        self._work_off()
+        self._locate()
+        self._tell_notes()
+        self._tell_calibrations()
+        if controller.watch(self._settings.safety, now_ns):
             self._report()
-        if self._controller.active:
-            self._publish_tracking_errors()
+        for axis, fault in controller.watch_sensors(values["feedback_fault_time"], now_ns):
+            self.get_logger().error(
+                f"axis '{axis.name}': feedback is off, the sensor is {fault.kind}: {fault.reason}; the model goes on "
+                "alone; mend the sensor, then set feedback to true again"
+            )
+            self._report()
+        if values["rearm"] and controller.rearm(now_ns):
+            self.get_logger().warning(f"rearmed at {', '.join(f'{v:.6g}' for v in controller.voltages)} V")
+            self._report()
+        self._publish_tracking_errors()
 
     def _publish_tracking_errors(self) -> None:
         """Publish the tracking errors of all axes if any axis was measured since the last call."""
@@ -384,6 +539,7 @@ class Compensator(LifecycleNode):
         self._error_publisher.publish(message)
 
     def _report(self) -> None:
+        self._measures_age = True
         self._reporter.report(self._settings)
 
     def _report_at_least(self, level: bytes) -> None:
@@ -442,13 +598,14 @@ class Compensator(LifecycleNode):
             raise ModelError(f"{source}: SHA-256 {fingerprint}, not {wanted} of model_sha256; give that model")
         if controller.model is None or fingerprint != reporter.model_id:
             try:
-                saved = None
+                saved, last = None, None
                 if not controller.driven:
-                    saved = self._memory_file.find(model, controller.names, settings.limits)
+                    saved = self._memory_file.find(model, controller.names)
             except SlpiError as error:
                 self.get_logger().warning(str(error))
+                last = self._memory_file.last_voltages
             try:
-                controller.use_model(model, saved, settings.values["start_memory"])
+                controller.use_model(model, saved, settings.values["start_memory"], last)
             except SlpiError as error:
                 raise ModelError(f"{source}: {error}") from None
             self.get_logger().info(
@@ -468,6 +625,9 @@ class Compensator(LifecycleNode):
         controller = self._controller
         unsure = [axis for axis in controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
         if controller.model is None or controller.mode is not Mode.STREAMING or not unsure:
+            return
+        if controller.ownership.obstacle:
+            # As soon as the voltages are known.
             return
         if self._settings.values["reset_on_start"]:
             self._start_reset()
@@ -493,7 +653,13 @@ class Compensator(LifecycleNode):
     def _start_reset(self) -> None:
         values, controller = self._settings.values, self._controller
         finals = values["safe_voltage"] if values["reset_to"] == "safe" else list(controller.voltages)
-        controller.reset_memory(values["reset_cycles"], values["reset_rate"], finals, time.monotonic_ns())
+        spans = self._settings.reset_spans
+        over = ", ".join(
+            f"axis '{name}' {limits.lower:g} to {limits.upper:g} V"
+            for name, limits in zip(controller.names, controller.reset_limits(spans), strict=True)
+        )
+        self.get_logger().warning(f"reset_memory moves the stage over its range: {over}; keep tip and sample apart")
+        controller.reset_memory(values["reset_cycles"], values["reset_rate"], finals, time.monotonic_ns(), spans)
         self._report()
 
     def _on_reset(self) -> str:
@@ -504,7 +670,10 @@ class Compensator(LifecycleNode):
         if controller.mode is Mode.TRAJECTORY:
             return f"not reset: {controller.activity(time.monotonic_ns())}; wait, or cancel it with an empty one"
         if controller.mode is not Mode.RESETTING:
-            self._start_reset()
+            try:
+                self._start_reset()
+            except RejectedError as error:
+                return f"not reset: {error}"
         return ""
 
     def _answer_reset(self) -> None:

@@ -37,6 +37,10 @@ class Reporter:
     models_refused : int
     model_id : str
         Fingerprint of the model in use.
+    lost, worked_off, largest_backlog : int
+        Messages that the middleware has lost; messages of a backlog that were answered in one go, and the most of them.
+    age : float or None, seconds
+        Age of the last answered command by its stamp; None without a stamp.
     """
 
     def __init__(self, node: Node, controller: Controller) -> None:
@@ -44,6 +48,8 @@ class Reporter:
         self.timing, self.lateness = Timing(), Timing()
         self.last_rejection = self.model_error = self.model_id = ""
         self.models_refused = 0
+        self.lost = self.worked_off = self.largest_backlog = 0
+        self.age: float | None = None
         self._controller = controller
         self._diagnostics = Diagnostics(node, "compensator")
         self.start_window()
@@ -60,6 +66,7 @@ class Reporter:
         if model:
             for axis in self._controller.axes:
                 values |= _axis_values(axis)
+                values[f"{axis.name}.start_voltage"] = self._controller.ownership.notes.get(axis.name, "")
         problems = tuple((level, text) for wrong, level, text in self._problems(settings) if wrong)
         hardware_id = settings.values["hardware_id"] or (model.hardware_id if model else "")
         self._diagnostics.report(Health(problems, self._summary(), values, hardware_id))
@@ -67,6 +74,7 @@ class Reporter:
     def start_window(self) -> None:
         """Start a new reporting period."""
         self._window, self._window_start = self._controller.counts.copy(), time.perf_counter()
+        self._lost_before = self.lost
         self.timing.restart()
         self.lateness.restart()
 
@@ -85,6 +93,8 @@ class Reporter:
         activity = controller.activity(time.monotonic_ns())
         if controller.mode is Mode.RESETTING:
             return activity
+        if controller.model and controller.ownership.obstacle:
+            return f"not moving: {controller.ownership.obstacle[1]}"
         axes = controller.axes
         doubts = [f" (axis '{axis.name}': {axis.confidence.doubt})" for axis in axes if axis.confidence.doubt]
         return f"{activity}; memory {self._memory()}{''.join(doubts)}"
@@ -118,6 +128,10 @@ class Reporter:
             "excursions": counts.excursions,
             "slew_limited": counts.slew_limited,
             "trajectories": counts.trajectories,
+            "messages_lost": self.lost,
+            "worked_off": self.worked_off,
+            "largest_backlog": self.largest_backlog,
+            "age_of_answered_ms": f"{self.age * 1e3:.3f}" if self.age is not None else "",
             "trajectories_rejected": counts.trajectories_rejected,
             "points_remaining": self._controller.trajectory.remaining,
             "points_skipped": self._controller.trajectory.skipped,
@@ -174,6 +188,15 @@ class Reporter:
         yield jumps > 0, WARN, f"the clock of the stamps was set back {jumps} times"
         points = counts.points_held - window.points_held
         yield points > 0, WARN, f"{points} points of a trajectory held at a voltage limit"
+        lost = self.lost - self._lost_before
+        yield lost > 0, WARN, f"{lost} messages lost by the middleware; send fewer, or make its queue deeper"
+        ownership = self._controller.ownership
+        if ready and active:
+            obstacle = ownership.obstacle
+            yield obstacle is not None, WARN if ownership.armed else ERROR, obstacle[1] if obstacle else ""
+            for name, note in ownership.notes.items():
+                yield note != "" and obstacle is None and not ownership.started, WARN, f"axis '{name}': {note}"
+        yield self._controller.too_fast != "", WARN, f"trajectory {self._controller.too_fast}"
         silence = self._silence()
         yield silence != "", WARN, silence
         if ready:
@@ -197,6 +220,10 @@ def _axis_values(axis: Axis) -> dict[str, object]:
         "held_out_rms_nm": f"{quality.held_out_rms * 1e9:.2f}" if quality else "",
         "feedback": axis.feedback_state,
         "correction_V": f"{axis.correction:.4f}",
+        "reported_V": "" if axis.amplifier.latest is None else f"{axis.amplifier.latest:.4f}",
+        "report_gain": f"{axis.amplifier.calibration.gain:.5g}",
+        "report_offset_V": f"{axis.amplifier.calibration.offset:.4g}",
+        "feedback_fault": axis.fault.kind if axis.fault else "",
         "residual_rms_nm": f"{drift.rms * 1e9:.2f}" if drift else "",
         "residual_mean_nm": f"{drift.mean * 1e9:.2f}" if drift else "",
     }
@@ -205,6 +232,12 @@ def _axis_values(axis: Axis) -> dict[str, object]:
 
 def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]:
     yield moving and axis.feedback_state == "holding", WARN, f"axis '{axis.name}': feedback holds, measurement too old"
+    if axis.fault:
+        fault = f"feedback is off, the sensor is {axis.fault.kind}: {axis.fault.reason}; set feedback to true again"
+        yield True, ERROR, f"axis '{axis.name}': {fault}"
+    yield axis.amplifier.silent, WARN, f"axis '{axis.name}': stage_state no longer reports its voltage (effort)"
+    saturated = f"axis '{axis.name}': the feedback is at correction_limit, {axis.correction:.4g} V"
+    yield moving and axis.feedback_state == "saturated", WARN, saturated
     yield axis.confidence.contradicted, WARN, f"axis '{axis.name}': {axis.confidence.doubt}"
     drift, quality = axis.drift, axis.model.quality if axis.model else None
     if drift and quality:

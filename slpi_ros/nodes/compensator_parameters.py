@@ -3,10 +3,11 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf
+from math import inf, nan
 from typing import Any
 
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.compensator.ownership import STARTS
 from slpi_ros.compensator.ramps import Safety
 from slpi_ros.compensator.validation import TimestampRules
 from slpi_ros.errors import UsageError
@@ -21,6 +22,8 @@ ACCELERATION = (0.0, 1e12)
 TIMEOUT = (0.0, 86_400.0)
 GAIN = (0.0, 1e15)
 HOLD_OR_SAFE = ("hold", "safe")
+# Default slew limit: the voltage range in this time, seconds. Default correction limit: this share of the range.
+DEFAULT_CROSSING, DEFAULT_CORRECTION = 0.1, 0.2
 
 
 def each_axis(name: str, default: float, description: str, between: tuple[float, float]) -> Declaration:
@@ -62,10 +65,31 @@ DECLARATIONS = (
     # Limits
     each_axis("voltage_min", 0.0, "Lower voltage limit, volts.", VOLTAGE),
     each_axis("voltage_max", 100.0, "Upper voltage limit, volts.", VOLTAGE),
-    each_axis("slew_limit", 0.0, "Maximum rate of a voltage, V/s; 0: no limit.", RATE),
+    each_axis(
+        "slew_limit", nan, "Maximum rate of a voltage, V/s; NaN: the voltage range in 0.1 s. 0: no limit.", RATE,
+    ),
     each_axis(
         "acceleration_limit", 0.0, "Maximum change of the rate, V/s^2; 0: no limit.",
         ACCELERATION,
+    ),
+    scalar(
+        "output_rate", 1000.0,
+        "Voltages per second while a trajectory, a ramp, a hold or what the limits held back is output, hertz. In one "
+        "step a voltage changes by at most two periods of the slew limit.",
+        (1.0, 20_000.0),
+    ),
+    # Start
+    text(
+        "start_voltage", "auto",
+        "Where the first voltage starts from: auto (as stage_state reports in effort; without a publisher of it as "
+        "saved, else as the record of the model ended), measured (as reported, and nothing before), saved (as saved or "
+        "recorded), or a number, volts. One value, or one for each axis, separated by commas.",
+        read_only=True,
+    ),
+    Declaration(
+        "rearm", False,
+        "Whether the node goes on by itself when somebody else has moved the stage and the reported voltages are "
+        "steady; if false, ~/arm does that.",
     ),
     # Commands
     text(
@@ -97,7 +121,7 @@ DECLARATIONS = (
         *HOLD_OR_SAFE,
     ),
     each_axis("safe_voltage", 0.0, "Safe voltage, volts.", VOLTAGE),
-    scalar("ramp_rate", 50.0, "Rate of the ramp to safe_voltage, V/s, at most slew_limit.", POSITIVE_RATE),
+    scalar("ramp_rate", 50.0, "Rate of the ramp to safe_voltage, V/s, at most 80 % of slew_limit.", POSITIVE_RATE),
     # Memory
     text(
         "start_memory", "end",
@@ -113,8 +137,10 @@ DECLARATIONS = (
         between=(1, 1000),
     ),
     scalar(
-        "reset_rate", 200.0, "Voltage rate of reset_memory, V/s, at most slew_limit.", POSITIVE_RATE
+        "reset_rate", 200.0, "Voltage rate of reset_memory, V/s, at most 80 % of slew_limit.", POSITIVE_RATE
     ),
+    each_axis("reset_min", nan, "Lowest voltage of reset_memory, volts; NaN: voltage_min.", VOLTAGE),
+    each_axis("reset_max", nan, "Highest voltage of reset_memory, volts; NaN: voltage_max.", VOLTAGE),
     text(
         "reset_to", "present", "Final voltage of reset_memory: present (before the reset) or safe (safe_voltage).",
         "present", "safe",
@@ -127,6 +153,16 @@ DECLARATIONS = (
     each_axis("kd", 0.0, "Derivative gain of the feedback, V s/m, on the measured displacement.", GAIN),
     each_axis(
         "derivative_filter", 0.0, "Time constant of the derivative low-pass, seconds; 0: none.", (0.0, 1e3)
+    ),
+    each_axis(
+        "correction_limit", nan,
+        "Largest voltage that the feedback adds or subtracts, volts; NaN: a fifth of the voltage range.",
+        (0.0, 20_000.0),
+    ),
+    scalar(
+        "feedback_fault_time", 0.5,
+        "Seconds for which a sensor is silent, stuck, inverted or noisy before the feedback is switched off; 0: never.",
+        TIMEOUT,
     ),
     scalar("measurement_timeout", 0.1, "Seconds; older measurements are ignored and the correction is held.", TIMEOUT),
     scalar(
@@ -158,6 +194,12 @@ class CompensatorSettings:
         All parameters by name, validated; a parameter that may differ between axes is a tuple, one value per axis.
     limits : tuple of Limits
         One for each axis.
+    starts : tuple of str or float
+        Start voltage of each axis.
+    reset_spans : tuple of (float, float), volts
+        Lowest and highest voltage of the reset of each axis.
+    period : float, seconds
+        Output period.
     time : TimestampRules
     safety : Safety
     loops : tuple of LoopSettings
@@ -166,6 +208,9 @@ class CompensatorSettings:
 
     values: Mapping[str, Any]
     limits: tuple[Limits, ...]
+    starts: tuple[str | float, ...]
+    reset_spans: tuple[tuple[float, float], ...]
+    period: float
     time: TimestampRules
     safety: Safety
     loops: tuple[LoopSettings, ...]
@@ -192,9 +237,15 @@ class CompensatorSettings:
             )
         gains = zip(values["kp"], values["ki"], values["kd"], values["derivative_filter"], strict=True)
         timeout = values["measurement_timeout"]
+        limits = _limits(values)
+        ranges = [each.upper - each.lower for each in limits]
+        corrections = values["correction_limit"] or [DEFAULT_CORRECTION * width for width in ranges]
         settings = cls(
             values,
-            _limits(values),
+            limits,
+            _starts(values),
+            _reset_spans(values, limits),
+            1.0 / values["output_rate"],
             TimestampRules(values["time_jump"], values["max_age"]),
             Safety(
                 values["command_timeout"],
@@ -203,7 +254,10 @@ class CompensatorSettings:
                 values["safe_voltage"],
                 values["ramp_rate"],
             ),
-            tuple(LoopSettings(values["feedback"], PidGains(*each), timeout) for each in gains),
+            tuple(
+                LoopSettings(values["feedback"], PidGains(*each), timeout, most)
+                for each, most in zip(gains, corrections, strict=True)
+            ),
         )
         settings._require_safe_voltages()
         return settings
@@ -227,7 +281,49 @@ def _limits(values: Mapping[str, Any]) -> tuple[Limits, ...]:
             raise UsageError(
                 f"axis '{name}': voltage_min {low:g} V is not below voltage_max {high:g} V; correct one of the two"
             )
-    each = (values[name] for name in ("voltage_min", "voltage_max", "slew_limit", "acceleration_limit"))
+    slew = values["slew_limit"] or [
+        (high - low) / DEFAULT_CROSSING for low, high in zip(values["voltage_min"], values["voltage_max"], strict=True)
+    ]
+    each = (values["voltage_min"], values["voltage_max"], slew, values["acceleration_limit"])
     return tuple(
         Limits(low, high, slew or inf, acceleration or inf) for low, high, slew, acceleration in zip(*each, strict=True)
     )
+
+
+def _starts(values: Mapping[str, Any]) -> tuple[str | float, ...]:
+    """Return the start voltage of each axis; UsageError if it is neither a word of `STARTS` nor a voltage in limits."""
+    given, axes = values["start_voltage"], values["axes"]
+    words = [each.strip() for each in given.split(",")]
+    words *= len(axes) if len(words) == 1 else 1
+    starts: list[str | float] = []
+    for word in words:
+        if word not in STARTS:
+            try:
+                starts.append(float(word))
+            except ValueError:
+                starts.append(nan)
+        else:
+            starts.append(word)
+    limits = zip(values["voltage_min"], values["voltage_max"], strict=True)
+    within = [
+        not isinstance(each, float) or low <= each <= high for each, (low, high) in zip(starts, limits, strict=False)
+    ]
+    if len(starts) != len(axes) or not all(within):
+        raise UsageError(
+            f"parameter start_voltage is {given!r}; give {', '.join(STARTS)} or a voltage within the limits, or one of "
+            f"these for each of the axes {', '.join(axes)}, separated by commas"
+        )
+    return tuple(starts)
+
+
+def _reset_spans(values: Mapping[str, Any], limits: tuple[Limits, ...]) -> tuple[tuple[float, float], ...]:
+    """Return the voltages of the reset of each axis; UsageError if they are not within the limits in this order."""
+    lows = values["reset_min"] or [each.lower for each in limits]
+    highs = values["reset_max"] or [each.upper for each in limits]
+    for name, each, low, high in zip(values["axes"], limits, lows, highs, strict=True):
+        if not each.lower <= low < high <= each.upper:
+            raise UsageError(
+                f"axis '{name}': reset_min {low:g} V, reset_max {high:g} V; give the lower one first, both within "
+                f"voltage_min..voltage_max, {each.lower:g}..{each.upper:g} V"
+            )
+    return tuple(zip(lows, highs, strict=True))

@@ -9,23 +9,19 @@ from dataclasses import dataclass
 
 from builtin_interfaces.msg import Duration as DurationMsg
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.errors import RecordError, SlpiError, UsageError
-from slpi_ros.excitation.drives import DRIVES, Drive, Playback, excite
+from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite, slew_limits
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.nodes.common import COMMANDS, LATCHED, request_stop, run
+from slpi_ros.model.limits import Limits
+from slpi_ros.nodes.common import COMMANDS, request_stop, run
+from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
 from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
-
-# A reported voltage outside the limits by at most this fraction of the range counts as at the limit.
-READ_BACK = 0.01
 
 VOLTAGE = (-10_000.0, 10_000.0)
 LIVE = "live"
@@ -41,14 +37,21 @@ DECLARATIONS = (
         number=True,
     ),
     Declaration(
-        "slew_limit", 0.0, "Maximum rate of a voltage, V/s; 0: no limit. One value, or one for each axis.",
+        "slew_limit", math.nan,
+        "Maximum rate of a voltage, V/s, of which the drive uses 80 %; NaN: the voltage range in 0.1 s. 0: no limit. "
+        "One value, or one for each axis.",
         between=(0.0, 1e9), number=True, each_axis=True,
     ),
     Declaration(
-        "start_voltage", math.nan,
-        "Voltage before and after the excitation, volts; NaN: as reported by stage_state, or voltage_min without a "
-        "report. One value, or one for each axis.",
+        "rest_voltage", math.nan,
+        "Voltage before and after the excitation, volts; NaN: as reported by stage_state. Without a publisher of "
+        "stage_state the amplifier is taken to be there. One value, or one for each axis.",
         number=True,
+    ),
+    Declaration(
+        "state_timeout", 0.5,
+        "Seconds without a valid stage_state after which the drive is given up; reports of the voltage may be as late.",
+        read_only=True, between=(1e-3, 60.0), number=True,
     ),
     Declaration("duration", 30.0, "Total excitation time of all axes, seconds.", between=(0.1, 86_400.0), number=True),
     Declaration("rate", 200.0, "Sample rate, hertz.", between=(1.0, 10_000.0), number=True),
@@ -79,15 +82,15 @@ class ExciterSettings:
     ----------
     values : mapping of str to object
         All parameters by name.
-    limits : (list of float, list of float), volts
-        Lowest and highest voltage of each axis.
-    start : list of float or None, volts
+    limits : tuple of Limits
+        Limits of each axis.
+    rest : list of float or None, volts
         Voltage of each axis before and after the excitation; None: as reported by ``stage_state``.
     """
 
     values: Values
-    limits: tuple[list[float], list[float]]
-    start: list[float] | None
+    limits: tuple[Limits, ...]
+    rest: list[float] | None
 
     @classmethod
     def of(cls, given: Values) -> "ExciterSettings":
@@ -100,61 +103,63 @@ class ExciterSettings:
         """
         values, axes = validated(DECLARATIONS, given), given["axes"]
         low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
-        start = given["start_voltage"]
-        start = None if start != start else numbers(given, "start_voltage", axes, *VOLTAGE)
+        rest = given["rest_voltage"]
+        rest = None if rest != rest else numbers(given, "rest_voltage", axes, *VOLTAGE)
         if values["repeat"] and values["output"] != LIVE:
             raise UsageError(f"parameters repeat and output '{values['output']}' do not go together; set one of them")
-        settings = cls(values, (low, high), start)
-        settings.drawn(None)
+        slew = slew_limits(values["slew_limit"], low, high)
+        limits = tuple(
+            Limits(lowest, highest, rate or math.inf) for lowest, highest, rate in zip(low, high, slew, strict=True)
+        )
+        settings = cls(values, limits, rest)
+        settings.drawn(low)
         return settings
 
-    def drawn(self, heard: Sequence[float] | None) -> Drive:
-        """Return the excitation, starting at the reported voltages `heard` (V, one per axis; None if unknown).
+    def drawn(self, found: Sequence[float]) -> Drive:
+        """Return the excitation, from and to rest: `rest`, or the voltages (V) at which the amplifier was found.
 
         Raises
         ------
         UsageError
             If the settings do not allow an excitation.
-        SlpiError
-            If a reported voltage is outside the limits.
         """
-        start = self._within_limits(heard) if self.start is None and heard else self.start
-        low, high = self.limits
-        given = {name: self.values[name] for name in ("axes", "slew_limit", "duration", "rate", "seed", "drive")}
-        return excite(voltage_min=low, voltage_max=high, start=start, **given)
-
-    def _within_limits(self, heard: Sequence[float]) -> list[float]:
-        for axis, v, low, high in zip(self.values["axes"], heard, *self.limits, strict=True):
-            slack = READ_BACK * (high - low)
-            if not low - slack <= v <= high + slack:
-                raise SlpiError(
-                    f"exciter: axis '{axis}' is at {v:g} V, outside {low:g} to {high:g} V; move it inside first"
-                )
-        return [min(max(v, low), high) for v, low, high in zip(heard, *self.limits, strict=True)]
+        rest = self.rest or [limits.clip(v) for limits, v in zip(self.limits, found, strict=True)]
+        given = {name: self.values[name] for name in ("axes", "duration", "rate", "seed", "drive")}
+        return excite(
+            voltage_min=[each.lower for each in self.limits],
+            voltage_max=[each.upper for each in self.limits],
+            slew_limit=[SLEW_USED * each.slew if each.slew < math.inf else 0.0 for each in self.limits],
+            start=rest,
+            **given,
+        )
 
 
-POLL_PERIOD = 0.1
+# Period of polls while nothing moves, and of the watch, seconds.
+POLL_PERIOD, WATCH_PERIOD = 0.1, 0.02
 LOG_PERIOD = 5.0
-# Time to wait at shutdown for the delivery of the last voltage.
-PATIENCE = Duration(seconds=1.0)
-# Time to wait at the end for stage_state to report the last voltage, and what a report within READ_BACK must then last
+# Time without a publisher of stage_state after which rest_voltage is taken for the voltage of the amplifier, seconds.
+NOBODY = 1.0
+# Time to wait at the end for stage_state to report the last voltage, and what such a report must then last
 # for a slow stage to have come all the way, seconds.
-REPORT_PATIENCE, REPORT_LASTS = 3.0, 0.2
+REPORT_PATIENCE, REPORT_LASTS = 3.0, 0.5
 # A warning is logged if the excitation takes longer than planned by this factor.
 SLUGGISH = 1.02
 
 
 class Exciter(Node):
-    """Excite a stage within its limits, and return it to its initial voltage when the excitation ends or is stopped.
+    """Excite a stage within its limits, and return it to its rest voltage when the excitation ends or is stopped.
 
     Publishes ``voltage_command`` with one sample per period of a monotonic clock: after a stall of the process the
     excitation continues with the next sample, without a voltage step. With the parameter ``output`` "trajectory" all
-    samples are published in one message on ``voltage_trajectory``, volts in ``effort``, no positions. Subscribes to
-    ``stage_state`` for the initial voltages. The node waits for a subscriber before it starts, and at the end for
-    ``stage_state`` to report the last voltage: a record that ends earlier would not hold the memory at its end.
-    It drives only while no other node publishes the topic of its voltages: beside one it does not start, and if one
-    appears later it returns to the initial voltages; in both cases it ends with exit code 1 (without ``autostart`` it
-    stays). Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
+    samples are published in one message on ``voltage_trajectory``, volts in ``effort``, no positions. The node waits
+    for a subscriber, and for ``stage_state`` to report where the amplifier is (or the parameter ``rest_voltage``), and
+    says so while it waits. At the end it waits for ``stage_state`` to report the last voltage: a record that ends
+    earlier would not hold the memory at its end.
+
+    It drives only while no other node publishes the topic of its voltages, and while ``stage_state`` reports what the
+    voltages can have caused (`slpi_ros.calibration.drive_watch`). Else it returns to rest at the slew limit and ends
+    with exit code 1 (without ``autostart`` it stays). A trajectory is not watched: the device plays it by itself.
+    Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
 
     Raises
     ------
@@ -166,38 +171,43 @@ class Exciter(Node):
         super().__init__("exciter")
         self._parameter_set = Parameters(self, DECLARATIONS, ExciterSettings.of)
         self._parameter_set.follow(lambda settings: None)
+        settings = self._parameter_set.settings
         self._playback: Playback | None = None
         self._timer = None
-        self._heard: list[float] | None = None
         self._live = self._values["output"] == LIVE
-        if self._live:
-            self._publisher = self.create_publisher(Float64MultiArray, "voltage_command", COMMANDS)
-        else:
-            self._publisher = self.create_publisher(JointTrajectory, "voltage_trajectory", LATCHED)
-        self.create_subscription(JointState, "stage_state", self._on_state, qos_profile_sensor_data)
+        publisher = None if self._live else self.create_publisher(JointTrajectory, "voltage_trajectory", COMMANDS)
+        self._guard = GuardedDrive(
+            self, settings.values["axes"], settings.limits, settings.values["rate"], settings.values["state_timeout"],
+            publisher=publisher,
+        )  # fmt: skip
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        # A simulated clock may stop.
+        # A simulated clock may stop, and the system clock may be set back.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._polls_left = self._listeners = 0
-        self._waiting = self.create_timer(POLL_PERIOD, self._poll_subscribers, clock=self._steady, autostart=False)
+        self._waiting = self.create_timer(POLL_PERIOD, self._poll, clock=self._steady, autostart=False)
         self._refusal: SlpiError | None = None
-        self._watching = self.create_timer(POLL_PERIOD, self._watch_for_others, clock=self._steady, autostart=False)
-        self._last: list[float] = []
-        self._away = 0.0
+        self._rest: list[float] = []
+        self._returning = self._arriving = False
+        self.create_timer(WATCH_PERIOD, self._watch, clock=self._steady)
+        self._away = self._said = 0.0
         self._leaving = self.create_timer(POLL_PERIOD, self._poll_report, clock=self._steady, autostart=False)
         if self._values["autostart"]:
             self._wait()
 
     def destroy_node(self) -> None:
-        """Return the axes to their initial voltage, then destroy the node."""
-        if self.context.ok():
-            if self._playback:
+        """Return the axes to rest, then destroy the node."""
+        if self.context.ok() and self._playback:
+            if self._live:
+                self._guard.return_to(self._rest)
+            else:
                 self._return(self._playback)
                 while not self._playback.done:
-                    self._publish_sample(self._playback.next())
+                    self._playback.next()
                     time.sleep(1.0 / self._playback.drive.rate)
-            self._publisher.wait_for_all_acked(PATIENCE)
+        if self.context.ok():
+            # Voltages that have not been delivered are lost when the process ends.
+            self._guard.publisher.wait_for_all_acked(DELIVERY)
         super().destroy_node()
 
     @property
@@ -216,66 +226,78 @@ class Exciter(Node):
         return response
 
     def _wait(self) -> None:
-        self._listeners = 0
-        self._polls_left = 1
+        self._guard.prepare(self._parameter_set.settings.limits, self._values["rate"])
+        self._listeners, self._said = 0, -math.inf
+        self._polls_left, self._begun = 1, time.monotonic()
         self._waiting.reset()
 
-    def _poll_subscribers(self) -> None:
+    def _poll(self) -> None:
         """Start once the number of subscribers has not changed for the time `settle`, so that none misses samples."""
-        listeners = self._publisher.get_subscription_count()
-        if not listeners:
-            self.get_logger().info(
-                f"waiting for a subscriber of {self._publisher.topic_name}", throttle_duration_sec=LOG_PERIOD
-            )
-        elif listeners != self._listeners:
+        listeners = self._guard.publisher.get_subscription_count()
+        if listeners and listeners == self._listeners:
+            self._polls_left = max(self._polls_left - 1, 1)
+        elif listeners:
             self._polls_left = 1 + round(self._values["settle"] / POLL_PERIOD)
-        else:
-            self._polls_left -= 1
-        self._listeners = listeners
-        if not self._polls_left:
+        settled, self._listeners = listeners > 0 and self._polls_left == 1, listeners
+        lacking = self._lacking()
+        now = time.monotonic()
+        if lacking and now - self._said > LOG_PERIOD:
+            self._said = now
+            self.get_logger().info(f"waiting: {lacking}")
+        if settled and not lacking:
             self._waiting.cancel()
+            self._polls_left = 0
             self._begin()
 
-    def _on_state(self, state: JointState) -> None:
-        at = dict(zip(state.name, state.effort, strict=False))
-        heard = [at.get(axis, math.nan) for axis in self._values["axes"]]
-        if all(map(math.isfinite, heard)):
-            self._heard = heard
+    def _lacking(self) -> str:
+        """Return what is missing before the drive may start, and what to do; "" if nothing is."""
+        lacking = self._guard.lacking()
+        if lacking and self._guard.publisher.get_subscription_count() and not self._guard.heard:
+            if self._parameter_set.settings.rest and time.monotonic() - self._begun > NOBODY:
+                return ""
+            return f"{lacking}; or give rest_voltage, if nothing reports where the amplifier is"
+        return lacking
 
     # Excitation
 
     def _begin(self) -> None:
-        values = self._values
+        values, settings = self._values, self._parameter_set.settings
+        found = self._guard.found() or settings.rest
+        assert found
         try:
-            self._require_alone()
-            drive = self._parameter_set.settings.drawn(self._heard)
+            self._guard.require_alone()
+            self._guard.start(found)
+            drive = settings.drawn(found)
+            self._rest = [float(v[0]) for v in drive.voltage.values()]
+            if not self._live and not self._guard.at(self._rest, TOLERATED_SHARE):
+                raise RecordError(
+                    f"exciter: the amplifier is at {', '.join(f'{v:g}' for v in found)} V, not at rest_voltage; a "
+                    "trajectory would begin with a jump: move it there first"
+                )
         except SlpiError as error:
             self._give_up(error)
             return
-        self._refusal = None
-        self._watching.reset()
+        if not self._guard.heard:
+            self.get_logger().warning(
+                "nobody publishes stage_state: the amplifier is taken to be at rest_voltage, and nothing watches the "
+                "sensor"
+            )
+        self._refusal, self._returning, self._arriving = None, False, self._live
         self._playback, self._begun = Playback(drive, repeat=values["repeat"]), time.monotonic()
+        if self._live and self._guard.heard:
+            self._guard.begin()
         self._timer = self.create_timer(1.0 / drive.rate, self._step, clock=self._steady)
         self._publish_trajectory(self._playback)
         self.get_logger().info(f"exciting {', '.join(drive.axes)} for {values['duration']:g} s. {drive.why}")
 
-    def _require_alone(self) -> None:
-        """Raise RecordError if another node publishes the topic of the voltages."""
-        others = self.count_publishers(self._publisher.topic_name) - 1
-        if others > 0:
-            raise RecordError(
-                f"exciter: {others} other publisher of {self._publisher.topic_name}; stop it, as the voltage would "
-                "jump between the commands of both"
-            )
-
-    def _watch_for_others(self) -> None:
-        """Start the return to the initial voltages if another publisher of voltages has appeared."""
-        if self._playback and not self._playback.stopping:
-            try:
-                self._require_alone()
-            except RecordError as error:
-                self._refusal = error
-                self._return(self._playback)
+    def _watch(self) -> None:
+        """Return to rest if the stage does not do what it is told, or another publisher of voltages has appeared."""
+        self._guard.listen()
+        fault = self._guard.fault()
+        if fault is not None and self._playback and not (self._returning or self._playback.stopping):
+            self._refusal = fault
+            self.get_logger().error(f"{fault}; returning to rest")
+            self._return(self._playback)
 
     def _give_up(self, error: SlpiError) -> None:
         """Report the error; end with its exit code if the node has started by itself."""
@@ -285,51 +307,61 @@ class Exciter(Node):
             self.get_logger().error(str(error))
 
     def _step(self) -> None:
-        if self._playback:
-            self._publish_sample(self._playback.next())
-            if self._playback.done:
-                self._end(self._playback)
-
-    def _publish_sample(self, voltages: list[float]) -> None:
-        if self._live:
-            self._publisher.publish(Float64MultiArray(data=array("d", voltages)))
+        playback = self._playback
+        if playback is None:
+            return
+        if not self._live:
+            playback.next()
+            if playback.done:
+                self._end(playback)
+        elif self._returning:
+            if self._guard.return_step(self._rest):
+                self._end(playback)
+        elif self._arriving and not self._guard.at(self._rest):
+            # To rest_voltage, from where the amplifier is.
+            self._guard.return_step(self._rest)
+            self._begun = time.monotonic()
+        else:
+            self._arriving = False
+            sample = playback.next()
+            self._guard.move(sample)
+            if playback.done and self._guard.at(sample):
+                self._end(playback)
 
     def _publish_trajectory(self, playback: Playback) -> None:
         if not self._live:
-            self._publisher.publish(trajectory_of(playback))
+            self._guard.publisher.publish(trajectory_of(playback))
 
     def _end(self, playback: Playback) -> None:
         self.destroy_timer(self._timer)
-        self._watching.cancel()
+        self._guard.end()
         self._playback = None
+        stopped = self._returning or playback.stopping
         took, planned = time.monotonic() - self._begun, playback.drive.t[-1]
-        rest = ", ".join(f"{axis} at {v[0]:g} V" for axis, v in playback.drive.voltage.items())
-        self.get_logger().info(f"{'stopped' if playback.stopping else 'done'} after {took:.1f} s; {rest}")
+        rest = ", ".join(f"{axis} at {v:g} V" for axis, v in zip(playback.drive.axes, self._rest, strict=True))
+        self.get_logger().info(f"{'stopped' if stopped else 'done'} after {took:.1f} s; {rest}")
         if self._refusal is not None:
             self._give_up(self._refusal)
-        elif not playback.stopping:
+        elif not stopped:
             if took > SLUGGISH * planned:
                 self.get_logger().warning(
                     f"the excitation took {took:.1f} s instead of {planned:.1f} s; use a lower rate on this machine"
                 )
             if self._values["autostart"]:
-                self._last = [float(v[-1]) for v in playback.drive.voltage.values()]
                 self._begun = self._away = time.monotonic()
                 self._leaving.reset()
 
     def _poll_report(self) -> None:
         """Stop once ``stage_state``, if it was ever received, has reported the last voltages for some time."""
-        now = time.monotonic()
-        spans = [high - low for low, high in zip(*self._parameter_set.settings.limits, strict=True)]
-        heard = self._heard or self._last
-        if any(abs(v - last) > READ_BACK * span for v, last, span in zip(heard, self._last, spans, strict=True)):
+        now, reported = time.monotonic(), self._guard.reported
+        if reported is not None and not self._guard.reports(self._rest):
             self._away = now
-        if self._heard is None or now - self._away >= REPORT_LASTS:
+        if reported is None or now - self._away >= REPORT_LASTS:
             request_stop()
         elif now - self._begun > REPORT_PATIENCE:
             self.get_logger().warning(
-                f"stage_state reports {', '.join(f'{v:.6g}' for v in heard)} V, {REPORT_PATIENCE:g} s after the end at "
-                f"{', '.join(f'{v:.6g}' for v in self._last)} V; a record that ends now does not hold the end"
+                f"stage_state reports {', '.join(f'{v:.6g}' for v in reported)} V, {REPORT_PATIENCE:g} s after the "
+                f"end at {', '.join(f'{v:.6g}' for v in self._rest)} V; a record that ends now does not hold the end"
             )
             request_stop()
 
@@ -343,7 +375,10 @@ class Exciter(Node):
         return response
 
     def _return(self, playback: Playback) -> float:
-        """Start the return to the initial voltages; return its duration, seconds."""
+        """Start the return to rest; return its duration, seconds."""
+        if self._live:
+            self._returning = True
+            return self._guard.return_seconds(self._rest)
         if playback.stop():
             self._publish_trajectory(playback)
         return playback.seconds_left

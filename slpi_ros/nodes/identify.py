@@ -18,7 +18,10 @@ from std_srvs.srv import Trigger
 from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
 from slpi_ros.identification.fit import KINDS
 from slpi_ros.io.bag_files import PATIENCE, BagWatch
+from slpi_ros.io.input_limits import TOPIC_MODEL_CHARACTERS
+from slpi_ros.io.outputs import allow_document
 from slpi_ros.model.document import parse_model, save_model
+from slpi_ros.model.sensor import LONGEST
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, run
 from slpi_ros.nodes.help import help_asked
@@ -48,6 +51,20 @@ DECLARATIONS = (
     Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
     Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}.", choices=tuple(KINDS)),
     Declaration("output", "", "File for the model document; empty: none."),
+    Declaration(
+        "replace", False,
+        "Whether a new model is published whatever it lacks beside the model in use: voltage range, coverage, samples, "
+        "held-out error.",
+    ),
+    Declaration(
+        "sensor_delay", 0.0, "Known delay of the sensor, seconds, taken out of its readings; the model keeps it.",
+        between=(0.0, LONGEST), number=True,
+    ),
+    Declaration(
+        "sensor_lag", 0.0,
+        "Known time constant of the sensor's low-pass filter, seconds, taken out of its readings; the model keeps it.",
+        between=(0.0, LONGEST), number=True,
+    ),
     Declaration(
         "start", math.nan, "Start of the fitted part, seconds from the first stamp; NaN or negative: first stamp.",
         number=True,
@@ -104,7 +121,17 @@ class IdentifySettings:
         start, stop = bound(values, "start"), bound(values, "stop")
         if start is not None and stop is not None and not start < stop:
             raise UsageError(f"parameter start is {start:g} s and stop {stop:g} s; start before you stop")
-        request = FitRequest(bags, values["topic"], values["kind"], start, stop, values["output"])
+        request = FitRequest(
+            bags,
+            values["topic"],
+            values["kind"],
+            start,
+            stop,
+            values["output"],
+            unconditional=values["replace"],
+            sensor_delay=checked["sensor_delay"],
+            sensor_lag=checked["sensor_lag"],
+        )
         folder = values["watch_directory"]
         if folder:
             BagWatch(folder)
@@ -244,6 +271,9 @@ class DiagnosisService:
 WATCH_PERIOD = 0.5
 NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
 
+# Time from the start within which a model that somebody else has published is heard of, seconds.
+DISCOVERY = 1.0
+
 
 class Identify(Node):
     """Identify the model of a stage from bags and publish it, latched, on ``stage_model``.
@@ -251,7 +281,8 @@ class Identify(Node):
     Publishes ``stage_model`` and ``/diagnostics``; parameters in `DECLARATIONS`. The service ``~/identify``
     (``std_srvs/Trigger``) repeats the identification, ``~/diagnose`` finds the causes of the errors of the published
     model on its bags. A bag that cannot be identified, or a bag of the watched folder that was recorded on another
-    stage, is reported and skipped; the last valid model stays published.
+    stage, is reported and skipped; the last valid model stays published. So it does if the new model is worse than the
+    model in use: the last one on ``stage_model``, by whomever, or else the one in the file ``output``.
 
     Raises
     ------
@@ -263,6 +294,10 @@ class Identify(Node):
         super().__init__("identify")
         self._parameter_set = Parameters(self, DECLARATIONS, IdentifySettings.of)
         self._publisher = self.create_publisher(String, "stage_model", LATCHED)
+        # The model in use, and the messages of this node that will come back.
+        self._in_use, self._begun = "", time.monotonic()
+        self._echoes: deque[str] = deque()
+        self.create_subscription(String, "stage_model", self._on_model, LATCHED)
         self._diagnostics = Diagnostics(self, "identify")
         self._job: WorkerProcess[FitRequest, FitOutcome] | None = None
         self._asked: FitRequest | None = None
@@ -296,6 +331,15 @@ class Identify(Node):
         self._end_job()
         self._diagnosis.end()
         super().destroy_node()
+
+    def _on_model(self, message: String) -> None:
+        """Take note of a model that somebody else has published."""
+        document = str(message.data)
+        if document in self._echoes:
+            while self._echoes.popleft() != document:
+                pass
+        elif len(document) <= TOPIC_MODEL_CHARACTERS:
+            self._in_use = document
 
     def _on_change(self, settings: IdentifySettings) -> None:
         """Repeat the identification, unless only the diagnosis folder has changed."""
@@ -340,7 +384,7 @@ class Identify(Node):
         """Publish a withheld model, if any; else identify again from the given bags or from the newest watched bag."""
         if self._doubtful:
             (asked, document), self._doubtful = self._doubtful, None
-            self._take(asked, FitOutcome(document, self._written(asked, document)))
+            self._take(asked, FitOutcome(document))
             response.success = not self._error
             response.message = self._error or shown(f"published the model of {asked.source}")
             return response
@@ -366,10 +410,8 @@ class Identify(Node):
         request, self._asked = self._asked, None
         if not request and self._waiting:
             bag = str(self._waiting.popleft())
-            published = self._identified.document if self._identified and self._stage else ""
-            wanted = self._parameter_set.settings.request
-            request = replace(wanted, bags=(bag,), stage=self._stage, published=published)
-        return request
+            request = replace(self._parameter_set.settings.request, bags=(bag,), stage=self._stage)
+        return replace(request, in_use=self._in_use) if request else None
 
     def _end_job(self) -> None:
         self._poll.cancel()
@@ -378,39 +420,50 @@ class Identify(Node):
             self._job = None
 
     def _poll_job(self) -> None:
-        """Check whether the identification is complete."""
+        """Check whether the identification is complete, once a model in use would have been heard of."""
+        if time.monotonic() - self._begun < DISCOVERY:
+            return
         outcome = self._job.outcome() if self._job else None
         if self._job and outcome:
             request, self._job = self._job.request, None
             self._poll.cancel()
-            self._take(request, outcome)
+            if request.in_use == self._in_use or request.unconditional or outcome.error:
+                self._take(request, outcome)
+            else:
+                # Another model has come into use meanwhile: compare with that one.
+                self._asked = request
             self._start_next()
 
-    def _written(self, request: FitRequest, document: str) -> str:
-        """Write a model to the output file, if any; return the error message, or ""."""
+    def _write(self, model: StageModel, output: str) -> None:
+        """Write a model to the output file, if any."""
         try:
-            if request.output:
-                save_model(parse_model(document, request.source), request.output)
+            if output:
+                allow_document(output, "model")
+                save_model(model, output)
         except SlpiError as error:
-            return str(error)
-        return ""
+            self._fail(error)
 
     def _take(self, request: FitRequest, outcome: FitOutcome) -> None:
         if outcome.doubt:
             self._doubtful = request, outcome.document
-            self._error = shown(f"{outcome.doubt}; not published: call ~/identify to publish it nevertheless")
+            self._error = shown(
+                f"{outcome.doubt}; the model in use stays: call ~/identify to publish the new one nevertheless, or "
+                "record more"
+            )
             self.get_logger().warning(self._error)
             self._report()
             return
-        self._doubtful = None
+        self._doubtful, self._error = None, ""
         if outcome.document:
             self._model = parse_model(outcome.document, "identify")
             self._stage = StageIdentity.of(self._model, request.stage)
             self._identified = DiagnosisRequest(request.bags, request.topic, outcome.document)
             self._diagnosis.forget()
+            self._write(self._model, request.output)
+            self._in_use = outcome.document
+            self._echoes.append(outcome.document)
             self._publisher.publish(String(data=outcome.document))
             self.get_logger().info(shown(described(self._model)))
-        self._error = ""
         if outcome.error:
             self._fail(outcome.error)
         self._report()

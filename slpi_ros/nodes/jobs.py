@@ -6,21 +6,20 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-
 from slpi_ros.compensator.persistence import model_id
+from slpi_ros.dependencies import DependencyError, dependencies_needed
 from slpi_ros.errors import ModelError, RecordError, SlpiError, shown
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.input_limits import TOPIC_MODEL_CHARACTERS
 from slpi_ros.io.record import Record
-from slpi_ros.model.document import format_model, model_from, parse_model, save_model
+from slpi_ros.model.document import format_model, load_model, model_from, parse_model
 from slpi_ros.model.stage_model import StageModel
 
 Request = TypeVar("Request")
@@ -84,7 +83,12 @@ def _run(sender: Connection, work: Callable[[Any], Any], request: Any) -> None:
     """Entry point of the process: send the outcome of a request."""
     # Like a line of the node's log, without the line of code that warns.
     warnings.formatwarning = lambda message, *_: f"[WARN] {shown(str(message))}\n"
-    sender.send_bytes(json.dumps(asdict(work(request))).encode())
+    try:
+        with dependencies_needed():
+            outcome = asdict(work(request))
+    except DependencyError as error:
+        outcome = {"error": str(error)}
+    sender.send_bytes(json.dumps(outcome).encode())
 
 
 @dataclass(frozen=True)
@@ -138,8 +142,12 @@ class FitRequest:
         File for the model document; "" if none.
     stage : StageIdentity, optional
         Stage that the bags must belong to; default: any.
-    published : str
-        Published model document, which is compared with the new one; "" (default): no comparison.
+    in_use : str
+        Document of the model in use, with which the new one is compared; "" (default): that in `output`, if any.
+    unconditional : bool
+        Whether the new model is published whatever the comparison says. Default False.
+    sensor_delay, sensor_lag : float, seconds
+        Known delay and lag of the sensor; default 0.
     """
 
     bags: tuple[str, ...]
@@ -149,7 +157,10 @@ class FitRequest:
     stop: float | None
     output: str
     stage: StageIdentity | None = None
-    published: str = ""
+    in_use: str = ""
+    unconditional: bool = False
+    sensor_delay: float = 0.0
+    sensor_lag: float = 0.0
 
     @property
     def source(self) -> str:
@@ -159,9 +170,9 @@ class FitRequest:
 
 @dataclass(frozen=True)
 class FitOutcome:
-    """Outcome of an identification: a model document, an error, or both if the file could not be written.
+    """Outcome of an identification: a model document or an error.
 
-    `doubt` is the reason why the model must not replace the published one automatically; no file is written then.
+    `doubt` is the reason why the model must not replace the one in use automatically.
     """
 
     document: str = ""
@@ -170,55 +181,59 @@ class FitOutcome:
 
 
 def fit(request: FitRequest) -> FitOutcome:
-    """Read the bags, identify the model and write it to the output file, if any."""
+    """Read the bags, identify the model and compare it with the one in use."""
     # Imported here because they load slowly: the compensator uses this module to read models only.
+    from slpi_ros.diagnosis.replacement import doubt_about
     from slpi_ros.identification.fit import identify
     from slpi_ros.io.bag_reader import read_bag
 
-    document = ""
     try:
         records = [read_bag(bag, request.topic) for bag in request.bags]
         if request.stage:
             for record in records:
                 request.stage.require(record)
-        model = identify(records, request.kind, start=request.start, stop=request.stop)
-        document = format_model(model)
-        if request.published:
-            doubt = doubt_about(model, parse_model(request.published, "stage_model"))
-            if doubt:
-                return FitOutcome(document, doubt=f"{request.source}: {doubt}")
-        if request.output:
-            save_model(model, request.output)
+        _require_usable(records, request.start, request.stop)
+        model = identify(
+            records,
+            request.kind,
+            start=request.start,
+            stop=request.stop,
+            sensor_delay=request.sensor_delay,
+            sensor_lag=request.sensor_lag,
+        )
+        document, doubt = format_model(model), ""
+        in_use = None if request.unconditional else _in_use(request, records)
+        if in_use:
+            doubt = doubt_about(model, in_use, records)
     except SlpiError as error:
-        return FitOutcome(document, str(error))
-    return FitOutcome(document)
+        return FitOutcome(error=str(error))
+    return FitOutcome(document, doubt=doubt and f"{request.source}: {doubt}")
 
 
-# Conditions for an automatic replacement of the published model: maximum ratio of the new to the old held-out error,
-# and maximum difference of the largest loops as a fraction of their height.
-MUCH_WORSE, FOREIGN = 3.0, 0.1
+def _require_usable(records: Sequence[Record], start: float | None = None, stop: float | None = None) -> None:
+    """Raise IdentificationError for the first record whose quality allows no fit, as the command line does."""
+    from slpi_ros.identification.record_quality import assess, findings, require_usable
+
+    for record in records:
+        for axis in record.axes:
+            found = findings(assess(record, axis, start=start, stop=stop))
+            require_usable(found, f"{record.source}: axis '{axis}'")
 
 
-def doubt_about(model: StageModel, published: StageModel) -> str:
-    """Return the reason not to replace the published model automatically (worse fit, or another stage), or ""."""
-    for name, old in published.axes.items():
-        new = model.axes[name]
-        errors = [axis.quality.held_out_rms * 1e9 for axis in (new, old)]
-        if errors[0] > MUCH_WORSE * errors[1]:
-            return (
-                f"axis '{name}': held-out error {errors[0]:.3g} nm rms, that of the published model {errors[1]:.3g} nm"
-            )
-        low = max(axis.voltage_range[0] for axis in (new, old))
-        high = min(axis.voltage_range[1] for axis in (new, old))
-        if not low < high:
-            return f"axis '{name}': none of the voltages of the published model"
-        rise = np.linspace(low, high, 101)
-        way = np.concatenate([[high], rise, rise[::-1]])
-        loops = [axis.simulate(np.zeros(way.size), way)[1:] for axis in (new, old)]
-        off = float(np.ptp(loops[0] - loops[1]) / np.ptp(loops[1]))
-        if off > FOREIGN:
-            return f"axis '{name}': its largest loop differs by {off:.0%} from that of the published model"
-    return ""
+def _in_use(request: FitRequest, records: Sequence[Record]) -> StageModel | None:
+    """Return the model in use of the stage of these records; None if there is none, or none that can be read."""
+    try:
+        if request.in_use:
+            model = parse_model(request.in_use, "stage_model")
+        elif request.output and Path(request.output).is_file():
+            model = load_model(request.output)
+        else:
+            return None
+        for record in records:
+            StageIdentity.of(model, None).require(record)
+    except SlpiError:
+        return None
+    return model
 
 
 @dataclass(frozen=True)
@@ -267,6 +282,7 @@ def run_diagnosis(request: DiagnosisRequest) -> DiagnosisOutcome:
     try:
         make_folder(folder, *FILES)
         records = [read_bag(bag, request.topic) for bag in request.bags]
+        _require_usable(records)
         diagnosis = diagnose(records, parse_model(request.document, "stage_model"))
         write_files(folder, diagnosis)
     except SlpiError as error:

@@ -50,12 +50,16 @@ class Declaration:
     def read(self, values: Values, axes: Sequence[str]) -> Any:
         """Return the validated value from `values`: a tuple with one value per axis if `each_axis`.
 
+        None stands for NaN, if that is the default: it depends on other parameters.
+
         Raises
         ------
         UsageError
             If the value is not valid; the message names the parameter and the allowed values.
         """
         given = values[self.name]
+        if self._is_nan(given) and self._is_nan(self.default):
+            return None
         if self.each_axis and self.between:
             return tuple(numbers(values, self.name, axes, *self.between))
         if self.number and self.between:
@@ -68,12 +72,16 @@ class Declaration:
             raise UsageError(f"parameter {self.name} is {given!r}; choose one of {', '.join(self.choices)}")
         return given
 
+    @staticmethod
+    def _is_nan(value: Any) -> bool:
+        return isinstance(value, float) and math.isnan(value)
+
     def descriptor(self) -> ParameterDescriptor:
-        """Return the ROS descriptor, including the range that rclpy checks."""
+        """Return the ROS descriptor, with the range that rclpy checks unless the default, NaN, is outside of it."""
         described = ParameterDescriptor(
             description=self.description, read_only=self.read_only, dynamic_typing=self.number
         )
-        if self.between:
+        if self.between and not self._is_nan(self.default):
             low, high = self.between
             if self.number:
                 described.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]

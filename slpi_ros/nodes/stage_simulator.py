@@ -25,8 +25,8 @@ from slpi_ros.simulation.character import Character, CharacterStage
 from slpi_ros.simulation.stage import Stage, p11_stage
 
 LOG_PERIOD = 5.0
-# Time without a command after which states are published again, seconds: somebody may wait for one before the next.
-QUIET = 2.0
+# Time without a command after which states are published again, seconds: a sensor that is silent is one that failed.
+QUIET = 0.3
 # Seconds; creep has decayed after this time.
 DAY = 86_400.0
 VOLTAGE = (-10_000.0, 10_000.0)
@@ -108,7 +108,7 @@ class StageSimulator(Node):
     Subscribes to ``voltage_command`` (std_msgs/Float64MultiArray, volts in the order of the axes) and publishes
     ``stage_state`` (sensor_msgs/JointState: measured displacement in metres in ``position``, applied voltage in volts
     in ``effort``) from its start on: once for each command; at the parameter ``rate`` before the first command and
-    after two seconds without a command, and at once when nobody publishes commands any more.
+    after 0.3 s without a command, and at once when nobody publishes commands any more.
     Commands beyond the voltage limits are clipped, as the amplifier saturates. Parameters in `DECLARATIONS`.
 
     Without a preset the stage has random hysteresis, drawn from the seed, and the effects of its character. Preset
@@ -151,16 +151,19 @@ class StageSimulator(Node):
         self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
         self._answers, self._commanded_at = values["answer_commands"], -math.inf
         period = 1.0 / values["rate"]
+        # The system clock may be set back.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
         if self._speed == 1.0:
-            self.create_timer(period, self._on_timer)
+            self.create_timer(period, self._on_timer, clock=steady)
         else:
             self._clock_publisher = self.create_publisher(ClockMsg, "/clock", COMMANDS)
-            self.create_timer(period / self._speed, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self.create_timer(period / self._speed, self._on_tick, clock=steady)
         self._commands = self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, COMMANDS)
         self.get_logger().info(
             f"stage '{self._state.header.frame_id}', axes {', '.join(axes)}, {self._low:g} to {self._high:g} V: takes "
             f"{self._commands.topic_name}, publishes {self._publisher.topic_name}"
         )
+        self._publish()
 
     def _now_ns(self) -> int:
         """Return the time of the stage (ns), which never decreases, even if the clock of the node is set back."""

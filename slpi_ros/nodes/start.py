@@ -7,6 +7,7 @@
 import signal
 import sys
 import threading
+import warnings
 from importlib import import_module
 
 TYPE_CHECKING = False
@@ -56,10 +57,19 @@ def _executable(name: str) -> "Callable[[], int]":
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 signal.signal(number, of_process.on_signal)
+        from slpi_ros.dependencies import DependencyError, dependencies_needed
+        from slpi_ros.errors import shown
+
+        # Like a line of the node's log, without the line of code that warns.
+        warnings.formatwarning = lambda message, *_: f"[WARN] {shown(str(message))}\n"
         try:
-            return int(import_module(f"slpi_ros.nodes.{name}").main())
+            with dependencies_needed():
+                return int(import_module(f"slpi_ros.nodes.{name}").main())
         except KeyboardInterrupt:
             return 0
+        except DependencyError as error:
+            print(f"{name}: {error}", file=sys.stderr, flush=True)
+            return error.exit_code
 
     main.__doc__ = f"Run the node ``{name}``; return the exit code of the process."
     return main

@@ -1,8 +1,10 @@
 """Exhibits: a table or figure of a paper in comparison with the reproduced one, and functions to draw them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -67,3 +69,14 @@ def label_axes(panel: Axes, x: str, y: str) -> None:
     panel.set_ylabel(y)
     panel.grid(color="#e4e9ee", linewidth=0.7)
     panel.spines[["top", "right"]].set_visible(False)
+
+
+def outer_legend(
+    figure: Figure, handles: Sequence[Artist], names: Sequence[str], *, inches: float, below: bool = False, **more: Any
+) -> None:
+    """Add a legend of a height (inches) above or below all panels; `more` are options of ``Figure.legend``."""
+    share = inches / float(figure.get_figheight())
+    # The place "outside ..." would keep this room itself, but Matplotlib 3.6 does not know it.
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=(0.0, share if below else 0.0, 1.0, 1.0 - share))
+    figure.legend(list(handles), list(names), loc="lower center" if below else "upper center", frameon=False, **more)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from slpi_ros.identification.signal_statistics import ErrorMetrics
-from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, panels, um
+from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, outer_legend, panels, um
 from slpi_ros.papers.mpi_study import (
     FAMILY,
     KINDS,
@@ -141,7 +141,7 @@ def _outer_labels(panel: Axes, x: str, y: str) -> None:
 def legend(figure: Figure, drawn: Sequence[Axes], used: int) -> None:
     """Add one legend above all panels, and hide the panels after the first `used` ones."""
     handles, names = drawn[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=7, frameon=False)
+    outer_legend(figure, handles, names, inches=0.35, ncols=7)
     for panel in drawn[used:]:
         panel.set_axis_off()
 

@@ -13,6 +13,9 @@ from slpi_ros.reports.page import Page
 
 FIRST = "Paper 1: Separated Level-loop Prandtl-Ishlinskii (SLPI) model"
 SECOND = "Paper 2: multi-slope Prandtl-Ishlinskii (MPI) model"
+# Files in the folder, and the columns of the table.
+PAGE, TABLE = "index.html", "separation.csv"
+COLUMNS = "k,voltage_V,displacement_m,tr,lv,sp"
 
 
 def write_experiments(folder: Path, data: Path | None) -> Path:
@@ -47,9 +50,9 @@ def write_experiments(folder: Path, data: Path | None) -> Path:
     for title, part in parts.items():
         page.heading(title)
         _show(page, part)
-    path = folder / "index.html"
+    path = folder / PAGE
     page.write(path)
-    _write_separation(folder / "separation.csv", random.separation)
+    _write_separation(folder / TABLE, random.separation)
     return path
 
 
@@ -66,6 +69,6 @@ def _show(page: Page, exhibits: Sequence[Exhibit]) -> None:
 def _write_separation(path: Path, separation: Separation) -> None:
     """Write the table of separated loops, ``NewData`` in the SLPI paper (Eq. 4), as CSV."""
     with all_or_nothing(path) as file:
-        file.write("k,voltage_V,displacement_m,tr,lv,sp\n")
+        file.write(f"{COLUMNS}\n")
         for k, voltage, displacement, tr, lv, sp in separation.table().tolist():
             file.write(f"{k:.0f},{voltage!r},{displacement!r},{tr:.0f},{lv:.0f},{sp:.0f}\n")

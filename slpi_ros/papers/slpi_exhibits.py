@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from slpi_ros.hysteresis.slpi_published import Loop, SeparatedLoops, Separation
 from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import least_iterations
-from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, panels, um
+from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, outer_legend, panels, um
 from slpi_ros.papers.slpi_study import (
     AT_REST,
     CLASSICAL,
@@ -177,9 +177,7 @@ def draw_compensation(study: Study, names: tuple[str, ...]) -> Figure:
             lower.plot(loop.samples, errors[name].error[loop.samples] * 1e6, ".", markersize=4, label=ROMAN[loop.level])
         label_axes(lower, "sample", "error (µm)" if not column else "")
     handles, levels = drawn[-1].get_legend_handles_labels()
-    figure.legend(
-        handles, levels, loc="outside lower center", title="level", ncols=len(handles), markerscale=3, frameon=False
-    )
+    outer_legend(figure, handles, levels, inches=0.55, below=True, title="level", ncols=len(handles), markerscale=3)
     return figure
 
 

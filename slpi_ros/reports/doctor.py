@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.calibration.drive_watch import FARTHEST
+from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.identification.record_quality import assess, findings
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
@@ -21,8 +23,6 @@ STATE_TYPE, COMMAND_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64Mu
 JITTER, GAP = 0.5, 5.0
 # Seconds by which a stamp may lie before and after the time of its arrival.
 OLDEST, NEWEST = 0.1, 0.01
-# A displacement beyond this is no reading in metres. A voltage may be outside its range by this share of the range.
-FARTHEST, READ_BACK = 0.1, 0.02
 # Fewest states from which a rate is told.
 FEWEST = 10
 
@@ -266,7 +266,7 @@ def _of_range(graph: Graph, model: StageModel) -> Iterator[Check]:
 
 
 def _within(axis: str, what: str, reached: Range, allowed: Range, whose: str, remedy: str) -> Check:
-    slack = READ_BACK * (allowed[1] - allowed[0])
+    slack = TOLERATED_SHARE * (allowed[1] - allowed[0])
     where = f"{reached[0]:.4g} V" if reached[0] == reached[1] else f"{reached[0]:.4g} to {reached[1]:.4g} V"
     text = f"axis {axis}: {what} {'at' if reached[0] == reached[1] else 'from'} {where}"
     bounds = f"{allowed[0]:.4g} to {allowed[1]:.4g} V of {whose}"
@@ -279,7 +279,7 @@ def _overlap(what: str, known: Range, limits: Range, remedy: str) -> Check:
     text = f"{what}: identified from {known[0]:.4g} to {known[1]:.4g} V, limits {limits[0]:.4g} to {limits[1]:.4g} V"
     if max(known[0], limits[0]) > min(known[1], limits[1]):
         return Check(MEND, f"{text} do not meet; {remedy}")
-    slack = READ_BACK * (known[1] - known[0])
+    slack = TOLERATED_SHARE * (known[1] - known[0])
     narrower = limits[0] > known[0] + slack or limits[1] < known[1] - slack
     return Check(NOTE, f"{text}: a part of the stroke is not used") if narrower else Check(OK, text)
 

@@ -60,10 +60,12 @@ def write_report(
     page.contents(tuple(model.axes))
     for name in model.axes:
         record.require_axis(name)
+    # What is known of the sensor is taken out: errors are those of the stage.
+    record = model.correct(record)
     driven = np.logical_and.reduce([np.isfinite(record.voltage[name]) for name in model.axes])
     t = record.t[driven]
     fitted = (t >= (-np.inf if start is None else start)) & (t < (np.inf if stop is None else stop))
-    simulated = model.simulate(t, {name: record.voltage[name][driven] for name in model.axes})
+    simulated = model.stage_only.simulate(t, {name: record.voltage[name][driven] for name in model.axes})
     for name, axis in model.axes.items():
         told = (held_out or {}).get(name)
         page.heading(f"Axis {name}", name)

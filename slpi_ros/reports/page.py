@@ -13,6 +13,7 @@ from urllib.parse import quote
 from slpi_ros.errors import shown
 from slpi_ros.identification.record_quality import Finding
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
+from slpi_ros.io.outputs import PAGE_MARK
 from slpi_ros.reports.chart import Chart
 
 if TYPE_CHECKING:
@@ -180,7 +181,7 @@ class Page:
         title = _text(self.title)
         scripts = ("plotly-cartesian.min.js", "page.js") if self._has_charts else ()
         document = (
-            f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+            f'<!doctype html><html lang="en"><head><meta charset="utf-8">{PAGE_MARK}<title>{title}</title>'
             f'<meta http-equiv="Content-Security-Policy" content="{_CONTENT_POLICY}">'
             f'<meta name="viewport" content="width=device-width"><style>{_asset("page.css")}</style></head>'
             f"<body><h1>{title}</h1>{''.join(self._parts)}"

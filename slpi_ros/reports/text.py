@@ -93,6 +93,7 @@ def describe_axis(axis: AxisModel, *, details: bool = True) -> list[str]:
         *(more if details else ()),
         *(f"{effect.name}: {effect.describe()}" for effect in axis.effects),
         *(() if axis.effects else ("effects: none",)),
+        *((f"sensor: {axis.sensor.describe()}, known and taken out of its readings",) if axis.sensor else ()),
     ]
 
 

@@ -152,6 +152,8 @@ def _notes(record: RecordVerification) -> list[str]:
         else f"evaluated from {record.known_from:.4g} s on, where the unknown history before it only adds a constant"
     )
     notes = [start]
+    if record.corrected:
+        notes.append(f"errors are those of the stage; taken out of the readings of its sensor: {record.corrected}")
     if record.zero_moved:
         notes.append(f"the zero has moved by {_um(record.offset)} µm, which is not counted as an error")
     if not record.passed:

@@ -17,7 +17,7 @@ from slpi_ros.compensator.controller import Controller  # noqa: E402
 from slpi_ros.compensator.validation import CAUSES, STALE, RejectedError, TimestampRules  # noqa: E402
 from slpi_ros.errors import SlpiError, UsageError  # noqa: E402
 from slpi_ros.model.axis_model import Start  # noqa: E402
-from slpi_ros.model.limits import MAX_DT, Limits  # noqa: E402
+from slpi_ros.model.limits import Limits  # noqa: E402
 from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel  # noqa: E402
 
 MS = 1_000_000
@@ -130,11 +130,13 @@ def test_slew_is_respected_from_the_first_sample_on():
     made = compensation(slew=500.0)
     path = stage_model().axis("x").simulate(np.arange(2000) * 5e-3, voltage_path(2000, 3))
     last = made.voltages[0]
-    reached = 0
+    reached, changed = 0, -2
     for i, y in enumerate(path):
         update(made, START_NS + i * MS, ["x"], [y])
-        assert abs(made.voltages[0] - last) <= (0.5 if i else 0.0) + 1e-9
+        # At most two output periods since the last change count, at the first sample as well.
+        assert abs(made.voltages[0] - last) <= 0.5 * min(i - changed, 2) + 1e-9
         reached += abs(made.axes[0].stream.memory.displacement - y) < 1e-12
+        changed = i if made.voltages[0] != last else changed
         last = made.voltages[0]
     assert reached > 0
 
@@ -143,7 +145,7 @@ def test_slew_is_respected_from_the_first_sample_on():
 def test_a_new_model_takes_over_where_the_voltage_is(slew):
     made = compensation(slew=slew)
     path = stage_model().axis("x").simulate(np.arange(400) * 5e-3, voltage_path(400, 5))
-    rng = np.random.default_rng(7)
+    rng, changed = np.random.default_rng(7), -2
     for i, y in enumerate(path):
         if i % 3 == 0:
             before = made.voltages[0]
@@ -153,7 +155,8 @@ def test_a_new_model_takes_over_where_the_voltage_is(slew):
         last = made.voltages[0]
         update(made, START_NS + i * MS, ["x"], [min(y, narrow.displacement_range[1])])
         assert 0.0 <= made.voltages[0] <= 100.0
-        assert abs(made.voltages[0] - last) <= slew * 1e-3 + 1e-9
+        assert abs(made.voltages[0] - last) <= slew * 1e-3 * min(i - changed, 2) + 1e-9
+        changed = i if made.voltages[0] != last else changed
 
 
 def refused_models():
@@ -175,19 +178,43 @@ def test_a_refused_model_leaves_the_old_one_working(why, axes):
     update(made, START_NS + MS, ["x"], [5e-6])
 
 
-def test_limits_change_while_it_runs_unless_they_leave_the_stage_outside():
+def advanced(made, now_ns, seconds):
+    """Return the voltages (V) of the first axis that follow, shape (N,), and the time then."""
+    way, end_ns = [], now_ns + int(seconds * 1e9)
+    while (due_ns := made.next_due_ns(now_ns, now_ns)) is not None and due_ns <= end_ns:
+        now_ns = max(due_ns, now_ns)
+        if made.advance(now_ns, now_ns):
+            way.append(made.voltages[0])
+    return np.array(way), end_ns
+
+
+def test_limits_change_while_it_runs_and_a_voltage_outside_goes_inside_at_the_slew_limit():
     made = compensation()
     update(made, START_NS, ["x"], [5e-6])
     before = snapshots(made)
-    made.use_limits([Limits(0.0, 70.0, 1000.0)])
+    now = START_NS + 10**9
+    made.use_limits([Limits(0.0, 70.0, 1000.0)], now)
     assert snapshots(made) == before
-    update(made, START_NS + 10**9, ["x"], [9e-6])
+    update(made, now, ["x"], [9e-6])
+    way, now = advanced(made, now, 0.2)
+    assert way[-1] == made.voltages[0] == 70.0 and np.diff(way).max() <= 1.0 + 1e-9
+    # Lower than where it is: accepted, inside at once or nearly so, never in one step.
+    made.use_limits([Limits(0.0, 60.0, 1000.0)], now)
     assert made.voltages[0] == 70.0
-    with pytest.raises(UsageError, match=r"'x'.*\b70 V.*\b60 V"):
-        made.use_limits([Limits(0.0, 60.0)])
-    made.cleanup()
-    with pytest.raises(UsageError, match=r"'x'.*\b70 V.*\b60 V"):
-        made.use_limits([Limits(0.0, 60.0)])
+    way, now = advanced(made, now, 0.2)
+    assert np.abs(np.diff([70.0, *way])).max() <= 2.0 + 1e-9 and (np.diff([70.0, *way]) < 0.0).all()
+    assert len(way) <= 11 and way[-1] == pytest.approx(60.0, abs=1e-9)
+    update(made, now, ["x"], [9e-6])
+    assert made.voltages[0] <= 60.0
+
+
+def test_limits_outside_of_what_was_identified_are_refused():
+    made = compensation()
+    update(made, START_NS, ["x"], [5e-6])
+    before = made.voltages[0]
+    with pytest.raises(UsageError, match=r"\b100 V.*\b120\b"):
+        made.use_limits([Limits(120.0, 150.0)], START_NS + MS)
+    assert made.axes[0].limits == Limits(0.0, 100.0) and made.voltages[0] == before
 
 
 @pytest.mark.parametrize(("max_age", "age", "taken"), [
@@ -232,6 +259,7 @@ def test_no_flood_brings_a_voltage_outside(events, bounds):
     clean.use_model(stage_model(("x", "y")))
     now, last = START_NS, list(made.voltages)
     latest: dict[str, int] = {}
+    changed: dict[str, int] = {}
     for event in events:
         if len(event) == 2:
             model = stage_model(("x", "y"), stroke=event[0], voltage=event[1])
@@ -254,9 +282,11 @@ def test_no_flood_brings_a_voltage_outside(events, bounds):
             update(clean, now, names, displacements)
             for name, before, after in zip("xy", last, made.voltages, strict=True):
                 assert limits.lower <= after <= limits.upper
-                elapsed = min(max(now - latest.get(name, now), 0) * 1e-9, MAX_DT)
+                elapsed = min(max(now, 0) - changed.get(name, -MS * 2), 2 * MS) * 1e-9
                 assert slew == math.inf or abs(after - before) <= slew * elapsed + 1e-9
                 assert name in names or after == before
+                if after != before:
+                    changed[name] = max(now, 0)
             latest |= dict.fromkeys(names, now)
         last = list(made.voltages)
         now = max([now, *latest.values()])

@@ -10,7 +10,7 @@ from strategies import FAMILY_CASE, fractions
 
 from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.errors import UsageError
-from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 from slpi_ros.model.streaming import StreamingInverse
 
 INF = float("inf")
@@ -175,11 +175,14 @@ def test_the_voltage_keeps_to_its_limits_and_their_slew(script, slew, start, gai
         if action not in ("correct", "hold"):
             assert feedback.voltage == voltage
             continue
-        reach = slew * (sample[0] - before) if before is not None and slew < INF else 0.0 if slew < INF else INF
+        # Time counts in whole nanoseconds; a pause counts no longer than 0.1 s.
+        elapsed = min(sample[0] - before + 1e-9, MAX_DT) if before is not None else 0.0
+        reach = slew * elapsed if slew < INF else INF
         assert abs(feedback.voltage - voltage) <= reach + 1e-12 * 100
         # Outside of new limits it goes inside at full pace.
         outside, was_outside = (max(limits.lower - v, v - limits.upper, 0.0) for v in (feedback.voltage, voltage))
-        assert outside <= max(was_outside - reach, 0.0) + 1e-12 * 100
+        surely = reach - slew * 2e-9 if slew < INF else INF
+        assert outside <= max(was_outside - surely, 0.0) + 1e-12 * 100
         before = sample[0]
 
 
@@ -262,11 +265,16 @@ def test_a_slew_limit_neither_winds_the_integral_up_nor_makes_it_forget(sign):
 def test_a_voltage_outside_goes_inside_as_a_rate_limiter_lets_it_and_no_faster(acceleration):
     """One rule for feedforward and feedback: at the start, and within new limits."""
     outside = Limits(0.0, 40.0, 10.0, acceleration)
-    feedback, pace, v = Feedback(PID, Limits(0.0, 100.0, 10.0, acceleration), 60.0), RateLimiter(outside), 60.0
+    feedback, pace, v = (
+        Feedback(PID, Limits(0.0, 100.0, 10.0, acceleration), 60.0),
+        RateLimiter(outside, MAX_DT / 2, 60.0),
+        60.0,
+    )
     feedback.hold(0.0, 60.0)
+    pace.begin(0)
     feedback.limits = outside
     for k in range(1, 30):
-        v = pace.step(v, 40.0, 0.1 * k - 0.1 * (k - 1))
+        v = pace.step(40.0, k * 10**8)
         assert feedback.hold(0.1 * k, 60.0) == pytest.approx(v, abs=1e-9)
     assert v == pytest.approx(40.0, abs=1e-6)
     feedback = Feedback(PID, Limits(0.0, 100.0, 10.0), 120.0)

@@ -80,6 +80,11 @@ def follow(made, paths=PATHS, first=0, start_ns=0):
     made.follow(list(paths), np.arange(len(rows)) * MS, rows, start_ns, START + first * MS, START + first * MS)
 
 
+def displacements(model, voltages):
+    """Return the displacement (m) of each axis for voltages (V), shape (N, axes), one each millisecond."""
+    return model.simulate(DT * np.arange(len(voltages)), {"x": voltages[:, 0], "y": voltages[:, 1]})
+
+
 def give(made, count=T.size, start=0):
     """Return the voltages after each millisecond, shape (count, axes)."""
     given = []
@@ -107,7 +112,12 @@ def test_a_path_reckons_with_axes_that_another_path_brings_elsewhere():
     # A pause of y before its path; a jump of x in both.
     twin.axes[1].stamps.accept(START)
     expected = np.array([move(twin, k, "x" if k < 300 else "y") for k in range(600)])
-    np.testing.assert_allclose(given, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(given[:300], expected[:300], rtol=0, atol=1e-9)
+    # The end of the path of x is followed by a hold, from three intervals on, at least 20 ms.
+    np.testing.assert_allclose(given[300:318], expected[300:318], rtol=0, atol=1e-9)
+    assert (given[318:, 0] != expected[318:, 0]).mean() > 0.9
+    np.testing.assert_allclose(displacements(COUPLED, given)["x"][400:], PATHS["x"][299], rtol=0, atol=5e-8)
+    np.testing.assert_allclose(displacements(COUPLED, given)["y"][400:], PATHS["y"][400:], rtol=0, atol=5e-8)
 
 
 DELAYED = StageModel({name: replace(axis, effects=(Delay(0.02), *axis.effects)) for name, axis in COUPLED.axes.items()})
@@ -246,11 +256,14 @@ def test_reset_and_ramps_move_the_effects_too(effects):
 def test_limits_are_kept_and_told(limits):
     axis, voltages, flags = with_effects(LAG, CREEP, limits=limits), [], set()
     for k in range(1500):
-        voltages.append(axis.update(DT if k else 0.0, 4e-6 if k % 500 < 250 else 9e-6, 0))
+        voltages.append(axis.update(DT if k else 0.0, 4e-6 if k % 500 < 250 else 9e-6, k * MS))
         flags |= {"held"} if axis.held else set()
         flags |= {"slewing"} if axis.slewing else set()
     assert min(voltages) >= limits.lower
     assert max(voltages) <= limits.upper
-    assert np.abs(np.diff(voltages)).max() <= limits.slew * DT * (1 + 1e-9)
+    steps = np.abs(np.diff([voltages[0], *voltages]))
+    # After a rest, two output periods count; within an acceleration limit, one.
+    rested = np.append([True], steps[:-1] == 0.0) & (limits.acceleration == np.inf)
+    assert (steps <= limits.slew * DT * np.where(rested, 2.0, 1.0) * (1 + 1e-9)).all()
     assert "slewing" in flags
     assert ("held" in flags) == (limits.upper < 50)

@@ -29,13 +29,11 @@ from slpi_ros.compensator.persistence import (
 )
 from slpi_ros.errors import ModelError
 from slpi_ros.model.document import save_model
-from slpi_ros.model.limits import Limits
 
 MODEL = two_axes()
 SAVED = SavedMemory(
     model_id(MODEL), True, {"x": SavedAxis((0.0, 60.0, 20.0, 1 / 3), True), "y": SavedAxis((-0.1,), False)}
 )
-LIMITS = [Limits(-1.0, 100.0)] * 2
 
 
 def test_it_comes_back_to_the_last_bit(tmp_path):
@@ -43,17 +41,30 @@ def test_it_comes_back_to_the_last_bit(tmp_path):
     assert load_memory(path) is None
     save_memory(SAVED, path)
     assert load_memory(path) == SAVED
-    SAVED.require_fit(MODEL, ["y", "x"], LIMITS)
+    SAVED.require_fit(MODEL, ["y", "x"])
+    assert load_memory(path).last_voltages == {"x": 1 / 3, "y": -0.1}
 
 
-def test_it_belongs_to_one_model_its_axes_and_its_limits():
+def test_it_belongs_to_one_model_and_its_axes():
+    """A voltage outside the limits is no reason to forget where the amplifier is."""
     other = replace(MODEL, created="2030-01-01T00:00:00Z")
     with pytest.raises(ModelError):
-        SAVED.require_fit(other, ["x"], LIMITS[:1])
+        SAVED.require_fit(other, ["x"])
     with pytest.raises(ModelError, match="'z'"):
-        SAVED.require_fit(MODEL, ["x", "z"], LIMITS)
-    with pytest.raises(ModelError, match=r"-0\.1 V.*'y'.*0\.\.1 V"):
-        SAVED.require_fit(MODEL, ["x", "y"], [Limits(0.0, 1.0)] * 2)
+        SAVED.require_fit(MODEL, ["x", "z"])
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_the_last_voltages_outlive_their_model(tmp_path, complete):
+    """A model that was refitted, and a restart: only the turning points are lost. It was a step of 44 V."""
+    path = tmp_path / "memory.json"
+    written = MemoryFile(str(path))
+    written.save(MODEL, SAVED.axes, complete)
+    written.note(as_given(48.0, 3.0))
+    read = MemoryFile(str(path))
+    with pytest.raises(ModelError, match="^[^\n]+$"):
+        read.find(replace(MODEL, created="2030-01-01T00:00:00Z"), ["x", "y"])
+    assert read.last_voltages == ({"x": 1 / 3, "y": -0.1} if complete else {"x": 48.0, "y": 3.0})
 
 
 def test_a_place_that_takes_no_file_stays_as_it_is(tmp_path):

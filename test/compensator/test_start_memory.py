@@ -7,11 +7,13 @@ import pytest
 from strategies import FAMILY_CASE, axis_model
 
 from slpi_ros.compensator.controller import Controller
+from slpi_ros.compensator.model_swap import take_over
 from slpi_ros.compensator.persistence import ASSUMED, RESTORED, SavedAxis
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 
+MS, START_NS, LIMITS = 1_000_000, 10**12, Limits(0.0, 100.0)
 PLAIN = axis_model(FAMILY_CASE)
 MODEL = replace(
     PLAIN,
@@ -23,7 +25,7 @@ MEMORIES = {name: MODEL.memory(name) for name in START_MEMORIES}
 
 
 def controller(start_memory="end", model=MODEL, saved=None, **settings) -> Controller:
-    made = Controller(["x"], [Limits(0.0, 100.0)], **settings)
+    made = Controller(["x"], [LIMITS], **settings)
     made.use_model(StageModel({"x": model}), saved, start_memory)
     made.activate(0)
     return made
@@ -46,24 +48,60 @@ def test_the_memories_of_this_model_are_told_apart_by_their_displacement():
     assert np.diff(places).min() > 0.1e-6
 
 
+def told(made: Controller, displacement: float, count: int = 5, since_ns: int = 0, fresh: bool = True) -> None:
+    """Tell a displacement (m) some times, a millisecond apart, and let the start be found."""
+    for k in range(count):
+        made.measure(["x"], [displacement], since_ns + k * MS, fresh)
+    made.locate(since_ns + count * MS)
+
+
 @pytest.mark.parametrize("assumed", START_MEMORIES)
 @pytest.mark.parametrize("true", START_MEMORIES)
-def test_a_first_measurement_decides(assumed, true):
+def test_first_measurements_choose_among_histories_and_never_the_voltage(assumed, true):
+    """Where the stage is at the present voltage is told by the history: the one that says so is taken."""
     made = controller(assumed)
-    changed = made.measure(["x"], [MEMORIES[true].displacement + 10e-9], 0)
-    assert [axis.name for axis in changed] == ([] if assumed == true else ["x"])
-    assert memory_of(made).snapshot() == MEMORIES[true].snapshot()
-    assert made.voltages[0] == MEMORIES[true].voltage
+    present = made.voltages[0]
+    there = {name: take_over(MODEL, LIMITS, (), name).drive(present) for name in START_MEMORIES}
+    told(made, there[true] + 10e-9)
+    best = min(START_MEMORIES, key=lambda name: abs(there[name] - there[true]))
+    assert memory_of(made).displacement == pytest.approx(there[best], abs=1e-12)
+    assert made.voltages[0] == made.axes[0].voltage == present
     assert not made.axes[0].confidence.contradicted and made.axes[0].start_memory is None
     # Later ones do not: the stage moves.
-    assert made.measure(["x"], [MEMORIES[assumed].displacement], 1) == []
-    made.update(1, ["x"], [6e-6], 1)
-    assert made.voltages[0] == MODEL.memory(true).inverse(6e-6)
+    before = memory_of(made).snapshot()
+    told(made, there[assumed], since_ns=100 * MS)
+    assert memory_of(made).snapshot() == before and made.voltages[0] == present
+    made.update(1, ["x"], [6e-6], 200 * MS)
+    expected = take_over(MODEL, LIMITS, (), best)
+    expected.drive(present)
+    assert made.voltages[0] == expected.memory.inverse(6e-6)
 
 
-def test_a_measurement_that_fits_none_is_told_and_changes_nothing():
+def spoiled():
+    """Return what must choose nothing: few, old, scattered, zero once, or of another time by its stamp."""
+    true = MEMORIES["wiped"].displacement
+    yield "four", [(true, k * MS, True) for k in range(4)]
+    yield "old", [(true, -300 * MS, True)] * 5
+    yield "scattered", [(true + (k % 2) * 1e-6, k * MS, True) for k in range(5)]
+    yield "one zero", [(0.0, 0, True)]
+    yield "stale or future stamps", [(true, k * MS, False) for k in range(9)]
+
+
+@pytest.mark.parametrize(("what", "readings"), list(spoiled()), ids=[what for what, _ in spoiled()])
+def test_measurements_that_do_not_agree_or_are_not_fresh_choose_nothing(what, readings):
+    """One sample of 0.0 before the first command moved the assumed start by 92 V."""
+    made = controller("end")
+    for y, at_ns, fresh in readings:
+        made.measure(["x"], [y], START_NS + at_ns, fresh)
+    made.locate(START_NS + 10 * MS)
+    assert memory_of(made).snapshot() == MEMORIES["end"].snapshot()
+    assert made.voltages[0] == MEMORIES["end"].voltage
+    assert made.axes[0].start_memory == "end" and not made.axes[0].confidence.contradicted
+
+
+def test_measurements_that_fit_none_are_told_and_change_nothing():
     made = controller()
-    assert made.measure(["x"], [MEMORIES["end"].displacement + 1e-6], 0) == made.axes
+    told(made, MEMORIES["end"].displacement + 1e-6)
     confidence = made.axes[0].confidence
     assert confidence.contradicted and confidence.state == ASSUMED and "reset_memory" in confidence.doubt
     assert memory_of(made).snapshot() == MEMORIES["end"].snapshot()
@@ -74,16 +112,16 @@ def test_noise_does_not_choose_between_memories_at_the_same_place():
     near = replace(MODEL, start=replace(MODEL.end, displacement=MODEL.end.displacement + 20e-9))
     for name in ("end", "start"):
         made = controller(name, near)
-        for noise in (-20e-9, 30e-9):
-            assert made.measure(["x"], [near.end.displacement + noise], 0) == []
-        assert memory_of(made).displacement == near.memory(name).displacement
+        before = memory_of(made).snapshot()
+        told(made, near.end.displacement + 10e-9)
+        assert memory_of(made).snapshot() == before
 
 
 def test_after_a_command_measurements_choose_no_memory():
     made = controller()
     made.update(1, ["x"], [6e-6], 1)
     before = memory_of(made).snapshot()
-    assert made.measure(["x"], [MEMORIES["wiped"].displacement], 2) == []
+    told(made, MEMORIES["wiped"].displacement, since_ns=2)
     assert memory_of(made).snapshot() == before and not made.axes[0].confidence.contradicted
 
 
@@ -91,7 +129,8 @@ def test_a_saved_memory_has_precedence():
     saved = {"x": SavedAxis((100.0, 0.0, 50.0), True)}
     made = controller("wiped", saved=saved)
     assert made.voltages[0] == 50.0 and made.axes[0].confidence.state == RESTORED
-    assert made.measure(["x"], [MEMORIES["wiped"].displacement], 0) == [] and made.voltages[0] == 50.0
+    told(made, MEMORIES["wiped"].displacement)
+    assert made.voltages[0] == 50.0 and made.axes[0].confidence.state == RESTORED
 
 
 def test_a_model_that_does_not_tell_its_end_starts_at_its_start():

@@ -8,6 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model, axis_models, cases_and_paths, stream_forward
 
+from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.controller import OPEN_LOOP
 from slpi_ros.compensator.model_swap import take_over, turning_voltages
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.turning_points import FAR
@@ -60,21 +62,30 @@ def test_another_model_stands_where_it_would_had_it_always_been_there(old, new, 
 AXIS = axis_model(FAMILY_CASE)
 
 
-@pytest.mark.parametrize(("present", "taken"), [(119.0, True), (121.0, False), (-19.0, True), (-21.0, False)])
-def test_a_voltage_just_outside_goes_inside_and_one_far_outside_is_a_reason_to_refuse(present, taken):
-    limits = Limits(-500.0, 500.0, 100.0)
-    if not taken:
-        with pytest.raises(UsageError, match=rf"{present:g} V.*\b0\.\.100 V"):
-            take_over(AXIS, limits, (0.0, present))
-        return
-    stream = take_over(AXIS, limits, (0.0, present))
+@pytest.mark.parametrize("present", [119.0, 121.0, -19.0, -210.0])
+def test_a_voltage_outside_goes_inside_at_the_slew_limit(present):
+    """However far: where the amplifier is, is no reason not to start."""
+    stream = take_over(AXIS, Limits(-500.0, 500.0, 100.0), (0.0, present))
     assert stream.voltage == present
     assert stream.limits == Limits(0.0, 100.0, 100.0)
     wish = 20e-6 if present > 0 else -15e-6
-    way = [stream.step(i * 0.05, wish) for i in range(6)]
+    way = [stream.step(i * 0.05, wish) for i in range(60)]
     assert way[0] == present
     assert np.abs(np.diff([present, *way])).max() <= 5.0 + 1e-9
     assert way[-1] == (100.0 if present > 0 else 0.0)
+
+
+@pytest.mark.parametrize(("present", "taken"), [(119.0, True), (121.0, False), (-19.0, True), (-21.0, False)])
+def test_a_running_axis_takes_no_model_that_would_extrapolate_far(present, taken):
+    wide = replace(AXIS, voltage_range=(-500.0, 500.0))
+    axis = Axis("x", 0, Limits(-500.0, 500.0, 100.0), OPEN_LOOP)
+    axis.use(wide, axis.prepare(wide, (0.0, present)))
+    if taken:
+        axis.use(AXIS, axis.prepare(AXIS))
+        assert axis.voltage == present
+        return
+    with pytest.raises(UsageError, match=rf"{present:g} V.*\b0\.\.100 V"):
+        axis.prepare(AXIS)
 
 
 def test_without_a_past_the_model_starts_where_it_says():

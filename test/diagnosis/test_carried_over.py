@@ -24,7 +24,6 @@ def error(model, record):
     (axis,) = record.axes
     v, y = record.voltage[axis], record.displacement[axis]
     own = model.axes[axis]
-    own = replace(own, effects=tuple(effect for effect in own.effects if effect.removable != "record"))
     histories = {(), (float(v[0]),), own.start.history}
     paths = [replace(own, start=Start(float(v[0]), 0.0, history)).simulate(record.t, v) for history in histories]
     return 100.0 * min(float(np.std(y - path)) for path in paths) / float(np.ptp(y))

@@ -126,6 +126,6 @@ def test_a_coercivity_that_grows_with_the_rate_is_found(tmp_path):
     (truth,) = hidden.truth
     found = diagnosed(hidden, tmp_path).axes[truth.axis]
     first = found.effects[0].effect
-    assert (first.name, first.side) == ("rate_dependence", "voltage"), found.summary
+    assert (first.name, first.acts_on) == ("rate_dependence", "voltage"), found.summary
     assert found.after_rms < 1.3 * hidden.floor[truth.axis]
     assert first.exponent == pytest.approx(truth.parameters["exponent"], rel=0.2)

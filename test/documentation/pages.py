@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 README = ROOT / "README.md"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)
-PROGRAMS = ROOT / "install" / "slpi_ros" / "lib" / "slpi_ros"
+PROGRAMS = ROOT / os.environ.get("SLPI_INSTALL", "install") / "slpi_ros" / "lib" / "slpi_ros"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$|^<!-- (?!generated)(\w[\w ]*): ([^\n]+) -->$", re.DOTALL | re.MULTILINE)
 PATIENCE_S = 120.0
 

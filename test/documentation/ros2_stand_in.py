@@ -14,7 +14,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 
 PATIENCE_S = 30.0
-PROGRAMS = Path(__file__).resolve().parents[2] / "install" / "slpi_ros" / "lib" / "slpi_ros"
+CHECKOUT = Path(__file__).resolve().parents[2]
+PROGRAMS = CHECKOUT / os.environ.get("SLPI_INSTALL", "install") / "slpi_ros" / "lib" / "slpi_ros"
 
 
 def until(node, done, what):

@@ -108,14 +108,14 @@ class Record:
 
 
 @st.composite
-def records(draw: st.DrawFn, side: str) -> Record:
+def records(draw: st.DrawFn, acts_on: str) -> Record:
     """Draw a smooth motion of three tones up to 3 Hz, faded in, at even stamps."""
     rate, size = draw(st.sampled_from((500.0, 1000.0, 4000.0))), draw(st.integers(700, 1500))
     rng = np.random.default_rng(draw(st.integers(0, 10**6)))
     t = np.arange(size) / rate
     u = 50 + 40 * _motion(t, rng)
     others = {"y": 1e-5 * _motion(t, rng)} if draw(st.booleans()) else {}
-    signal = u if side == "voltage" else middle(u) + 1e-6 * _motion(t, rng)
+    signal = u if acts_on == "voltage" else middle(u) + 1e-6 * _motion(t, rng)
     return Record(signal, EffectContext(t, u, middle, others))
 
 
@@ -132,4 +132,4 @@ def _motion(t: FloatArray, rng: np.random.Generator) -> FloatArray:
 @st.composite
 def effects_and_records(draw: st.DrawFn, names: tuple[str, ...] = tuple(BY_NAME)) -> tuple[Effect, Record]:
     effect = draw(BY_NAME[draw(st.sampled_from(names))])
-    return effect, draw(records(effect.side))
+    return effect, draw(records(effect.acts_on))

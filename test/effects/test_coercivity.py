@@ -23,7 +23,7 @@ from slpi_ros.model.stage_model import StageModel
 
 BARE = replace(axis_model(FAMILY_CASE), voltage_range=(-20.0, 120.0))
 SPAN, DT = 10e-6, 1e-3
-T = DT * np.arange(4000)
+T, MS = DT * np.arange(4000), 1_000_000
 CORNERS = np.interp(T, 0.3 + 0.25 * np.arange(16), [2e-6, *(10e-6, 4e-6, 8e-6, 5e-6, 9e-6) * 3])
 SMOOTH = 2e-6 + 4e-6 * (1 - np.cos(2 * np.pi * 0.5 * T)) * (1 - 0.4 * np.sin(2 * np.pi * 0.9 * T) ** 2)
 PATHS = pytest.mark.parametrize("wish", [SMOOTH, CORNERS], ids=["smooth", "corners"])
@@ -235,7 +235,7 @@ def test_a_stream_goes_on_where_another_has_been(effect):
     other.resume(one)
     assert other.voltage == one.voltage
     before = one.voltage
-    after = other.move(DT, float(CORNERS[1500]))
+    after = other.move(DT, float(CORNERS[1500]), 1500 * MS)
     assert abs(after - before) < 1.0 + 2 * effect.coercivity
 
 
@@ -245,6 +245,6 @@ def test_twins_go_their_own_ways(effect):
     for now, y in zip(T[:700].tolist(), CORNERS.tolist(), strict=False):
         stream.step(now, y)
     twin, state = stream.copy(), stream.snapshot()
-    ahead = [twin.move(DT, float(y)) for y in CORNERS[700:800]]
+    ahead = [twin.move(DT, float(y), k * MS) for k, y in enumerate(CORNERS[700:800], 700)]
     assert stream.snapshot() == state
-    assert [stream.move(DT, float(y)) for y in CORNERS[700:800]] == ahead
+    assert [stream.move(DT, float(y), k * MS) for k, y in enumerate(CORNERS[700:800], 700)] == ahead

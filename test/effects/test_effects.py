@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.signal import lsim
 
 from slpi_ros.effects.base import Effect, EffectContext
+from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.lag import Lag
@@ -34,9 +35,15 @@ def test_registry_schemas_and_strategies_know_the_same_effects():
 
 
 @given(EVERY)
-def test_every_effect_has_its_side(effect):
+def test_every_effect_has_its_side_and_acts_on_one_signal(effect):
     before = effect.name in ("delay", "lag", "saturation") or getattr(effect, "coercivity", 0.0) > 0
-    assert effect.side == ("voltage" if before else "displacement")
+    assert effect.acts_on == ("voltage" if before else "displacement")
+    others = {"sensor_periodic": "sensor", "hum": "record", "thermal_drift": "record"}
+    assert effect.side == others.get(effect.name, "stage")
+    # No inverse for the stage holds what is not of the stage.
+    chain = Chain.of((effect,))
+    assert (effect in chain.measured) == (effect.side != "stage")
+    assert (effect in (*chain.before, *chain.own, *chain.shared)) == (effect.side == "stage")
 
 
 @given(effects_and_records(EXACT))

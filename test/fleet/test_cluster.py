@@ -3,9 +3,11 @@
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
@@ -94,5 +96,18 @@ def test_no_scheduler(fleet, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "RECONNECT", 0.5)
     with pytest.raises(SlpiError):
         run([fleet], tmp_path / "out", scheduler="tcp://127.0.0.1:9")
-    with pytest.raises(SlpiError):
-        run([fleet], tmp_path / "out", scheduler="no address")
+
+
+@pytest.mark.parametrize(
+    ("address", "code"),
+    [("nope", 2), ("", 2), ("tcp://host:port", 2), ("gopher://host:70", 2), ("tcp://unheard.of:8786", 1)],
+)
+def test_what_is_no_address_is_told_in_one_line_before_anything_is_written(fleet, tmp_path, address, code, monkeypatch):
+    unknown = socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+    monkeypatch.setattr(socket, "getaddrinfo", Mock(side_effect=unknown))
+    # No client is made for it: one that fails ends in a traceback after ten seconds.
+    monkeypatch.setattr("distributed.Client", None)
+    out = tmp_path / "out"
+    with pytest.raises(SlpiError) as refused:
+        run([fleet], out, scheduler=address)
+    assert refused.value.exit_code == code and address in str(refused.value) and not out.exists()

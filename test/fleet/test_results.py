@@ -1,15 +1,20 @@
 """The journal and the table: nothing finished is lost."""
 
+import re
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.fleet.bags import PASSED, Examined, Judged, Row
+from slpi_ros.fleet.bags import PASSED, Examined, Judged, Row, plain_name
+from slpi_ros.fleet.pages import stage_page
 from slpi_ros.fleet.results import JOURNAL, SCHEMA, TABLE, Results
 from slpi_ros.fleet.sources import Bag
 
@@ -100,3 +105,16 @@ def test_a_full_disk_keeps_what_is_there(tmp_path):
         assert len(results.state.judged) == kept
         fill(results, 100)
         assert len(results.state.judged) == 100
+
+
+TEXT = st.text(st.characters(codec="utf-8"), min_size=1, max_size=320)
+
+
+@given(st.lists(TEXT, min_size=2, max_size=2, unique=True), st.sampled_from(["", "a" * 300]))
+def test_every_stage_has_a_page_of_its_own(names, before):
+    """A file system takes names of 255 characters."""
+    stages = [before + name for name in names]
+    pages = {stage_page(stage) for stage in stages}
+    assert len(pages) == 2 and all(len(Path(page).name) <= 255 and page.count("/") == 1 for page in pages)
+    plain = (stage for stage in stages if len(stage) <= 200 and re.fullmatch(r"[\w-]+", stage, re.ASCII))
+    assert all(plain_name(stage) == stage for stage in plain)

@@ -13,7 +13,7 @@ from slpi_ros.identification.least_squares import solve_free, solve_qp
 def test_non_negative_least_squares(seed):
     rng = np.random.default_rng(seed)
     a, y = rng.normal(size=(60, 12)), rng.normal(size=60)
-    x = solve_qp(a.T @ a, a.T @ y, sp.csr_array(sp.eye_array(12)), np.zeros(12))
+    x = solve_qp(a.T @ a, a.T @ y, sp.csr_array(np.eye(12)), np.zeros(12))
     np.testing.assert_allclose(x, nnls(a, y)[0], atol=1e-5)
 
 
@@ -22,7 +22,7 @@ def test_rising_sequences(seed):
     rng = np.random.default_rng(seed)
     a = rng.normal(size=(40, 8))
     y = a @ np.sort(rng.normal(size=8)) + rng.normal(size=40)
-    rise = sp.csr_array(sp.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(7, 8)))
+    rise = sp.csr_array(np.eye(7, 8, 1) - np.eye(7, 8))
     x = solve_qp(a.T @ a, a.T @ y, rise, np.full(7, 0.1))
     other = minimize(
         lambda z: 0.5 * np.sum((a @ z - y) ** 2),

@@ -12,6 +12,7 @@ from strategies import FAMILY_CASE, PI_CASE, axis_model, two_axes
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.hum import Hum
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
@@ -32,7 +33,15 @@ T = DT * np.arange(4000)
 CREEP = Creep((0.03, 0.3, 3.0), (0.02, 0.02, 0.03))
 DRIFT = ThermalDrift((0.0, 2.0, 3.0), (0.0, 1e-7, -1e-7))
 # What is undone exactly, whatever the path.
-EXACT = ("creep", "gain_drift", "thermal_drift", "sensor_periodic", "hum")
+EXACT = ("creep", "gain_drift")
+# What belongs to the sensor or to the record: in no inverse.
+NEVER = ("thermal_drift", "sensor_periodic", "hum")
+
+
+def drawn(names, **options):
+    """Draw some of the named effects."""
+    chosen = st.sets(st.sampled_from(names), **options)
+    return chosen.flatmap(lambda some: st.tuples(*map(BY_NAME.get, sorted(some))))
 
 
 def path(low=4e-6, high=10e-6, seed=0):
@@ -51,7 +60,7 @@ def with_effects(*effects, axis=X):
 
 
 @settings(max_examples=40)
-@given(st.sets(st.sampled_from(EXACT)).flatmap(lambda names: st.tuples(*map(BY_NAME.get, sorted(names)))))
+@given(drawn(EXACT))
 def test_compensate_undoes_simulate_exactly(effects):
     model = StageModel({"x": with_effects(*effects)})
     with warnings.catch_warnings(record=True) as told:
@@ -60,6 +69,39 @@ def test_compensate_undoes_simulate_exactly(effects):
     # A sensitivity that falls far may put a part of the path out of reach.
     assume(not any(issubclass(warning.category, HeldAtLimitWarning) for warning in told))
     np.testing.assert_allclose(model.simulate(T, v), path(), rtol=0, atol=1e-8 * SPAN)
+
+
+@settings(max_examples=40)
+@given(drawn(NEVER, min_size=1), st.floats(0.0, 0.1), st.floats(0.0, 0.1))
+def test_an_independent_stage_goes_where_it_shall_whatever_the_model_knows_of_sensor_and_record(effects, delay, lag):
+    """The stage itself, without the model: its displacement is the path, not what the sensor would make of it."""
+    model = StageModel({"x": with_effects(*effects)}).with_sensor(delay=delay, lag=lag)
+    stream = model.stream("x")
+    for v in (model.compensate(T, path()), np.array([stream.step(*sample) for sample in zip(T, path(), strict=True)])):
+        np.testing.assert_allclose(FAMILY_CASE.memory().forward_array(v), path(), rtol=0, atol=1e-9 * SPAN)
+
+
+def test_what_the_sensor_will_say_has_its_effects_and_none_of_the_record():
+    sensor, hum = SensorPeriodic(3e-7, 5e-9, 1.0), Hum(50.0, 3e-9, 0.0)
+    axis, v = with_effects(CREEP, DRIFT, sensor, hum), X.compensate(T, path())[0]
+    there = with_effects(CREEP).simulate(T, v)
+    np.testing.assert_allclose(axis.stage_only.simulate(T, v), there, rtol=0, atol=1e-20)
+    said = there + 5e-9 * np.sin(2 * np.pi * there / 3e-7 + 1.0)
+    np.testing.assert_allclose(axis.simulate(T, v), said, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(axis.simulate(T, v), StageModel({"x": axis}).simulate(T, v))
+    drifted = there + np.interp(T, DRIFT.times, DRIFT.values)
+    told = drifted + 5e-9 * np.sin(2 * np.pi * drifted / 3e-7 + 1.0) + 3e-9 * np.sin(100 * np.pi * T)
+    np.testing.assert_allclose(axis.simulate(T, v, of_record=True), told, rtol=0, atol=1e-15)
+
+
+def test_after_its_record_a_gain_drift_keeps_its_last_value():
+    axis, v = with_effects(GainDrift((1.0, 3.0), (0.1, 0.02), 2e-6)), X.compensate(T, path())[0]
+    at_start = X.simulate(T, v) - 2e-6
+    np.testing.assert_allclose(axis.simulate(T, v), 2e-6 + 1.02 * at_start, rtol=1e-12)
+    then = 1.0 + np.interp(T, (0.0, 1.0, 3.0), (0.0, 0.1, 0.02))
+    np.testing.assert_allclose(axis.simulate(T, v, of_record=True), 2e-6 + then * at_start, rtol=1e-12)
+    reached = X.simulate(T, StageModel({"x": axis}).compensate(T, path()))
+    np.testing.assert_allclose(2e-6 + 1.02 * (reached - 2e-6), path(), rtol=0, atol=1e-8 * SPAN)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.turning_points import Memory
-from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 from slpi_ros.model.streaming import ROUNDING, TOLERATED_SHARE, StreamingInverse
 
 RANGE = (2e-6, 14e-6)
@@ -73,12 +73,14 @@ def test_with_a_slew_limit_the_voltage_keeps_to_it_and_the_memory_to_the_voltage
     for t, y in samples:
         v = stream(t, y)
         assert limits.lower <= v <= limits.upper
-        assert abs(v - voltage) <= limits.slew * (t - before) + 1e-12 * max(1.0, abs(v))
+        # Time counts in whole nanoseconds.
+        assert abs(v - voltage) <= limits.slew * (t - before + 1e-9) + 1e-12 * max(1.0, abs(v))
         assert abs(twin.forward(v) - stream.memory.displacement) < 1e-9 * case.height
         before, voltage = t, v
     # Given time, it gets where it would have been told to go at once.
-    t += 100 * case.width / limits.slew
-    there = stream.step(t, y)
+    for _ in range(int(2 * case.width / (limits.slew * MAX_DT)) + 2):
+        t += MAX_DT
+        there = stream.step(t, y)
     assert stream.step(t + 1, y) == pytest.approx(there, abs=1e-9 * case.width)
     assert there == pytest.approx(twin.inverse(y, limits.lower, limits.upper), abs=1e-9 * case.width)
 
@@ -87,8 +89,19 @@ def test_at_the_first_sample_the_voltage_stays_and_catches_up_from_there():
     stream = stream_of(limits=Limits(0.0, 100.0, 50.0))
     goal = stream_of().step(0.0, 10e-6)
     assert goal > 70
-    assert [stream.step(t, 10e-6) for t in (7.0, 7.5, 7.5, 8.0)] == pytest.approx([0.0, 25.0, 25.0, 50.0])
-    assert stream.step(9.0, 10e-6) == pytest.approx(goal)
+    # A pause counts no longer than 0.1 s.
+    times = (7.0, 7.06, 7.06, 7.1, 9.0)
+    assert [stream.step(t, 10e-6) for t in times] == pytest.approx([0.0, 3.0, 3.0, 5.0, 10.0])
+    assert [stream.step(9.1 + 0.1 * k, 10e-6) for k in range(20)][-1] == pytest.approx(goal)
+
+
+def test_a_wish_that_has_been_met_for_long_earns_no_time():
+    """At 1 kHz the next one moves the voltage by what the slew limit allows in 1 ms."""
+    stream = stream_of(limits=Limits(0.0, 100.0, 50.0))
+    for k in range(3000):
+        before = stream.step(1e-3 * k, 3e-6)
+    assert not stream.missed
+    assert stream.step(3.0, 10e-6) - before == pytest.approx(0.05)
 
 
 def test_without_slew_limit_the_first_sample_is_met_at_once():
@@ -247,28 +260,32 @@ GENTLE = Limits(0.0, 100.0, 300.0, 5000.0)
 STEPS = st.lists(fractions(2e-3, 0.1), min_size=1, max_size=7)
 
 
-def gently(pace: RateLimiter, v: float, goals: list[float], steps: list[float]) -> Iterator[tuple[float, float]]:
-    """Yield time and voltage; check what a pace promises of every step."""
-    t, rate, limits = 0.0, 0.0, pace.limits
+def gently(pace: RateLimiter, v: float, goals: list[float], steps: list[float]) -> Iterator[tuple[int, float]]:
+    """Yield time (ns) and voltage (V); check what a pace promises of every step."""
+    now_ns, rate, limits = 0, 0.0, pace.limits
+    pace.start(v)
+    pace.begin(now_ns)
     for i, goal in enumerate(goals):
-        dt = steps[i % len(steps)]
-        before, v, t = v, pace.step(v, goal, dt), t + dt
+        step_ns = round(steps[i % len(steps)] * 1e9)
+        dt, now_ns = step_ns * 1e-9, now_ns + step_ns
+        before, v = v, pace.step(goal, now_ns)
+        pace.begin(now_ns)
         assert limits.lower <= v <= limits.upper
         assert abs(v - before) <= limits.slew * dt * (1 + 1e-9) + 1e-12
         assert abs((v - before) / dt - rate) <= limits.acceleration * dt * (1 + 1e-9) + 1e-9
         rate = (v - before) / dt
-        yield t, v
+        yield now_ns, v
 
 
 @given(st.lists(fractions(-50, 150), min_size=1, max_size=30), STEPS)
 def test_a_gentle_pace_keeps_all_limits_wherever_it_is_told_to_go(goals, steps):
     """Goals jump and turn, far outside the limits too; every one stays for a few samples."""
-    list(gently(RateLimiter(GENTLE), 40.0, [goal for goal in goals for _ in range(5)], steps))
+    list(gently(RateLimiter(GENTLE, MAX_DT / 2), 40.0, [goal for goal in goals for _ in range(5)], steps))
 
 
 @given(fractions(0, 100), STEPS)
 def test_a_gentle_pace_comes_to_rest_at_its_goal_without_overshoot(goal, steps):
-    way = [v for _, v in gently(RateLimiter(GENTLE), 40.0, [goal] * 400, steps)]
+    way = [v for _, v in gently(RateLimiter(GENTLE, MAX_DT / 2), 40.0, [goal] * 400, steps)]
     assert way[-1] == pytest.approx(goal, abs=1e-9)
     towards = np.diff(way) * np.sign(goal - 40.0)
     assert towards.min(initial=0.0) >= -1e-12
@@ -290,17 +307,26 @@ def test_a_gentle_stream_follows_a_path_within_its_limits_exactly(omega, dt):
 @given(streams(st.sampled_from([np.inf, 300.0])), fractions(100, 1e5))
 def test_a_gentle_stream_keeps_to_its_limits_and_the_memory_to_the_voltage(drawn, acceleration):
     case, limits, samples = drawn
+    # Time counts in whole nanoseconds.
+    samples = [(round(t * 1e9) / 1e9, y) for t, y in samples]
     limits = replace(limits, acceleration=acceleration)
     stream, twin = stream_of(case, limits, everywhere(case)), case.memory()
-    v, rate, before = stream.voltage, 0.0, samples[0][0]
+    v, rate, before, doubt = stream.voltage, 0.0, samples[0][0], 0.0
     twin.forward(v)
     for t, y in samples:
         last, v, dt = v, stream.step(t, y), t - before
+        if dt > MAX_DT:
+            # After a pause it starts from rest.
+            dt, rate, doubt = MAX_DT / 2, 0.0, 0.0
         assert limits.lower <= v <= limits.upper
-        assert abs(v - last) <= limits.slew * dt + 1e-9 if dt else v == last
+        # Time counts in whole nanoseconds.
+        assert abs(v - last) <= (limits.slew if limits.slew < np.inf else 1e6) * (dt + 1e-9) if dt else v == last
         if dt:
-            assert abs(v - last - rate * dt) <= acceleration * dt**2 + 1e-9
+            # So the rate of a short step is not known better than this.
+            slack = (2 * acceleration * dt + abs(rate)) * 1e-9 + doubt * dt + 1e-9
+            assert abs(v - last - rate * dt) <= acceleration * dt**2 + slack
             rate = (v - last) / dt
+            doubt = abs(rate) * 1e-9 / dt
         assert abs(twin.forward(v) - stream.memory.displacement) < 1e-9 * case.height
         before = t
 
@@ -316,5 +342,5 @@ def test_a_gentle_stream_reaches_a_far_wish_and_stays_there():
 
 @pytest.mark.parametrize(("present", "expected"), [(60.0, 55.0), (52.0, 50.0), (10.0, 15.0), (38.0, 40.0)])
 def test_a_voltage_outside_new_limits_goes_inside_at_full_pace(present, expected):
-    pace = RateLimiter(Limits(40.0, 50.0, 500.0))
-    assert pace.step(present, present, 0.01) == expected
+    pace = RateLimiter(Limits(40.0, 50.0, 500.0), 0.005, present)
+    assert pace.step(present, 0) == pytest.approx(expected)

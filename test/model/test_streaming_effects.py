@@ -18,11 +18,13 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
 
+MS = 1_000_000
 LAG, MODE = Lag(0.015), Resonance(150.0, 0.02)
 RATE = RateDependence(0.1, 2e-8, 0.7, 500.0, 2.0)
 SENSOR = SensorPeriodic(3e-7, 5e-9, 1.0)
-EVERY = (LAG, RATE, CREEP, MODE, SENSOR)
-SETS = [(LAG,), (CREEP,), (MODE,), (RATE,), (SENSOR,), (CREEP, SENSOR), (LAG, CREEP), EVERY]
+EVERY = (LAG, RATE, CREEP, MODE)
+# That of the sensor changes nothing, alone or beside others: see test_model_effects.
+SETS = [(LAG,), (CREEP,), (MODE,), (RATE,), (LAG, CREEP), EVERY]
 
 
 def ids(effects):
@@ -54,7 +56,7 @@ def test_what_is_streamed_gives_the_wish(effects):
 @pytest.mark.parametrize("effects", SETS, ids=ids)
 def test_the_stream_knows_where_the_model_is(effects):
     """What it says of its own displacement is what the model makes of its voltages, limits or not."""
-    axis = with_effects(*(effect for effect in effects if effect is not SENSOR))
+    axis = with_effects(*effects)
     stream = axis.stream(Limits(10.0, 70.0, 400.0, 4e4))
     v, own = [], []
     for now, wish in zip(T.tolist(), path(1e-6, 13e-6).tolist(), strict=True):
@@ -171,17 +173,22 @@ def test_creep_goes_on_in_a_pause(pause):
 @given(st.integers(0, 300))
 def test_snapshots_and_twins(effects, at):
     axis = with_effects(*effects)
-    stream, y = axis.stream(Limits(0.0, 80.0, 2000.0, 1e6)), path()[400:]
+    stream, y = axis.stream(Limits(0.0, 80.0, 2000.0)), path()[400:]
     for k in range(at):
         stream.step(k * DT, float(y[k]))
     state, twin, other = stream.snapshot(), stream.copy(), axis.stream(stream.limits)
     other.restore(state)
     wishes_after = y[at : at + 30].tolist()
-    expected = [stream.move(DT, wish) for wish in wishes_after]
-    assert [twin.move(DT, wish) for wish in wishes_after] == expected
-    np.testing.assert_allclose([other.move(DT, wish) for wish in wishes_after], expected, rtol=0, atol=1e-9)
+
+    def go_on(one, since_ns):
+        one.pace.begin(since_ns)
+        return [one.move(DT, wish, since_ns + k * MS) for k, wish in enumerate(wishes_after, 1)]
+
+    expected = go_on(stream, at * MS)
+    assert go_on(twin, at * MS) == expected
+    np.testing.assert_allclose(go_on(other, 0), expected, rtol=0, atol=1e-9)
     stream.restore(state)
-    np.testing.assert_allclose([stream.move(DT, wish) for wish in wishes_after], expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(go_on(stream, 10**12), expected, rtol=0, atol=1e-9)
 
 
 def test_without_effects_there_is_nothing_in_the_way():
@@ -189,10 +196,10 @@ def test_without_effects_there_is_nothing_in_the_way():
     stream = X.stream()
     followed(stream, path()[:500], T[:500])
     twin, state = stream.copy(), stream.snapshot()
-    expected = stream.move(DT, 5e-6)
-    assert twin.move(DT, 5e-6) == expected
+    expected = stream.move(DT, 5e-6, MS)
+    assert twin.move(DT, 5e-6, MS) == expected
     stream.restore(state)
-    assert stream.move(DT, 5e-6) == expected
+    assert stream.move(DT, 5e-6, 2 * MS) == expected
 
 
 # Several axes

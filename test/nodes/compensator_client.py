@@ -17,7 +17,8 @@ PERIOD_NS = 5_000_000
 # Sent but not yet answered: less than the depth of the compensator's queue.
 AHEAD = 50
 # Reports are what most tests wait for.
-QUICK = {"diagnostic_period": 0.2}
+# Without a slew limit the answers are those of the library, one for each message. No amplifier reports its voltage.
+QUICK = {"diagnostic_period": 0.2, "slew_limit": 0.0, "start_voltage": "saved"}
 
 
 class Client:
@@ -95,12 +96,6 @@ class Client:
             self.graph.spin_until(lambda sent=i: sent - (len(self._answers) - before) < AHEAD, f"answer {i}")
         self.graph.spin_until(lambda: len(self._answers) - before >= len(path), f"{len(path)} answers")
         return np.array(self.answers[before:])
-
-
-def last_at_full_pace(voltages: np.ndarray, step: float = 1.0) -> float:
-    """Return the last of voltages (V), shape (N,), that is whole steps (V) away from the first above 30 V."""
-    steps = (voltages - voltages[voltages > 30.0][0]) / step
-    return float(voltages[(voltages > 30.0) & (np.abs(steps - np.round(steps)) < 1e-6)][-1])
 
 
 def wish(names: Sequence[str], displacements: Sequence[float], stamp_ns: int = 0) -> JointState:

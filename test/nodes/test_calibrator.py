@@ -110,6 +110,30 @@ def test_a_killed_calibration_is_resumed_with_the_bags_that_are_complete(tmp_pat
 
 
 @pytest.mark.ros
+def test_a_kept_bag_that_is_no_use_is_named(tmp_path):
+    parameters = {**PARAMETERS, "output": str(tmp_path / "out")}
+    with on_graph() as graph:
+        stage = FaultyStage(graph.node)
+        with started("calibrator", parameters) as node:
+            begun(graph, node, stage)
+            os.killpg(node.process.pid, signal.SIGTERM)
+            assert ended(graph, node) == 1
+
+        def last_line(**changes) -> str:
+            with started("calibrator", {**parameters, "resume": True, **changes}) as node:
+                assert ended(graph, node) == 1
+                assert "Traceback" not in node.stderr
+                return node.stderr.strip().splitlines()[-1]
+
+        said = last_line(voltage_max=40.0)
+        assert "01_check" in said and "voltage_max" in said and "limits" in said and "amplifier" not in said
+        (bag,) = (tmp_path / "out" / "01_check").glob("*.mcap")
+        bag.write_bytes(bag.read_bytes()[:3000])
+        assert "01_check" in (said := last_line()) and "rename it" in said
+        require_safe(stage)
+
+
+@pytest.mark.ros
 def test_it_pauses_and_goes_on(tmp_path):
     with on_graph() as graph, started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}) as node:
         stage = FaultyStage(graph.node)
@@ -122,6 +146,36 @@ def test_it_pauses_and_goes_on(tmp_path):
         graph.spin_until(lambda: np.ptp(stage.commands[-30:]) > 1.0, "motion")
         graph.watch_diagnostics()
         graph.wait_for_status("/calibrator: calibrator", lambda status: "02_calibration" in status.message, "progress")
+
+
+@pytest.mark.ros
+def test_a_pause_before_the_start_does_not_keep_it_from_starting(tmp_path):
+    parameters = {**PARAMETERS, "output": str(tmp_path / "out"), "autostart": False}
+    with on_graph() as graph, started("calibrator", parameters) as node:
+        stage = FaultyStage(graph.node)
+        assert graph.call(Trigger, "/calibrator/pause", Trigger.Request()).success
+        assert graph.call(Trigger, "/calibrator/start", Trigger.Request()).success
+        begun(graph, node, stage)
+
+
+@pytest.mark.ros
+def test_its_worker_ends_with_it_however_it_ends(tmp_path):
+    with on_graph() as graph, started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}) as node:
+        stage = FaultyStage(graph.node)
+        begun(graph, node, stage)
+        children = Path(f"/proc/{node.process.pid}/task/{node.process.pid}/children").read_text().split()
+        assert children
+        os.kill(node.process.pid, signal.SIGKILL)
+        node.wait()
+        graph.tested = None
+        graph.spin_until(lambda: not any(alive(int(pid)) for pid in children), "the end of the worker")
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 @pytest.mark.ros

@@ -49,7 +49,7 @@ PATH = (5e-6 + 2e-6 * np.sin(np.linspace(0.0, 6.0, 400))).tolist()
 
 
 def test_feedback_corrects_what_the_model_does_not_know_and_the_drift_is_told(x_file):
-    with compensator(model_file=x_file, measurement_timeout=10, **GAINS) as client:
+    with compensator(model_file=x_file, measurement_timeout=10, feedback_fault_time=0, **GAINS) as client:
         client.connect()
         stage = DriftedStage(client, 4.0)
         without = stage.follow(PATH)
@@ -106,7 +106,7 @@ def test_without_measurements_the_feedback_holds_and_says_so(x_file):
 
 def test_a_measurement_that_cannot_be_is_told_and_moves_nothing(x_file):
     """A wrong unit, and a sensor that fails: whatever comes between the good ones."""
-    with compensator(model_file=x_file, feedback=True, slew_limit=2000.0, **GAINS) as client:
+    with compensator(model_file=x_file, feedback=True, feedback_fault_time=0, **GAINS) as client:
         client.connect()
         stage = DriftedStage(client, 2.0)
         stage.follow([5e-6] * 200)

@@ -175,7 +175,6 @@ def test_parameters_change_together_or_not_at_all(x_file):
         assert client.ask(["x"], [10e-6]) == [70.0]
         for refused, why in (
             ({"voltage_min": 20.0, "voltage_max": 15.0}, "not below"),
-            ({"voltage_max": 60.0}, "move it inside first"),
             ({"voltage_max": float("inf")}, "voltage_max"),
             ({"voltage_max": None}, "voltage_max"),
             ({"voltage_min": 0.0, "axes": ["z"]}, "read-only"),
@@ -184,6 +183,10 @@ def test_parameters_change_together_or_not_at_all(x_file):
         ):
             assert why in client.graph.set_parameters(client.name, **refused)
         assert client.ask(["x"], [10.2e-6]) == [70.0]
+        # A limit below the present voltage: it goes there, at the slew limit.
+        assert client.graph.set_parameters(client.name, voltage_max=60.0, slew_limit=500.0) == ""
+        client.wait_for_rest(60.0)
+        assert np.abs(np.diff(np.array(client.answers[-10:])[:, 0])).max() <= 2.0 * 500.0 / 1000 + 1e-9
         request = DescribeParameters.Request(names=["voltage_max", "axes"])
         described = client.graph.call(DescribeParameters, f"{client.name}/describe_parameters", request).descriptors
         assert all(descriptor.description for descriptor in described) and described[1].read_only

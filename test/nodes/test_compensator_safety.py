@@ -12,15 +12,14 @@ rclpy = pytest.importorskip("rclpy")
 
 from builtin_interfaces.msg import Duration  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
-from nodes.compensator_client import Client, compensator, last_at_full_pace  # noqa: E402
+from nodes.compensator_client import Client, compensator  # noqa: E402
 from nodes.ros_helpers import LATCHED, stage_model, started  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
-from slpi_ros.compensator.ramps import PERIOD  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
-from slpi_ros.model.limits import MAX_DT  # noqa: E402
+from slpi_ros.model.limits import MAX_DT, PERIOD  # noqa: E402
 
 RAMP_RATE = 50.0
 SAFE = {"safe_voltage": 10, "ramp_rate": RAMP_RATE}
@@ -48,18 +47,15 @@ def test_silence_leads_to_the_safe_voltage_and_the_next_command_takes_over_from_
         client.connect()
         while (before := client.ask(["x"], [5e-6])[0]) < 40.0:
             pass
-        sent = len(client.answers)
         client.wait_for_rest(10.0)
-        way = np.array([before, *voltages(client, sent)])
-        assert (np.diff(way) < 0).all() and np.abs(np.diff(way)).max() <= RAMP_RATE * MAX_DT
+        # What the slew limit held back of the last command has followed before.
+        way = voltages(client)
+        way = way[int(np.argmax(way)) :]
+        assert (np.diff(way) < 0).all() and np.abs(np.diff(way)).max() <= 2.0 * RAMP_RATE * PERIOD + 1e-9
         # Timers are late on a busy machine: not every period has its own step.
         assert len(way) > 0.2 * (before - 10.0) / RAMP_RATE / PERIOD
-        ramped = len(client.answers)
-        # No time has passed at the first sample of a new path: it starts where the ramp has ended.
-        assert client.ask(["x"], [5e-6]) == [10.0]
-        assert client.ask(["x"], [5e-6])[0] > 10.0
-        time.sleep(0.1)
-        assert len(client.answers) == ramped + 2
+        # A new path starts where the ramp has ended.
+        assert 10.0 < client.ask(["x"], [5e-6])[0] <= 10.0 + 2.0 * 2000 * PERIOD + 1e-9
 
 
 def test_a_command_ends_a_ramp(x_file):
@@ -73,7 +69,9 @@ def test_a_command_ends_a_ramp(x_file):
         before = len(client.answers)
         client.wish(["x"], [8e-6])
         client.report(accepted=4)
-        assert np.abs(np.diff(voltages(client, before - 1))).max() < 0.1
+        client.graph.spin_until(lambda: client.answers[-1][0] > client.answers[before - 1][0] + 1.0, "the command")
+        # From where the ramp was, at the slew limit.
+        assert np.abs(np.diff(voltages(client, before - 1))).max() <= 2.0 * 2000.0 * PERIOD + 1e-9
 
 
 @pytest.mark.parametrize("how", ["deactivate", "signal", "shutdown"])
@@ -113,9 +111,11 @@ def test_an_end_in_motion_brakes_where_acceleration_is_limited(x_file, how):
             assert client.change_state(Transition.TRANSITION_DEACTIVATE)
             client.report(state="inactive")
         # Voltages may come after the process has ended.
-        client.graph.spin_until(lambda: voltages(client)[-1] - last_at_full_pace(voltages(client)) > 5.0, "a way")
+        client.graph.spin_for(0.3)
         way = voltages(client)
-        assert way[-1] - last_at_full_pace(way) <= 200.0**2 / 2 / 1000.0 + 1e-6 and (np.diff(way) >= 0.0).all()
+        assert (np.diff(way) >= 0.0).all() and np.diff(way).max() <= 2.0 * 200.0 * PERIOD + 1e-9
+        # Not at once: it goes on for a while, but not to its goal.
+        assert way[-1] < stage_model().axis("x").memory().inverse(8e-6) - 1.0
 
 
 def test_on_the_way_from_a_limit_nothing_is_out_of_reach(x_file):
@@ -211,7 +211,8 @@ def test_the_memory_comes_back_after_a_restart(x_file, tmp_path):
     with compensator(**kept) as client:
         client.connect()
         _, values = client.report(memory="assumed")
-        assert values["x.voltage_V"] == "0.0000"
+        # But for the voltage that the amplifier still has.
+        assert float(values["x.voltage_V"]) == pytest.approx(expected[3], abs=1e-4)
         assert "belongs to another model" in client.node.stderr
 
 

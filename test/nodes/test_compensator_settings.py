@@ -24,9 +24,13 @@ def settings(**values: Any) -> CompensatorSettings:
     return CompensatorSettings.of(DEFAULTS | values)
 
 
-def test_defaults_limit_the_voltage_only_and_change_nothing_on_their_own():
+def test_defaults_limit_voltage_slew_and_correction_and_change_nothing_on_their_own():
     told = settings()
-    assert told.limits == (Limits(0.0, 100.0),)
+    # The voltage range in 0.1 s, and a fifth of it.
+    assert told.limits == (Limits(0.0, 100.0, 1000.0),) and told.loops[0].correction_limit == 20.0
+    assert settings(voltage_min=-20.0, voltage_max=130.0).limits == (Limits(-20.0, 130.0, 1500.0),)
+    assert settings(slew_limit=0.0).limits == (Limits(0.0, 100.0),)
+    assert told.starts == ("auto",) and told.reset_spans == ((0.0, 100.0),) and told.period == 1e-3
     assert not (told.safety.ramps_on_timeout or told.safety.ramps_on_deactivate or told.loops[0].enabled)
     assert told.safety.command_timeout == told.time.max_age == told.values["realtime_priority"] == 0
 
@@ -46,6 +50,8 @@ WRONG = [
     {"on_timeout": "explode"}, {"on_deactivate": ""}, {"reset_to": "home"}, {"reset_cycles": 0}, {"reset_cycles": 2.5},
     {"reset_cycles": True}, {"reset_rate": 0}, {"ramp_rate": -1.0}, {"realtime_priority": 100}, {"kp": [1.0, 2.0]},
     {"ki": -1.0}, {"kd": math.nan}, {"derivative_filter": math.inf}, {"acceleration_limit": -1.0}, {"time_jump": 0.0},
+    {"start_voltage": "there"}, {"start_voltage": "1,2"}, {"start_voltage": "inf"}, {"start_voltage": "500"},
+    {"output_rate": 0.0}, {"correction_limit": -1.0}, {"reset_min": 120.0}, {"reset_max": -1.0}, {"slew_limit": -1.0},
     {"max_age": -1.0}, {"drift_alarm": -3.0}, {"measurement_timeout": "long"}, {"start_memory": "yesterday"},
 ]  # fmt: skip
 
@@ -88,7 +94,8 @@ def test_config_files_hold_known_parameters(path):
 
 def test_one_file_shows_every_parameter_and_its_default():
     path = CONFIG / "one_axis.yaml"
-    assert parameters(path, commented=True) == DEFAULTS
+    shown = {name: str(value) for name, value in parameters(path, commented=True).items()}
+    assert shown == {name: str(value) for name, value in (DEFAULTS | {"slew_limit": 1000.0}).items()}
     assert parameters(path).keys() == {"axes", "model_file", "voltage_min", "voltage_max", "slew_limit"}
 
 
@@ -97,5 +104,7 @@ def test_every_parameter_is_described():
         described = entry.descriptor()
         assert described.description.endswith((".", ")."))
         assert described.read_only == entry.read_only
-        assert bool(described.floating_point_range) == bool(entry.between and entry.number)
+        # NaN, which stands for a default of its own, is in no range.
+        ranged = entry.between and entry.number and not (isinstance(entry.default, float) and math.isnan(entry.default))
+        assert bool(described.floating_point_range) == bool(ranged)
         assert bool(described.integer_range) == bool(entry.between and not entry.number)

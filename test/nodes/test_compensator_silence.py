@@ -85,11 +85,12 @@ def test_a_gap_in_a_trajectory_is_no_silence(x_file):
     with compensator(model_file=x_file, on_timeout="safe", **TIMEOUT) as client:
         client.connect()
         sender(client).publish(trajectory(["x"], [0, 3600 * SECOND_NS], [[3e-6], [6e-6]]))
-        client.graph.spin_until(lambda: client.answered == 1, "the first point")
+        client.graph.spin_until(lambda: client.answered >= 1, "the first point")
         reported = len(client.reports)
         client.graph.spin_until(lambda: len(client.reports) > reported + 4, "a while longer than the timeout")
-        assert client.answered == 1 and not any("no command" in said for said in messages(client)[reported:])
-        assert "waiting for a trajectory that goes on in 3" in messages(client)[-1]
+        assert not any("no command" in said for said in messages(client)[reported:])
+        # On its way to the second point, which is an hour away.
+        assert "following a trajectory" in messages(client)[-1]
 
 
 def test_a_reset_is_no_silence(x_file):

@@ -9,7 +9,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from builtin_interfaces.msg import Duration  # noqa: E402
-from nodes.compensator_client import SECOND_NS, Client, compensator, last_at_full_pace  # noqa: E402
+from nodes.compensator_client import SECOND_NS, Client, compensator  # noqa: E402
 from nodes.ros_helpers import LATCHED, RELIABLE, stage_model, voltage_path  # noqa: E402
 from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
@@ -41,11 +41,10 @@ def trajectory(names, times_ns, positions, start_ns=0) -> JointTrajectory:
 
 
 def settle(client: Client, points: int) -> dict[str, str]:
-    """Return the report of the end, once all voltages have come: it may overtake them."""
+    """Return the report of the end, once all voltages have come: at least one for each point."""
     _, values = client.report("the end", points_remaining=0, trajectories=1)
     given = points - int(values["points_skipped"])
     client.graph.spin_until(lambda: client.answered >= given, f"{given} points")
-    assert client.answered == given
     return values
 
 
@@ -80,10 +79,15 @@ def test_a_trajectory_is_given_point_by_point_at_its_times(xy_file):
         client.graph.spin_until(lambda: client.answered >= 1, "the first point")
         client.wish(["x"], [1e-6])
         values = settle(client, 300)
-        expected = library(path)
+        # Between the points the displacement is interpolated once a millisecond.
+        fine = np.arange(299 * 4 + 1)
+        expected = library(np.column_stack([np.interp(fine, 4 * np.arange(300), each) for each in path.T]))
         places = [int(np.abs(expected - answer).sum(axis=1).argmin()) for answer in client.answers]
         assert np.array(client.answers) == pytest.approx(expected[places], abs=1e-8)
-        assert places == sorted(places) and client.answers[-1] == pytest.approx(expected[-1].tolist(), abs=1e-8)
+        x = np.array(client.answers)[:, 0]
+        top = int(x.argmax())
+        assert (np.diff(x[: top + 1]) >= -1e-8).all() and (np.diff(x[top:]) <= 1e-8).all()
+        assert client.answers[-1] == pytest.approx(expected[-1].tolist(), abs=1e-8)
         assert values["rejected.following"] == "1"
         # Each report tells of the points since the one before, of which there may be none.
         late = [float(report["deadline_error_p50_us"] or "nan") for report in client.reports]
@@ -129,6 +133,8 @@ def test_cancel_replace_append_and_refuse(xy_file):
         client.graph.spin_until(lambda: client.answers[-1][0] > client.answers[3][0] + 1.0, "the other path")
         publisher.publish(JointTrajectory())
         _, values = client.report(points_remaining=0, trajectories=13)
+        # Voltages may come after the report.
+        client.graph.spin_for(0.3)
         held = client.answered
         assert client.ask(["x"], [4e-6])[0] == pytest.approx(client.answers[held - 1][0], abs=1e-8)
         assert client.answered == held + 1
@@ -147,8 +153,8 @@ def test_a_trajectory_keeps_to_the_slew_limit_and_survives_new_limits_and_a_new_
         v = np.vstack([[0.0, 0.0], client.answers])
     assert values["models_refused"] == "0" and values["last_rejection"] == ""
     assert v.min() >= 0.0 and v.max() <= 100.0
-    # A step after skipped points may be as long as theirs together.
-    assert np.abs(np.diff(v, axis=0)).max() <= 2000.0 * 2e-3 * (1 + int(values["points_skipped"])) + 1e-9
+    # In one step two output periods at most.
+    assert np.abs(np.diff(v, axis=0)).max() <= 2.0 * 2000.0 / 1000 + 1e-9
 
 
 def test_a_trajectory_that_waits_is_given_with_the_model_that_came_meanwhile(xy_file):
@@ -164,8 +170,10 @@ def test_a_trajectory_that_waits_is_given_with_the_model_that_came_meanwhile(xy_
         settle(client, 20)
         x = [answer[0] for answer in client.answers]
         expected = other.compensate(np.arange(20), {"x": path, "y": np.zeros(20)})["x"]
-        # A busy machine may lose points, but the path has no turns.
-        assert all(np.abs(expected - v).min() < 1e-8 for v in x) and x[-1] == pytest.approx(expected[-1], abs=1e-8)
+        # Interpolated on the way, which has no turns; a busy machine may lose points.
+        assert (np.diff(x) >= -1e-8).all() and x[-1] == pytest.approx(expected[-1], abs=1e-8)
+        reached = [np.abs(np.array(x) - v).min() < 1e-8 for v in expected]
+        assert sum(reached) >= 20 - int(client.reports[-1]["points_skipped"])
         assert client.ask(["x"], [path[-1]])[0] == pytest.approx(x[-1], abs=1e-8)
 
 
@@ -182,8 +190,9 @@ def test_a_cancelled_trajectory_brakes(xy_file):
         told = len(client.reports)
         client.graph.spin_until(lambda: len(client.reports) > told + 5, "rest")
         v = np.array(client.answers)[:, 0]
-        way = v[-1] - last_at_full_pace(v)
-        assert 5.0 < way <= 200.0**2 / 2 / 1000.0 + 1e-6 and (np.diff(v) >= 0.0).all()
+        assert (np.diff(v) >= 0.0).all() and np.diff(v).max() <= 2.0 * 200.0 / 1000 + 1e-9
+        # It goes on for a while, but not to its goal.
+        assert 30.0 < v[-1] < stage_model().axis("x").memory().inverse(8e-6) - 1.0
 
 
 def test_points_that_come_too_fast_hold_up_no_report(xy_file):

@@ -1,6 +1,7 @@
 """The node identify as a process of its own, over DDS: a bag in, a latched model out."""
 
 import json
+import math
 import os
 import signal
 import time
@@ -29,13 +30,16 @@ from nodes.ros_helpers import (  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from slpi_ros.errors import RecordError  # noqa: E402
+from slpi_ros import cli  # noqa: E402
+from slpi_ros.errors import RecordError, UsageError  # noqa: E402
 from slpi_ros.identification.fit import identify  # noqa: E402
 from slpi_ros.io.bag_reader import read_bag  # noqa: E402
 from slpi_ros.io.bag_writer import write_bag  # noqa: E402
 from slpi_ros.io.record import Record  # noqa: E402
 from slpi_ros.io.schemas import validate  # noqa: E402
-from slpi_ros.model.document import format_model, load_model, parse_model  # noqa: E402
+from slpi_ros.model.document import format_model, load_model, parse_model, save_model  # noqa: E402
+from slpi_ros.model.sensor import Sensor  # noqa: E402
+from slpi_ros.nodes.identify import DECLARATIONS, IdentifySettings  # noqa: E402
 from slpi_ros.nodes.jobs import DiagnosisRequest, FitOutcome, FitRequest, WorkerProcess, fit, run_diagnosis  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -52,11 +56,14 @@ def write_calibration(
     hum: float = 0.0,
     axes: Sequence[str] = ("x",),
     hardware_id: str = "stage 7",
+    top: float = 100.0,
+    digit: float = 0.0,
 ) -> str:
-    """Write a bag of 200 samples per second, with a hum (m) of 30 Hz."""
-    v = voltage_path(samples, seed)
+    """Write a bag of 200 samples per second up to `top` V, with a hum (m) of 30 Hz and a resolution `digit` (m)."""
+    v = voltage_path(samples, seed, top)
     y = stage_model().axis("x").simulate(np.arange(samples), v) + np.random.default_rng(seed).normal(0.0, 5e-9, samples)
     y += hum * np.sin(2 * np.pi * 30.0 * np.arange(samples) / 200.0)
+    y = np.round(y / digit) * digit if digit else y
     stamps = 1_700_000_000_000_000_000 + np.arange(samples, dtype=np.int64) * 5_000_000
     write_bag(path, Record(stamps, dict.fromkeys(axes, v), dict.fromkeys(axes, y), hardware_id=hardware_id))
     return str(path)
@@ -311,6 +318,84 @@ def test_a_bag_of_another_stage_replaces_no_model(tmp_path, other, why):
         assert strange in client.identified(4)
 
 
+def test_a_small_record_does_not_replace_a_model_of_the_whole_range(tmp_path):
+    """Unless somebody asks for it; the line says what is less, by how much, and what is wanted."""
+    watched, output = tmp_path / "watched", tmp_path / "model.json"
+    whole = write_calibration(watched / "whole")
+    with identifying(watch_directory=str(watched), output=str(output)) as client:
+        first = client.identified()
+        small = write_calibration(watched / "small", seed=2, samples=60, top=5.0)
+
+        def kept(text: str, bag: str) -> None:
+            status = client.status(lambda status: text in status.message and bag in status.message, text)
+            assert status.level == b"\1" and "stays" in status.message and "\n" not in status.message
+            assert values_of(status)["x.source"] == whole and output.read_text() == first and len(client.models) == 1
+
+        kept("80%", small)
+        assert client.node.stderr.count("80%") == 1
+        # Neither does one that is named, nor one with a sensor that is far too coarse.
+        assert client.set(bags=[small], watch_directory="") == ""
+        kept("80%", small)
+        coarse = write_calibration(tmp_path / "coarse", seed=3, digit=1.2e-6)
+        assert client.set(bags=[coarse]) == ""
+        client.failed("too coarse")
+        assert len(client.models) == 1
+        assert client.set(bags=[small]) == ""
+        kept("80%", small)
+        assert client.graph.call(Trigger, "/identify/identify", Trigger.Request()).success
+        assert source_of(client.identified(2)) == small and source_of(output.read_text()) == small
+        # A better one needs no word.
+        assert client.set(bags=[whole]) == ""
+        assert source_of(client.identified(3)) == whole
+        assert client.set(bags=[small], replace=True) == ""
+        assert source_of(client.identified(4)) == small
+        assert "Traceback" not in client.node.stderr
+
+
+@pytest.mark.parametrize("where", ["topic", "file"])
+def test_the_model_in_use_may_be_of_somebody_else(bag, tmp_path, where):
+    """The last one on the topic, or that in the file after a restart."""
+    small, output = write_calibration(tmp_path / "small", seed=2, samples=60, top=5.0), tmp_path / "model.json"
+    model = identify(read_bag(bag), "pi")
+    parameters = {"bags": [small]}
+    if where == "file":
+        save_model(model, output)
+        parameters["output"] = str(output)
+    with on_graph() as other:
+        publisher = other.node.create_publisher(String, "stage_model", LATCHED)
+        if where == "topic":
+            publisher.publish(String(data=format_model(model)))
+        with identifying(**parameters) as client:
+            status = client.status(lambda status: "stays" in status.message, "a word on it")
+            assert small in status.message and "80%" in status.message and status.level == b"\1"
+            assert not client.node.stderr.count("[ERROR]")
+            answer = client.graph.call(Trigger, "/identify/identify", Trigger.Request())
+            assert answer.success
+            client.graph.spin_until(lambda: any(source_of(each.data) == small for each in client.models), "the model")
+
+
+def test_no_file_of_somebody_else_becomes_the_model(bag, tmp_path):
+    (tmp_path / "notes.csv").write_text("mine")
+    with identifying(bags=[bag], output=str(tmp_path / "notes.csv")) as client:
+        client.identified()
+        client.failed("notes.csv")
+        assert (tmp_path / "notes.csv").read_text() == "mine"
+        assert client.set(output="a" * 300) == ""
+        client.failed("name too long")
+        assert client.set(output="nowhere/model.json") == ""
+        client.failed("nowhere")
+
+
+def test_a_record_that_the_command_line_refuses_is_refused(bag, tmp_path):
+    coarse = write_calibration(tmp_path / "coarse", digit=1.2e-6)
+    outcome = fit(FitRequest((coarse,), "stage_state", "pi", None, None, ""))
+    assert not outcome.document and coarse in outcome.error and "too coarse" in outcome.error
+    document = format_model(identify(read_bag(bag), "pi"))
+    diagnosed = run_diagnosis(DiagnosisRequest((coarse,), "stage_state", document, str(tmp_path / "out")))
+    assert "too coarse" in diagnosed.error
+    assert cli.main(["identify", coarse, "-o", str(tmp_path / "m.json")]) == 1
+
+
 def test_the_stage_of_another_folder_is_another_one(tmp_path):
     mine = write_calibration(tmp_path / "mine" / "bag")
     yours = write_calibration(tmp_path / "yours" / "bag", axes=("y",), hardware_id="stage 8")
@@ -457,6 +542,19 @@ def test_a_worker_that_dies_is_an_error_not_a_hang(bag):
     while (outcome := job.outcome()) is None:
         assert time.monotonic() < deadline
     assert not outcome.document and "exit code -9" in outcome.error
+
+
+def test_what_is_known_of_the_sensor_is_in_the_model(bag):
+    given = {"sensor_delay": 0.01, "sensor_lag": 0.002}
+    values = {one.name: one.default for one in DECLARATIONS} | {"bags": [bag], "kind": "pi"} | given
+    request = IdentifySettings.of(values).request
+    assert (request.sensor_delay, request.sensor_lag) == (0.01, 0.002)
+    outcome = fit(request)
+    assert parse_model(outcome.document, "new").axes["x"].sensor == Sensor(0.01, 0.002)
+    for name in given:
+        for value in (-0.001, 1.5, math.nan):
+            with pytest.raises(UsageError, match=name):
+                IdentifySettings.of(values | {name: value})
 
 
 def test_the_compensator_takes_the_model_over(bag, tmp_path):

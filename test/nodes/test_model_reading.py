@@ -56,7 +56,12 @@ def test_a_large_document_is_the_model_that_a_small_one_would_be(nothing_checked
     assert fingerprint == model_id(model) == model_id(parse_model(FINE, "here"))
 
 
-@pytest.mark.parametrize("text", [HOSTILE, FINE[:-1], FINE.replace("1e-07", "1e-7000", 1) + "]", "[" * (SMALL + 1)])
+# Names, as pytest puts the name of a test into the environment, which takes no megabytes: no process could be started.
+@pytest.mark.parametrize(
+    "text",
+    [HOSTILE, FINE[:-1], FINE.replace("1e-07", "1e-7000", 1) + "]", "[" * (SMALL + 1)],
+    ids=["hostile", "cut", "too much", "deep"],
+)
 def test_a_large_wrong_document_is_refused_elsewhere(nothing_checked_here, text):
     with pytest.raises(ModelError, match="^here: [^\n]+$"):
         Reading(text, "here").read()

@@ -1,0 +1,301 @@
+"""The voltage that the amplifier of an axis reports, held against the voltages that were output."""
+
+from collections import deque
+from dataclasses import dataclass
+from math import isfinite
+from statistics import median
+
+import numpy as np
+
+from slpi_ros.io.messages import SECOND_NS
+
+# A start is the median of this many reports, to this many, of at most this age; of a slow driver, after this time, the
+# latest one.
+REPORTS, MOST_REPORTS, REPORT_AGE_NS, SLOW_NS = 3, 5, SECOND_NS // 5, SECOND_NS
+# After this time a publisher that has never reported a finite voltage counts as none.
+MUTE_NS = 3 * SECOND_NS
+# Reports are compared with the voltages of this time, and of the delay and of this many lags of the stage.
+BAND_NS, LAGS = SECOND_NS // 5, 5.0
+# They may be off by this share of the voltage range, or by this many times their noise.
+TOLERATED_SHARE, TOLERATED_NOISES = 0.02, 4.0
+# This many reports over this time outside: the voltage is another one.
+FOREIGN_REPORTS, FOREIGN_NS = 3, SECOND_NS // 10
+# Reports are steady if they stay within the tolerance for this time; a rearming node waits longer.
+STEADY_NS, REARM_NS = SECOND_NS // 5, SECOND_NS // 2
+# A voltage of this many ranges is none, in whatever unit.
+ABSURD = 1e4
+# Voltages are kept in pieces of this length.
+PIECE_NS = SECOND_NS // 100
+# A gain or an offset of the reports is one that explains this share of them, and of those while the voltage moved;
+# fewest reports for that.
+EXPLAINED, EXPLAINED_MOVING, FEWEST = 0.98, 0.9, 8
+# They have followed a motion of this many tolerances. As long as there was none, a difference of up to this share of
+# the range that is there from the start on is not judged.
+MOVED, CONSTANT_SHARE = 5.0, 0.1
+# Voltages between are those that are further than this share of the motion from its ends.
+BETWEEN = 0.2
+# Reports kept for that, and gains that are calibration.
+KEPT, GAINS = 512, (0.05, 20.0)
+# Differences of reports from which the noise is estimated: of steady voltages.
+DIFFERENCES = 32
+# Median of the absolute difference of two normal values, in standard deviations.
+NORMAL_DIFFERENCE = 0.6745 * 2**0.5
+# The same of the second difference of three.
+NORMAL_BEND = 0.6745 * 6**0.5
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Constant relation of a reported voltage to the voltage that was output: ``gain * voltage + offset``.
+
+    Parameters
+    ----------
+    gain : float
+    offset : float, volts
+    """
+
+    gain: float = 1.0
+    offset: float = 0.0
+
+    def voltage(self, reported: float) -> float:
+        """Return the output voltage (V) for a reported one (V)."""
+        return (reported - self.offset) / self.gain
+
+
+class Amplifier:
+    """Reports of the voltage of one axis: where it starts, and whether somebody else moves it.
+
+    All times are nanoseconds on the steady clock.
+
+    Parameters
+    ----------
+    span : float, volts
+        Voltage range of the node.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        Relation of reports to voltages that was found; at first that of equal ones.
+    foreign : str
+        How the reports contradict the voltages that were output; "" while they agree.
+    window_ns : int, nanoseconds
+        Time for which an output voltage may still be reported.
+    span : float, volts
+    """
+
+    def __init__(self, span: float) -> None:
+        self.span = span
+        self.calibration = Calibration()
+        self.foreign = ""
+        self.window_ns = BAND_NS
+        # Reports (ns, V); output voltages as pieces (number, lowest, highest); time, output and report (ns, V, V).
+        self._reports: deque[tuple[int, float]] = deque(maxlen=64)
+        self._pieces: deque[tuple[int, float, float]] = deque()
+        # Reports as pieces, for longer than the last ones of a fast driver last.
+        self._told: deque[tuple[int, float, float]] = deque(maxlen=2 * REARM_NS // PIECE_NS)
+        self._last: float | None = None
+        self._pairs: deque[tuple[float, float, float]] = deque(maxlen=KEPT)
+        self._differences: deque[float] = deque(maxlen=DIFFERENCES)
+        self._outside, self._outside_ns = 0, 0
+        self._begun_ns = self._output_ns = 0
+
+    # Reports
+
+    @property
+    def latest(self) -> float | None:
+        """Latest reported voltage, volts; None before the first."""
+        return self._reports[-1][1] if self._reports else None
+
+    @property
+    def scatter(self) -> float:
+        """Difference (V) between a report and a voltage that the noise of the reports may make."""
+        if len(self._differences) == DIFFERENCES:
+            return TOLERATED_NOISES * median(self._differences) / NORMAL_DIFFERENCE
+        # Of steady voltages there are too few yet: second differences of the last reports, which even motion is not in.
+        last = [v for _, v in self._reports][-DIFFERENCES:]
+        bends = [abs(c - 2.0 * b + a) for a, b, c in zip(last, last[1:], last[2:], strict=False)]
+        return TOLERATED_NOISES * median(bends) / NORMAL_BEND if bends else 0.0
+
+    @property
+    def tolerance(self) -> float:
+        """Largest difference (V) between a report and an output voltage that means nothing."""
+        return max(TOLERATED_SHARE * self.span, self._noise)
+
+    @property
+    def _noise(self) -> float:
+        """What the noise of the reports may make of a steady voltage, in volts of the reports; 0 if not known yet."""
+        return self.scatter if len(self._differences) == DIFFERENCES else 0.0
+
+    @property
+    def silent(self) -> bool:
+        """Whether reports have stopped while the output goes on."""
+        return bool(self._reports) and self._output_ns - self._reports[-1][0] > SLOW_NS
+
+    def report(self, voltage: float, now_ns: int) -> None:
+        """Take a reported voltage (V) that arrived at `now_ns`; one that is not finite or absurd is no report."""
+        if not (isfinite(voltage) and abs(voltage) <= ABSURD * self.span):
+            return
+        before = self.latest
+        self._reports.append((now_ns, voltage))
+        number, told = now_ns // PIECE_NS, self._told
+        if told and told[-1][0] == number:
+            told[-1] = number, min(told[-1][1], voltage), max(told[-1][2], voltage)
+        else:
+            told.append((number, voltage, voltage))
+        if self._last is None or self.foreign:
+            return
+        low, high = self._band(now_ns)
+        if before is not None and high == low:
+            self._differences.append(abs(voltage - before))
+        self._pairs.append((now_ns, self._last, voltage))
+        if self._beyond(low, high, voltage, self.calibration) <= 0.0:
+            self._outside = 0
+            return
+        if not self._outside:
+            self._outside_ns = now_ns
+        self._outside += 1
+        if self._outside >= FOREIGN_REPORTS and now_ns - self._outside_ns >= FOREIGN_NS:
+            self._judge(low, high, voltage)
+
+    def output(self, voltage: float, now_ns: int) -> None:
+        """Take a voltage (V) that is output at `now_ns`."""
+        number, last = now_ns // PIECE_NS, self._last
+        pieces = self._pieces
+        if last is None:
+            last = voltage
+        if voltage != last:
+            self._output_ns = now_ns
+        self._last = voltage
+        if pieces and pieces[-1][0] == number:
+            _, low, high = pieces[-1]
+            if not low <= voltage <= high:
+                pieces[-1] = number, min(low, voltage), max(high, voltage)
+            return
+        if voltage == last and pieces:
+            return
+        pieces.append((number, min(last, voltage), max(last, voltage)))
+        oldest = (now_ns - self.window_ns) // PIECE_NS
+        while pieces[0][0] < oldest:
+            pieces.popleft()
+
+    # Where it is
+
+    def found(self, now_ns: int, since_ns: int) -> float | None:
+        """Return the voltage (V) at which the axis starts; None if more reports are needed.
+
+        Parameters
+        ----------
+        now_ns : int, nanoseconds
+        since_ns : int, nanoseconds
+            Time since which reports are awaited.
+        """
+        recent = [v for t, v in list(self._reports)[-MOST_REPORTS:] if now_ns - t <= REPORT_AGE_NS]
+        if len(recent) >= REPORTS:
+            return self.calibration.voltage(median(recent))
+        if now_ns - since_ns >= SLOW_NS and self._reports and self._reports[-1][0] >= since_ns - SLOW_NS:
+            return self.calibration.voltage(self._reports[-1][1])
+        return None
+
+    def steady(self, now_ns: int, for_ns: int = STEADY_NS) -> float | None:
+        """Return the voltage (V) that the last reports agree on for `for_ns`; None if there is none."""
+        last = list(self._reports)[-REPORTS:]
+        if len(last) < REPORTS:
+            return None
+        # A slow driver reports less often.
+        longest_ns = max(REPORT_AGE_NS, REPORTS * (last[-1][0] - last[0][0]) // (REPORTS - 1))
+        if now_ns - last[-1][0] > min(longest_ns, SLOW_NS):
+            return None
+        told = [each for each in self._told if each[0] * PIECE_NS >= now_ns - for_ns]
+        oldest_ns = min([last[0][0], *(number * PIECE_NS for number, _, _ in told)])
+        values = [v for _, v in last] + [v for _, low, high in told for v in (low, high)]
+        if now_ns - oldest_ns < for_ns * 0.9 or max(values) - min(values) > 2.0 * self.tolerance:
+            return None
+        recent = [v for t, v in self._reports if now_ns - t <= for_ns]
+        return self.calibration.voltage(median(recent or [v for _, v in last]))
+
+    def begin(self, voltage: float, now_ns: int) -> None:
+        """Continue from a voltage (V) that is known to be there; what was output before no longer counts."""
+        self.foreign, self._outside, self._last = "", 0, None
+        self._pieces.clear()
+        self._pairs.clear()
+        self._begun_ns = now_ns
+        self.output(voltage, now_ns)
+        self._last = voltage
+
+    def forget_output(self) -> None:
+        """Compare no reports until the next `begin`: nothing is being output."""
+        self._last, self._outside = None, 0
+
+    def _band(self, now_ns: int) -> tuple[float, float]:
+        """Return the lowest and highest voltage (V) that was in force within the window."""
+        oldest = (now_ns - self.window_ns) // PIECE_NS
+        low = high = self._last if self._last is not None else 0.0
+        for number, lowest, highest in self._pieces:
+            # The voltage at the begin of a piece is in it: that before the oldest piece of the window is, too.
+            if number >= oldest:
+                low, high = min(low, lowest), max(high, highest)
+        return low, high
+
+    def _beyond(self, low: float, high: float, reported: float, calibration: Calibration) -> float:
+        """Return by how much (V) a report, with `calibration` a voltage, is outside a band of voltages."""
+        voltage = calibration.voltage(reported)
+        tolerance = max(TOLERATED_SHARE * self.span, self._noise / calibration.gain)
+        return max(low - voltage, voltage - high, tolerance) - tolerance
+
+    def _judge(self, low: float, high: float, reported: float) -> None:
+        """Find the calibration that explains the reports, or state that the voltage is another one."""
+        found, followed = self._explained()
+        if found and followed:
+            self.calibration, self._outside = found, 0
+            return
+        if found and max(low - reported, reported - high) <= CONSTANT_SHARE * self.span:
+            # So far from the start on, and little: motion will tell.
+            return
+        self._outside = 0
+        there = f"{low:.4g} V was output" if high - low < 1e-6 else f"{low:.4g} to {high:.4g} V were output"
+        self.foreign = (
+            f"stage_state reports {reported:.4g} V (effort), but {there}: somebody else moves the stage, its driver "
+            "limits the voltage, or the report is wrong; find out which, then call ~/arm"
+        )
+
+    def _explained(self) -> tuple[Calibration | None, bool]:
+        """Return a constant gain or offset that explains all reports so far, and whether they have followed a motion.
+
+        The reports may be late by up to the window. Gain and offset at once are none: any two voltages lie on a line.
+        """
+        times, given, reported = np.array(self._pairs).T
+        best: tuple[float, float, Calibration, bool] | None = None
+        for late in np.arange(0.0, self.window_ns, PIECE_NS):
+            told = times - late - 2.0 * PIECE_NS >= self._begun_ns
+            if np.count_nonzero(told) < FEWEST:
+                break
+            early = times[told] - late
+            # The report may tell of any voltage since the one before.
+            ends = np.array([np.interp(early - since, times, given) for since in (0.0, PIECE_NS, 2.0 * PIECE_NS)])
+            low, high, r = ends.min(axis=0), ends.max(axis=0), reported[told]
+            middle = ends[1]
+            power = float(middle @ middle)
+            moved = np.abs(middle - middle[-1]) > self.tolerance
+            for found in (
+                Calibration(1.0, float(np.median(r - middle))),
+                Calibration(float(middle @ r) / power if power > 0.0 else 0.0),
+            ):
+                if not GAINS[0] <= found.gain <= GAINS[1]:
+                    continue
+                near = np.array([self._beyond(*each, found) <= 0.0 for each in zip(low, high, r, strict=True)])
+                share = float(near.mean())
+                if share < EXPLAINED or (moved.any() and float(near[moved].mean()) < EXPLAINED_MOVING):
+                    continue
+                error = float(np.abs(found.gain * middle + found.offset - r).mean())
+                if best is None or (-share, error) < best[:2]:
+                    followed = min(np.ptp(middle), np.ptp(r) / found.gain) >= MOVED * self.tolerance
+                    # Noise divided by a small gain is no motion.
+                    noise = self.scatter if len(self._differences) == DIFFERENCES else 0.0
+                    # At the voltages between, too: a jump of somebody else beside a move of this node is no gain.
+                    span = float(np.ptp(middle))
+                    between = np.abs(middle - 0.5 * (middle.min() + middle.max())) < (0.5 - BETWEEN) * span
+                    along = np.abs((r - found.offset) / found.gain - middle) < BETWEEN * span
+                    followed = followed and np.ptp(r) >= MOVED * noise and np.count_nonzero(between) >= REPORTS
+                    followed = followed and bool(along[between].mean() >= EXPLAINED_MOVING)
+                    best = -share, error, found, bool(followed)
+        return best[2:] if best else (None, False)

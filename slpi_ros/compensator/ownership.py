@@ -1,0 +1,170 @@
+"""Who owns the voltages of a stage: where they start, and whether somebody else moves it."""
+
+from collections.abc import Sequence
+
+from slpi_ros.compensator.amplifier import MUTE_NS, STEADY_NS
+from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.validation import NOT_ARMED, STARTING, RejectedError
+
+# Start voltages: as reported, or else as saved or recorded; as reported only; as saved or recorded; or a number (V).
+AUTO, MEASURED, SAVED = "auto", "measured", "saved"
+STARTS = (AUTO, MEASURED, SAVED)
+# A reported voltage this many voltage ranges beyond the limits is none of this amplifier.
+BEYOND = 2.0
+
+
+class Ownership:
+    """Whether voltages may be output: the amplifiers are where they are known to be, and nobody else moves them.
+
+    All times are nanoseconds on the steady clock.
+
+    Parameters
+    ----------
+    axes : sequence of Axis
+    starts : sequence of str or float
+        Where the voltage of each axis starts: `AUTO`, `MEASURED`, `SAVED`, or a voltage (V). Empty: `AUTO`.
+
+    Attributes
+    ----------
+    reporting : bool
+        Whether ``stage_state`` has a publisher.
+    started : bool
+        Whether a voltage has been output since the activation.
+    obstacle : (str, str) or None
+        Cause of rejection, and reason, if no voltage may be output.
+    notes : dict of axis name to str
+        What is not certain about the voltage at the start; "" if nothing.
+    """
+
+    def __init__(self, axes: Sequence[Axis], starts: Sequence[str | float] = ()) -> None:
+        self.reporting = self.started = False
+        self.obstacle: tuple[str, str] | None = None
+        self.notes: dict[str, str] = {}
+        self._axes = axes
+        self._starts = list(starts) or [AUTO] * len(axes)
+        self._since_ns, self._ever = 0, False
+
+    @property
+    def armed(self) -> bool:
+        """Whether nobody else moves the stage, as far as is known."""
+        return self.obstacle is None or self.obstacle[0] != NOT_ARMED
+
+    @property
+    def owned(self) -> bool:
+        """Whether voltages are being output."""
+        return self.started and self.obstacle is None
+
+    def await_start(self, now_ns: int) -> None:
+        """Find the voltages anew before the next output."""
+        self.started, self._since_ns = False, now_ns
+        self.obstacle = STARTING, "the voltages at the start are not known yet; send it again"
+
+    def locate(self, now_ns: int) -> None:
+        """Move the axes of the model to where their amplifiers are found."""
+        missing = ""
+        for axis, start in zip(self._axes, self._starts, strict=True):
+            found, self.notes[axis.name] = self._find(axis, start, now_ns)
+            if found is None:
+                missing = missing or f"axis '{axis.name}': {self.notes[axis.name]}"
+                continue
+            axis.locate(found)
+            axis.choose_memory(now_ns)
+        self.obstacle = (STARTING, missing) if missing else None
+
+    def _find(self, axis: Axis, start: str | float, now_ns: int) -> tuple[float | None, str]:
+        """Return the voltage (V) at which an axis starts, and what is not certain about it; None: not known yet."""
+        if isinstance(start, float):
+            # Later, the voltage of this node is known better.
+            return (axis.voltage if self._ever else start), ""
+        if start == SAVED:
+            return axis.voltage, ""
+        found = axis.amplifier.found(now_ns, self._since_ns)
+        if found is not None and not self._possible(axis, found):
+            return None, self._impossible(found)
+        if found is not None:
+            # The last output is known better than a noisy report of it.
+            same = self._ever and abs(found - axis.voltage) <= axis.amplifier.scatter
+            return (axis.voltage if same else found), ""
+        awaited = self.reporting and (now_ns - self._since_ns < MUTE_NS or axis.amplifier.latest is not None)
+        if start == MEASURED or awaited:
+            return None, (
+                "waiting for the voltage of the amplifier (effort of stage_state); check its driver, or set "
+                "start_voltage"
+            )
+        if self._ever:
+            return axis.voltage, ""
+        if self.reporting:
+            return axis.voltage, (
+                f"stage_state holds no usable voltage of this axis (effort); it is taken to be at {axis.voltage:.4g} "
+                "V: check the driver before you send anything, or set start_voltage"
+            )
+        return axis.voltage, (
+            f"nobody reports the voltage of the amplifier (effort of stage_state); it is taken to be at "
+            f"{axis.voltage:.4g} V: check that before you send anything, or set start_voltage"
+        )
+
+    def begin_output(self, now_ns: int) -> None:
+        """Find the voltages at the start once more, and take them to be those of the amplifiers.
+
+        Raises
+        ------
+        RejectedError
+            If they are not known, or somebody else moves the stage.
+        """
+        if not self.started and self.armed:
+            self.locate(now_ns)
+        if self.obstacle:
+            raise RejectedError(*self.obstacle)
+        if not self.started:
+            self.started = self._ever = True
+            for axis in self._axes:
+                self._take(axis, now_ns)
+
+    def lost(self) -> bool:
+        """Return whether somebody else has begun to move an axis; nothing may then be output until `arm`."""
+        for axis in self._axes:
+            if axis.amplifier.foreign and self.armed:
+                self.obstacle = NOT_ARMED, f"axis '{axis.name}': {axis.amplifier.foreign}"
+                return True
+        return False
+
+    def arm(self, now_ns: int, steady_ns: int = STEADY_NS) -> str:
+        """Continue from the steady voltages that are reported; return the reason if there are none, else ""."""
+        found = {axis.name: axis.amplifier.steady(now_ns, steady_ns) for axis in self._axes}
+        for name, voltage in found.items():
+            if voltage is None:
+                return f"axis '{name}': stage_state reports no steady voltage (effort); stop what moves the stage"
+        for axis in self._axes:
+            voltage = found[axis.name]
+            if voltage is not None and not self._possible(axis, voltage):
+                return f"axis '{axis.name}': {self._impossible(voltage)}"
+        for axis in self._axes:
+            voltage = found[axis.name]
+            assert voltage is not None
+            # The last output of an axis that nobody moved is known better than a noisy report of it.
+            if axis.amplifier.foreign or abs(voltage - axis.voltage) > axis.amplifier.scatter:
+                axis.locate(voltage)
+            self._take(axis, now_ns)
+        self.obstacle = None
+        return ""
+
+    @staticmethod
+    def _possible(axis: Axis, voltage: float) -> bool:
+        """Return whether an amplifier of these limits can be at a voltage (V): at most `BEYOND` ranges outside."""
+        lower, upper = axis.limits.lower, axis.limits.upper
+        margin = BEYOND * (upper - lower)
+        return lower - margin <= voltage <= upper + margin
+
+    @staticmethod
+    def _impossible(voltage: float) -> str:
+        return (
+            f"stage_state reports {voltage:.6g} V (effort), more than {BEYOND:g} voltage ranges beyond the limits; "
+            "correct its unit, or the limits"
+        )
+
+    @staticmethod
+    def _take(axis: Axis, now_ns: int) -> None:
+        """Take the voltage of an axis to be that of its amplifier from now on."""
+        axis.amplifier.begin(axis.voltage, now_ns)
+        axis.given_ns = now_ns
+        axis.return_inside(now_ns)

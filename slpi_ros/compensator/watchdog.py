@@ -1,0 +1,52 @@
+"""Watchdog of the commands: they have to keep coming."""
+
+from slpi_ros.compensator.ramps import Safety
+
+
+class CommandWatchdog:
+    """Detect that no command has arrived within the command timeout.
+
+    Attributes
+    ----------
+    commanded : bool
+        Whether a command has been executed since the activation. Before the first command, a timeout moves no axis.
+    expired : bool
+        Whether the timeout had elapsed at the last call of `update`.
+    safe_voltages : tuple of float, length of axes, volts, or None
+        Target voltages of the ramp started at expiry; None if the voltages are held.
+    """
+
+    def __init__(self) -> None:
+        self.start(0)
+
+    def start(self, now_ns: int) -> None:
+        """Restart the timeout at `now_ns` (ns) and clear all flags."""
+        self.commanded = self.expired = False
+        self.safe_voltages: tuple[float, ...] | None = None
+        self._heard_ns = now_ns
+
+    def feed(self, now_ns: int) -> None:
+        """Restart the timeout at `now_ns` (ns) because a command has arrived."""
+        self._heard_ns = now_ns
+        self.expired, self.safe_voltages = False, None
+
+    def update(self, safety: Safety, now_ns: int, waiting: bool) -> bool:
+        """Update `expired`; return True at expiry, and again if the reaction in `safety` changes afterwards.
+
+        Parameters
+        ----------
+        safety : Safety
+            Command timeout, and the reaction to it.
+        now_ns : int, nanoseconds
+        waiting : bool
+            Whether commands are expected; if False, the watchdog does not expire.
+        """
+        before = self.expired, self.safe_voltages
+        self.expired = waiting and 0.0 < safety.command_timeout < self.silence(now_ns)
+        moves = self.expired and self.commanded and safety.ramps_on_timeout
+        self.safe_voltages = safety.voltages if moves else None
+        return self.expired and (self.expired, self.safe_voltages) != before
+
+    def silence(self, now_ns: int) -> float:
+        """Return the time (s) from the last command, or from `start`, to `now_ns` (ns)."""
+        return (now_ns - self._heard_ns) * 1e-9

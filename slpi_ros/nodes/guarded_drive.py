@@ -1,0 +1,248 @@
+"""How exciter and calibrator drive a stage: limits, sole publisher, read-back, watch, return to rest."""
+
+import math
+import time
+from array import array
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from slpi_ros.calibration.drive_watch import DriveWatch
+from slpi_ros.compensator.amplifier import TOLERATED_SHARE
+from slpi_ros.errors import RecordError, SlpiError
+from slpi_ros.excitation.calibration import MEAN_SPEED
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.nodes.common import COMMANDS
+
+STATE, COMMAND = "stage_state", "voltage_command"
+# A voltage is at its goal within this share of the range. Time for the delivery of the last voltage.
+ARRIVED, DELIVERY = 1e-6, Duration(seconds=1.0)
+
+OnState = Callable[[bytes, int], None]
+
+
+class GuardedDrive:
+    """Drive a stage within its limits, alone, from where it is, and only while it does what it is told.
+
+    Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock.
+
+    Parameters
+    ----------
+    node : Node
+        Its name begins the messages of errors.
+    axes : sequence of str
+        In the order of the voltages.
+    limits : sequence of Limits
+    rate : float, hertz
+        Rate at which `move` is called.
+    timeout : float, seconds
+        Longest time without a valid state during a drive.
+    on_state : callable, optional
+        Called with each serialized state and its time on the clock of the node.
+    publisher : rclpy publisher, optional
+        Publisher of the voltages; default: a new one of ``voltage_command``.
+
+    Attributes
+    ----------
+    publisher : rclpy publisher
+    watch : DriveWatch
+    reported : list of float or None
+        Voltages of the last valid state, volts.
+    hardware_id : str
+        Of the last valid state.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        axes: Sequence[str],
+        limits: Sequence[Limits],
+        rate: float,
+        timeout: float,
+        on_state: OnState | None = None,
+        publisher: Any = None,
+    ) -> None:
+        self._node, self._axes, self._on_valid = node, tuple(axes), on_state
+        self._timeout = timeout
+        self._simulated = bool(node.get_parameter("use_sim_time").value)
+        self.publisher: Any = publisher or node.create_publisher(Float64MultiArray, COMMAND, COMMANDS)
+        self._subscription = None
+        self.reported: list[float] | None = None
+        self.hardware_id, self._count = "", 0
+        self.prepare(limits, rate)
+
+    def prepare(self, limits: Sequence[Limits], rate: float) -> None:
+        """Begin a run within the given limits, at a rate (Hz): nothing is known of the stage."""
+        self._limits, self._rate = tuple(limits), rate
+        self._limiters = [RateLimiter(each, 1.0 / self._rate) for each in limits]
+        self._started = False
+        self._since_ns = time.monotonic_ns()
+        self.watch = DriveWatch(self._axes, limits, self._timeout, simulated=self._simulated)
+
+    @property
+    def voltages(self) -> list[float]:
+        """Voltages that were published last, volts; those found at the amplifier before."""
+        return [limiter.voltage for limiter in self._limiters]
+
+    @property
+    def started(self) -> bool:
+        """Whether voltages may be published."""
+        return self._started
+
+    @property
+    def heard(self) -> bool:
+        """Whether anybody publishes, or has published, states."""
+        return self._subscription is not None
+
+    def listen(self) -> None:
+        """Subscribe to the states with the reliability that their publishers offer; again and again until there are."""
+        if self._subscription is not None:
+            return
+        publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(STATE))
+        if publishers:
+            reliable = all(each.qos_profile.reliability == ReliabilityPolicy.RELIABLE for each in publishers)
+            reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+            qos = QoSProfile(depth=1000, reliability=reliability)
+            self._subscription = self._node.create_subscription(JointState, STATE, self._on_state, qos, raw=True)
+
+    # Before a drive
+
+    @property
+    def others(self) -> int:
+        """Number of other publishers of the topic of the voltages."""
+        return self._node.count_publishers(self.publisher.topic_name) - 1
+
+    def require_alone(self) -> None:
+        """Raise RecordError if another node publishes the topic of the voltages."""
+        if self.others > 0:
+            raise RecordError(
+                f"{self._node.get_name()}: {self.others} other publisher of {self.publisher.topic_name}; stop it, as "
+                "the voltage would jump between the commands of both"
+            )
+
+    def lacking(self) -> str:
+        """Return what is missing before a drive may start, with what to do; "" if nothing is."""
+        topic = self._node.resolve_topic_name(STATE)
+        if self._subscription is None:
+            return f"no publisher of {topic}; start the driver of the stage, or remap its topic"
+        if not self.publisher.get_subscription_count():
+            return f"no subscriber of {self.publisher.topic_name}; start the driver of the stage, or remap its topic"
+        if self.watch.refused:
+            return f"no valid {topic}: {self.watch.refused}"
+        if self.found() is None:
+            return f"no report of the voltage of the axes {', '.join(self._axes)} on {topic}; check the driver"
+        return ""
+
+    def found(self) -> list[float] | None:
+        """Return the voltages (V) at which the amplifier is, as reported; None if they are not known yet."""
+        return self.watch.started_from(time.monotonic_ns(), self._since_ns)
+
+    def start(self, voltages: Sequence[float]) -> None:
+        """Start from voltages (V) at which the amplifier is.
+
+        Raises
+        ------
+        RecordError
+            If one is outside the limits by more than `TOLERATED_SHARE` of the range.
+        """
+        for axis, limits, v in zip(self._axes, self._limits, voltages, strict=True):
+            slack = TOLERATED_SHARE * (limits.upper - limits.lower)
+            if not limits.lower - slack <= v <= limits.upper + slack:
+                raise RecordError(
+                    f"{self._node.get_name()}: axis '{axis}' is at {v:g} V, outside {limits.lower:g} to "
+                    f"{limits.upper:g} V; move it inside first"
+                )
+        for limiter, limits, v in zip(self._limiters, self._limits, voltages, strict=True):
+            limiter.start(limits.clip(v))
+        self._started = True
+
+    # A drive
+
+    def begin(self) -> None:
+        """Begin to hold the states against the voltages."""
+        self.watch.begin(self.voltages, time.monotonic_ns())
+
+    def end(self) -> None:
+        """End a drive: the stage is no longer watched."""
+        self.watch.end()
+
+    def move(self, goals: Sequence[float], fastest: Sequence[float] | None = None) -> list[float]:
+        """Move all axes towards their goals (V), at most as fast as given (V/s), and publish the voltages."""
+        now_ns = time.monotonic_ns()
+        rates = fastest or [math.inf] * len(self._axes)
+        voltages = [
+            limiter.step(goal, now_ns, rate) for limiter, goal, rate in zip(self._limiters, goals, rates, strict=True)
+        ]
+        self.watch.command(voltages, now_ns)
+        self.publisher.publish(Float64MultiArray(data=array("d", voltages)))
+        return voltages
+
+    def fault(self) -> SlpiError | None:
+        """Return what speaks against going on with a drive, None if nothing does; call it again and again."""
+        fault = self.watch.check(time.monotonic_ns())
+        if fault:
+            return RecordError(f"{self._node.get_name()}: {fault}")
+        try:
+            self.require_alone()
+        except RecordError as error:
+            return error
+        return None
+
+    # Return
+
+    def return_step(self, rest: Sequence[float]) -> bool:
+        """Move towards rest (V) at the slew limit, gently if there is none; return whether all axes are there."""
+        fastest = [min(each.slew, MEAN_SPEED * (each.upper - each.lower)) if each.slew == math.inf else each.slew
+                   for each in self._limits]  # fmt: skip
+        self.move(rest, fastest)
+        return self.at(rest)
+
+    def return_to(self, rest: Sequence[float]) -> None:
+        """Return to rest (V), blocking; for the end of the node."""
+        while self._started and not self.at(rest):
+            self.return_step(rest)
+            time.sleep(1.0 / self._rate)
+        self.publisher.wait_for_all_acked(DELIVERY)
+
+    def return_seconds(self, rest: Sequence[float]) -> float:
+        """Return how long the way to rest (V) takes from here, seconds."""
+        ways = zip(self.voltages, rest, self._limits, strict=True)
+        return max(
+            abs(v - to) / (each.slew if each.slew < math.inf else MEAN_SPEED * (each.upper - each.lower))
+            for v, to, each in ways
+        )
+
+    def at(self, voltages: Sequence[float], share: float = ARRIVED) -> bool:
+        """Return whether the voltages published last are the given ones (V), within a share of the range."""
+        return self._within(self.voltages, voltages, share)
+
+    def reports(self, voltages: Sequence[float]) -> bool:
+        """Return whether the last valid state reports the given voltages (V), within `TOLERATED_SHARE` of the range."""
+        return self.reported is not None and self._within(self.reported, voltages, TOLERATED_SHARE)
+
+    def _within(self, v: Sequence[float], goal: Sequence[float], share: float) -> bool:
+        return all(
+            abs(each - to) <= share * (limits.upper - limits.lower)
+            for each, to, limits in zip(v, goal, self._limits, strict=True)
+        )
+
+    def _on_state(self, data: bytes) -> None:
+        try:
+            state = deserialize_message(data, JointState)
+        except RuntimeError:
+            return
+        volts, metres = (dict(zip(state.name, values, strict=False)) for values in (state.effort, state.position))
+        v, y = ([float(values.get(axis, math.nan)) for axis in self._axes] for values in (volts, metres))
+        stamp = state.header.stamp
+        clock_ns = self._node.get_clock().now().nanoseconds
+        if self.watch.state(stamp.sec * SECOND_NS + stamp.nanosec, clock_ns, v, y, time.monotonic_ns()):
+            self.reported, self.hardware_id = v, state.header.frame_id
+        if self._on_valid is not None:
+            self._on_valid(data, clock_ns)

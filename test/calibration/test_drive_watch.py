@@ -1,0 +1,92 @@
+"""What a stage reports during a drive: lies are found within a second, honest sensors are let alone."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.sensor_lies import DRIVERS, LIES, MARK, SENSORS, live, stage_of
+from slpi_ros.calibration.drive_watch import DriveWatch
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.limits import Limits
+
+# What names each lie in the message.
+NAMES = {
+    "stale stamps": "stamps", "effort 0": "effort", "effort stays": "effort", "silent": "no valid stage_state",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("lie", LIES)
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 10_000), at=st.floats(0.05, 0.9), sign=st.sampled_from([1.0, -1.0]))
+def test_a_lie_is_found_within_a_second_of_what_shows_it(driver, lie, seed, at, sign):
+    life = live(driver, lie, stage_of(seed), SENSORS["usual" if sign > 0 else "negative gain"], seed, at=at)
+    if life.shown == life.shown:
+        assert life.driven <= MARK, life.fault
+        assert NAMES.get(lie, "axis 'x'") in life.fault
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("sensor", SENSORS)
+@settings(max_examples=2, deadline=None)
+@given(seed=st.integers(0, 10_000), drive=st.sampled_from(["calibration", "sweep", "creep", "resonance", "lag"]))
+def test_an_honest_sensor_is_let_alone(driver, sensor, seed, drive):
+    assert not live(driver, "", stage_of(seed), SENSORS[sensor], seed, drive=drive).fault
+
+
+def watch_of(**given):
+    watch = DriveWatch(["x"], [Limits(0.0, 100.0)], 0.5, **given)
+    watch.begin([20.0], 0)
+    return watch
+
+
+@pytest.mark.parametrize(
+    ("v", "y", "words"),
+    [
+        (20.0, 12.3, ("position 12.3", "'x'", "0.1 m", "micrometres")),
+        (20.0, float("nan"), ("position", "'x'", "nan")),
+        (float("nan"), 1e-6, ("effort", "'x'", "nan")),
+    ],
+)
+def test_the_rule_that_a_state_breaks_is_named(v, y, words):
+    watch = watch_of()
+    assert not watch.state(SECOND_NS, SECOND_NS, [v], [y], 0)
+    assert all(word in watch.refused for word in words)
+    for now in np.arange(0.0, 0.7, 0.01):
+        watch.state(SECOND_NS, SECOND_NS, [v], [y], round(now * SECOND_NS))
+        fault = watch.check(round(now * SECOND_NS))
+    assert "no valid stage_state" in fault and all(word in fault for word in words)
+
+
+def test_a_process_that_was_held_up_does_not_take_it_for_silence():
+    watch = watch_of()
+    watch.state(SECOND_NS, SECOND_NS, [20.0], [1e-6], 0)
+    assert not watch.check(8 * SECOND_NS)
+    watch.state(SECOND_NS + 20_000_000, 9 * SECOND_NS, [20.0], [1e-6], 8 * SECOND_NS)
+    watch.state(9 * SECOND_NS, 9 * SECOND_NS, [20.0], [1e-6], 8 * SECOND_NS)
+    assert not watch.check(8 * SECOND_NS + 10_000_000)
+
+
+def test_stamps_that_jump_are_named_with_value_and_limit():
+    watch = watch_of()
+    fault = ""
+    for number in range(40):
+        now = number * SECOND_NS // 100
+        watch.state(SECOND_NS + now + (3600 * SECOND_NS if number > 10 else 0), SECOND_NS + now, [20.0], [1e-6], now)
+        fault = watch.check(now)
+    assert "3.6e+03 s ahead" in fault and "0.5 s" in fault
+
+
+def test_the_start_is_the_median_of_three_recent_reports_or_the_latest_of_a_slow_driver():
+    watch = DriveWatch(["x"], [Limits(0.0, 100.0)], 0.5)
+    for number, v in enumerate([40.0, 0.0, 40.1]):
+        at = number * 20_000_000
+        assert watch.started_from(at, 0) is None
+        watch.state(SECOND_NS, SECOND_NS, [v], [1e-6], at)
+    assert watch.started_from(40_000_000, 0) == [40.0]
+    slow = DriveWatch(["x"], [Limits(0.0, 100.0)], 0.5)
+    slow.state(SECOND_NS, SECOND_NS, [30.0], [1e-6], 0)
+    for number in range(60):
+        slow.check(number * 20_000_000)
+    assert slow.started_from(1_180_000_000, 0) == [30.0]

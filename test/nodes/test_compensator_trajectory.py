@@ -163,7 +163,9 @@ def test_a_trajectory_that_waits_is_given_with_the_model_that_came_meanwhile(xy_
     with compensator(axes=["x", "y"], model_file=xy_file) as client:
         client.connect()
         models = client.graph.publisher(String, "/stage_model", LATCHED)
-        sender(client).publish(trajectory(["x"], SECOND_NS + np.arange(20) * 20 * MS, path[:, None]))
+        # Its way begins at its start, which comes after the model.
+        start = client.graph.node.get_clock().now().nanoseconds + 4 * SECOND_NS
+        sender(client).publish(trajectory(["x"], 20 * MS + np.arange(20) * 20 * MS, path[:, None], start))
         client.report(trajectories=1, points_remaining=20)
         models.publish(String(data=format_model(other)))
         client.report(**{"model.id": model_id(other)[:12], "points_remaining": 20})

@@ -91,13 +91,16 @@ class Wire:
         self._old: list[tuple[Limits, float]] = []
         self._changes: list[tuple[int, float]] = []
         self._rate, self._before_ns = 0.0, -SECOND_NS
-        self.known = False
+        self._may_stop = self.known = False
 
     def change(self, limits: Limits, period: float) -> None:
         """Set new limits."""
         if self._rate and self.limits.acceleration < inf:
             self._old.append((self.limits, self.period))
-        elif not self._old:
+        elif self._old:
+            # Without acceleration limit for a while, the axis has stopped at once, or goes on to brake.
+            self._may_stop = True
+        else:
             # Without acceleration limit so far, the axis stops at once.
             self._rate = 0.0
         self.limits, self.period, self._changes = limits, period, []
@@ -105,7 +108,7 @@ class Wire:
     def moved(self, voltage: float) -> None:
         """Somebody else moves the amplifier; what comes next is not compared with what came before."""
         self.voltage, self._rate, self._old, self._changes = voltage, 0.0, [], []
-        self._before_ns = -SECOND_NS
+        self._before_ns, self._may_stop = -SECOND_NS, False
 
     def begin(self, voltage: float, rate: float, now_ns: int) -> None:
         """Take a first voltage (V), and its rate (V/s), as they are."""
@@ -156,6 +159,8 @@ class Wire:
         self._rate = step / dt
         # A rounding error of the voltage is one of the rate.
         change = max(abs(self._rate - rate) - 2.0 * ROUNDING / dt, 0.0)
+        if self._may_stop:
+            change, self._may_stop = min(change, abs(self._rate)), False
         ratios.note("acceleration", change / (acceleration * dt), what)
         most = max(limits.slew * min(gap, 2.0 * each) for limits, each in force)
         if most < inf and abs(self._rate) > abs(rate):

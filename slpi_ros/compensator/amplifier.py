@@ -112,9 +112,11 @@ class Amplifier:
         if len(self._differences) == DIFFERENCES:
             return TOLERATED_NOISES * median(self._differences) / NORMAL_DIFFERENCE
         # Of steady voltages there are too few yet: second differences of the last reports, which even motion is not in.
+        # Uneven motion is, which must not pass for noise.
         last = [v for _, v in self._reports][-DIFFERENCES:]
         bends = [abs(c - 2.0 * b + a) for a, b, c in zip(last, last[1:], last[2:], strict=False)]
-        return TOLERATED_NOISES * median(bends) / NORMAL_BEND if bends else 0.0
+        noise = TOLERATED_NOISES * median(bends) / NORMAL_BEND if bends else 0.0
+        return min(noise, TOLERATED_SHARE * self.span)
 
     @property
     def tolerance(self) -> float:

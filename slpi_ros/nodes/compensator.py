@@ -434,12 +434,13 @@ class Compensator(LifecycleNode):
     def _publish(self) -> None:
         # Published as bytes: creating a message object takes longer than compensating an axis.
         voltages = self._controller.voltages.tobytes()
-        self._publisher.publish(self._voltage_header + voltages)
+        # Stored first: of a voltage that somebody has received, the next start knows, even after a SIGKILL in between.
         if self._keeps_memory:
             try:
                 self._memory_file.note(voltages)
             except ModelError as error:
                 self.get_logger().error(str(error), throttle_duration_sec=FILE_LOG_PERIOD)
+        self._publisher.publish(self._voltage_header + voltages)
 
     def _warn_held(self) -> None:
         """Warn once for each excursion beyond the reachable displacements."""

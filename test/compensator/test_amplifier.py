@@ -353,3 +353,10 @@ def test_reports_that_end_while_voltages_go_on_are_missed():
     for k in range(2000):
         amplifier.output(0.01 * k, START + k * MS)
         assert amplifier.silent == (k > 1000)
+
+
+def test_uneven_motion_is_no_noise_of_the_reports():
+    amplifier = Amplifier(SPAN)
+    for k in range(20):
+        amplifier.report(50.0 + 20.0 * (-1) ** k, START + 5 * k * MS)
+    assert amplifier.scatter <= 0.02 * SPAN

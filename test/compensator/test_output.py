@@ -5,7 +5,7 @@ from math import inf
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model
 
@@ -255,6 +255,8 @@ def test_without_effects_and_feedback_nothing_follows_a_set_point_that_is_reache
 
 
 @settings(max_examples=60)
+@example(3002297)
+@example(3004729)
 @given(st.integers(0, 2**31))
 def test_random_episodes_keep_all_limits(seed):
     """An independent oracle at the amplifier; a restart, an intruder or a lie of a sensor is no excuse."""

@@ -45,6 +45,11 @@ def settle(client: Client, points: int) -> dict[str, str]:
     _, values = client.report("the end", points_remaining=0, trajectories=1)
     given = points - int(values["points_skipped"])
     client.graph.spin_until(lambda: client.answered >= given, f"{given} points")
+    # Voltages between the points come too, and may come after the report.
+    answered = -1
+    while client.answered > answered:
+        answered = client.answered
+        client.graph.spin_for(0.5)
     return values
 
 

@@ -271,16 +271,20 @@ class StreamingInverse:
         """Apply a voltage (V), `dt` (s) after the last sample, without a setpoint; return where the stage is (m)."""
         if voltage != self.pace.voltage:
             self.pace.start(voltage)
+        self._apply(dt, voltage)
+        return self.uncoupled_displacement + self.coupled
+
+    def wait(self, duration: float) -> None:
+        """Advance the effects by `duration` (s) at the present voltage; `pace` stays where the amplifier is."""
+        if self._streaming:
+            self._apply(duration, self.voltage)
+
+    def _apply(self, dt: float, voltage: float) -> None:
+        """Let memory and effects follow a voltage (V), `dt` (s) after the last sample."""
         self._command = self.goal = voltage
         self.memory.forward(self._reaching(dt, voltage))
         self.desired, self._missing = self.memory.displacement, 0.0
         self._follow(dt)
-        return self.uncoupled_displacement + self.coupled
-
-    def wait(self, duration: float) -> None:
-        """Advance the effects by `duration` (s) at the present voltage."""
-        if self._streaming:
-            self.drive(self.voltage, duration)
 
     def snapshot(self) -> StreamState:
         """Return the complete state for `restore`."""

@@ -257,6 +257,7 @@ def test_without_effects_and_feedback_nothing_follows_a_set_point_that_is_reache
 @settings(max_examples=60)
 @example(3002297)
 @example(3004729)
+@example(55207689)
 @given(st.integers(0, 2**31))
 def test_random_episodes_keep_all_limits(seed):
     """An independent oracle at the amplifier; a restart, an intruder or a lie of a sensor is no excuse."""

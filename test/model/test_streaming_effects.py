@@ -15,7 +15,7 @@ from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.errors import SlpiError
-from slpi_ros.model.limits import Limits
+from slpi_ros.model.limits import MAX_DT, Limits
 from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
 
 MS = 1_000_000
@@ -166,6 +166,18 @@ def test_creep_goes_on_in_a_pause(pause):
     assert v < v_before
     held_longer = 0.2 if pause > 1 else 0.05
     assert v == pytest.approx(expected, abs=held_longer * (v_before - expected) + 1e-3)
+
+
+@pytest.mark.parametrize("effects", [(LAG,), (CREEP,)], ids=ids)
+def test_a_pause_leaves_the_output_where_the_amplifier_is(effects):
+    """A noisy report moves the output and not the memory: the step after a pause is one from the output."""
+    stream = with_effects(*effects).stream(Limits(0.0, 100.0, 0.01))
+    stream.move(0.0, 0.5 * SPAN, MS)
+    stream.pace.start(stream.voltage + 0.08)
+    found = stream.pace.voltage
+    v = stream.move(1.0, 0.5 * SPAN, 1001 * MS)
+    # Two periods of the limiter count, MAX_DT together.
+    assert abs(v - found) <= 0.01 * MAX_DT + 1e-9
 
 
 @pytest.mark.parametrize("effects", SETS, ids=ids)

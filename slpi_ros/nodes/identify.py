@@ -273,6 +273,8 @@ NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
 
 # Time from the start within which a model that somebody else has published is heard of, seconds.
 DISCOVERY = 1.0
+# The same where there is another publisher: Fast DDS repeats a latched message that was lost every three seconds.
+LATCHED_WITHIN = 7.0
 
 
 class Identify(Node):
@@ -421,7 +423,9 @@ class Identify(Node):
 
     def _poll_job(self) -> None:
         """Check whether the identification is complete, once a model in use would have been heard of."""
-        if time.monotonic() - self._begun < DISCOVERY:
+        waited = time.monotonic() - self._begun
+        others = not self._in_use and self.count_publishers("stage_model") > 1
+        if waited < (LATCHED_WITHIN if others else DISCOVERY):
             return
         outcome = self._job.outcome() if self._job else None
         if self._job and outcome:

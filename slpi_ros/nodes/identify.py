@@ -271,9 +271,10 @@ class DiagnosisService:
 WATCH_PERIOD = 0.5
 NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
 
-# Time from the start within which a model that somebody else has published is heard of, seconds.
-DISCOVERY = 1.0
-# The same where there is another publisher: Fast DDS repeats a latched message that was lost every three seconds.
+# Time from the start within which a model that somebody else has published is heard of, seconds: Fast DDS announces a
+# participant again after three seconds, if the first announcements were lost.
+DISCOVERY = 4.0
+# The same where there is another publisher: a latched message that was lost comes again after three more seconds.
 LATCHED_WITHIN = 7.0
 
 

@@ -110,6 +110,7 @@ class Compensator(LifecycleNode):
         self._too_fast = ""
         self._assumption = ""
         self._memory_file = MemoryFile(values["memory_file"])
+        self._memory_waits = False
         self._keeps_memory = values["memory_file"] != ""
         self._reporter = Reporter(self, self._controller)
         self._reset_service = DeferredService(self, "~/reset_memory", self._on_reset)
@@ -365,14 +366,15 @@ class Compensator(LifecycleNode):
 
     def _locate(self) -> None:
         """Find the voltages at the start, until one has been output."""
-        ownership, before = self._controller.ownership, self._controller.ownership.obstacle
+        ownership = self._controller.ownership
         if not ownership.started:
             ownership.reporting = self._reports_expected
             self._controller.locate(time.monotonic_ns())
             self._tell_doubts()
-            if before and not ownership.obstacle:
-                self._begin_memory()
-                self._report()
+        # A first message may have found the voltages before this.
+        if self._memory_waits and not ownership.obstacle:
+            self._begin_memory()
+            self._report()
 
     def _tell_notes(self) -> None:
         """Log once what is not certain about the voltages at the start, when reports can no longer be expected."""
@@ -627,8 +629,9 @@ class Compensator(LifecycleNode):
         unsure = [axis for axis in controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
         if controller.model is None or controller.mode is not Mode.STREAMING or not unsure:
             return
-        if controller.ownership.obstacle:
-            # As soon as the voltages are known.
+        # As soon as the voltages are known.
+        self._memory_waits = controller.ownership.obstacle is not None
+        if self._memory_waits:
             return
         if self._settings.values["reset_on_start"]:
             self._start_reset()

@@ -40,8 +40,7 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "lag": (Lag(5e-3),),
     "creep": (Creep((0.1, 1.0, 10.0), (0.01, 0.01, 0.01)),),
     "resonance": (Resonance(100.0, 0.02),),
-    "coercivity": (RateDependence(0.0, 0.0, 0.3, 2 * SPAN, SPAN, 0.002 * SPAN, 0.2 * SPAN, 2e-3, (5e-8,)),),
-    "wider loops": (RateDependence(0.1, 1e-8, 0.3, 2 * SPAN, 0.05 * SPAN),),
+    "rate law": (RateDependence(0.01 * SPAN, 0.1 * SPAN, 5e-8),),
 }
 
 

@@ -18,7 +18,6 @@ from slpi_ros.calibration.settings import CALIBRATION, VERIFICATION, Calibration
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.diagnosis.result import AxisDiagnosis, Diagnosis
 from slpi_ros.effects.base import EffectContext
-from slpi_ros.effects.chain import reaching
 from slpi_ros.errors import RecordError
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.drives import SWEEP, Drive
@@ -393,7 +392,7 @@ def _left_at(model: StageModel, last: Record) -> StageModel:
     for name, axis in model.axes.items():
         v = last.voltage[name]
         known = np.isfinite(v)
-        u, _ = reaching(axis.chain.before, v[known], EffectContext(last.t[known]))
+        u, _ = axis.chain.reaching(v[known], EffectContext(last.t[known]))
         axes[name] = replace(axis, end=axis.after(u, "end"))
     return replace(model, axes=axes)
 

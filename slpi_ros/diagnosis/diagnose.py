@@ -12,7 +12,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, Selection, counts, in_phase, is_own, select
+from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, NO_WORSE, Selection, counts, in_phase, is_own, select
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.gain_drift import GainDrift
@@ -134,16 +134,49 @@ def _diagnose_axis(
     if not fitted and before > WRONG_KIND * base.held_out.rms:
         selection = replace(selection, structures=(BIAS, *selection.structures))
     given = _given(model, runs, selection)
+    source = ", ".join(part.source for part in evidence.parts)
+    extension = _extension(model, selection, given, source)
+    if extension and _worse(extension[0], runs, selection.now):
+        # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
+        selection = _without_causes(selection)
+        given = _given(model, runs, selection)
+        extension = _extension(model, selection, given, source)
+        if extension and _worse(extension[0], runs, selection.now):
+            extension = None
+    extended, missing = extension or (model, [named.name for named in selection.named])
+    outcomes = _outcomes(runs, _runs(extended, selection.now) if extension else runs, selection.now)
     floor = _floor(selection.now)
-    left_out = _ambiguous(selection)
-    # If effects remain ambiguous, parameters that were fitted together with them are not reliable on other records.
-    refitted = given.changed or BIAS in selection.structures or bool(selection.named and not left_out)
-    final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
-    extended = _extended(model, final, floor, ", ".join(part.source for part in evidence.parts)) if refitted else model
-    outcomes = _outcomes(runs, selection.now, final if refitted else None)
-    missing = left_out if refitted else [named.name for named in selection.named]
     found = judged(selection, floor, before, given, outcomes, missing, driven_alike(records, axis))
     return found, extended
+
+
+def _extension(model: AxisModel, selection: Selection, given: Given, source: str) -> tuple[AxisModel, list[str]] | None:
+    """Return the refitted model, and the effects of the selection that it does without; None if nothing is to refit."""
+    left_out = _ambiguous(selection)
+    # If effects remain ambiguous, parameters that were fitted together with them are not reliable on other records.
+    if not (given.changed or BIAS in selection.structures or (selection.named and not left_out)):
+        return None
+    final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
+    return _extended(model, final, _floor(selection.now), source), left_out
+
+
+def _without_causes(selection: Selection) -> Selection:
+    """Return the selection without the selected effects, which are reported as dropped."""
+    causes = {named.name for named in selection.named}
+    now = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in causes])
+    return replace(selection, now=now, named=(), dropped=tuple(sorted({*selection.dropped, *causes})))
+
+
+def _runs(model: AxisModel, now: Explanation) -> "list[_FreeRun]":
+    """Return the free run of an extended model on each of its records."""
+    parts = now.evidence.parts
+    return [_free_run(model, part, of_record=len(parts) == 1) for part in parts]
+
+
+def _worse(extended: AxisModel, runs: "Sequence[_FreeRun]", now: Explanation) -> bool:
+    """Return whether the free run of an extended model is worse than that of the given one on any of its records."""
+    pairs = zip(runs, _runs(extended, now), strict=True)
+    return any(after.rms > NO_WORSE * before.rms for before, after in pairs)
 
 
 def _ambiguous(selection: Selection) -> list[str]:
@@ -360,14 +393,13 @@ def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:
     return whole, float(np.sqrt(np.sum(np.square(parts))) / max(float(moved @ moved), 1e-300))
 
 
-def _outcomes(runs: Sequence[_FreeRun], now: Explanation, final: Explanation | None) -> tuple[RecordOutcome, ...]:
-    """Return the errors of each record before and after the diagnosis; without `final` the model is unchanged."""
+def _outcomes(runs: Sequence[_FreeRun], runs_after: Sequence[_FreeRun], now: Explanation) -> tuple[RecordOutcome, ...]:
+    """Return the errors of each record in the free runs of the given and of the extended model."""
     left_out = [error if np.isfinite(error) else None for error in np.sqrt(now.held_out.records).tolist()] or [None]
-    outcomes = []
-    for part, rows, run, other in zip(now.evidence.parts, now.evidence.slices, runs, left_out, strict=True):
-        after = float(np.std(final.residual[rows][part.used])) if final else run.rms
-        outcomes.append(RecordOutcome(part.source, run.offset, run.rms, after, other))
-    return tuple(outcomes)
+    return tuple(
+        RecordOutcome(part.source, before.offset, before.rms, after.rms, other)
+        for part, before, after, other in zip(now.evidence.parts, runs, runs_after, left_out, strict=True)
+    )
 
 
 def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> AxisModel:

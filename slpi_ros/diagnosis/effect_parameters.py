@@ -2,24 +2,32 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import exp, isfinite, log
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import Candidate, Effect, EffectContext, ResidualView, Side, Signal, usual_step
+from slpi_ros.effects.base import (
+    Candidate,
+    Effect,
+    EffectBase,
+    EffectContext,
+    ResidualView,
+    Side,
+    Signal,
+    usual_step,
+)
 from slpi_ros.effects.creep import FASTEST, LAW_FEWEST, Creep, plausible
-from slpi_ros.effects.rate_dependence import RateDependence
 
 FloatArray = NDArray[np.float64]
 
-# Fitted parameters of each effect; the others (times of a drift, form of a rate dependence) are chosen, not fitted.
+# Fitted parameters of each effect; the others (times of a drift) are chosen, not fitted.
 FREE = {
     "delay": ("seconds",),
     "lag": ("time_constant",),
     "saturation": ("lower", "upper"),
-    "rate_dependence": ("widening", "backlash", "exponent", "transition"),
+    "rate_dependence": ("threshold", "onset_rate", "reversible_gain", "initial"),
     "creep": ("time_constants", "gains"),
     "resonance": ("frequency", "damping"),
     "gain_drift": ("gains", "origin"),
@@ -28,9 +36,8 @@ FREE = {
     "sensor_periodic": ("period", "amplitude", "phase"),
     "hum": ("frequency", "amplitude", "phase"),
 }
-# Fitted parameters of a rate dependence without backlash, and of one in coercivity form.
-WIDENING = ("widening", "exponent")
-COERCIVE = ("coercivity", "exponent", "onset", "settling", "reversible")
+# Fields with the state of an effect at the start of each record; an entry that is 0 stays 0.
+STARTS = ("initial",)
 # Lower bounds; other parameters may be negative, except those of `NOT_NEGATIVE`.
 LEAST = {
     "time_constant": 1e-6,
@@ -39,41 +46,29 @@ LEAST = {
     "frequency": 1e-3,
     "period": 1e-9,
     "amplitude": 0.0,
-    "exponent": 0.05,
-    "transition": 1e-3,
-    "coercivity": 1e-6,
-    "settling": 1e-4,
-    "onset": 0.1,
-    "reversible": -np.inf,
+    "threshold": 1e-6,
+    "onset_rate": 1e-9,
+    "initial": -np.inf,
 }
-# Upper bounds by parameter, or by effect or side and parameter. With more damping there is no resonance; a rate
-# dependence proportional to the rate is a time shift.
+# Upper bounds by parameter, or by effect and parameter. With more damping there is no resonance.
 MOST = {
     "damping": 0.4,
-    "displacement.exponent": 0.6,
-    "voltage.exponent": 0.9,
-    "settling": 0.05,
     "cross_coupling.gains": 0.4,
 }
 # Effects whose parameters have the lower bound 0 if `LEAST` states no other.
 NOT_NEGATIVE = ("creep", "rate_dependence")
 # Parameters in which the displacement is linear, or nearly so; their steps are not limited.
-LINEAR = ("gains", "values", "origin", "widening", "backlash", "seconds", "reversible")
+LINEAR = ("gains", "values", "origin", "seconds", "reversible_gain")
+# Parameters that are fitted by their logarithms, as they range over decades, and the largest change of one in a step.
+LOGARITHMIC, LARGEST_LOG_STEP = ("threshold", "onset_rate"), 2.0
+# A state at the start below this size (V) is none.
+NO_START = 1e-6
 # Largest change of a parameter in one step, relative to its magnitude.
 LARGEST_STEP = 0.7
 
 
-def _free_fields(effect: Effect) -> tuple[str, ...]:
-    if isinstance(effect, RateDependence):
-        if effect.acts_on == "voltage":
-            return COERCIVE
-        if not effect.backlash:
-            return WIDENING
-    return FREE[effect.name]
-
-
 @dataclass(frozen=True)
-class EachRecord:
+class EachRecord(EffectBase):
     """An effect with separate parameters in each record, such as drift or hum.
 
     Parameters
@@ -132,14 +127,14 @@ def _items(effect: Effect) -> list[tuple[str, float]]:
     if isinstance(effect, Creep) and _is_law(effect):
         return [("gains", effect.gains[0])]
     found: list[tuple[str, float]] = []
-    for name in _free_fields(effect):
+    for name in FREE[effect.name]:
         value = getattr(effect, name)
         if isinstance(value, Mapping):
             found += [(f"{name}.{key}", gain) for key, gain in value.items()]
         elif isinstance(value, tuple):
-            found += [(f"{name}.{k}", part) for k, part in enumerate(value)]
+            found += [(f"{name}.{k}", part) for k, part in enumerate(value) if part or name not in STARTS]
         elif isfinite(value):
-            found.append((name, value))
+            found.append((name, log(max(value, LEAST[name])) if name in LOGARITHMIC else value))
     return found
 
 
@@ -148,8 +143,13 @@ def names(effect: Effect) -> list[str]:
     return [name for name, _ in _items(effect)]
 
 
+def of_starts(effect: Effect) -> list[bool]:
+    """Return for each free parameter whether it is the state at the start of a record."""
+    return [name.partition(".")[0] in STARTS for name in names(effect)]
+
+
 def free(effect: Effect) -> FloatArray:
-    """Return the values of the free parameters, shape (k,), SI."""
+    """Return the values of the free parameters, shape (k,), SI, or logarithms of these, see `LOGARITHMIC`."""
     return np.array([value for _, value in _items(effect)], dtype=np.float64)
 
 
@@ -165,15 +165,19 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
             effect, gains=(min(plausible(effect.time_constants, (gain,) * len(effect.gains))),) * len(effect.gains)
         )
     changed: dict[str, Any] = {}
-    for name in _free_fields(effect):
+    for name in FREE[effect.name]:
         value = getattr(effect, name)
         least = LEAST.get(name, 0.0 if effect.name in NOT_NEGATIVE else -np.inf)
-        keys = (name, f"{effect.name}.{name}", f"{effect.acts_on}.{name}")
+        keys = (name, f"{effect.name}.{name}")
         most = longest if name == "time_constants" else min(MOST.get(key, np.inf) for key in keys)
         if isinstance(value, Mapping):
             changed[name] = {key: min(max(left.pop(0), least), most) for key in value}
         elif isinstance(value, tuple):
-            changed[name] = tuple(min(max(left.pop(0), least), most) for _ in value)
+            kept = [part or name not in STARTS for part in value]
+            parts = [min(max(left.pop(0), least), most) if some else 0.0 for some in kept]
+            changed[name] = tuple(0.0 if name in STARTS and abs(part) < NO_START else part for part in parts)
+        elif name in LOGARITHMIC:
+            changed[name] = min(max(exp(min(left.pop(0), 300.0)), least), most)
         elif isfinite(value):
             changed[name] = min(max(left.pop(0), least), most)
     if isinstance(effect, Creep):
@@ -198,9 +202,13 @@ def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
         scale = {"hum": 1e-3 / float(np.ptp(t)), "sensor_periodic": 1e-5 * abs(value)}
         if name in ("frequency", "period") and effect.name in scale:
             found.append(scale[effect.name])
-        elif name.partition(".")[0] in ("gains", "widening"):
+        elif name in LOGARITHMIC:
+            found.append(1e-4)
+        elif name.partition(".")[0] == "gains":
             found.append(1e-5)
-        elif name.partition(".")[0] in ("values", "backlash", "origin"):
+        elif name == "reversible_gain":
+            found.append(1e-9 / float(np.ptp(v)))
+        elif name.partition(".")[0] in ("values", "origin"):
             found.append(1e-9)
         else:
             found.append(small.get(name, 1e-4 * abs(value) + 1e-12))
@@ -213,6 +221,8 @@ def bounded(effect: Effect, change: FloatArray) -> FloatArray:
     for k, name in enumerate(names(effect)):
         if name.partition(".")[0] in LINEAR:
             limit[k] = np.inf
+        elif name in LOGARITHMIC:
+            limit[k] = LARGEST_LOG_STEP
         elif name == "phase":
             limit[k] = LARGEST_STEP
     return np.clip(change, -limit, limit)
@@ -223,4 +233,7 @@ def certain(effect: Effect, spread: Sequence[float]) -> Effect:
     left = list(spread)
     if isinstance(effect, EachRecord):
         return EachRecord(tuple(certain(part, [left.pop(0) for _ in free(part)]) for part in effect.parts))
-    return replace(effect, uncertainty=dict(zip(names(effect), left, strict=True)))  # type: ignore[type-var]
+    found = dict(zip(names(effect), left, strict=True))
+    for name in found.keys() & set(LOGARITHMIC):
+        found[name] *= getattr(effect, name)
+    return replace(effect, uncertainty=found)  # type: ignore[type-var]

@@ -9,9 +9,9 @@ other records, and only offset and initial relaxation are estimated from the hel
 """
 
 import operator
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, reduce
+from functools import cached_property, reduce
 from itertools import pairwise
 
 import numpy as np
@@ -19,15 +19,15 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, steps
+from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, of_starts, steps
 from slpi_ros.diagnosis.prepare import Evidence
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
-from slpi_ros.effects.chain import reaching
+from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.creep import Creep, settling
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import Hysteresis
-from slpi_ros.identification.design_matrix import Design, Rows
+from slpi_ros.identification.design_matrix import Rows
 from slpi_ros.identification.least_squares import FOLDS, Problem, blocked_folds
 from slpi_ros.identification.linear_kinds import SMOOTHNESS
 from slpi_ros.identification.samples import Samples
@@ -38,8 +38,6 @@ Factor = tuple[FloatArray, bool]
 # Effects and hysteresis are updated in turn: largest number of iterations, and change (share of the error) below which
 # they stop.
 MOST_TURNS, SETTLED = 15, 0.001
-# Number of voltages at which the mid-line of the largest loop is computed.
-LEVELS = 60
 # Gauss-Newton steps end when one lowers the objective by less than this share.
 ENOUGH = 1e-3
 # Upper bound of time constants, as a multiple of the duration of the longest record.
@@ -171,16 +169,6 @@ class Joint:
         """Row indices of each held-out block, in time order."""
         left_out = [self._groups[group] for fold in self.held_out[0] for group in fold.left]
         return np.array_split(np.sort(np.concatenate(left_out)), BLOCKS)
-
-    @cached_property
-    def largest_loops(self) -> list[tuple[FloatArray, Design]]:
-        """For each record, voltages (V) and the design matrix of a rise, fall and rise over these voltages."""
-        levels, loops = np.linspace(float(self.u.min()), float(self.u.max()), LEVELS), []
-        for part, rows in zip(self.evidence.parts, self.evidence.slices, strict=True):
-            path = np.concatenate([self.u[rows.start : rows.start + 1], levels, levels[::-1], levels])
-            whole = Samples(path, path, np.ones(path.size, dtype=bool)).after(part.history)
-            loops.append((levels, self.evidence.design([whole])))
-        return loops
 
     def padded(self, signal: FloatArray) -> FloatArray:
         """Return a signal, shape (N,), metres, at the rows of the problem, in units of its scale; 0 at others."""
@@ -469,11 +457,10 @@ class Explanation:
     joint: Joint
     h: FloatArray
     added: FloatArray
-    _middles: "list[Callable[[FloatArray], FloatArray]]"
 
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
-        self.u, self._aside = reaching(self.effects, evidence.v, evidence.around)
+        self.u, self._aside = Chain.of(self.effects).reaching(evidence.v, evidence.around)
         if like and not (like.evidence.parts is evidence.parts and like.evidence.smoothness == evidence.smoothness):
             like = None
         if like and np.array_equal(like.u, self.u):
@@ -491,10 +478,10 @@ class Explanation:
         if not behind:
             return
         if like:
-            self.h, self.added, self._middles = like.h, like.added, like._middles
+            self.h, self.added = like.h, like.added
         for _ in range(MOST_TURNS):
             h, before = self.h, self.added
-            self.added = self._behind(self.effects, h + self._aside, self.u) - h
+            self.added = self._behind(self.effects, h + self._aside) - h
             self._fit(beside)
             if np.ptp(self.added - before) < SETTLED * np.std(self.target - h):
                 break
@@ -503,7 +490,6 @@ class Explanation:
         self._x, gains = beside.fit(self.target)
         self.h = self.joint.predict(self._x)
         self.settling, self.began = self._before @ gains, gains[: len(self._starting)]
-        self._middles = [self._middle(k) for k in range(len(self.evidence.parts))]
 
     @property
     def _relaxations(self) -> list[float]:
@@ -547,15 +533,7 @@ class Explanation:
     @property
     def around(self) -> EffectContext:
         """Context passed to the effects."""
-        return self._around(self.u)
-
-    def _around(self, u: FloatArray) -> EffectContext:
-        around = self.evidence.around
-        records = tuple(
-            replace(record, u=u[rows], middle=self._middles[k])
-            for k, (rows, record) in enumerate(zip(self.evidence.slices, around.records, strict=True))
-        )
-        return replace(around, u=u, middle=self._middles[0], records=records)
+        return self.evidence.around
 
     def of_record(self, k: int) -> "RecordLeft":
         """Return the signals and the residual of record `k`."""
@@ -563,32 +541,13 @@ class Explanation:
         t, u, h, y, residual = (x[rows] for x in (self.t, self.u, self.h, self.y, self.residual))
         return RecordLeft(t, u, h, y, self.used[rows], residual, around)
 
-    def _behind(self, effects: Sequence[Effect], h: FloatArray, u: FloatArray) -> FloatArray:
+    def _behind(self, effects: Sequence[Effect], h: FloatArray) -> FloatArray:
         """Return the displacement, shape (N,), metres, after effects have been applied to the hysteresis output `h`."""
-        around = self._around(u)
+        around = self.evidence.around
         for effect in effects:
             if effect.acts_on == "displacement":
                 h = effect.apply(h, around)
         return h
-
-    def _middle(self, k: int) -> Callable[[FloatArray], FloatArray]:
-        """Return the function that maps voltage (V) to the mid-line of the largest loop (m) of record `k`.
-
-        The mid-line is the mean of the rising and the falling branch.
-        """
-        x, first = self._x[: self.evidence.basis.size + 1], float(self.h[self.evidence.slices[k].start])
-        levels, whole = self.joint.largest_loops[k]
-        # The function must not refer to this object, which takes much memory and would be kept alive by it.
-        scale = self.joint.problem.scale
-
-        @cache
-        def middle() -> FloatArray:
-            y = whole.predict(x)[-1 - 3 * LEVELS :] * scale
-            falling, rising = y[1 + LEVELS : 1 + 2 * LEVELS][::-1], y[1 + 2 * LEVELS :]
-            centre: FloatArray = 0.5 * (falling + rising) + first - y[0]
-            return centre
-
-        return lambda u: np.asarray(np.interp(u, levels, middle()), dtype=np.float64)
 
     def respond(self, u: FloatArray) -> FloatArray:
         """Return the displacement of the hysteresis, shape (N,), metres, for another voltage `u`, shape (N,), volts."""
@@ -610,9 +569,9 @@ class Explanation:
 
     def _whole(self, effects: Sequence[Effect]) -> FloatArray:
         """Return the prediction, shape (N,), metres, of the same hysteresis with other effects."""
-        u, reversible_bypass = reaching(effects, self.evidence.v, self.evidence.around)
+        u, beside = Chain.of(tuple(effects)).reaching(self.evidence.v, self.evidence.around)
         h = self.h if np.array_equal(u, self.u) else self.respond(u)
-        return self.settling + self._behind(effects, h + reversible_bypass, u)
+        return self.settling + self._behind(effects, h + beside)
 
     def prediction_without(self, name: str) -> FloatArray:
         """Return the prediction, shape (N,), metres, without one of the effects and with everything else unchanged."""
@@ -621,7 +580,7 @@ class Explanation:
     def score(self, candidate: Candidate) -> Score:
         """Return the held-out errors with a candidate added and all effects refitted to first order."""
         first = self._before.shape[1] + self.tangents.shape[1]
-        starting = [*self._starting, *range(first, first + candidate.starting)]
+        starting = [*self._starting_columns, *range(first, first + candidate.starting)]
         signals = self._signals, self.joint.columns(candidate.columns)
         return self.joint.score(signals, positive=candidate.positive, starting=starting)
 
@@ -633,7 +592,14 @@ class Explanation:
     @cached_property
     def held_out(self) -> Score:
         """Held-out errors of this fit."""
-        return self.joint.score([self._signals], starting=self._starting)
+        return self.joint.score([self._signals], starting=self._starting_columns)
+
+    @property
+    def _starting_columns(self) -> list[int]:
+        """Indices of the columns that describe the state before a record: relaxations, and starts of the effects."""
+        own = [is_start for effect in self.effects for is_start in of_starts(effect)]
+        first = self._before.shape[1]
+        return [*self._starting, *(first + k for k, is_start in enumerate(own) if is_start)]
 
     @property
     def objective(self) -> float:
@@ -715,8 +681,16 @@ class Explanation:
     @cached_property
     def zeros(self) -> FloatArray:
         """Displacement at the centre of the largest loop of each record, shape (records,), metres."""
-        voltage = np.array([0.5 * (float(self.u.min()) + float(self.u.max()))])
-        return np.array([float(middle(voltage)[0]) for middle in self._middles])
+        low, high = float(self.u.min()), float(self.u.max())
+        middle, zeros = 0.5 * (low + high), []
+        for part, rows in zip(self.evidence.parts, self.evidence.slices, strict=True):
+            first = float(self.u[rows.start])
+            path = np.array([first, low, high, middle, low, middle])
+            whole = Samples(path, path, np.ones(path.size, dtype=bool)).after(part.history)
+            x = self._x[: self.evidence.basis.size + 1]
+            y = self.evidence.design([whole]).predict(x)[-path.size :] * self.joint.problem.scale
+            zeros.append(0.5 * (y[3] + y[5]) + float(self.h[rows.start]) - y[0])
+        return np.array(zeros)
 
     def effect(self, name: str) -> Effect:
         """Return the effect of this name."""

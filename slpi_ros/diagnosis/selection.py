@@ -58,6 +58,10 @@ ALTERNATIVE = 0.7
 ALTERNATIVE_AT_ONE_SPEED = 0.4
 # Effects that a single drive frequency cannot distinguish.
 DYNAMIC = {"delay", "lag", "rate_dependence", "creep"}
+# Effects that trade against a delay: they are fitted together with one.
+BESIDE_DELAY = {"rate_dependence"}
+# Smallest relative reduction of the held-out error by them: two effects at once find more by chance.
+LEAST_GAIN_BESIDE_DELAY = 0.1
 # Effects that are common to all records or separate in each: a sensor may start each record with another phase.
 MAY_BE_OWN = {"sensor_periodic"}
 # Largest difference of the zeros of records, as a share of the period, for a common periodic sensor error.
@@ -66,7 +70,10 @@ IN_PHASE = 0.1
 SHIFTS = {"delay", "lag"}
 # Effects that shift the displacement in time, among other things.
 SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
-STEPS = 5
+# Gauss-Newton steps of a candidate, and of the selected effects in the end.
+STEPS, CONVERGED = 5, 15
+# Steps that lower the objective below this share of it began far from the best parameters.
+FAR_OFF = 0.9
 # Largest accepted ratio of the error with an effect to that without it, on any held-out record.
 NO_WORSE = 1.05
 # Time shifts below this share of the sampling period may be due to the hold of commands between samples.
@@ -121,13 +128,19 @@ class Contender:
         return free(self.effect).size
 
     def refined(self, steps: int = STEPS) -> "Contender":
-        """Return the candidate after up to `steps` Gauss-Newton steps, unless these increase the held-out error."""
+        """Return the candidate after up to `steps` Gauss-Newton steps, unless these increase the held-out error.
+
+        Far from the best parameters the held-out error, of a fit that is linear in them, says nothing.
+        """
         better = Contender(self.name, self.explanation.refined(steps))
+        if self.name in BESIDE_DELAY and better.explanation.objective < FAR_OFF * self.explanation.objective:
+            return better
         return min(self, better, key=lambda one: one.rms)
 
     def counts_beside(self, now: Explanation) -> bool:
         """Return whether the candidate significantly improves the joint fit `now`, which does not include it."""
-        return counts(now.held_out, self.score, own=is_own(self.effect))
+        least = LEAST_GAIN_BESIDE_DELAY if self.name in BESIDE_DELAY else LEAST_GAIN
+        return counts(now.held_out, self.score, own=is_own(self.effect), least=least)
 
 
 def is_own(effect: Effect | type[Any]) -> bool:
@@ -147,25 +160,37 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
     Of several records, significant effects precede all others, and among them those that are common to all records.
     """
     taken = {effect.name for effect in now.effects}
-    screened = {name: best for name in names if name not in taken and (best := _screened(name, now))}
+    screened = [best for name in names if name not in taken for best in _screened(name, now)]
     error = now.held_out.rms
     # Implausible effects do not determine the threshold.
-    most = max((error - score.rms for score, effect in screened.values() if plausible(effect, now)), default=0.0)
+    most = max((error - score.rms for score, effect in screened if plausible(effect, now)), default=0.0)
     least = max(WORTH_TRYING * most, LEAST_SCREENED * error)
     tried = [
-        Contender(name, now.adding(effect)).refined(1)
-        for name, (score, effect) in screened.items()
+        Contender(effect.name, _beside_delay(now, effect).adding(effect)).refined(1)
+        for score, effect in screened
         if error - score.rms > least
     ]
     sound = [one for one in tried if plausible(one.effect, one.explanation)]
     most = max((error**2 - one.score.rms**2 for one in sound), default=0.0)
     sound = [one for one in _refined(tried, now, most) if plausible(one.effect, one.explanation)]
+    # Of an effect that was refined from several forms, the best.
+    sound = [min((one for one in sound if one.name == name), key=_error) for name in {one.name: None for one in sound}]
     several = len(now.evidence.parts) > 1
 
     def rank(one: Contender) -> tuple[bool, bool, float]:
         return several and not one.counts_beside(now), several and is_own(one.effect), one.rms
 
     return sorted(sound, key=rank)
+
+
+def _beside_delay(now: Explanation, effect: Effect) -> Explanation:
+    """Return the fit, for an effect that trades against a delay with one, unless there is a time shift already."""
+    shifted = SHIFTS & {other.name for other in now.effects}
+    return now.adding(Delay(0.0)) if effect.name in BESIDE_DELAY and not shifted else now
+
+
+def _error(one: Contender) -> float:
+    return one.rms
 
 
 def _refined(tried: Sequence[Contender], before: Explanation, most: float) -> list[Contender]:
@@ -241,15 +266,20 @@ def _is_harmonic(frequency: float, evidence: Evidence) -> bool:
     return False
 
 
-def _screened(name: str, now: Explanation) -> tuple[Score, Effect] | None:
-    """Return the held-out errors and the effect for the best form of the effect `name`; None if there is no form.
+def _screened(name: str, now: Explanation) -> list[tuple[Score, Effect]]:
+    """Return the held-out errors and the effect for the best form of each group of forms of the effect `name`.
 
-    Of forms that do not differ significantly from the best, the one with the fewest parameters is returned, because
-    surplus parameters extrapolate poorly.
+    Surplus parameters extrapolate poorly.
     """
-    tried = [scored for form in _forms(name, now) if (scored := _scored(form, now)) and in_phase(scored[1], now)]
-    if not tried:
-        return None
+    tried: dict[int, list[tuple[Score, Effect]]] = {}
+    for form in _forms(name, now):
+        if (scored := _scored(form, now)) and in_phase(scored[1], now):
+            tried.setdefault(getattr(form, "group", 0), []).append(scored)
+    return [_simplest_of_best(group) for group in tried.values()]
+
+
+def _simplest_of_best(tried: Sequence[tuple[Score, Effect]]) -> tuple[Score, Effect]:
+    """Return the form with the fewest parameters among those that do not differ significantly from the best."""
 
     def error(one: tuple[Score, Effect]) -> float:
         return held_out_error(one[0], own=is_own(one[1]))
@@ -347,10 +377,10 @@ def _ratio_on_records(before: Score, after: Score) -> FloatArray:
     return ratio
 
 
-def counts(before: Score, after: Score, *, own: bool = True) -> bool:
-    """Return whether a gain is large, significant and, unless the effect is separate in each record, carries over."""
+def counts(before: Score, after: Score, *, own: bool = True, least: float = LEAST_GAIN) -> bool:
+    """Return whether a gain is at least `least`, significant and, unless the effect is of one record, carries over."""
     chance = CHANCE if gain(before, after) < LARGE_GAIN else CHANCE_OF_LARGE_GAIN
-    if not (gain(before, after) >= LEAST_GAIN and chance_of_gain(before, after) <= chance):
+    if not (gain(before, after) >= least and chance_of_gain(before, after) <= chance):
         return False
     return own or carries_over(before, after)
 
@@ -466,7 +496,12 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
                 break
             continue
         best = _simplest(found, now)
-        rivals[best.name] = [other.effect for other in found if other is not best]
+        if best.name in BESIDE_DELAY:
+            best = best.refined(CONVERGED)
+        others = [other.effect for other in found if other is not best]
+        for effect in best.explanation.effects:
+            if effect.name == best.name or effect.name not in {known.name for known in now.effects}:
+                rivals[effect.name] = others
         now = _without_needless(best.explanation.smoothed(), set(rivals) - {best.name})
         if {Creep.name, ThermalDrift.name} <= {effect.name for effect in now.effects} and not now.evidence.older_moves:
             # Creep from long before a record looks like a thermal drift.
@@ -474,6 +509,8 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     # Exchanged effects and removed structures may have made other effects unnecessary.
     with_structures, now = now, now.bare()
     now = _without_needless(now, set(rivals), restart=now is not with_structures)
+    # At their best parameters together, some may no longer be necessary.
+    now = _without_needless(now.refined(CONVERGED), set(rivals), restart=False)
     named = _named(start, now, rivals)
     return Selection(base, now, named, structures, tuple(sorted(dropped - {one.name for one in named})))
 
@@ -535,7 +572,8 @@ def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation
 def _tried(name: str, now: Explanation, rest: Explanation, rivals: Sequence[Effect]) -> list[Contender]:
     """Return the rivals of an effect as candidates added to `rest`, the fit without the effect, the best one first."""
     present = {effect.name for effect in now.effects}
-    tried = [Contender(rival.name, rest.adding(rival).refined(1)) for rival in rivals if rival.name not in present]
+    absent = {rival.name: rival for rival in rivals if rival.name not in present}
+    tried = [Contender(name, rest.adding(rival).refined(1)) for name, rival in absent.items()]
     refined = _refined(tried, rest, rest.held_out.rms**2 - now.held_out.rms**2)
     return sorted(refined, key=lambda contender: contender.rms)
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import wraps
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import ModelError
+from slpi_ros.hysteresis.turning_points import Memory
 
 FloatArray = NDArray[np.float64]
 
-Signal = Literal["voltage", "displacement"]
+# The voltage, the hysteresis itself (between the voltage that it feels and its displacement), or the displacement.
+Signal = Literal["voltage", "hysteresis", "displacement"]
 # What an effect belongs to. Stage: the compensator inverts it. Sensor: it is taken out of measurements and never
 # inverted into the stage, which would follow the error of its sensor. Record: it is taken out of the fit of its record.
 Side = Literal["stage", "sensor", "record"]
@@ -30,10 +32,6 @@ class EffectContext:
     ----------
     t : ndarray, shape (N,), seconds
         Time from the first stamp, non-decreasing.
-    u : ndarray, shape (N,), volts, optional
-        Voltage that drives the hysteresis; None if not known.
-    middle : callable, optional
-        Maps voltage (V) to the mid-line of the largest loop (m), the mean of its rising and falling branch.
     others : mapping of axis name to ndarray, shape (N,), metres
         Displacement of the other axes relative to their start, before coupling.
     records : tuple of EffectContext
@@ -43,8 +41,6 @@ class EffectContext:
     """
 
     t: FloatArray
-    u: FloatArray | None = None
-    middle: Callable[[FloatArray], FloatArray] | None = None
     others: Mapping[str, FloatArray] = field(default_factory=dict)
     records: "tuple[EffectContext, ...]" = ()
     grid: Uniform | None = None
@@ -91,6 +87,9 @@ class StreamingEffect(Protocol):
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the input, or a stable approximation, for the output `wanted` after `dt` (s); keep the state."""
 
+    def resume(self, other: Any, x: float) -> None:
+        """Continue from the state of the same effect of another model, at the input `x` (V or m)."""
+
     def snapshot(self) -> Any:
         """Return the complete state as JSON-compatible numbers and tuples of numbers."""
 
@@ -98,14 +97,37 @@ class StreamingEffect(Protocol):
         """Replace the state by one returned by `snapshot`."""
 
 
-class DrivenStreamingEffect(StreamingEffect, Protocol):
-    """A streaming effect that also depends on the voltage that drives the hysteresis."""
+class StreamingAround(Protocol):
+    """Streaming evaluation of an effect around the hysteresis: what the hysteresis feels, and what goes beside it."""
 
-    def attach(self, middle: Callable[[float], float]) -> None:
-        """Set the function that maps voltage (V) to the mid-line of the largest loop (m)."""
+    def start(self, x: float) -> None:
+        """Initialise the state to equilibrium at the constant voltage `x` (V)."""
 
-    def drive(self, dt: float, u: float) -> None:
-        """Record the voltage `u` (V), applied `dt` (s) after the previous one."""
+    def forward(self, dt: float, x: float) -> float:
+        """Advance the state by `dt` (s) to the voltage `x` (V) and return the voltage that the hysteresis feels."""
+
+    def inverse(self, dt: float, wanted: float, memory: Memory, lower: float, upper: float) -> float:
+        """Return the voltage (V) for the displacement `wanted` (m); `memory` moves, within `lower` and `upper` (V)."""
+
+    @property
+    def beside(self) -> float:
+        """Displacement (m) beside that of the hysteresis."""
+
+    def resume(self, other: Any, x: float) -> None:
+        """Continue from the state of the same effect of another model, at the voltage `x` (V)."""
+
+    def snapshot(self) -> Any:
+        """Return the complete state as JSON-compatible numbers and tuples of numbers."""
+
+    def restore(self, state: Any) -> None:
+        """Replace the state by one returned by `snapshot`."""
+
+
+class StreamingBase:
+    """What streaming effects do unless they say otherwise."""
+
+    def resume(self, other: Any, x: float) -> None:
+        """Keep the state: this effect does not continue from that of another model."""
 
 
 class Effect(Protocol):
@@ -116,7 +138,7 @@ class Effect(Protocol):
 
     @property
     def acts_on(self) -> Signal:
-        """Signal on which the effect acts: voltage or displacement."""
+        """Signal on which the effect acts: the voltage, the hysteresis, or the displacement."""
 
     @property
     def uncertainty(self) -> Mapping[str, float]:
@@ -135,8 +157,65 @@ class Effect(Protocol):
     def describe(self) -> str:
         """Describe the effect with its parameter values in one sentence."""
 
-    def streaming(self) -> StreamingEffect | None:
-        """Return the streaming evaluation of the effect, or None if it cannot be compensated sample by sample."""
+    def streaming(self) -> Any:
+        """Return the `StreamingEffect`, or for one around the hysteresis the `StreamingAround`; None if there is none.
+
+        An effect without one is not compensated sample by sample.
+        """
+
+    @property
+    def lasting(self) -> "Effect | None":
+        """The effect as it is after its record; None if it ends with it."""
+
+    @property
+    def passes(self) -> tuple[float, float]:
+        """Lowest and highest voltage (V) that the effect lets through."""
+
+    @property
+    def shift(self) -> float:
+        """Transport delay, seconds."""
+
+    @property
+    def coupling(self) -> Mapping[str, float]:
+        """Gains by which motions of other axes are added, by their names."""
+
+
+class EffectBase:
+    """What effects are unless they say otherwise."""
+
+    side: ClassVar[Side]
+
+    @property
+    def lasting(self) -> "Effect | None":
+        """The effect, or None if it belongs to one record."""
+        return None if self.side == "record" else self  # type: ignore[return-value]
+
+    @property
+    def passes(self) -> tuple[float, float]:
+        """Infinite limits."""
+        return -inf, inf
+
+    @property
+    def shift(self) -> float:
+        """No delay."""
+        return 0.0
+
+    @property
+    def coupling(self) -> Mapping[str, float]:
+        """No coupling."""
+        return {}
+
+
+class AroundHysteresis(Effect, Protocol):
+    """An effect around the hysteresis: its `apply` returns the voltage that the hysteresis feels."""
+
+    def beside(self, v: FloatArray, u: FloatArray) -> FloatArray:
+        """Return the displacement (m) beside the hysteresis for applied and felt voltages (V), shape (N,) each."""
+
+    def command(
+        self, t: FloatArray, h: FloatArray, memory: Memory, limits: tuple[float, float]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the applied voltages (V) for displacements `h` (m), and what they reach (m), shape (N,) each."""
 
 
 @dataclass(frozen=True)
@@ -153,12 +232,15 @@ class Candidate:
         Number of trailing columns whose gains must be non-negative; if not 0, `effect` receives only these gains.
     starting : int
         Number of leading columns that describe the initial state of the records; each belongs to one record.
+    group : int
+        Forms of different groups are refined each by itself, as they lead to different parameters.
     """
 
     columns: FloatArray
     effect: Callable[[FloatArray], Effect | None]
     positive: int = 0
     starting: int = 0
+    group: int = 0
 
 
 class ResidualView(Protocol):

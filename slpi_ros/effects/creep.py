@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from slpi_ros.effects.base import (
     Candidate,
+    EffectBase,
     EffectContext,
     FloatArray,
     ResidualView,
     Side,
     Signal,
+    StreamingBase,
     by_record,
     longest,
     require,
@@ -37,7 +39,7 @@ SOON_SETTLED = 0.025
 
 
 @dataclass(frozen=True)
-class Creep:
+class Creep(EffectBase):
     """Parallel first-order relaxations, ``y = h + sum_k g_k z_k`` with ``tau_k dz_k/dt = (h - h_0) - z_k``.
 
     ``h_0`` is the displacement at the start, where all relaxations are in equilibrium.
@@ -150,7 +152,7 @@ class Creep:
         return [hold(dt, tau) for tau in self.time_constants]
 
 
-class StreamingCreep:
+class StreamingCreep(StreamingBase):
     """Streaming (sample by sample) creep."""
 
     def __init__(self, creep: Creep) -> None:
@@ -182,7 +184,7 @@ class StreamingCreep:
         return self._origin + (wanted - self._origin - self._crept()) / (1.0 + self._now)
 
     def resume(self, other: "StreamingCreep", x: float) -> None:
-        """Take over the state of another model's creep at the input displacement `x` (m).
+        """Take over the state of another model's creep at the input `x` (m).
 
         Relaxations with a time constant that `other` also has continue from its state; all others start in equilibrium.
         """

@@ -7,11 +7,11 @@ from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, ResidualView, Side, Signal, require
+from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FloatArray, ResidualView, Side, Signal, require
 
 
 @dataclass(frozen=True)
-class CrossCoupling:
+class CrossCoupling(EffectBase):
     """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j relative to its start.
 
     Parameters
@@ -63,6 +63,11 @@ class CrossCoupling:
     @classmethod
     def _of(cls, axes: tuple[str, ...], gains: FloatArray) -> "CrossCoupling":
         return cls(dict(zip(axes, gains.tolist(), strict=True)))
+
+    @property
+    def coupling(self) -> Mapping[str, float]:
+        """The gains."""
+        return self.gains
 
     def describe(self) -> str:
         """Describe the coupling gains by axis."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from slpi_ros.effects.base import (
     Candidate,
+    EffectBase,
     EffectContext,
     FloatArray,
     ResidualView,
@@ -21,7 +22,7 @@ from slpi_ros.effects.base import (
 
 
 @dataclass(frozen=True)
-class Delay:
+class Delay(EffectBase):
     """Transport delay, or offset between the stamps of voltage and displacement.
 
     Parameters
@@ -62,6 +63,11 @@ class Delay:
     @classmethod
     def _times(cls, seconds: float, gains: FloatArray) -> "Delay":
         return cls(seconds * float(gains[0]))
+
+    @property
+    def shift(self) -> float:
+        """The delay, seconds."""
+        return self.seconds
 
     def describe(self) -> str:
         """Describe the delay."""

@@ -7,7 +7,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, ResidualView, Side, Signal, require
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectBase,
+    EffectContext,
+    FloatArray,
+    ResidualView,
+    Side,
+    Signal,
+    StreamingBase,
+    require,
+)
 
 # Numbers of uniform knots of the candidates. The first interval has more knots, spaced logarithmically (number per
 # decade), as piezo ageing is logarithmic in time; the first lies after one loop and at least this many readings.
@@ -15,7 +25,7 @@ UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
 
 
 @dataclass(frozen=True)
-class GainDrift:
+class GainDrift(EffectBase):
     """A time-dependent factor on the displacement, ``y = origin + (1 + g(t)) (x - origin)``.
 
     ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
@@ -64,7 +74,7 @@ class GainDrift:
         return 1.0 + np.interp(t, (0.0, *self.times), (0.0, *self.gains))
 
     @property
-    def last(self) -> "GainDrift":
+    def lasting(self) -> "GainDrift":
         """The sensitivity at the end of the record, constant."""
         return GainDrift((0.0,), self.gains[-1:], self.origin)
 
@@ -126,7 +136,7 @@ class GainDrift:
         return StreamingGainDrift(self.origin, 1.0 + self.gains[-1])
 
 
-class StreamingGainDrift:
+class StreamingGainDrift(StreamingBase):
     """Streaming (sample by sample) constant sensitivity factor, without state."""
 
     def __init__(self, origin: float, factor: float) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from slpi_ros.effects.base import (
     Candidate,
+    EffectBase,
     EffectContext,
     FloatArray,
     ResidualView,
@@ -26,7 +27,7 @@ LINES, SLOWEST = 4, 2.0
 
 
 @dataclass(frozen=True)
-class Hum:
+class Hum(EffectBase):
     """A sinusoid in time, ``y = x + amplitude sin(2 pi frequency t + phase)``.
 
     Parameters

@@ -9,11 +9,13 @@ import numpy as np
 
 from slpi_ros.effects.base import (
     Candidate,
+    EffectBase,
     EffectContext,
     FloatArray,
     ResidualView,
     Side,
     Signal,
+    StreamingBase,
     by_record,
     require,
     usual_step,
@@ -26,7 +28,7 @@ DAMPING = 1 / 8
 
 
 @dataclass(frozen=True)
-class Lag:
+class Lag(EffectBase):
     """First-order lag, ``tau du/dt = v - u``.
 
     Parameters
@@ -85,7 +87,7 @@ class Lag:
         return StreamingLag(self.time_constant)
 
 
-class StreamingLag:
+class StreamingLag(StreamingBase):
     """Streaming (sample by sample) first-order lag."""
 
     def __init__(self, time_constant: float) -> None:

@@ -11,11 +11,13 @@ import numpy as np
 
 from slpi_ros.effects.base import (
     Candidate,
+    EffectBase,
     EffectContext,
     FloatArray,
     ResidualView,
     Side,
     Signal,
+    StreamingBase,
     by_record,
     require,
     rhythms,
@@ -63,7 +65,7 @@ class Unringing:
         )
 
 
-class StreamingResonance:
+class StreamingResonance(StreamingBase):
     """Streaming (sample by sample) second-order mode."""
 
     def __init__(self, mode: Mode) -> None:
@@ -147,7 +149,7 @@ DAMPINGS = (0.02, 0.08)
 
 
 @dataclass(frozen=True)
-class Resonance:
+class Resonance(EffectBase):
     """A second-order mode, ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``.
 
     The exact inverse of the sampled mode is unstable. This inverse has zeros at the poles of the mode, which cancels

@@ -8,14 +8,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import EffectContext, FloatArray, ResidualView, Side, Signal, require_rules
+from slpi_ros.effects.base import EffectBase, EffectContext, FloatArray, ResidualView, Side, Signal, require_rules
 
 # Number of voltage bins; a bin is clipped if its gain is below this share of the median gain.
 BINS, STILL = 200, 0.35
 
 
 @dataclass(frozen=True)
-class Saturation:
+class Saturation(EffectBase):
     """Limits of the voltage at the piezo.
 
     Parameters
@@ -65,15 +65,20 @@ class Saturation:
             for shift in np.linspace(-1.0, 1.0, 9).tolist():
                 yield cls(lower + shift * width, upper - shift * width)
 
+    @property
+    def passes(self) -> tuple[float, float]:
+        """The limits, volts."""
+        return self.lower, self.upper
+
     def describe(self) -> str:
         """Describe the limits."""
         below, above = f"below {self.lower:.4g} V", f"above {self.upper:.4g} V"
         where = [text for text, limit in ((below, self.lower), (above, self.upper)) if not isinf(limit)]
         return f"the amplifier clips {' and '.join(where) or 'nowhere'}"
 
-    def streaming(self) -> "StreamingSaturation":
-        """Return the limits as a streaming effect."""
-        return StreamingSaturation(self.lower, self.upper)
+    def streaming(self) -> None:
+        """Return None: the limits of the command, which are within `passes`, are the limits of the effect."""
+        return
 
 
 def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -93,28 +98,3 @@ def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tupl
     outward = (dv > 0) == (middle > 0.5 * (low + high))
     chosen = used[every:] & used[:-every] & outward & (dv != 0.0)
     return middle[chosen], dv[chosen], dy[chosen]
-
-
-class StreamingSaturation:
-    """Streaming (sample by sample) limits, without state."""
-
-    def __init__(self, lower: float, upper: float) -> None:
-        self.lower, self.upper = lower, upper
-
-    def start(self, x: float) -> None:
-        """Do nothing: the effect has no state."""
-
-    def forward(self, dt: float, x: float) -> float:
-        """Return the voltage (V) clipped to the limits."""
-        return min(max(x, self.lower), self.upper)
-
-    def inverse(self, dt: float, wanted: float) -> float:
-        """Return the voltage (V) clipped to the limits."""
-        return min(max(wanted, self.lower), self.upper)
-
-    def snapshot(self) -> tuple[()]:
-        """Return nothing: the effect has no state."""
-        return ()
-
-    def restore(self, state: tuple[()]) -> None:
-        """Do nothing: the effect has no state."""

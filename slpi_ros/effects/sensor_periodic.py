@@ -10,11 +10,13 @@ import numpy as np
 
 from slpi_ros.effects.base import (
     Candidate,
+    EffectBase,
     EffectContext,
     FloatArray,
     ResidualView,
     Side,
     Signal,
+    StreamingBase,
     amplitude_and_phase,
     require,
     strongest_lines,
@@ -30,7 +32,7 @@ _CLOSE = 1e-12
 
 
 @dataclass(frozen=True)
-class SensorPeriodic:
+class SensorPeriodic(EffectBase):
     """Periodic sensor error, ``y = x + amplitude sin(2 pi x / period + phase)``.
 
     Parameters
@@ -110,7 +112,7 @@ class SensorPeriodic:
         return StreamingSensorError(self)
 
 
-class StreamingSensorError:
+class StreamingSensorError(StreamingBase):
     """Streaming (sample by sample) sensor error, without state."""
 
     def __init__(self, sensor: SensorPeriodic) -> None:

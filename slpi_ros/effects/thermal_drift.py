@@ -7,14 +7,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Candidate, EffectContext, FloatArray, ResidualView, Side, Signal, require
+from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FloatArray, ResidualView, Side, Signal, require
 
 # Numbers of knots of the candidates.
 KNOTS = (2, 3, 5, 8, 13)
 
 
 @dataclass(frozen=True)
-class ThermalDrift:
+class ThermalDrift(EffectBase):
     """A displacement that depends on time only, linear between knots and constant outside.
 
     Parameters

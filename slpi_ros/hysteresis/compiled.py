@@ -4,13 +4,14 @@ Importing Numba takes about 0.5 s: import this module only where a long path is 
 """
 
 from collections.abc import Callable
-from math import exp, inf, isnan, nan
-from typing import Any, NamedTuple, TypeVar, cast
+from math import asinh, inf, sinh
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis import compilation
+from slpi_ros.hysteresis import compilation, rate_law
+from slpi_ros.hysteresis.rate_law import LARGEST
 from slpi_ros.hysteresis.turning_points import END, Branches
 
 FloatArray = NDArray[np.float64]
@@ -225,110 +226,68 @@ def through(
     return n, s, depth
 
 
-class Play(NamedTuple):
-    """A play operator with rate-dependent half-width before the hysteresis.
+solved = compiled(rate_law.solved)
+
+
+@compiled
+def felt(t: FloatArray, v: FloatArray, threshold: float, onset_rate: float, lead: float) -> FloatArray:
+    """Return the voltage that the hysteresis feels, shape (N,), volts, by the rate law.
 
     Parameters
     ----------
-    coercivity, exponent, reference_rate, onset, settling : float
-    reversible : ndarray, shape (k,)
-        As in `slpi_ros.effects.rate_dependence.RateDependence`.
-    inside : float
-        Share of the half-width from which on a command is at the end of the play.
-    trials, chords : int
-        Numbers of iterations for the voltage at the hysteresis, and for a command within the play.
+    t, v : ndarray, shape (N,), seconds and volts
+        Applied voltage.
+    threshold, onset_rate : float, volts and V/s
+        Law, see `slpi_ros.hysteresis.rate_law`.
+    lead : float, volts
+        Difference of the two voltages, applied minus felt, at the first sample.
     """
-
-    coercivity: float
-    exponent: float
-    reference_rate: float
-    onset: float
-    settling: float
-    reversible: FloatArray
-    inside: float
-    trials: int
-    chords: int
-
-
-@compiled
-def half_width(rate: float, coercivity: float, exponent: float, reference_rate: float, onset: float) -> float:
-    """Return the half-width (V) of a play operator at a rate (V/s); parameters as in `RateDependence`."""
-    if not onset:
-        grown: float = (rate / reference_rate) ** exponent
-    else:
-        # The compiler moves this constant out of a loop.
-        at_reference = (1.0 + reference_rate / onset) ** exponent - 1.0
-        grown = ((1.0 + rate / onset) ** exponent - 1.0) / at_reference
-    return coercivity * grown
+    felt_voltage, w, before = np.empty_like(v), 0.0, 0.0
+    u = v[0] - lead if v.size else 0.0
+    for k in range(v.size):
+        scale, way = onset_rate * (t[k] - t[k - 1]) if k else 0.0, v[k] - u
+        if scale > 0.0:
+            if way != 0.0:
+                # The guess is extrapolated, as steps of a smooth path change smoothly.
+                w, before = solved(scale, threshold, abs(way), 2.0 * w - before), w
+                u = v[k] - threshold * (w if way > 0.0 else -w)
+        elif k:
+            # In no time the difference between the two voltages stays what it was.
+            u += v[k] - v[k - 1]
+        felt_voltage[k] = u
+    return felt_voltage
 
 
 @compiled
-def bypass(gains: FloatArray, v: float, u: float) -> float:
-    """Return the reversible displacement (m) at a command `v` (V) and a voltage `u` (V) of the hysteresis."""
-    total, v_power, u_power = 0.0, 1.0, 1.0
-    for gain in gains:
-        v_power, u_power = v_power * v, u_power * u
-        total += gain * (v_power - u_power)
-    return total
-
-
-@compiled
-def transfer(source: FloatArray, target: FloatArray) -> None:
-    """Copy a piece, shape (2, 4). An assignment of a whole array would take several seconds to compile."""
-    for c in range(2):
-        for k in range(4):
-            target[c, k] = source[c, k]
-
-
-@compiled
-def on_piece(x: float, now: float, s: float, here: int, piece: FloatArray) -> float:
-    """Return the other coordinate at `x`, ahead of `now`, on a piece of a branch as in `through`; NaN beyond it."""
-    there, u = 1 - here, s * (x - piece[here, 0])
-    if s * (x - now) > 0.0 and piece[here, 2] <= u < piece[here, 3] and s * (x - piece[here, 1]) < 0.0:
-        slope = (piece[there, 3] - piece[there, 2]) / (piece[here, 3] - piece[here, 2])
-        answer: float = piece[there, 0] + s * (piece[there, 2] + (u - piece[here, 2]) * slope)
-        return answer
-    return nan
-
-
-@compiled
-def through_play(
-    elapsed: FloatArray,
-    pause: float,
+def through_law(
+    t: FloatArray,
     h: FloatArray,
+    law: FloatArray,
     lower: float,
     upper: float,
-    rounding: FloatArray,
     out: FloatArray,
-    held: NDArray[np.bool_],
+    reached: FloatArray,
     direction: float,
     point: FloatArray,
     turns: FloatArray,
     depth: int,
-    play: Play,
     rest: FloatArray,
     symmetric_rest: bool,
     first: FloatArray,
     branches: Branches,
-) -> tuple[int, float]:
-    """Compensate a play operator before the hysteresis, as `StreamingInverse.move` does at each sample.
+) -> int:
+    """Compensate the rate law and the hysteresis along a path, as `StreamingInverse.move` does at each sample.
 
     Parameters
     ----------
-    elapsed : ndarray, shape (N,), seconds
-        Time since the preceding sample.
-    pause : float, seconds
-        Of a longer time only this last part counts for the new command.
+    t : ndarray, shape (N,), seconds
     h : ndarray, shape (N,), metres
         Desired displacement of hysteresis and reversible part.
-    rounding : ndarray, shape (2,), relative and metres
-        Tolerances for rounding errors of voltages and displacements.
-    out : ndarray, shape (N,), volts
-        Output: the commands.
-    held : ndarray of bool, shape (N,)
-        Output: whether the command is held at the limit beyond which the displacement lies.
+    law : ndarray, shape (3,), V, V/s, m/V
+        Threshold, onset rate and reversible gain.
+    out, reached : ndarray, shape (N,), volts and metres
+        Output: applied voltages within the limits, and the displacements that they give.
     turns : ndarray, shape (2, depth + 2 N + 2), volts and metres
-    play : Play
     lower, upper, direction, point, depth, rest, symmetric_rest, first, branches
         As in `through`.
 
@@ -336,95 +295,80 @@ def through_play(
     -------
     done : int
         Number of samples evaluated; less than N if the model cannot reach the next one.
-    wanted : float, metres
-        Last displacement of the hysteresis.
     """
-    s, gains, shape = direction, play.reversible, (rest, symmetric_rest, first, branches)
-    law = play.coercivity, play.exponent, play.reference_rate, play.onset
-    settling, inside, trials, chords = play.settling, play.inside, play.trials, play.chords
+    threshold, onset_rate, reversible, rise = law[0], law[1], law[2], 0.0
+    s, shape = direction, (rest, symmetric_rest, first, branches)
     one, other, walk = np.empty(1), np.empty(1), np.empty((3, 0), dtype=np.int64)
-    # Before the first motion the piece is not known; comparisons with NaN are false.
-    piece, kept = np.full((2, 4), nan), np.empty((2, 4))
-    command = u = aimed = point[0]
-    rate = rate_out = rate_aimed = wanted = 0.0
+    piece, known = np.empty((2, 4)), False
+    v, w, w_before, kept = point[0], 0.0, 0.0, False
     for n in range(h.size):
-        missing = 0.0
-        # Part 0: the last command during a pause; part 1: the new command.
-        for part in range(0 if elapsed[n] > pause else 1, 2):
-            dt = min(elapsed[n], pause) if part else elapsed[n] - pause
-            width, aim = half_width(rate_out, *law), nan
-            v, s_0, v_0, y_0, depth_0, moved = command, s, point[0], point[1], depth, False
-            if part:
-                low, high = bypass(gains, u - width, u), bypass(gains, u + width, u)
-                way = 1.0 if h[n] - y_0 > 0.5 * (low + high) else -1.0
-                if low < h[n] - y_0 < high:
-                    v, slope = u, 0.5 * (high - low) / width
-                    for _ in range(chords):
-                        v += (h[n] - y_0 - bypass(gains, v, u)) / slope
-                    missing = h[n] - bypass(gains, v, v_0) - y_0
-                else:
-                    before, reached = nan, v_0
-                    for _ in range(trials):
-                        wanted = h[n] - bypass(gains, reached + way * width, reached)
-                        wanted = max(wanted, y_0) if way > 0.0 else min(wanted, y_0)
-                        if wanted == before:
-                            break
-                        if moved:
-                            s, depth, point[0], point[1] = s_0, depth_0, v_0, y_0
-                            transfer(kept, piece)
-                        before = wanted
-                        if wanted == y_0:
-                            reached = v_0
-                            continue
-                        moved = True
-                        transfer(piece, kept)
-                        reached = on_piece(wanted, y_0, s, 1, piece)
-                        if lower <= reached <= upper:
-                            point[0], point[1] = reached, wanted
-                            continue
-                        one[0] = wanted
-                        done, s, depth = through(
-                            one, 1, lower, upper, other, s, point, turns, depth, walk, piece, *shape
-                        )
-                        if not done:
-                            return n, wanted
-                        reached = point[0]
-                    v, aim = reached + way * width, reached
-                    missing = h[n] - bypass(gains, v, reached) - point[1]
-                goal, v = v, min(max(v, lower), upper)
-                if abs(missing) <= rounding[1]:
-                    missing = goal - v if abs(goal - v) > rounding[0] * (1.0 + abs(goal)) else 0.0
-            # The play operator moves with the command.
-            change, u_0 = v - command, u
-            if dt > 0.0:
-                faded = exp(-dt / settling) if settling else 0.0
-                rate = abs(change) / dt + (rate - abs(change) / dt) * faded
-            reach = half_width(rate, *law)
-            command, u = v, min(max(u_0, v - reach), v + reach)
-            if dt > 0.0 and (u != u_0 or abs(v - u_0) < inside * width):
-                speed = abs(u - u_0 if u != u_0 else change) / dt
-                rate_out = speed + (rate_out - speed) * faded
-            if isnan(aim):
-                aimed, rate_aimed = u, rate_out
+        scale, u0, y0, s_0, depth_0 = onset_rate * (t[n] - t[n - 1]) if n else 0.0, point[0], point[1], s, depth
+        lead = v - u0
+        if kept and not scale > 0.0 and h[n] == h[n - 1]:
+            out[n], reached[n] = out[n - 1], reached[n - 1]
+            continue
+        gain = reversible * threshold if scale > 0.0 else 0.0
+        target = h[n] if scale > 0.0 else h[n] - reversible * lead
+        turn = 1.0 if target > y0 else -1.0
+        limit = upper if turn > 0.0 else lower
+        if not scale > 0.0:
+            limit -= lead
+        guess, w_before, w = 2.0 * w - w_before, w, 0.0
+        if target != y0 and turn * (limit - u0) > 0.0:
+            if not known or turn != s:
+                # The smallest step enters the branch.
+                one[0] = np.nextafter(u0, turn * inf)
+                done, s, depth = through(one, 0, lower, upper, other, s, point, turns, depth, walk, piece, *shape)
+                if not done:
+                    return n
+                known, height = True, piece[1, 3] - piece[1, 2]
+                rise = (piece[0, 3] - piece[0, 2]) / height if height > 0.0 else 0.0
+            while True:
+                u = piece[0, 0] + s * (piece[0, 2] + (s * (target - piece[1, 0]) - piece[1, 2]) * rise)
+                if rise == 0.0:
+                    # On a flat piece only the reversible part moves; without it the piece is passed.
+                    w = max(s * (target - piece[1, 0]) - piece[1, 2], 0.0) / gain if gain > 0.0 else LARGEST
+                    u = u0 + s * (scale * sinh(min(w, LARGEST))) if w < LARGEST else s * inf
+                elif scale > 0.0:
+                    goal = max(s * (u - u0), 0.0)
+                    w = guess = solved(scale, gain * rise, goal, guess)
+                    u = u0 + s * (goal - gain * rise * w)
+                end = piece[0, 0] + s * piece[0, 3]
+                if s * (piece[0, 1] - end) < 0.0:
+                    end = piece[0, 1]
+                if s * (limit - end) < 0.0:
+                    end = limit
+                if s * (end - u) > 0.0:
+                    point[0], point[1] = u, target - s * (gain * w)
+                    break
+                # A rounding error must not leave it on the piece that ends here.
+                one[0] = limit if end == limit else np.nextafter(end, turn * inf)
+                done, s, depth = through(one, 0, lower, upper, other, s, point, turns, depth, walk, piece, *shape)
+                if not done:
+                    return n
+                height = piece[1, 3] - piece[1, 2]
+                rise = (piece[0, 3] - piece[0, 2]) / height if height > 0.0 else 0.0
+                if end == limit:
+                    w = asinh(abs(limit - u0) / scale) if scale > 0.0 else 0.0
+                    break
+        u = point[0]
+        wanted = u + threshold * (w if turn > 0.0 else -w) if scale > 0.0 else u + lead
+        before, v = v, min(max(wanted, lower), upper)
+        kept = v == wanted
+        if not kept:
+            # A limit holds the voltage back: the memory follows what is applied.
+            point[0], point[1], s, depth, known = u0, y0, s_0, depth_0, False
+            if scale > 0.0:
+                way, u = v - u0, u0
+                if way != 0.0:
+                    w = solved(scale, threshold, abs(way), w)
+                    u = v - threshold * (w if way > 0.0 else -w)
             else:
-                if dt > 0.0:
-                    speed = abs(aim - aimed) / dt
-                    rate_aimed = speed + (rate_aimed - speed) * faded
-                aimed, rate_out = aim, min(rate_out, rate_aimed)
-            if u != point[0]:
-                if moved:
-                    s, depth, point[0], point[1] = s_0, depth_0, v_0, y_0
-                    transfer(kept, piece)
-                answer = on_piece(u, v_0, s, 0, piece)
-                if not isnan(answer):
-                    point[0], point[1] = u, answer
-                    continue
+                u = u0 + (v - before)
+            if u != u0:
                 one[0] = u
                 done, s, depth = through(one, 0, lower, upper, other, s, point, turns, depth, walk, piece, *shape)
                 if not done:
-                    return n, wanted
-        short = h[n] - (point[1] + bypass(gains, command, u))
-        limit = upper if missing > 0.0 else lower
-        near = abs(command - limit) <= rounding[0] * (1.0 + abs(limit))
-        out[n], held[n] = command, near and missing * short > 0.0
-    return h.size, wanted
+                    return n
+        out[n], reached[n] = v, point[1] + reversible * (v - point[0])
+    return h.size

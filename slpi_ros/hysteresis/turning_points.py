@@ -15,18 +15,16 @@ import sys
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from math import asinh, inf, sinh
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.compilation import compiler
+from slpi_ros.hysteresis.rate_law import LARGEST, solved
 from slpi_ros.hysteresis.reversals import require_finite
-
-if TYPE_CHECKING:
-    from slpi_ros.hysteresis.compiled import Play
 
 FloatArray = NDArray[np.float64]
 
@@ -326,6 +324,68 @@ class Memory:
         self._v, self._y = v, y
         return v
 
+    def inverse_beside(
+        self, y: float, gain: float, scale: float, lower: float = -inf, upper: float = inf, guess: float = 0.0
+    ) -> float:
+        """Move to the voltage at which the displacement plus ``gain w`` is `y` (m), and return the magnitude of ``w``.
+
+        Here ``w = asinh(d / scale)`` for the change ``d`` (V) of the voltage; see `slpi_ros.hysteresis.rate_law`.
+
+        Parameters
+        ----------
+        y, gain : float, metres
+        scale : float, volts
+            More than 0.
+        lower, upper : float, volts
+            Limits of the voltage; one that is outside goes no further out.
+        guess : float
+            First value of ``w``.
+
+        Raises
+        ------
+        UsageError
+            If `y` is not finite or out of range; the memory is unchanged.
+        """
+        if not abs(y - self._rest[1]) < self._far[1]:
+            raise UsageError(f"displacement {y} m is out of range; leave such samples out")
+        start, s = self._v, 1 if y > self._y else -1
+        limit = upper if s > 0 else lower
+        if y == self._y or s * (limit - start) <= 0.0:
+            return 0.0
+        self._turn_to(s)
+        i = bisect_right(self._u, s * (start - self._v0), 1)
+        while True:
+            v0, y0, u_knots, f_knots = self._v0, self._y0, self._u, self._f
+            if i >= len(u_knots):
+                raise UsageError(f"displacement {y} m cannot be reached by this model; leave such samples out")
+            u_a, f_a = u_knots[i - 1], f_knots[i - 1]
+            end, height = v0 + s * u_knots[i], f_knots[i] - f_a
+            if height > 0.0:
+                rise = (u_knots[i] - u_a) / height
+                # Way to the voltage without the part of `w`, on the straight line through this piece.
+                goal = max(s * (v0 + s * (u_a + (s * (y - y0) - f_a) * rise) - start), 0.0)
+                w = guess = solved(scale, gain * rise, goal, guess)
+                v = start + s * (goal - gain * rise * w)
+            else:
+                # On a flat piece only the part of `w` moves; without it the piece is passed.
+                w = max(s * (y - y0) - f_a, 0.0) / gain if gain > 0.0 else LARGEST
+                v = start + s * (scale * sinh(min(w, LARGEST))) if w < LARGEST else s * inf
+            closing = s * (self._close[0] - end) <= 0.0
+            if closing:
+                end = self._close[0]
+            if s * (limit - end) < 0.0 and s * (v - limit) >= 0.0:
+                self.forward(limit)
+                return asinh(abs(limit - start) / scale)
+            if s * (end - v) > 0.0:
+                self._v, self._y = v, y - s * (gain * w)
+                return w
+            if closing:
+                self._v, self._y = self._close
+                self._close_loop()
+                i = bisect_right(self._u, s * (end - self._v0), 1)
+            else:
+                i += 1
+
     # Whole paths
 
     def forward_array(self, v: FloatArray) -> FloatArray:
@@ -380,31 +440,24 @@ class Memory:
             (self.inverse if coordinate else self.forward)(float(x[done]))
         return out
 
-    def inverse_behind_play(
-        self,
-        elapsed: FloatArray,
-        pause: float,
-        h: FloatArray,
-        limits: tuple[float, float],
-        rounding: FloatArray,
-        play: "Play",
-    ) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Return the commands before a play operator (V) and where they are held, shape (N,) each.
+    def inverse_of_law(
+        self, t: FloatArray, h: FloatArray, law: FloatArray, limits: tuple[float, float]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the voltages (V) before a rate law, and the displacements (m) that they reach, shape (N,) each.
 
-        `slpi_ros.hysteresis.compiled.through_play` describes the arguments. The memory itself does not move.
+        `slpi_ros.hysteresis.compiled.through_law` describes the arguments. The memory itself does not move.
         """
-        from slpi_ros.hysteresis.compiled import through_play
+        from slpi_ros.hysteresis.compiled import through_law
 
-        v, held = np.empty_like(h), np.zeros(h.size, dtype=np.bool_)
-        lower, upper = float(limits[0]), float(limits[1])
+        v, reached = np.empty_like(h), np.empty_like(h)
         direction, point, turns, depth = self._arrays(2 * h.size + 2)
-        done, wanted = through_play(
-            *(elapsed, pause, h, lower, upper, rounding, v, held, direction, point, turns, depth, play),
+        done = through_law(
+            *(t, h, law, float(limits[0]), float(limits[1]), v, reached, direction, point, turns, depth),
             *self._shape_arrays(),
         )
         if done < h.size:
-            raise UsageError(f"displacement {wanted} m cannot be reached by this model; leave such samples out")
-        return v, held
+            raise UsageError(f"displacement {h[done]} m cannot be reached by this model; leave such samples out")
+        return v, reached
 
     def _arrays(self, more: int) -> tuple[float, FloatArray, FloatArray, int]:
         """Return direction, current point, stack with room for `more` reversals, and depth, for the compiled engine."""

@@ -12,7 +12,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.chain import loop_middle
 from slpi_ros.identification.samples import FEWEST, Samples
 from slpi_ros.model.axis_model import AxisModel, Start
 
@@ -153,6 +152,8 @@ PARTS = 10
 BEYOND_CHANCE = 4.0
 # Errors beyond this many robust standard deviations are outliers.
 OUTLIER = 6.0
+# Number of voltages at which the mid-line of the largest loop is computed.
+LEVELS = 201
 
 
 @dataclass(frozen=True)
@@ -336,8 +337,11 @@ def _changes(
     """Return changes of gain and width, their standard deviations, and the rms errors (m) before and after the fit."""
     if np.count_nonzero(known) < FEWEST:
         return np.zeros(2), np.full(2, np.inf), axis.quality.held_out_rms, axis.quality.held_out_rms
-    voltages, centre = loop_middle(lambda v: axis.hysteresis_only.simulate(np.zeros(v.size), v), *axis.voltage_range)
-    middle = np.interp(samples.v, voltages, centre)
+    # Mid-line of the largest loop: the mean of its rising and its falling branch.
+    rise = np.linspace(*axis.voltage_range, LEVELS)
+    loop = np.concatenate([rise[-1:], rise, rise[::-1]])
+    _, rising, falling = np.split(axis.hysteresis_only.simulate(np.zeros(loop.size), loop), [1, 1 + rise.size])
+    middle = np.interp(samples.v, rise, (rising + falling[::-1]) / 2)
     # A lag or delay, and a slow drift, change neither gain nor width.
     speed = np.gradient(predicted, np.maximum.accumulate(t + 1e-9 * np.arange(t.size)))
     columns = np.column_stack([predicted, predicted - middle, speed, t])[known]

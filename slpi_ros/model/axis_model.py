@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.effects.base import Effect, EffectContext
-from slpi_ros.effects.chain import Chain, Middle, backward, forward, lasting, loop_middle, reaching
-from slpi_ros.effects.rate_dependence import RateDependence
+from slpi_ros.effects.chain import Chain, backward, forward, lasting
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.hysteresis import multi_slope as smpi
@@ -20,7 +19,7 @@ from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.reversals import require_finite
 from slpi_ros.hysteresis.turning_points import FAR, Memory
-from slpi_ros.model.limits import MAX_DT, Limits, decaying_turns
+from slpi_ros.model.limits import Limits, decaying_turns
 from slpi_ros.model.sensor import IDEAL, Sensor, StreamingSensor
 from slpi_ros.model.streaming import ROUNDING, StreamingInverse, accepted_range, refusal
 
@@ -232,8 +231,7 @@ class AxisModel:
 
     def stream_from(self, memory: Memory, allowed: Limits) -> StreamingInverse:
         """Return a streaming inverse that continues from a memory of this axis; the effects start in equilibrium."""
-        middle = self._middle if self.chain.rate_dependence else None
-        return StreamingInverse(memory, self.displacement_range, allowed, self.effects, middle)
+        return StreamingInverse(memory, self.displacement_range, allowed, self.effects)
 
     def simulate(
         self, t: FloatArray, v: FloatArray, others: Mapping[str, FloatArray] | None = None, *, of_record: bool = False
@@ -254,13 +252,8 @@ class AxisModel:
         if not self.effects:
             return self._forward_array(v)
         around = EffectContext(t - t[:1])
-        u, reversible_bypass = reaching(chain.before, v, around)
-        middle = self._middle if chain.rate_dependence else None
-        return forward(
-            chain.own,
-            self._forward_array(u) + reversible_bypass,
-            replace(around, u=u, middle=middle),
-        )
+        u, beside = chain.reaching(v, around)
+        return forward(chain.own, self._forward_array(u) + beside, around)
 
     def seen(self, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
         """Return what the sensor says, shape (N,), metres.
@@ -359,26 +352,28 @@ class AxisModel:
             return self._invert_hysteresis(own, allowed)
         chain, (lowest, highest) = self.chain, self.chain.clipped
         between = replace(allowed, lower=max(allowed.lower, lowest), upper=max(min(allowed.upper, highest), lowest))
-        around = EffectContext(t - t[:1], middle=self._middle if chain.rate_dependence else None)
-        if chain.coercivity and self.causal:
-            return self._through_play(chain.coercivity, around, own, allowed, between)
-        h, u = chain.hysteresis_for(own, around, lambda h: self._invert_hysteresis(h, between)[0])
-        held = self._missed(h, u, between)
+        around = EffectContext(t - t[:1])
+        h = backward(chain.own, own, around)
+        if chain.around:
+            # The axis may start outside its limits; the first output voltage is inside.
+            memory = StreamingInverse(self.memory("start"), self.displacement_range, between).memory
+            u, reached = chain.around.command(t, h, memory, (between.lower, between.upper))
+            held = self._held(u, h - reached, between)
+            if not chain.before:
+                return u, held
+        else:
+            u, held = self._invert_hysteresis(h, between)
         return self._kept(backward(chain.before, u, around), held, allowed)
 
-    def _through_play(
-        self, coercivity: RateDependence, around: EffectContext, own: FloatArray, allowed: Limits, between: Limits
-    ) -> tuple[FloatArray, Mask]:
-        """Return the result of `command` for a play operator before the hysteresis, equal to streaming."""
-        chain = self.chain
-        h = backward(chain.own, own, around)
-        # The axis may start outside its limits; the first output voltage is inside.
-        memory = StreamingInverse(self.memory("start"), self.displacement_range, between).memory
-        rounding = np.array([ROUNDING, ROUNDING * (self.displacement_range[1] - self.displacement_range[0])])
-        elapsed = np.diff(around.t, prepend=around.t[:1])
-        play = coercivity.compiled_play()
-        u, held = memory.inverse_behind_play(elapsed, MAX_DT, h, (between.lower, between.upper), rounding, play)
-        return self._kept(backward(chain.before[:-1], u, around), held, allowed)
+    def _held(self, v: FloatArray, missed: FloatArray, limits: Limits) -> Mask:
+        """Return where voltages (V) are held at the limit beyond which the `missed` part (m) lies, shape (N,) each."""
+        low, high = self.displacement_range
+        rounding = ROUNDING * (high - low)
+        short, beyond = missed > rounding, missed < -rounding
+        if short.any() or beyond.any():
+            short &= v >= limits.upper - ROUNDING * (1.0 + abs(limits.upper))
+            beyond &= v <= limits.lower + ROUNDING * (1.0 + abs(limits.lower))
+        return np.asarray(short | beyond)
 
     def _kept(self, wanted: FloatArray, held: Mask, allowed: Limits) -> tuple[FloatArray, Mask]:
         v = np.clip(wanted, allowed.lower, allowed.upper)
@@ -395,12 +390,6 @@ class AxisModel:
         """Voltage range (V) of the hysteresis in the record: `voltage_range` within the limits of a saturation."""
         (low, high), (lowest, highest) = self.voltage_range, self.chain.clipped
         return max(low, lowest), min(high, highest)
-
-    @cached_property
-    def _middle(self) -> Middle:
-        """Function from voltage (V) to the mid-line of the largest loop (m)."""
-        voltages, middle = loop_middle(self._forward_array, *self.voltage_range)
-        return lambda u: np.interp(u, voltages, middle)
 
     def _allowed(self, limits: Limits | None) -> Limits:
         return (limits or Limits(-inf, inf)).within(self.voltage_range)

@@ -74,11 +74,26 @@ def parse_model(text: str, source: str) -> StageModel:
     if schema != SCHEMA:
         found = textwrap.shorten(repr(schema), 80)
         raise ModelError(f"{source}: schema is {found}, this version reads {SCHEMA!r}; identify the stage again")
+    _refuse_retired(document, source)
     try:
         validate(document, "model", source)
     except RecursionError:
         raise ModelError(f"{source}: not a model document: nested too deeply; identify the stage again") from None
     return model_from(document, source)
+
+
+def _refuse_retired(document: dict[str, Any], source: str) -> None:
+    """Raise ModelError if an effect has a form that this version no longer has."""
+    axes = document.get("axes")
+    for name, axis in axes.items() if isinstance(axes, dict) else ():
+        effects = axis.get("effects", []) if isinstance(axis, dict) else []
+        for effect in effects if isinstance(effects, list) else ():
+            given = effect.get("parameters") if isinstance(effect, dict) else None
+            if isinstance(given, dict) and effect.get("name") == "rate_dependence" and "exponent" in given:
+                raise ModelError(
+                    f"{source}: axis {name[:40]!r}: rate_dependence has a retired form (a power of the rate); diagnose "
+                    "again from its bags with slpi diagnose"
+                )
 
 
 def model_from(document: dict[str, Any], source: str) -> StageModel:

@@ -1,26 +1,19 @@
 """Streaming (sample by sample) causal inverse of one axis, and of several cross-coupled axes."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from copy import copy, deepcopy
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite
-from typing import Any, cast
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from slpi_ros.effects.base import DrivenStreamingEffect, Effect, StreamingEffect
+from slpi_ros.effects.base import Effect, StreamingAround, StreamingEffect
 from slpi_ros.effects.chain import Chain
-from slpi_ros.effects.creep import StreamingCreep
 from slpi_ros.effects.cross_coupling import Coupling
-from slpi_ros.effects.rate_dependence import TRIALS, RateDependence, StreamingCoercivity
-from slpi_ros.effects.saturation import Saturation
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
 from slpi_ros.hysteresis.turning_points import Memory, MemoryState
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 
-FloatArray = NDArray[np.float64]
 StreamingEffects = dict[str, StreamingEffect]
 
 # A desired displacement outside the identified range by more than this share of its span is refused as an error (wrong
@@ -66,11 +59,9 @@ class StreamingInverse:
     displacement_range : (float, float), metres
         Smallest and largest displacement of the identified range.
     limits : Limits
-        Limits of the command; further restricted by a `Saturation` effect.
+        Limits of the command; further restricted to what passes the effects.
     effects : tuple of Effect
         Effects besides the hysteresis; those of sensor and record are ignored. Default: none.
-    middle : callable, optional
-        Returns the mid-line of the largest loop (m) for voltages (V), shape (N,); for rate dependence. Default None.
 
     Attributes
     ----------
@@ -94,19 +85,18 @@ class StreamingInverse:
         displacement_range: tuple[float, float],
         limits: Limits,
         effects: tuple[Effect, ...] = (),
-        middle: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         chain = Chain.of(effects)
         self.memory, self._clipped = memory, chain.clipped
-        self._without_effects = not (chain.before or chain.own or chain.shared)
+        self._without_effects = not (chain.before or chain.around or chain.own or chain.shared)
         self.accepted = self._lowest, self._highest = accepted_range(displacement_range)
         self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
         self._t = -inf
         self.coupled = 0.0
-        # Saturation restricts the limits and needs no streaming effect.
-        self._before = _streaming(effect for effect in chain.before if not isinstance(effect, Saturation))
-        self._behind = _streaming(chain.own)
-        self._find()
+        self._before, self._behind = _streaming(chain.before), _streaming(chain.own)
+        self._around: StreamingAround | None = chain.around.streaming() if chain.around else None
+        self._around_name = chain.around.name if chain.around else ""
+        self._static = not (self._before or self._around or self._behind)
         self.pace = RateLimiter(limits, MAX_DT / 2)
         self.limits = limits
         # The axis may start outside its limits; the first output voltage is inside.
@@ -114,23 +104,21 @@ class StreamingInverse:
         self.pace.start(memory.voltage)
         for streaming in self._before.values():
             streaming.start(memory.voltage)
+        if self._around:
+            self._around.start(memory.voltage)
         for streaming in self._behind.values():
             streaming.start(memory.displacement)
-        if self._driven and middle:
-            self._driven.attach(lambda u: float(middle(np.array(u))))
-            self._driven.drive(0.0, memory.voltage)
         self._command = self.goal = memory.voltage
         self.desired = memory.displacement
         # Shortfall of the last sample: of the hysteresis or the voltage (m or V), and of the axis as a whole (m).
         self._missing = self._short = 0.0
         self._follow(0.0)
 
-    def _find(self) -> None:
-        """Find the streaming effects that need more input than the displacement."""
-        self._streaming: StreamingEffects = {**self._before, **self._behind}
-        rate = self._streaming.get(RateDependence.name)
-        self._play = rate if isinstance(rate, StreamingCoercivity) else None
-        self._driven = None if self._play else cast(DrivenStreamingEffect | None, rate)
+    @property
+    def _streaming(self) -> "dict[str, StreamingEffect | StreamingAround]":
+        """All streaming effects by name."""
+        around = {self._around_name: self._around} if self._around else {}
+        return {**self._before, **around, **self._behind}
 
     @property
     def limits(self) -> Limits:
@@ -145,29 +133,29 @@ class StreamingInverse:
         self._bare = self._without_effects and limits.slew == limits.acceleration == inf
 
     def restricted(self, limits: Limits) -> Limits:
-        """Return limits, restricted to the voltages that a `Saturation` lets through."""
+        """Return limits, restricted to the voltages that pass the effects."""
         lower = min(max(limits.lower, self._clipped[0]), limits.upper)
         return replace(limits, lower=lower, upper=max(min(limits.upper, self._clipped[1]), lower))
 
     @property
     def timeless(self) -> bool:
         """Whether the model does not depend on time."""
-        return not self._streaming
+        return self._static
 
     @property
     def voltage(self) -> float:
         """Present command, volts."""
-        return self._command if self._before else self.memory.voltage
+        return self._command if self._before or self._around else self.memory.voltage
 
     @property
     def uncoupled_displacement(self) -> float:
         """Displacement (m) of the model for the present voltage, without cross-coupling."""
-        return self._displacement if self._streaming else self.memory.displacement
+        return self.memory.displacement if self._static else self._displacement
 
     @property
     def missed(self) -> bool:
         """Whether any limit prevented the model from reaching the last desired displacement."""
-        if self._streaming:
+        if not self._static:
             return self._missing != 0.0
         return abs(self.desired - self.memory.displacement) > self._rounding
 
@@ -175,7 +163,7 @@ class StreamingInverse:
     def held(self) -> bool:
         """Whether the voltage is held at the limit beyond which the last desired displacement lies."""
         missing = short = self._beyond_rounding(self.desired)
-        if self._streaming:
+        if not self._static:
             missing, short = self._missing, self._short
         limits, v = self.pace.limits, self.voltage
         # With effects, a limit is reached only up to rounding errors, and their inverse may overshoot.
@@ -233,20 +221,23 @@ class StreamingInverse:
         UsageError
             If the model cannot reach `y`; without effects the state is unchanged.
         """
-        if not self._streaming:
+        if self._static:
             h = y - self.coupled
-            v = self._move(dt, h, now_ns)
+            v = self._move(dt, dt, h, now_ns)
             self.desired = h
             return v
         counted = dt
         if dt > MAX_DT:
-            # The voltage was held during the pause; only its last part counts for the new voltage.
-            counted = MAX_DT
-            self.wait(dt - counted)
+            # The voltage was held during the pause; only its last part counts for the new voltage, except in the effect
+            # around the hysteresis, which knows only its voltages at the samples.
+            counted, held = MAX_DT, self._command
+            for before in self._before.values():
+                held = before.forward(dt - counted, held)
+            self._follow(dt - counted)
         h = displacement = y - self.coupled
         for streaming in reversed(self._behind.values()):
             h = streaming.inverse(counted, h)
-        v = self._move(counted, h, now_ns)
+        v = self._move(counted, dt, h, now_ns)
         self.desired, self._command = h, v
         self._follow(counted)
         self._short = displacement - self._displacement
@@ -257,8 +248,8 @@ class StreamingInverse:
 
         For what a slew or acceleration limit has held back of the last sample.
         """
-        if not self._streaming:
-            return self._move(dt, self.desired, now_ns)
+        if self._static:
+            return self._move(dt, dt, self.desired, now_ns)
         desired, goal = self.desired, self.goal
         v = self.pace.step(goal, now_ns)
         self.drive(v, dt)
@@ -276,7 +267,7 @@ class StreamingInverse:
 
     def wait(self, duration: float) -> None:
         """Advance the effects by `duration` (s) at the present voltage; `pace` stays where the amplifier is."""
-        if self._streaming:
+        if not self._static:
             self._apply(duration, self.voltage)
 
     def _apply(self, dt: float, voltage: float) -> None:
@@ -308,17 +299,16 @@ class StreamingInverse:
             self.pace.start(state.voltage)
 
     def resume(self, before: "StreamingInverse") -> None:
-        """Continue from the inverse of another model: same voltage, coercivity and creep state."""
+        """Continue from the inverse of another model: same voltage, and the state of the effects that it also has."""
         self._command = self.goal = before.voltage
-        if self._play and before._play:
-            self._play.restore(before._play.snapshot())
+        if self._around and before._around and self._around_name == before._around_name:
+            self._around.resume(before._around, before.voltage)
         # The command is set without elapsed time.
         self.memory.forward(self._reaching(0.0, before.voltage))
         self.desired = self.memory.displacement
         for name, streaming in self._behind.items():
-            other = before._behind.get(name)
-            if isinstance(streaming, StreamingCreep) and isinstance(other, StreamingCreep):
-                streaming.resume(other, self.memory.displacement)
+            if name in before._behind:
+                streaming.resume(before._behind[name], self.memory.displacement)
         self._follow(0.0)
 
     def copy(self) -> "StreamingInverse":
@@ -326,73 +316,54 @@ class StreamingInverse:
         other = copy(self)
         other.memory, other.pace = copy(self.memory), self.pace.copy()
         other.memory.restore(self.memory.snapshot())
-        other._before, other._behind = deepcopy((self._before, self._behind))
-        other._find()
+        other._before, other._around, other._behind = deepcopy((self._before, self._around, self._behind))
         return other
 
-    def _move(self, dt: float, h: float, now_ns: int) -> float:
+    def _move(self, dt: float, elapsed: float, h: float, now_ns: int) -> float:
         """Move command and memory towards a displacement of the hysteresis (m); return the command (V).
 
-        `dt` (s) is the time for the effects, `now_ns` (ns) that for the rate limits.
+        `dt` (s) is the time for the effects, `elapsed` (s) that for the effect around the hysteresis, `now_ns` (ns)
+        that for the rate limits.
         """
-        memory, pace = self.memory, self.pace
-        if not self._before and pace.limits.acceleration == inf:
+        memory, pace, around = self.memory, self.pace, self._around
+        if not self._before and not around and pace.limits.acceleration == inf:
             v = self.goal = pace.move(memory.inverse(h, *pace.reach(now_ns)), now_ns)
-            if self._streaming:
+            if not self._static:
                 self._missing = self._beyond_rounding(h)
             return v
-        state = memory.snapshot()
-        goal, reversible_bypass = self._played(h)
+        state, limits = memory.snapshot(), pace.limits
+        if around:
+            goal = around.inverse(elapsed, h, memory, limits.lower, limits.upper)
+        else:
+            goal = memory.inverse(h, limits.lower, limits.upper)
         u = memory.voltage
-        self._missing = self._beyond_rounding(h - reversible_bypass)
+        self._missing = self._beyond_rounding(h - (around.beside if around else 0.0))
         for streaming in reversed(self._before.values()):
-            if streaming is not self._play:
-                goal = streaming.inverse(dt, goal)
+            goal = streaming.inverse(dt, goal)
         v = pace.step(goal, now_ns)
         if not self._missing and abs(goal - v) > ROUNDING * (1.0 + abs(goal)):
             self._missing = goal - v
         self.goal = goal
-        reached = self._reaching(dt, v)
+        reached = self._reaching(dt, v, elapsed)
         if reached != u:
             memory.restore(state)
             memory.forward(reached)
         return v
-
-    def _played(self, h: float) -> tuple[float, float]:
-        """Move the memory to `h` (m); return the voltage (V) before the play operator and the reversible bypass (m)."""
-        memory, limits, play = self.memory, self.pace.limits, self._play
-        if not play:
-            return memory.inverse(h, limits.lower, limits.upper), 0.0
-        state, rest = memory.snapshot(), memory.displacement
-        v, direction = play.within(h - rest)
-        if v is not None:
-            return v, play.between(v, memory.voltage)
-        u, reversible_bypass = memory.voltage, 0.0
-        for _ in range(TRIALS):
-            v = play.ahead(u, direction)
-            reversible_bypass = play.between(v, u)
-            wanted = max(h - reversible_bypass, rest) if direction > 0 else min(h - reversible_bypass, rest)
-            memory.restore(state)
-            u = memory.inverse(wanted, limits.lower, limits.upper)
-        v = play.aim(u, direction)
-        return v, play.between(v, u)
 
     def _beyond_rounding(self, h: float) -> float:
         """Return the setpoint `h` minus the displacement of the hysteresis (m); 0 if it is only a rounding error."""
         missing = h - self.memory.displacement
         return missing if abs(missing) > self._rounding else 0.0
 
-    def _reaching(self, dt: float, v: float) -> float:
-        """Return the voltage (V) of the hysteresis for a command `v` (V), after the effects that precede it."""
+    def _reaching(self, dt: float, v: float, elapsed: float | None = None) -> float:
+        """Return the voltage (V) that the hysteresis feels for a command `v` (V), with times as in `_move`."""
         for streaming in self._before.values():
             v = streaming.forward(dt, v)
-        return v
+        return self._around.forward(dt if elapsed is None else elapsed, v) if self._around else v
 
     def _follow(self, dt: float) -> None:
         """Propagate the output of the hysteresis through the effects after it."""
-        y = self.memory.displacement + (self._play.reversible_bypass if self._play else 0.0)
-        if self._driven:
-            self._driven.drive(dt, self.memory.voltage)
+        y = self.memory.displacement + (self._around.beside if self._around else 0.0)
         for streaming in self._behind.values():
             y = streaming.forward(dt, y)
         self._displacement = y

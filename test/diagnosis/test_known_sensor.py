@@ -139,7 +139,7 @@ def test_refit_leaves_out_what_belongs_to_the_old_record(other, prompt):
     model = slpi_ros.StageModel({"x": replace(prompt.axes["x"], effects=effects)})
     new, changes = slpi_ros.refit(model, record_of(t, v, said(t, x, late=False, seed=5)))
     assert changes["x"].error_before < 1.3 * NOISE
-    assert new.axes["x"].effects == (effects[0].last,)
+    assert new.axes["x"].effects == (effects[0].lasting,)
 
 
 @pytest.mark.slow

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from effects.cases import EVERY, coercivities
+from effects.cases import EVERY
 from hypothesis import given
 
-from slpi_ros.diagnosis.effect_parameters import FREE, bounded, free, moved, names, steps
+from slpi_ros.diagnosis.effect_parameters import FREE, bounded, certain, free, moved, names, of_starts, steps
+from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS
 
 T, V = np.linspace(0, 10, 1001), np.linspace(0, 100, 1001)
@@ -34,14 +35,19 @@ def test_a_step_is_never_lengthened(effect):
     assert np.all(np.abs(bounded(effect, change)) <= np.abs(change))
 
 
-@given(coercivities())
-def test_a_coercivity_has_parameters_of_its_own(effect):
-    """The others stay as they are, and gains may have either sign."""
-    assert not {"widening", "backlash", "transition"} & set(names(effect))
-    assert {"coercivity", "exponent", "onset", "settling"} <= set(names(effect))
-    values = free(effect)
-    values[-len(effect.reversible) or values.size :] = -1e-9
-    assert moved(effect, values).reversible == (-1e-9,) * len(effect.reversible)
+def test_a_start_that_is_none_stays_none():
+    """The state at the start of a record is free only where the record shows one."""
+    law = RateDependence(1.0, 0.1, 1e-8, (0.0, -2.0))
+    assert names(law) == ["threshold", "onset_rate", "reversible_gain", "initial.1"]
+    assert of_starts(law) == [False, False, False, True]
+    values = free(law)
+    values[-1] = 1e-9
+    assert moved(law, values).initial == (0.0, 0.0)
+
+
+def test_the_uncertainty_of_a_logarithm_is_in_the_unit_of_the_parameter():
+    law = certain(RateDependence(2.0, 0.5, 1e-8), [0.1, 0.2, 3e-9])
+    assert law.uncertainty == pytest.approx({"threshold": 0.2, "onset_rate": 0.1, "reversible_gain": 3e-9})
 
 
 @pytest.mark.parametrize("name", EFFECTS)

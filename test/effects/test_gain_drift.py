@@ -26,6 +26,8 @@ def test_loops_shrink_about_the_origin():
 
 def test_after_the_record_the_last_sensitivity_stays():
     later = EffectContext(T + 1e6)
+    assert DRIFT.lasting == GainDrift((0.0,), (-0.03,), 4e-6)
+    np.testing.assert_array_equal(DRIFT.lasting.apply(H, EffectContext(T)), DRIFT.apply(H, later))
     np.testing.assert_allclose(DRIFT.apply(H, later), 4e-6 + 0.97 * (H - 4e-6), rtol=1e-12)
     streaming = DRIFT.streaming()
     streaming.start(float(H[0]))

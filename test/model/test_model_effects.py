@@ -33,7 +33,7 @@ T = DT * np.arange(4000)
 CREEP = Creep((0.03, 0.3, 3.0), (0.02, 0.02, 0.03))
 DRIFT = ThermalDrift((0.0, 2.0, 3.0), (0.0, 1e-7, -1e-7))
 # What is undone exactly, whatever the path.
-EXACT = ("creep", "gain_drift")
+EXACT = ("rate_dependence", "creep", "gain_drift")
 # What belongs to the sensor or to the record: in no inverse.
 NEVER = ("thermal_drift", "sensor_periodic", "hum")
 
@@ -111,7 +111,7 @@ def test_after_its_record_a_gain_drift_keeps_its_last_value():
         (Delay(0.02), 1e-3),
         (Delay(-0.02), 1e-3),
         (Resonance(150.0, 0.02), 1e-3),
-        (RateDependence(0.1, 2e-8, 0.7, 500.0, 2.0), 1e-3),
+        (RateDependence(1.0, 0.1, 2e-8), 1e-12),
         (Saturation(-10.0, 95.0), 1e-9),
     ],
     ids=lambda value: getattr(value, "name", None),
@@ -265,7 +265,7 @@ def test_a_document_has_each_effect_once():
 
 def test_few_samples():
     axis = with_effects(
-        *(Lag(0.01), CREEP, Resonance(100.0, 0.1), RateDependence(0.1, 1e-8, 1.0, 100.0, 1.0), Delay(0.1)),
+        *(Lag(0.01), CREEP, Resonance(100.0, 0.1), RateDependence(1.0, 0.1, 1e-8), Delay(0.1)),
         *(SensorPeriodic(1e-7, 1e-9, 0.0), Hum(50.0, 1e-9, 0.0), DRIFT),
     )
     model = StageModel({"x": axis})

@@ -1,0 +1,43 @@
+"""The equation of the rate law, ``v = u + c asinh((du/dt) / s0)`` (Eyring), for one sample.
+
+With ``w = asinh(d / (s0 dt))`` for the change ``d`` of the voltage ``u`` that the hysteresis feels, both directions of
+the law are ``a sinh(w) + b w = goal``, with a unique solution: the forward law with ``a = s0 dt`` and ``b = c``, the
+inverse on a straight piece of a branch with the reversible gain, relative to its slope, times ``c`` as ``b``.
+"""
+
+from math import asinh, exp
+
+# The iteration ends after a step below this size: its convergence is cubic.
+CONVERGED = 1e-4
+# Largest number of iterations, a step after which they begin anew from the bound, and the largest guess.
+MOST, TOO_FAR, LARGEST = 100, 1.5, 30.0
+
+
+def solved(a: float, b: float, goal: float, guess: float) -> float:
+    """Return ``w`` of ``a sinh(w) + b w = goal`` by Chebyshev's method; `a`, `b`, `goal`: 0 or more, `a` or `b` more.
+
+    `guess` is a first value, extrapolated from the last samples; any number is valid.
+    """
+    if b == 0.0:
+        return asinh(goal / a)
+    if a == 0.0:
+        return goal / b
+    w, half = guess, 0.5 * a
+    if not 0.0 < w < LARGEST:
+        w = min(goal / b, asinh(goal / a))
+    for k in range(MOST):
+        grown = exp(w)
+        up, down = half * grown, half / grown
+        bent, inverse_slope = up - down, 1.0 / (up + down + b)
+        step = (goal - bent - b * w) * inverse_slope
+        curvature = 0.5 * step * bent * inverse_slope
+        if abs(curvature) < 0.5:
+            step *= 1.0 - curvature
+        if k < 3 and (step > TOO_FAR or step <= -w):
+            # Both terms are at most the goal, so that this bound is above the solution; all steps from it go down.
+            w = min(goal / b, asinh(goal / a))
+            continue
+        w += step
+        if abs(step) <= CONVERGED:
+            break
+    return w

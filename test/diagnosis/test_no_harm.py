@@ -1,0 +1,49 @@
+"""What is written is what was judged: an extended model that is worse on a record of its own is not written."""
+
+from dataclasses import replace
+
+import pytest
+
+import slpi_ros
+from benchmarks.hidden import hide
+from slpi_ros.diagnosis import diagnose as module
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def hidden():
+    record = hide(2, ["creep"], size=10.0, samples=6_000).record
+    return record, slpi_ros.identify(record)
+
+
+def test_causes_that_make_the_fitted_record_worse_are_dropped(hidden, monkeypatch):
+    record, model = hidden
+    extended = module._extended
+
+    def spoiled(*arguments):
+        """Stand for a joint fit that does not hold in a free run: 20 % too much gain wherever there is an effect."""
+        found = extended(*arguments)
+        high = found.displacement_range[1]
+        effects = tuple(drifting(high) if effect.name == "creep" else effect for effect in found.effects)
+        return replace(found, effects=effects)
+
+    def drifting(origin):
+        return module.GainDrift((0.0,), (0.2,), origin)
+
+    (sound,) = slpi_ros.diagnose(record, model).axes.values()
+    assert "creep" in [one.name for one in sound.effects]
+    monkeypatch.setattr(module, "_extended", spoiled)
+    diagnosis = slpi_ros.diagnose(record, model)
+    (found,) = diagnosis.axes.values()
+    (axis,) = diagnosis.extended.axes
+    assert (found.effects, found.verdict) == ((), "unexplained")
+    assert diagnosis.extended.axes[axis] == model.axes[axis]
+    (outcome,) = found.records
+    assert outcome.after_rms == outcome.before_rms
+
+
+def test_no_record_is_worse_with_the_extended_model(hidden):
+    record, model = hidden
+    (found,) = slpi_ros.diagnose(record, model).axes.values()
+    assert all(one.after_rms <= 1.05 * one.before_rms for one in found.records)

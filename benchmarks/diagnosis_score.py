@@ -149,6 +149,10 @@ def parameter_errors(truth: Truth, effect, hidden: Hidden) -> dict[str, float]:
     ``gain_drift``, ``thermal_drift``: course in time, without its mean. ``wave``: the sine, including its phase.
     """
     true, t = truth.parameters, hidden.record.t
+    if truth.name in ("resonance", "hum"):
+        # The true stage has one mode, or one line.
+        found = effect.modes if truth.name == "resonance" else effect.lines
+        effect = min(found, key=lambda one: abs(one.frequency - true["frequency"]))
     v = hidden.record.voltage[truth.axis]
     match truth.name:
         case "saturation":

@@ -20,6 +20,7 @@ import slpi_ros
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
@@ -39,7 +40,7 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "delay": (Delay(1e-3),),
     "lag": (Lag(5e-3),),
     "creep": (Creep((0.1, 1.0, 10.0), (0.01, 0.01, 0.01)),),
-    "resonance": (Resonance(100.0, 0.02),),
+    "resonance": (Resonance((Mode(100.0, 0.02),)),),
     "rate law": (RateDependence(0.01 * SPAN, 0.1 * SPAN, 5e-8),),
 }
 

@@ -10,7 +10,7 @@ import argparse
 import os
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 
 import slpi_ros
+from slpi_ros.effects.base import Effect
 from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 from slpi_ros.model.axis_model import AxisModel, Start
@@ -29,21 +31,45 @@ STAGES = {
 }
 
 
-def free_run(model: AxisModel, record: Record, axis: str) -> float:
-    """Return the error, % of the stroke, for the best of the possible initial histories (such as never moved)."""
+def measured_folder() -> Path | None:
+    """Return the folder of the measured data; None, with a sentence on standard output, where there is none."""
+    folder = Path(os.environ.get("SLPI_MEASURED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    if folder.is_dir():
+        return folder
+    print("no measured data: set SLPI_MEASURED_DATA to its folder")
+    return None
+
+
+def free_run(model: AxisModel, record: Record, axis: str, others: Collection[tuple[float, ...]] = frozenset()) -> float:
+    """Return the error, % of the stroke, for the best of the possible initial histories (such as never moved).
+
+    Parameters
+    ----------
+    model : AxisModel
+    record : Record
+    axis : str
+    others : collection of tuple of float, volts
+        Further initial histories, such as those of the models that this one is compared with. Default: none.
+    """
     v, y = record.voltage[axis], record.displacement[axis]
     known = np.isfinite(y)
-    # Creep that continues from before a record is specific to the record, like its initial history.
-    settled = replace(
-        model,
-        effects=tuple(replace(one, initial=0.0) if isinstance(one, Creep) else one for one in model.effects),
-    )
+    # Creep and rate law that continue from before a record are specific to the record, like its initial history.
+    settled = replace(model, effects=tuple(_settled(one) for one in model.effects))
     errors = [
         replace(each, start=Start(float(v[0]), 0.0, history)).simulate(record.t, v)[known] - y[known]
-        for history in {(), (float(v[0]),), model.start.history}
+        for history in {(), (float(v[0]),), model.start.history, *others}
         for each in (model, settled)
     ]
     return 100.0 * min(float(np.std(error)) for error in errors) / float(np.ptp(y[known]))
+
+
+def _settled(effect: Effect) -> Effect:
+    match effect:
+        case Creep():
+            return replace(effect, initial=0.0)
+        case RateDependence():
+            return replace(effect, initial=())
+    return effect
 
 
 def splits(names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
@@ -80,9 +106,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", choices=STAGES, help="this stage alone")
     options = parser.parse_args()
-    folder = Path(os.environ.get("SLPI_MEASURED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
-    if not folder.is_dir():
-        print("no measured data: set SLPI_MEASURED_DATA to its folder")
+    folder = measured_folder()
+    if not folder:
         return
     warnings.simplefilter("ignore")
     for stage in [options.only] if options.only else STAGES:

@@ -99,8 +99,8 @@ def test_a_hidden_hum_is_named_and_mended(folder, hidden, diagnosed):
     (truth,) = hidden.truth
     assert found["verdict"] == "named" and [effect["name"] for effect in found["effects"]] == ["hum"]
     parameters = found["effects"][0]["parameters"]
-    assert parameters["frequency"] == pytest.approx(truth.parameters["frequency"], rel=1e-2)
-    assert parameters["amplitude"] == pytest.approx(truth.parameters["amplitude"], rel=0.1)
+    assert parameters["lines"][0]["frequency"] == pytest.approx(truth.parameters["frequency"], rel=1e-2)
+    assert parameters["lines"][0]["amplitude"] == pytest.approx(truth.parameters["amplitude"], rel=0.1)
     told = diagnosed.stdout.splitlines()
     assert told[0].startswith("LIMITED BY: axis x: hum ")
     assert told[1] == "axis x: verdict: named" and told[2] == f"axis x: {found['summary']}"

@@ -109,15 +109,17 @@ def test_an_error_of_the_package_itself_is_not_blamed_on_another_one(tmp_path):
 def test_without_numba_the_results_are_the_same_and_it_is_told_once(tmp_path, contents):
     code = (
         "import json, sys, numpy as np\n"
-        "from slpi_ros.effects import paths\n"
+        "from slpi_ros.effects.base import EffectContext\n"
+        "from slpi_ros.effects.creep import Creep\n"
+        "from slpi_ros.effects.rate_dependence import RateDependence\n"
         "from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii\n"
         "from slpi_ros.hysteresis.turning_points import Memory\n"
         "v = 50.0 + 40.0 * np.sin(np.arange(30_000) ** 1.3 * 1e-3)\n"
         "memory = Memory(PrandtlIshlinskii(np.array([0.0, 5.0, 20.0]), np.array([1e-7, 2e-8, 3e-8])), 0.0)\n"
         "y = memory.forward_array(v)\n"
-        "played = paths.play(v, np.full(v.size, 3.0))\n"
-        "slope = paths.smoothed_slope(v[:100])\n"
-        "print(json.dumps([y[::100].tolist(), played[::100].tolist(), slope.tolist()]))"
+        "around = EffectContext(1e-3 * np.arange(v.size))\n"
+        "felt, crept = RateDependence(1.0, 0.5).apply(v, around), Creep((1.0,), (0.02,)).apply(y, around)\n"
+        "print(json.dumps([each[::100].tolist() for each in (y, felt, crept)]))"
     )
     with_numba = run(tmp_path, "unused", "", "-c", code)
     without = run(tmp_path, "numba", contents, "-c", code)

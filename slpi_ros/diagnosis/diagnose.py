@@ -35,6 +35,9 @@ FloatArray = NDArray[np.float64]
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects with the same predictions wherever they cannot be distinguished: the model may contain either of them.
 SAME_ELSEWHERE = ({"delay", "lag"},)
+# Effects are part of the model if they leave at most this multiple of the repeatability floor, or this share of the
+# error (a third of its mean square).
+LEFT_BY_NOISE, LEFT_OF_ERROR = 1.5, 0.6
 # Creep from a move before the records is part of the model if all records agree on the move within this share.
 BEGAN_ALIKE = 0.3
 # An initial history is possible up to this multiple of the lowest error; a zero has moved if its shift exceeds this
@@ -136,7 +139,7 @@ def _diagnose_axis(
     given = _given(model, runs, selection)
     source = ", ".join(part.source for part in evidence.parts)
     extension = _extension(model, selection, given, source)
-    if extension and _worse(extension[0], runs, selection.now):
+    if extension and (_of_another_kind(selection) or _worse(extension[0], runs, selection.now)):
         # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
         selection = _without_causes(selection)
         given = _given(model, runs, selection)
@@ -158,6 +161,14 @@ def _extension(model: AxisModel, selection: Selection, given: Given, source: str
         return None
     final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
     return _extended(model, final, _floor(selection.now), source), left_out
+
+
+def _of_another_kind(selection: Selection) -> bool:
+    """Return whether the effects leave so much that the physics is another, where they would not carry over."""
+    if not selection.named:
+        return False
+    before, after = selection.named[0].before.rms_of_records, selection.now.held_out.rms_of_records
+    return after > LEFT_BY_NOISE * _floor(selection.now).rms and after > LEFT_OF_ERROR * before
 
 
 def _without_causes(selection: Selection) -> Selection:

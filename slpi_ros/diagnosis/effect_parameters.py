@@ -16,9 +16,12 @@ from slpi_ros.effects.base import (
     ResidualView,
     Side,
     Signal,
+    leaves,
     usual_step,
+    with_leaves,
 )
 from slpi_ros.effects.creep import FASTEST, LAW_FEWEST, Creep, plausible
+from slpi_ros.effects.resonance import LEAST_GAIN, Resonance, within
 
 FloatArray = NDArray[np.float64]
 
@@ -29,16 +32,16 @@ FREE = {
     "saturation": ("lower", "upper"),
     "rate_dependence": ("threshold", "onset_rate", "reversible_gain", "initial"),
     "creep": ("time_constants", "gains"),
-    "resonance": ("frequency", "damping"),
+    "resonance": ("modes",),
     "gain_drift": ("gains", "origin"),
     "cross_coupling": ("gains",),
     "thermal_drift": ("values",),
     "sensor_periodic": ("period", "amplitude", "phase"),
-    "hum": ("frequency", "amplitude", "phase"),
+    "hum": ("lines",),
 }
 # Fields with the state of an effect at the start of each record; an entry that is 0 stays 0.
 STARTS = ("initial",)
-# Lower bounds; other parameters may be negative, except those of `NOT_NEGATIVE`.
+# Lower bounds by parameter, or by effect and parameter; others may be negative, except those of `NOT_NEGATIVE`.
 LEAST = {
     "time_constant": 1e-6,
     "time_constants": FASTEST,
@@ -46,6 +49,7 @@ LEAST = {
     "frequency": 1e-3,
     "period": 1e-9,
     "amplitude": 0.0,
+    "resonance.gain": LEAST_GAIN,
     "threshold": 1e-6,
     "onset_rate": 1e-9,
     "initial": -np.inf,
@@ -53,12 +57,13 @@ LEAST = {
 # Upper bounds by parameter, or by effect and parameter. With more damping there is no resonance.
 MOST = {
     "damping": 0.4,
+    "resonance.gain": 1.0,
     "cross_coupling.gains": 0.4,
 }
 # Effects whose parameters have the lower bound 0 if `LEAST` states no other.
 NOT_NEGATIVE = ("creep", "rate_dependence")
 # Parameters in which the displacement is linear, or nearly so; their steps are not limited.
-LINEAR = ("gains", "values", "origin", "seconds", "reversible_gain")
+LINEAR = ("gain", "gains", "values", "origin", "seconds", "reversible_gain")
 # Parameters that are fitted by their logarithms, as they range over decades, and the largest change of one in a step.
 LOGARITHMIC, LARGEST_LOG_STEP = ("threshold", "onset_rate"), 2.0
 # A state at the start below this size (V) is none.
@@ -110,47 +115,46 @@ class EachRecord(EffectBase):
         """Yield nothing: candidates come from the effect of each record."""
         yield from ()
 
-    def streaming(self) -> None:
-        """Return None: the effect depends on the time in its record and cannot be compensated sample by sample."""
-        return
-
 
 def _is_law(effect: Effect) -> bool:
     """Return whether an effect is logarithmic creep: several relaxations with equal gains."""
     return isinstance(effect, Creep) and len(effect.gains) >= LAW_FEWEST and len(set(effect.gains)) == 1
 
 
-def _items(effect: Effect) -> list[tuple[str, float]]:
-    """Return name and value of each free parameter; elements of a field have names such as ``gains.0``."""
+def _leaves(effect: Effect) -> list[tuple[str, str, float]]:
+    """Return place, field and value of each free parameter, such as ``modes.0.gain``, ``gain`` and 1."""
     if isinstance(effect, EachRecord):
-        return [(f"{name}", value) for part in effect.parts for name, value in _items(part)]
+        return [leaf for part in effect.parts for leaf in _leaves(part)]
     if isinstance(effect, Creep) and _is_law(effect):
-        return [("gains", effect.gains[0])]
-    found: list[tuple[str, float]] = []
-    for name in FREE[effect.name]:
-        value = getattr(effect, name)
-        if isinstance(value, Mapping):
-            found += [(f"{name}.{key}", gain) for key, gain in value.items()]
-        elif isinstance(value, tuple):
-            found += [(f"{name}.{k}", part) for k, part in enumerate(value) if part or name not in STARTS]
-        elif isfinite(value):
-            found.append((name, log(max(value, LEAST[name])) if name in LOGARITHMIC else value))
-    return found
+        return [("gains", "gains", effect.gains[0])]
+    found = [leaf for name in FREE[effect.name] for leaf in leaves(name, getattr(effect, name))]
+    return [leaf for leaf in found if _is_free(*leaf[1:])]
+
+
+def _is_free(field: str, value: float) -> bool:
+    return isfinite(value) and (bool(value) or field not in STARTS)
+
+
+def _bounds(effect: Effect, field: str) -> tuple[float, float]:
+    """Return the bounds of the numbers in a field."""
+    own, least = f"{effect.name}.{field}", 0.0 if effect.name in NOT_NEGATIVE else -np.inf
+    return LEAST.get(own, LEAST.get(field, least)), MOST.get(own, MOST.get(field, np.inf))
 
 
 def names(effect: Effect) -> list[str]:
-    """Return the names of the free parameters."""
-    return [name for name, _ in _items(effect)]
+    """Return the names of the free parameters; elements of a field have names such as ``gains.0``."""
+    return [place for place, _, _ in _leaves(effect)]
 
 
 def of_starts(effect: Effect) -> list[bool]:
     """Return for each free parameter whether it is the state at the start of a record."""
-    return [name.partition(".")[0] in STARTS for name in names(effect)]
+    return [field in STARTS for _, field, _ in _leaves(effect)]
 
 
 def free(effect: Effect) -> FloatArray:
     """Return the values of the free parameters, shape (k,), SI, or logarithms of these, see `LOGARITHMIC`."""
-    return np.array([value for _, value in _items(effect)], dtype=np.float64)
+    values = [log(max(value, LEAST[field])) if field in LOGARITHMIC else value for _, field, value in _leaves(effect)]
+    return np.array(values, dtype=np.float64)
 
 
 def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect:
@@ -164,24 +168,23 @@ def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect
         return replace(
             effect, gains=(min(plausible(effect.time_constants, (gain,) * len(effect.gains))),) * len(effect.gains)
         )
+
+    def new(field: str, value: float) -> float:
+        if not _is_free(field, value):
+            return value
+        value = exp(min(left.pop(0), 300.0)) if field in LOGARITHMIC else left.pop(0)
+        least, most = _bounds(effect, field)
+        value = min(max(value, least), longest if field == "time_constants" else most)
+        return 0.0 if field in STARTS and abs(value) < NO_START else value
+
     changed: dict[str, Any] = {}
     for name in FREE[effect.name]:
-        value = getattr(effect, name)
-        least = LEAST.get(name, 0.0 if effect.name in NOT_NEGATIVE else -np.inf)
-        keys = (name, f"{effect.name}.{name}")
-        most = longest if name == "time_constants" else min(MOST.get(key, np.inf) for key in keys)
-        if isinstance(value, Mapping):
-            changed[name] = {key: min(max(left.pop(0), least), most) for key in value}
-        elif isinstance(value, tuple):
-            kept = [part or name not in STARTS for part in value]
-            parts = [min(max(left.pop(0), least), most) if some else 0.0 for some in kept]
-            changed[name] = tuple(0.0 if name in STARTS and abs(part) < NO_START else part for part in parts)
-        elif name in LOGARITHMIC:
-            changed[name] = min(max(exp(min(left.pop(0), 300.0)), least), most)
-        elif isfinite(value):
-            changed[name] = min(max(left.pop(0), least), most)
+        now = getattr(effect, name)
+        changed[name] = with_leaves(now, iter([new(field, value) for _, field, value in leaves(name, now)]))
     if isinstance(effect, Creep):
         changed["gains"] = plausible(changed["time_constants"], changed["gains"])
+    if isinstance(effect, Resonance):
+        changed["modes"] = within(changed["modes"])
     return replace(effect, **changed)  # type: ignore[type-var]
 
 
@@ -198,32 +201,35 @@ def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
         "phase": 1e-4,
     }
     found = []
-    for name, value in _items(effect):
+    for _, field, value in _leaves(effect):
         scale = {"hum": 1e-3 / float(np.ptp(t)), "sensor_periodic": 1e-5 * abs(value)}
-        if name in ("frequency", "period") and effect.name in scale:
-            found.append(scale[effect.name])
-        elif name in LOGARITHMIC:
-            found.append(1e-4)
-        elif name.partition(".")[0] == "gains":
-            found.append(1e-5)
-        elif name == "reversible_gain":
-            found.append(1e-9 / float(np.ptp(v)))
-        elif name.partition(".")[0] in ("values", "origin"):
-            found.append(1e-9)
+        if field in ("frequency", "period") and effect.name in scale:
+            step = scale[effect.name]
+        elif field in LOGARITHMIC:
+            step = 1e-4
+        elif field in ("gain", "gains"):
+            step = 1e-5
+        elif field == "reversible_gain":
+            step = 1e-9 / float(np.ptp(v))
+        elif field in ("values", "origin"):
+            step = 1e-9
         else:
-            found.append(small.get(name, 1e-4 * abs(value) + 1e-12))
+            step = small.get(field, 1e-4 * abs(value) + 1e-12)
+        # Downwards where there is an upper bound: at the bound, a step upwards would change nothing.
+        least, most = _bounds(effect, field)
+        found.append(-step if most < np.inf and value - step >= least else step)
     return np.array(found)
 
 
 def bounded(effect: Effect, change: FloatArray) -> FloatArray:
     """Return a change of the free parameters, limited to the range in which the linearised fit is valid."""
     limit = LARGEST_STEP * np.abs(free(effect))
-    for k, name in enumerate(names(effect)):
-        if name.partition(".")[0] in LINEAR:
+    for k, (_, field, _) in enumerate(_leaves(effect)):
+        if field in LINEAR:
             limit[k] = np.inf
-        elif name in LOGARITHMIC:
+        elif field in LOGARITHMIC:
             limit[k] = LARGEST_LOG_STEP
-        elif name == "phase":
+        elif field == "phase":
             limit[k] = LARGEST_STEP
     return np.clip(change, -limit, limit)
 

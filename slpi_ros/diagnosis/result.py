@@ -59,7 +59,7 @@ AS_BEFORE = 1.1
 # standard deviations.
 CHANGED, LEAST_CHANGE, CERTAIN = 1e-3, 3e-3, 5.0
 
-SCHEMA = "slpi_ros/diagnosis/1"
+SCHEMA = "slpi_ros/diagnosis/2"
 NAMED, AMBIGUOUS, UNEXPLAINED, NOTHING_FOUND = "named", "ambiguous", "unexplained", "nothing_found"
 
 

@@ -80,12 +80,13 @@ NO_WORSE = 1.05
 HELD = 0.6
 # Thermal drift: shortest duration (s), and highest rate (share of the motion per second).
 DRIFT_TAKES, DRIFT_RATE = 10.0, 1e-2
-# Largest distance of the origin of a gain drift from the displacement range, as a share of that range.
-ORIGIN = 0.3
+# Gain drift: largest distance of the origin from the displacement range, as a share of that range, and largest gain.
+ORIGIN, LARGEST_DRIFT = 0.3, 0.3
 # Highest harmonic of the drive frequency that may be residual hysteresis.
 MOST_HARMONICS = 15
-# Highest resonance frequency that can be identified, as a multiple of the highest excited frequency.
-RINGS = 2.0
+# Highest frequency of any resonance, as a multiple of the highest excited frequency; above it only sharp ones can be
+# identified, with at most this damping ratio: turns excite them.
+RINGS, SHARP = 2.0, 0.1
 # Multiples of the rms rounding error: shortest period of a sensor error (rounding repeats with every digit, sqrt(12)
 # times its rms), and largest residual that counts as rounding.
 ROUNDING_PERIOD, ROUNDING_LEFT = 1.3 * 12**0.5, 1.3
@@ -224,17 +225,19 @@ def plausible(effect: Effect, now: Explanation) -> bool:
             pairs = zip(np.diff(effect.values).tolist(), np.diff(effect.times).tolist(), strict=True)
             return effect.times[-1] >= DRIFT_TAKES and all(abs(dy) <= DRIFT_RATE * motion * dt for dy, dt in pairs)
         case GainDrift():
-            # With an origin far away, a gain drift is a thermal drift.
+            # With an origin far away, a gain drift is a thermal drift; no piezo changes by more than `LARGEST_DRIFT`.
             y = now.y[now.used]
             near = float(y.min()) - ORIGIN * motion <= effect.origin <= float(y.max()) + ORIGIN * motion
-            return near and effect.times[-1] >= DRIFT_TAKES
+            small = max(map(abs, effect.gains)) <= LARGEST_DRIFT
+            return near and small and effect.times[-1] >= DRIFT_TAKES
         case Saturation():
             return _stands_still(effect, now)
         case Hum():
-            return not _is_harmonic(effect.frequency, evidence)
+            return not any(_is_harmonic(line.frequency, evidence) for line in effect.lines)
         case Resonance():
-            # Far above the excited frequencies a resonance only shifts in time, and can imitate hysteresis.
-            return effect.frequency <= RINGS * excited_frequency(evidence)
+            # Far above the excited frequencies a damped mode only shifts in time, and can imitate hysteresis.
+            highest = RINGS * excited_frequency(evidence)
+            return all(mode.frequency <= highest or mode.damping <= SHARP for mode in effect.modes)
         case SensorPeriodic():
             return bool(effect.period > ROUNDING_PERIOD * evidence.rounding)
     return True

@@ -1,9 +1,10 @@
 """The `Effect` protocol, its context and fit candidates, and validation of effect parameters."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import wraps
 from math import inf, isfinite
+from textwrap import shorten
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
@@ -35,15 +36,20 @@ class EffectContext:
     others : mapping of axis name to ndarray, shape (N,), metres
         Displacement of the other axes relative to their start, before coupling.
     records : tuple of EffectContext
-        One context per record if the signals are concatenated from several records; empty for a single record.
+        Contexts of the records that the signals are concatenated from; empty for a single record.
     grid : Uniform, optional
-        Uniform grid that covers `t`, if already computed.
+        Grid that covers `t`, if already computed.
     """
 
     t: FloatArray
     others: Mapping[str, FloatArray] = field(default_factory=dict)
     records: "tuple[EffectContext, ...]" = ()
     grid: Uniform | None = None
+
+    @classmethod
+    def since_start(cls, t: FloatArray, others: Mapping[str, FloatArray] | None = None) -> "EffectContext":
+        """Return the context for stamps `t`, shape (N,), seconds, counted from the first one."""
+        return cls(t - t[0] if t.size and t[0] else t, others or {})
 
     @property
     def uniform(self) -> Uniform:
@@ -75,17 +81,14 @@ def by_record(
     return applied
 
 
-class StreamingEffect(Protocol):
+class Streaming(Protocol):
     """Streaming (sample by sample) evaluation of an effect, including its state."""
 
     def start(self, x: float) -> None:
         """Initialise the state to equilibrium at the constant input `x` (V or m)."""
 
     def forward(self, dt: float, x: float) -> float:
-        """Advance the state by `dt` (s) to the input `x` and return the output."""
-
-    def inverse(self, dt: float, wanted: float) -> float:
-        """Return the input, or a stable approximation, for the output `wanted` after `dt` (s); keep the state."""
+        """Advance the state by `dt` (s) to the input `x` and return the output: what the hysteresis feels, or m."""
 
     def resume(self, other: Any, x: float) -> None:
         """Continue from the state of the same effect of another model, at the input `x` (V or m)."""
@@ -97,14 +100,15 @@ class StreamingEffect(Protocol):
         """Replace the state by one returned by `snapshot`."""
 
 
-class StreamingAround(Protocol):
+class StreamingEffect(Streaming, Protocol):
+    """Streaming evaluation of an effect on the voltage or on the displacement."""
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the input, or a stable approximation, for the output `wanted` after `dt` (s); keep the state."""
+
+
+class StreamingAround(Streaming, Protocol):
     """Streaming evaluation of an effect around the hysteresis: what the hysteresis feels, and what goes beside it."""
-
-    def start(self, x: float) -> None:
-        """Initialise the state to equilibrium at the constant voltage `x` (V)."""
-
-    def forward(self, dt: float, x: float) -> float:
-        """Advance the state by `dt` (s) to the voltage `x` (V) and return the voltage that the hysteresis feels."""
 
     def inverse(self, dt: float, wanted: float, memory: Memory, lower: float, upper: float) -> float:
         """Return the voltage (V) for the displacement `wanted` (m); `memory` moves, within `lower` and `upper` (V)."""
@@ -113,28 +117,58 @@ class StreamingAround(Protocol):
     def beside(self) -> float:
         """Displacement (m) beside that of the hysteresis."""
 
-    def resume(self, other: Any, x: float) -> None:
-        """Continue from the state of the same effect of another model, at the voltage `x` (V)."""
-
-    def snapshot(self) -> Any:
-        """Return the complete state as JSON-compatible numbers and tuples of numbers."""
-
-    def restore(self, state: Any) -> None:
-        """Replace the state by one returned by `snapshot`."""
-
 
 class StreamingBase:
-    """What streaming effects do unless they say otherwise."""
+    """What streaming effects do unless they say otherwise: they have no state."""
+
+    def start(self, x: float) -> None:
+        """Do nothing."""
+
+    def snapshot(self) -> Any:
+        """Return nothing."""
+        return ()
+
+    def restore(self, state: Any) -> None:
+        """Do nothing."""
 
     def resume(self, other: Any, x: float) -> None:
         """Keep the state: this effect does not continue from that of another model."""
 
 
-class Effect(Protocol):
+class EffectBase(Protocol):
+    """What effects are unless they say otherwise."""
+
+    side: ClassVar[Side]
+
+    def streaming(self) -> Any:
+        """Return the `StreamingEffect` or `StreamingAround`; None if it is not compensated sample by sample."""
+        return
+
+    @property
+    def lasting(self) -> "Effect | None":
+        """The effect as it is after its record; None if it ends with it."""
+        return None if self.side == "record" else self  # type: ignore[return-value]
+
+    @property
+    def passes(self) -> tuple[float, float]:
+        """Lowest and highest voltage (V) that the effect lets through."""
+        return -inf, inf
+
+    @property
+    def shift(self) -> float:
+        """Transport delay, seconds."""
+        return 0.0
+
+    @property
+    def coupling(self) -> Mapping[str, float]:
+        """Gains by which motions of other axes are added, by their names."""
+        return {}
+
+
+class Effect(EffectBase, Protocol):
     """One effect: a frozen dataclass whose fields are its parameters in SI units and their `uncertainty`."""
 
     name: ClassVar[str]
-    side: ClassVar[Side]
 
     @property
     def acts_on(self) -> Signal:
@@ -142,7 +176,7 @@ class Effect(Protocol):
 
     @property
     def uncertainty(self) -> Mapping[str, float]:
-        """Standard deviation by parameter name, in the unit of the parameter."""
+        """Standard deviation by place, such as ``gains.y`` or ``modes.0.gain``, in the unit of the parameter."""
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the output of the effect for an input signal, shape (N,), volts or metres, starting at equilibrium."""
@@ -156,54 +190,6 @@ class Effect(Protocol):
 
     def describe(self) -> str:
         """Describe the effect with its parameter values in one sentence."""
-
-    def streaming(self) -> Any:
-        """Return the `StreamingEffect`, or for one around the hysteresis the `StreamingAround`; None if there is none.
-
-        An effect without one is not compensated sample by sample.
-        """
-
-    @property
-    def lasting(self) -> "Effect | None":
-        """The effect as it is after its record; None if it ends with it."""
-
-    @property
-    def passes(self) -> tuple[float, float]:
-        """Lowest and highest voltage (V) that the effect lets through."""
-
-    @property
-    def shift(self) -> float:
-        """Transport delay, seconds."""
-
-    @property
-    def coupling(self) -> Mapping[str, float]:
-        """Gains by which motions of other axes are added, by their names."""
-
-
-class EffectBase:
-    """What effects are unless they say otherwise."""
-
-    side: ClassVar[Side]
-
-    @property
-    def lasting(self) -> "Effect | None":
-        """The effect, or None if it belongs to one record."""
-        return None if self.side == "record" else self  # type: ignore[return-value]
-
-    @property
-    def passes(self) -> tuple[float, float]:
-        """Infinite limits."""
-        return -inf, inf
-
-    @property
-    def shift(self) -> float:
-        """No delay."""
-        return 0.0
-
-    @property
-    def coupling(self) -> Mapping[str, float]:
-        """No coupling."""
-        return {}
 
 
 class AroundHysteresis(Effect, Protocol):
@@ -332,40 +318,27 @@ def rhythms(left: ResidualView, count: int, lowest: float) -> list[float]:
     return strongest_lines(power, frequency, count)
 
 
+# Place of a parameter, such as ``modes.0.gain``, whether the rule holds, and the requirement as text.
 Rule = tuple[str, bool, str]
 
 
 def require(effect: Any, *rules: Rule) -> None:
-    """Raise an error if a parameter is not finite or violates a rule.
-
-    Parameters
-    ----------
-    effect : Effect
-        A frozen dataclass whose parameters must all be finite.
-    rules : (str, bool, str)
-        Name of a parameter, whether the rule holds, and the requirement as text.
-
-    Raises
-    ------
-    ModelError
-        If a parameter is invalid; the message names the first one.
-    """
-    require_finite(effect)
-    require_rules(effect, *rules)
-
-
-def require_finite(effect: Any) -> None:
-    """Raise ModelError if a parameter is not finite."""
+    """Raise ModelError if a parameter is not finite or violates a rule."""
     for name, value in parameters_of(effect).items():
-        if not all(isfinite(number) for number in numbers_in(value)):
-            raise ModelError(f"effect '{effect.name}': {name} is {value}; give finite numbers")
+        for place, _, number in leaves(name, value):
+            if not isfinite(number):
+                raise ModelError(f"effect '{effect.name}': {place} is {number}; give finite numbers")
+    require_rules(effect, *rules)
 
 
 def require_rules(effect: Any, *rules: Rule) -> None:
     """Raise ModelError if a parameter violates a rule or an uncertainty belongs to no parameter."""
-    for name, holds, need in rules:
+    for place, holds, need in rules:
         if not holds:
-            raise ModelError(f"effect '{effect.name}': {name} is {getattr(effect, name)}; it must be {need}")
+            value = effect
+            for key in place.split("."):
+                value = value[int(key)] if isinstance(value, tuple) else getattr(value, key)
+            raise ModelError(f"effect '{effect.name}': {place} is {shorten(str(value), 80)}; it must be {need}")
     names = parameters_of(effect)
     for name, deviation in effect.uncertainty.items():
         if name.split(".")[0] not in names or not (isfinite(deviation) and deviation >= 0):
@@ -380,11 +353,23 @@ def parameters_of(effect: Any) -> dict[str, Any]:
     return {item.name: getattr(effect, item.name) for item in fields(effect) if item.name != "uncertainty"}
 
 
-def numbers_in(value: Any) -> Iterator[float]:
-    """Yield the numbers in a parameter: a scalar, the elements of a tuple, or the values of a mapping."""
-    if isinstance(value, Mapping):
-        yield from value.values()
-    elif isinstance(value, tuple):
-        yield from value
+def leaves(place: str, value: Any, owner: str = "") -> Iterator[tuple[str, str, float]]:
+    """Yield the numbers in a parameter, each with its place, such as ``modes.0.gain``, and the field that holds it."""
+    owner = owner or place
+    if is_dataclass(value):
+        for item in fields(value):
+            yield from leaves(f"{place}.{item.name}", getattr(value, item.name), item.name)
+    elif isinstance(value, Mapping | tuple):
+        for key, one in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from leaves(f"{place}.{key}", one, owner)
     else:
-        yield value
+        yield place, owner, value
+
+
+def with_leaves(value: Any, numbers: Iterator[float]) -> Any:
+    """Return a parameter with other numbers, in the order of `leaves`."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{item.name: with_leaves(getattr(value, item.name), numbers) for item in fields(value)})
+    if isinstance(value, Mapping):
+        return {key: with_leaves(one, numbers) for key, one in value.items()}
+    return tuple(with_leaves(one, numbers) for one in value) if isinstance(value, tuple) else next(numbers)

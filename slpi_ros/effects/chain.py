@@ -15,21 +15,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Chain:
-    """The effects of one axis, grouped in the order in which they act.
+    """The effects of one axis, in the order in which they act.
 
-    Parameters
-    ----------
-    before : tuple of Effect
-        Effects on the voltage.
-    around : AroundHysteresis or None
-        Effect around the hysteresis.
-    own : tuple of Effect
-        Effects on the displacement before the contributions of other axes.
-    shared : tuple of Effect
-        Coupling to other axes, and the effects of the stage that act after it.
-    measured : tuple of Effect
-        Effects of the sensor and of the record, between the displacement of the stage and the reading. No inverse for
-        the stage contains them.
+    On the voltage (`before`), `around` the hysteresis, on the displacement of the axis itself (`own`); coupling to
+    other axes and the effects of the stage after it (`shared`); and between the displacement of the stage and the
+    reading those of sensor and record (`measured`), which no inverse for the stage contains.
     """
 
     before: tuple[Effect, ...]

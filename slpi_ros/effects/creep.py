@@ -31,9 +31,9 @@ LARGEST, SOON, LARGEST_SOON = 0.15, 1.0, 0.12
 # Candidates: number of single relaxations; sets of several (number, longest time constant as share of the record).
 # Gains below this share of the largest gain are dropped.
 SINGLE, SEVERAL, LEAST_SHARE = 7, ((2, 0.1), (2, 0.5), (3, 0.3), (4, 0.7)), 0.02
-# Logarithmic law, equal gains: relaxations per decade, from the longer of a time (s) and a number of samples, to a
-# share of the longest record, and the smallest number of relaxations.
-LAW_PER_DECADE, LAW_FROM, LAW_SAMPLES, LAW_TO, LAW_FEWEST = 2, (0.0, FASTEST), 3.0, (0.3, 3.0), 4
+# Logarithmic law, equal gains: relaxations per decade, from the longer of `FASTEST` and a number of samples, to a share
+# of the longest record, and the smallest number of relaxations.
+LAW_PER_DECADE, LAW_SAMPLES, LAW_TO, LAW_FEWEST = 2, 3.0, (0.3, 3.0), 4
 # Relaxations with a time constant below this share of the record may have an identifiable state at its start.
 SOON_SETTLED = 0.025
 
@@ -114,8 +114,8 @@ class Creep(EffectBase):
                 starting = settling(taus.tolist(), left.around, left.used)
                 columns = np.column_stack([starting, *cls._creeping(taus, left)])
                 yield Candidate(columns, partial(cls._each, taus), taus.size, starting.shape[1])
-        for fast, slow in ((fast, slow) for fast in LAW_FROM for slow in LAW_TO):
-            first, last = max(fast, LAW_SAMPLES * step), slow * most
+        for slow in LAW_TO:
+            first, last = max(FASTEST, LAW_SAMPLES * step), slow * most
             if last > 10 * first:
                 taus = np.geomspace(first, last, max(LAW_FEWEST, 1 + round(LAW_PER_DECADE * np.log10(last / first))))
                 starting = settling(taus.tolist(), left.around, left.used)

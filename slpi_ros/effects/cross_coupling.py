@@ -14,12 +14,12 @@ from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FloatArr
 class CrossCoupling(EffectBase):
     """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j relative to its start.
 
+    It needs the setpoints of all axes and is compensated by the stage model.
+
     Parameters
     ----------
     gains : mapping of axis name to float
         Gain by axis name, metres per metre. An axis with unknown motion is taken as stationary.
-    uncertainty : mapping of parameter name to standard deviation, optional
-        Standard deviations; those of single axes have keys such as ``gains.y``.
     """
 
     name: ClassVar[str] = "cross_coupling"
@@ -30,15 +30,10 @@ class CrossCoupling(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters, including invertibility."""
         require(
             self,
             ("gains", 1 <= len(self.gains) <= 100, "for at least one axis"),
-            (
-                "gains",
-                sum(map(abs, self.gains.values())) < 0.9,
-                "less than 0.9 in sum, or the axes cannot be told apart",
-            ),
+            ("gains", sum(map(abs, self.gains.values())) < 0.9, "less than 0.9 in sum, to tell the axes apart"),
         )
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
@@ -74,10 +69,6 @@ class CrossCoupling(EffectBase):
         parts = [f"{gain * 100:.3g} % of axis {axis}" for axis, gain in self.gains.items()]
         return f"the axis follows {' and '.join(parts)}"
 
-    def streaming(self) -> None:
-        """Return None: decoupling requires the setpoints of all axes and is done by the stage model."""
-        return
-
 
 Motion = TypeVar("Motion", float, FloatArray)
 
@@ -85,15 +76,8 @@ Motion = TypeVar("Motion", float, FloatArray)
 class Coupling:
     """Linear coupling of all axes: the observed motions are ``(I + G) m``, with ``m`` the motions without coupling.
 
-    Parameters
-    ----------
-    gains : mapping of axis name to mapping of axis name to float
-        ``gains[x][y]``: displacement of x per metre of y. Axes that are not in the mapping have no coupling.
-
-    Attributes
-    ----------
-    on : bool
-        Whether any gain is not zero.
+    ``gains[x][y]`` is the displacement of x per metre of y; axes that are not in the mapping have no coupling, and
+    without any gain it is not `on`.
     """
 
     def __init__(self, gains: Mapping[str, Mapping[str, float]]) -> None:
@@ -109,14 +93,9 @@ class Coupling:
         return sum((gain * motions[other] for other, gain in self._gains[name].items() if other in motions), 0.0)
 
     def decouple(self, seen: Mapping[str, Motion], resting: Mapping[str, Motion]) -> dict[str, Motion]:
-        """Return the own motions (m), those without coupling, that produce the observed motions.
+        """Return the own motions (m), those without coupling, that produce the observed ones, `seen` (m).
 
-        Parameters
-        ----------
-        seen : mapping of axis name to float or ndarray, shape (N,), metres
-            Desired observed motions relative to the start.
-        resting : mapping of axis name to float or ndarray, shape (N,), metres
-            Own motions of the axes that are held in position.
+        Each from the start, a number or of shape (N,). `resting` are own motions (m) of axes held in position.
         """
         left = {name: motion - self.part(name, resting) for name, motion in seen.items()}
         rows = self._solution(tuple(seen))

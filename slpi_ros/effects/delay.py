@@ -25,11 +25,12 @@ from slpi_ros.effects.base import (
 class Delay(EffectBase):
     """Transport delay, or offset between the stamps of voltage and displacement.
 
+    It is not compensated sample by sample, which needs future setpoints.
+
     Parameters
     ----------
     seconds : float, seconds
         Delay from voltage to displacement; negative if the displacement is stamped too early or the voltage too late.
-    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "delay"
@@ -40,7 +41,6 @@ class Delay(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters."""
         require(self, ("seconds", abs(self.seconds) <= 100, "from -100 to 100 s"))
 
     @by_record
@@ -74,7 +74,3 @@ class Delay(EffectBase):
         if self.seconds < 0:
             return f"the displacement is stamped {-self.seconds * 1e3:.3g} ms too early for its voltage"
         return f"the displacement follows {self.seconds * 1e3:.3g} ms after the voltage"
-
-    def streaming(self) -> None:
-        """Return None: a delay cannot be compensated sample by sample without future reference samples."""
-        return

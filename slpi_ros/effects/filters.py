@@ -1,7 +1,8 @@
 """Linear filters: first-order hold of a lag, second-order mode, and resampling to a uniform grid."""
 
 from dataclasses import dataclass
-from math import cos, exp, expm1, sin, sqrt
+from functools import cached_property
+from math import cos, exp, expm1, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -43,20 +44,28 @@ def filtered(numerator: ArrayLike, denominator: ArrayLike, signal: FloatArray) -
 
 @dataclass(frozen=True)
 class Mode:
-    """Second-order mode ``y'' + 2 z w y' + w^2 y = w^2 h``.
+    """Second-order mode ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``.
 
     Parameters
     ----------
-    omega : float, rad/s
-        Undamped angular frequency ``w``.
+    frequency : float, hertz
+        Undamped natural frequency.
     damping : float
         Damping ratio ``z``, from above 0 to below 1.
+    gain : float
+        Share of the static displacement that the mode carries; default: all of it.
     """
 
-    omega: float
+    frequency: float
     damping: float
+    gain: float = 1.0
 
-    @property
+    @cached_property
+    def omega(self) -> float:
+        """Undamped angular frequency ``w``, rad/s."""
+        return 2 * pi * self.frequency
+
+    @cached_property
     def lag(self) -> float:
         """Steady-state delay of the response to a ramp, seconds."""
         return 2 * self.damping / self.omega
@@ -73,19 +82,56 @@ class Mode:
         decay = exp(-self.damping * self.omega * dt)
         return 2 * decay * cos(self.omega * sqrt(1 - self.damping**2) * dt), decay * decay
 
-    def transfer(self, dt: float) -> tuple[FloatArray, FloatArray]:
-        """Return numerator and denominator, shape (3,) each, of the mode discretised with step `dt` (s)."""
+    def transfer(
+        self, dt: float, direct: float = 0.0, position: float = 1.0, velocity: float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the discrete transfer function with step `dt` (s), numerator and denominator, shape (3,) each.
+
+        For an input linear between samples; the output is a weighted sum of the input, `position` and `velocity` (s).
+        """
         m11, m12, m21, m22 = self.free(dt)
         late = self.lag / dt
         # Response of position and velocity to the input at the start and at the end of a step.
-        position = late - m11 * (1 + late) + m12 / dt, 1 - late + m11 * late - m12 / dt
-        velocity = -1 / dt - m21 * (1 + late) + m22 / dt, 1 / dt + m21 * late - m22 / dt
+        p0, p1 = late - m11 * (1 + late) + m12 / dt, 1 - late + m11 * late - m12 / dt
+        v0, v1 = -1 / dt - m21 * (1 + late) + m22 / dt, 1 / dt + m21 * late - m22 / dt
         total, product = self.ringing(dt)
-        middle = position[0] - m22 * position[1] + m12 * velocity[1]
-        numerator = np.array([position[1], middle, m12 * velocity[0] - m22 * position[0]])
         denominator = np.array([1.0, -total, product])
-        # Remove rounding errors from the static gain.
-        return numerator * (denominator.sum() / numerator.sum()), denominator
+        moved = np.array([p1, p0 - m22 * p1 + m12 * v1, m12 * v0 - m22 * p0])
+        moving = np.array([v1, v0 - m11 * v1 + m21 * p1, m21 * p0 - m11 * v0])
+        # Remove rounding errors from the static gains.
+        moved *= denominator.sum() / moved.sum()
+        moving[1] -= moving.sum()
+        return direct * denominator + position * moved + velocity * moving, denominator
+
+
+class StreamingMode:
+    """A mode sample by sample, for an input linear between samples; `state`: input (m), position (m), velocity."""
+
+    def __init__(self, mode: Mode) -> None:
+        self._lag, self._mode = mode.lag, mode
+        self._dt, self._free = 0.0, mode.free(0.0)
+        self.start(0.0)
+
+    def start(self, x: float) -> None:
+        """Initialise to equilibrium at `x` (m)."""
+        self.state = x, x, 0.0
+
+    def after(self, dt: float, x: float) -> tuple[float, float, float]:
+        """Return the state after `dt` (s) with the input `x` (m) at the end."""
+        before, position, velocity = self.state
+        if dt <= 0.0:
+            return x, position, velocity
+        if dt != self._dt:
+            self._dt, self._free = dt, self._mode.free(dt)
+        m11, m12, m21, m22 = self._free
+        slope = (x - before) / dt
+        behind = self._lag * slope
+        position, velocity = position - before + behind, velocity - slope
+        return x, x - behind + m11 * position + m12 * velocity, slope + m21 * position + m22 * velocity
+
+    def move(self, dt: float, x: float) -> None:
+        """Advance by `dt` (s) to the input `x` (m)."""
+        self.state = self.after(dt, x)
 
 
 @dataclass(frozen=True)
@@ -94,10 +140,8 @@ class Uniform:
 
     Parameters
     ----------
-    t : ndarray, shape (N,), seconds
-        Stamps, non-decreasing.
-    grid : ndarray, shape (M,), seconds
-        Grid points; equal to `t` if the stamps are uniform.
+    t, grid : ndarray, shapes (N,) and (M,), seconds
+        Stamps, non-decreasing, and grid points, which are the stamps if these are uniform.
     dt : float, seconds
         Grid step; 0 if all stamps are equal.
     """

@@ -29,10 +29,8 @@ class GainDrift(EffectBase):
     """A time-dependent factor on the displacement, ``y = origin + (1 + g(t)) (x - origin)``.
 
     ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
-    record; after it the sensitivity stays at its last value, see `last`.
-
-    The factor acts after hysteresis, creep and resonance, and scales all three. It acts before the cross coupling, so
-    that other axes receive the scaled motion.
+    record; after it the sensitivity stays at its last value, see `lasting`. The factor scales hysteresis, creep and
+    resonance, and acts before the cross coupling, so that other axes receive the scaled motion.
 
     Parameters
     ----------
@@ -42,8 +40,6 @@ class GainDrift(EffectBase):
         Relative change of sensitivity ``g`` at the knots.
     origin : float, metres
         Displacement that does not change with the sensitivity.
-    uncertainty : mapping of parameter name to standard deviation, optional
-        Standard deviations; those of single elements have keys such as ``gains.0``.
     """
 
     name: ClassVar[str] = "gain_drift"
@@ -56,7 +52,6 @@ class GainDrift(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters."""
         rising = self.times == (0.0,) or all(a < b for a, b in zip((0.0, *self.times), self.times, strict=False))
         require(
             self,
@@ -142,9 +137,6 @@ class StreamingGainDrift(StreamingBase):
     def __init__(self, origin: float, factor: float) -> None:
         self._origin, self._factor = origin, factor
 
-    def start(self, x: float) -> None:
-        """Do nothing: the effect has no state."""
-
     def forward(self, dt: float, x: float) -> float:
         """Return the displacement (m) with the changed sensitivity."""
         return self._origin + self._factor * (x - self._origin)
@@ -152,10 +144,3 @@ class StreamingGainDrift(StreamingBase):
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the displacement (m) with the initial sensitivity."""
         return self._origin + (wanted - self._origin) / self._factor
-
-    def snapshot(self) -> tuple[()]:
-        """Return nothing: the effect has no state."""
-        return ()
-
-    def restore(self, state: tuple[()]) -> None:
-        """Do nothing: the effect has no state."""

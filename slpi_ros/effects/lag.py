@@ -34,7 +34,6 @@ class Lag(EffectBase):
     Parameters
     ----------
     time_constant : float, seconds, ``tau``
-    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "lag"
@@ -45,7 +44,6 @@ class Lag(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters."""
         require(self, ("time_constant", 0 < self.time_constant <= 1e4, "more than 0 s, at most 10000 s"))
 
     @by_record

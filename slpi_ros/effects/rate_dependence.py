@@ -90,11 +90,14 @@ class RateDependence(EffectBase):
         leads = (*self.initial, *(0.0,) * len(times))
         law = self.threshold, self.onset_rate
         parts = zip(times, around.split(signal), leads, strict=False)
-        return np.concatenate([felt(t, v, *law, lead) for t, v, lead in parts])
+        whole = [felt(t, v, *law, lead) for t, v, lead in parts]
+        return whole[0] if len(whole) == 1 else np.concatenate(whole)
 
     def beside(self, v: FloatArray, u: FloatArray) -> FloatArray:
         """Return the reversible displacement, shape (N,), m, for applied voltages `v` and felt ones `u`, volts."""
-        return np.asarray(self.reversible_gain * (v - u), dtype=np.float64)
+        lead = v - u
+        lead *= self.reversible_gain
+        return lead
 
     def command(
         self, t: FloatArray, h: FloatArray, memory: "Memory", limits: tuple[float, float]
@@ -104,7 +107,7 @@ class RateDependence(EffectBase):
         The inverse of the law and of the hysteresis, from equilibrium at the present state of `memory`, which moves.
         """
         law = np.array([self.threshold, self.onset_rate, self.reversible_gain])
-        return memory.inverse_of_law(t, h, law, limits)
+        return memory.inverse_of_law_array(t, h, law, limits)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the applied voltage, shape (N,), volts, for the felt voltage `signal`; it starts at equilibrium."""
@@ -162,21 +165,17 @@ class StreamingRateDependence(StreamingBase):
 
     def __init__(self, law: RateDependence) -> None:
         self._c, self._s0, self._g = law.threshold, law.onset_rate, law.reversible_gain
-        self.start(0.0)
+        self._v = self._u = 0.0
+        self._wish: float | None = None
+        # Magnitudes of ``w`` of the last samples, for the first guess of the next one.
+        self._w = self._before = self._earlier = 0.0
 
     def start(self, x: float) -> None:
         """Initialise to equilibrium at `x` (V)."""
-        self._v = self._u = x
-        self._asked: tuple[float, float] | None = None
-        self._wish: float | None = None
-        self._w = self._w_before = 0.0
+        self.restore((x, x))
 
     def forward(self, dt: float, x: float) -> float:
         """Advance by `dt` (s) to the applied voltage `x` (V) and return the voltage (V) that the hysteresis feels."""
-        asked, self._asked = self._asked, None
-        if asked and asked[0] == x:
-            self._v, self._u = asked
-            return self._u
         self._wish = None
         scale = self._s0 * dt
         if scale > 0.0:
@@ -193,30 +192,28 @@ class StreamingRateDependence(StreamingBase):
     def inverse(self, dt: float, wanted: float, memory: "Memory", lower: float, upper: float) -> float:
         """Return the voltage (V) for the displacement `wanted` (m) of hysteresis and reversible part, `dt` (s) later.
 
-        The memory moves to the voltage that the hysteresis feels, within `lower` and `upper` (V).
+        It is within `lower` and `upper` (V). The memory moves to the voltage that the hysteresis then feels.
         """
         scale = self._s0 * dt
-        wish, self._wish = self._wish, wanted
         if scale > 0.0:
-            rising, guess = wanted > memory.displacement, 2.0 * self._w - self._w_before
-            self._w_before = self._w
-            self._w = memory.inverse_beside(wanted, self._g * self._c, scale, lower, upper, guess)
-            u = memory.voltage
-            v = u + self._c * (self._w if rising else -self._w)
-        elif wish == wanted:
-            v, u = self._v, self._u
-        else:
+            before, earlier = self._before, self._earlier
+            self._earlier, self._before = before, self._w
+            guess = 3.0 * before - 2.0 * earlier
+            w = memory.inverse_of_law(wanted, self._g * self._c, self._c, scale, lower, upper, guess)
+            self._w, self._u = abs(w), memory.voltage
+            v = self._u + self._c * w
+            self._v = lower if v < lower else upper if v > upper else v
+        elif self._wish != wanted:
             lead = self._v - self._u
-            u = memory.inverse(wanted - self._g * lead, lower - lead, upper - lead)
-            v = u + lead
-        self._asked = v, u
-        return v
+            self._u = memory.inverse(wanted - self._g * lead, lower - lead, upper - lead)
+            self._v = min(max(self._u + lead, lower), upper)
+        self._wish = wanted
+        return self._v
 
     @property
     def beside(self) -> float:
         """Reversible displacement (m) beside that of the hysteresis."""
-        v, u = self._asked or (self._v, self._u)
-        return self._g * (v - u)
+        return self._g * (self._v - self._u)
 
     def resume(self, other: "StreamingRateDependence", x: float) -> None:
         """Take over the voltages of another model's law."""
@@ -229,7 +226,7 @@ class StreamingRateDependence(StreamingBase):
     def restore(self, state: tuple[float, float]) -> None:
         """Replace the state by one returned by `snapshot`."""
         self._v, self._u = state
-        self._asked, self._wish, self._w, self._w_before = None, None, 0.0, 0.0
+        self._wish, self._w, self._before, self._earlier = None, 0.0, 0.0, 0.0
 
 
 def _records(left: ResidualView) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:

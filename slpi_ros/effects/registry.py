@@ -1,9 +1,9 @@
 """Registry of the effects by name, and their conversion to and from documents."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, is_dataclass
 from math import isinf
-from typing import Any, get_origin
+from typing import Any, get_args, get_origin
 
 from slpi_ros.effects.base import Effect, parameters_of
 from slpi_ros.effects.creep import Creep
@@ -31,13 +31,7 @@ _PLACE = {name: place for place, name in enumerate(EFFECTS)}
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Return effects in the order in which they act.
-
-    Raises
-    ------
-    ModelError
-        If an effect occurs twice.
-    """
+    """Return effects in the order in which they act; ModelError if an effect occurs twice."""
     ordered = tuple(sorted(effects, key=lambda effect: _PLACE[effect.name]))
     for one, other in zip(ordered, ordered[1:], strict=False):
         if one.name == other.name:
@@ -55,54 +49,52 @@ def to_document(effect: Effect) -> dict[str, Any]:
 
 
 def from_document(document: Any) -> Effect:
-    """Build an effect from a document.
-
-    Raises
-    ------
-    ModelError
-        If the effect is unknown or its parameters are invalid.
-    """
+    """Build an effect from a document; ModelError if it is unknown or its parameters are invalid."""
     name = _member(document, "name")
     if not isinstance(name, str) or name not in EFFECTS:
         found = name[:40] if isinstance(name, str) else type(name).__name__
         raise ModelError(f"no effect {found!r}; this version knows {', '.join(EFFECTS)}")
-    given, kind = _mapping(name, "parameters", _member(document, "parameters")), EFFECTS[name]
-    wanted = {item.name: item for item in fields(kind) if item.name != "uncertainty"}
-    needed = {key for key, item in wanted.items() if item.default is MISSING}
-    if not needed <= given.keys() <= wanted.keys():
-        raise ModelError(
-            f"effect '{name}' has parameters {', '.join(map(str, given))[:80]!r}; give {', '.join(wanted)}"
-        )
-    read = {key: _read(name, wanted[key], value) for key, value in given.items()}
+    read = _built(name, "parameters", EFFECTS[name], _member(document, "parameters"))
     spread = _mapping(name, "uncertainty", document.get("uncertainty", {}))
-    uncertainty = {str(key): _number(name, f"uncertainty of {str(key)[:40]!r}", value) for key, value in spread.items()}
-    effect: Effect = kind(**read, uncertainty=uncertainty)
+    read["uncertainty"] = {
+        str(key): _number(name, f"uncertainty of {str(key)[:40]!r}", value) for key, value in spread.items()
+    }
+    effect: Effect = EFFECTS[name](**read)
     return effect
 
 
 def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return {item.name: _plain(getattr(value, item.name)) for item in fields(value)}
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, tuple):
-        return list(value)
+        return [_plain(one) for one in value]
     return None if isinf(value) else value
 
 
-def _read(effect: str, item: Any, value: Any) -> Any:
-    """Convert one parameter to the type of its field: a number, a tuple of numbers, or a mapping of numbers."""
-    holds = get_origin(item.type) or item.type
+def _built(effect: str, what: str, kind: Any, value: Any) -> dict[str, Any]:
+    """Convert a mapping to the fields of a dataclass other than `uncertainty`, by name."""
+    given = _mapping(effect, what, value)
+    wanted = {item.name: item for item in fields(kind) if item.name != "uncertainty"}
+    if not {key for key, item in wanted.items() if item.default is MISSING} <= given.keys() <= wanted.keys():
+        raise ModelError(f"effect '{effect}': {what} are {', '.join(map(str, given))[:80]!r}; give {', '.join(wanted)}")
+    place = "" if what == "parameters" else f"{what}."
+    return {key: _read(effect, place + key, wanted[key].type, one, wanted[key].default) for key, one in given.items()}
+
+
+def _read(effect: str, what: str, kind: Any, value: Any, default: Any = MISSING) -> Any:
+    """Convert a value to the type `kind`: a number, a tuple or mapping of numbers, or a tuple of dataclasses."""
+    holds: Any = get_origin(kind) or kind
     if holds is tuple:
         if not isinstance(value, list | tuple):
-            raise ModelError(
-                f"effect '{effect}': {item.name} is of type {type(value).__name__}; give a list of numbers"
-            )
-        return tuple(_number(effect, item.name, each) for each in value)
+            raise ModelError(f"effect '{effect}': {what} is of type {type(value).__name__}; give a list")
+        return tuple(_read(effect, f"{what}.{k}", get_args(kind)[0], each) for k, each in enumerate(value))
     if holds is Mapping:
-        pairs = _mapping(effect, item.name, value).items()
-        return {str(key): _number(effect, item.name, each) for key, each in pairs}
-    if value is None and isinstance(item.default, float):
-        return item.default
-    return _number(effect, item.name, value)
+        return {str(key): _number(effect, what, each) for key, each in _mapping(effect, what, value).items()}
+    if is_dataclass(holds):
+        return kind(**_built(effect, what, kind, value))
+    return default if value is None and isinstance(default, float) else _number(effect, what, value)
 
 
 def _number(effect: str, what: str, value: Any) -> float:

@@ -1,11 +1,12 @@
-"""Resonance: a lightly damped flexure mode that is excited by every reversal."""
+"""Resonance: lightly damped flexure modes that are excited by every reversal."""
 
 from collections import deque
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import zip_longest
 from math import pi
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,87 +24,96 @@ from slpi_ros.effects.base import (
     rhythms,
     usual_step,
 )
-from slpi_ros.effects.filters import Mode, filtered
+from slpi_ros.effects.filters import Mode, StreamingMode, filtered
 
-# Smallest tap spacing, in units of 1 / w; smaller spacings give larger taps without benefit.
-SPACING = 0.5
-# Largest tap spacing, in units of 1 / w; larger spacings cannot cancel the oscillation.
-WIDEST = 3.0
+# Smallest spacing of taps, in units of 1 / w: smaller ones make larger taps without benefit. From the step `WIDEST` on
+# a mode is not resolved, and only its lag is compensated.
+SPACING, WIDEST = 0.5, 3.0
+# A zero is near a mode up to this ratio of the squared frequencies, which is the largest gain of `Exact`.
+NEAR = 10.0
+# Largest number of modes, and the smallest share of the motion beside the modes that is none by rounding.
+MOST_MODES, LEAST_REST = 10, 1e-9
 
 
-@dataclass(frozen=True)
-class Unringing:
-    """Finite-impulse-response inverse of a mode, ``sum_k taps[k] y(t + preview - k spacing)``.
+class Exact(StreamingMode):
+    """Inverse of a mode with a zero near it: the ratio of their polynomials, with static gain 1, as a filter.
 
-    Parameters
-    ----------
-    taps : tuple of float
-        Taps with sum 1: their zeros are at the poles of the mode, and one more zero compensates the remaining delay.
-    spacing : float, seconds
+    It is a weighted sum of input, position and velocity of the zero, a mode that the desired displacement drives.
     """
 
-    taps: tuple[float, ...]
-    spacing: float
+    def __init__(self, mode: Mode, zero: Mode) -> None:
+        super().__init__(zero)
+        high = (zero.omega / mode.omega) ** 2
+        self._weights, self._late = (high, 1 - high, mode.lag - high * zero.lag), mode.lag - zero.lag
+        self._longest = WIDEST / zero.omega
 
-    @staticmethod
-    def shortest(mode: Mode) -> float:
-        """Return the smallest useful spacing, seconds."""
-        return SPACING / mode.omega
+    def invert(self, desired: FloatArray, dt: float) -> FloatArray:
+        """Return the input, shape (N,), metres, for a desired displacement on a grid of `dt` (s)."""
+        start = desired[:1]
+        if dt >= self._longest:
+            return desired + np.diff(desired, prepend=start) * (self._late / dt)
+        return np.asarray(start + filtered(*self._mode.transfer(dt, *self._weights), desired - start))
 
-    @classmethod
-    def of(cls, mode: Mode, spacing: float, preview: float = 0.0) -> "Unringing":
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the input (m) for `wanted` (m) after `dt` (s); keep the state."""
+        if dt >= self._longest:
+            return wanted + (wanted - self.state[0]) * (self._late / dt)
+        direct, moved, moving = self._weights
+        _, position, velocity = self.after(dt, wanted)
+        return direct * wanted + moved * position + moving * velocity
+
+
+class Unringing:
+    """Inverse of a mode as a finite impulse response, ``sum_k taps[k] y(t + preview - k spacing)``.
+
+    The sum of the taps is 1. Two zeros are at the poles of the mode, and one more compensates the remaining delay but
+    `known` (s).
+    """
+
+    def __init__(self, mode: Mode, known: float) -> None:
+        self._mode, self._known = mode, known
+        self._spacing = self._shortest = SPACING / mode.omega
+        self._taps = self._of(self._shortest)
+
+    def _of(self, spacing: float, preview: float = 0.0) -> tuple[float, float, float, float]:
         """Return the taps for a spacing (s), if the desired displacement is known a `preview` (s) in advance."""
-        zeros = (1.0, 0.0, 0.0)
-        if spacing * mode.omega < WIDEST:
-            total, product = mode.ringing(spacing)
-            zeros = (1 / (1 - total + product), -total / (1 - total + product), product / (1 - total + product))
-        delay = mode.lag / spacing + zeros[1] + 2 * zeros[2] - preview / spacing
-        a, b, c = zeros
-        return cls(
-            (a * (1 + delay), b * (1 + delay) - a * delay, c * (1 + delay) - b * delay, -c * delay),
-            spacing,
-        )
+        a, b, c = 1.0, 0.0, 0.0
+        if spacing * self._mode.omega < WIDEST:
+            total, product = self._mode.ringing(spacing)
+            a, b, c = (part / (1 - total + product) for part in (1.0, -total, product))
+        delay = (self._mode.lag - self._known - preview) / spacing + b + 2 * c
+        return a * (1 + delay), b * (1 + delay) - a * delay, c * (1 + delay) - b * delay, -c * delay
 
-
-class StreamingResonance(StreamingBase):
-    """Streaming (sample by sample) second-order mode."""
-
-    def __init__(self, mode: Mode) -> None:
-        self._mode = mode
-        self._dt, self._free = 0.0, mode.free(0.0)
-        self._shortest = self._unringing = Unringing.of(mode, Unringing.shortest(mode))
-        self.start(0.0)
+    def invert(self, desired: FloatArray, dt: float) -> FloatArray:
+        """Return the input, shape (N,), metres, for a desired displacement on a grid of `dt` (s)."""
+        between = max(1, round(self._shortest / dt))
+        padded = np.pad(desired, (2 * between, 0), mode="edge")
+        # The path is extrapolated by reflection at its end.
+        padded = np.pad(padded, (0, between), mode="reflect", reflect_type="odd")
+        taps = enumerate(self._of(between * dt, preview=between * dt))
+        parts = (tap * padded[(3 - k) * between :][: desired.size] for k, tap in taps)
+        return sum(parts, np.zeros_like(desired))
 
     def start(self, x: float) -> None:
         """Initialise to equilibrium at `x` (m)."""
-        self._input = self._position = x
-        self._velocity = 0.0
-        self._asked: float | None = None
-        # Age (s) and value (m) of the stored desired displacements, newest last; constant before the oldest.
-        self._desired: deque[tuple[float, float]] = deque([(0.0, x)])
-        self._now = 0.0
+        self.state = (0.0,), (x,)
 
-    def forward(self, dt: float, x: float) -> float:
-        """Advance by `dt` (s) to the input `x` (m) and return the position of the stage (m)."""
-        if dt > 0.0:
-            if dt != self._dt:
-                self._dt, self._free = dt, self._mode.free(dt)
-            m11, m12, m21, m22 = self._free
-            slope = (x - self._input) / dt
-            behind = self._mode.lag * slope
-            position, velocity = self._position - self._input + behind, self._velocity - slope
-            self._position = x - behind + m11 * position + m12 * velocity
-            self._velocity = slope + m21 * position + m22 * velocity
-        self._input = x
-        self._remember(dt)
-        return self._position
+    @property
+    def state(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Stored desired displacements: ages (s), and values (m), constant before the oldest."""
+        return tuple(self._now - t for t, _ in self._desired), tuple(y for _, y in self._desired)
+
+    @state.setter
+    def state(self, state: tuple[tuple[float, ...], tuple[float, ...]]) -> None:
+        self._now = 0.0
+        self._desired = deque((-age, y) for age, y in zip(*state, strict=True))
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the input (m) for the desired position `wanted` (m)."""
-        self._asked = wanted
-        if max(dt, self._shortest.spacing) != self._unringing.spacing:
-            self._unringing = Unringing.of(self._mode, dt) if dt > self._shortest.spacing else self._shortest
-        taps, spacing = self._unringing.taps, self._unringing.spacing
+        """Return the input (m) for `wanted` (m) after `dt` (s), without preview; keep the state."""
+        spacing = max(dt, self._shortest)
+        if spacing != self._spacing:
+            self._spacing, self._taps = spacing, self._of(spacing)
+        taps = self._taps
         later, value, at = self._now + dt, wanted, self._now + dt - spacing
         needed, k = taps[0] * wanted, 1
         # From the newest sample to the oldest, with linear interpolation.
@@ -118,67 +128,110 @@ class StreamingResonance(StreamingBase):
             later, value = earlier, before
         return needed + sum(taps[k:]) * value
 
-    def snapshot(self) -> tuple[float | tuple[float, ...], ...]:
-        """Return input, position, velocity, and the desired displacements by age."""
-        ages = tuple(self._now - t for t, _ in self._desired)
-        return self._input, self._position, self._velocity, ages, tuple(y for _, y in self._desired)
-
-    def restore(self, state: tuple[float | tuple[float, ...], ...]) -> None:
-        """Replace the state by one returned by `snapshot`."""
-        self._input, self._position, self._velocity, ages, desired = state  # type: ignore[assignment]
-        self._now = 0.0
-        self._desired = deque((-age, y) for age, y in zip(ages, desired, strict=True))  # type: ignore[arg-type]
-        self._asked = None
-
-    def _remember(self, dt: float) -> None:
-        """Store the last desired displacement (the position if none was given) and drop those older than all taps."""
+    def move(self, dt: float, wanted: float) -> None:
+        """Advance by `dt` (s) to `wanted` (m), and forget what is older than all taps."""
         self._now += dt
         desired = self._desired
         if dt <= 0.0:
             desired.pop()
-        desired.append((self._now, self._position if self._asked is None else self._asked))
-        self._asked = None
-        oldest = self._now - 4 * max(self._shortest.spacing, dt)
+        desired.append((self._now, wanted))
+        oldest = self._now - 4 * max(self._shortest, dt)
         while len(desired) > 2 and desired[1][0] <= oldest:
             desired.popleft()
+
+
+class StreamingResonance(StreamingBase):
+    """Streaming (sample by sample) resonance."""
+
+    def __init__(self, resonance: "Resonance") -> None:
+        self._gains, self._rest = [mode.gain for mode in resonance.modes], resonance.rest
+        self._modes, self._factors = [StreamingMode(mode) for mode in resonance.modes], resonance.factors()
+        self.start(0.0)
+
+    def start(self, x: float) -> None:
+        """Initialise to equilibrium at `x` (m)."""
+        for each in (*self._modes, *self._factors):
+            each.start(x)
+        # Time step (s) of the last call of `inverse`, -1 after a move; inputs (m) of the factors.
+        self._asked, self._inputs = -1.0, [x] * len(self._factors)
+
+    def forward(self, dt: float, x: float) -> float:
+        """Advance by `dt` (s) to the input `x` (m) and return the position of the stage (m)."""
+        y = self._rest * x
+        for gain, mode in zip(self._gains, self._modes, strict=True):
+            mode.state = state = mode.after(dt, x)
+            y += gain * state[1]
+        if dt != self._asked:
+            self.inverse(dt, y if self._asked < 0.0 else self._inputs[0])
+        for factor, wanted in zip(self._factors, self._inputs, strict=True):
+            factor.move(dt, wanted)
+        self._asked = -1.0
+        return y
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the input (m) for the desired position `wanted` (m)."""
+        self._asked = dt
+        for k, factor in enumerate(self._factors):
+            self._inputs[k] = wanted
+            wanted = factor.inverse(dt, wanted)
+        return wanted
+
+    def snapshot(self) -> tuple[Any, ...]:
+        """Return the states of the modes, and of the factors of the inverse."""
+        return tuple(each.state for each in (*self._modes, *self._factors))
+
+    def restore(self, state: tuple[Any, ...]) -> None:
+        """Replace the state by one returned by `snapshot`."""
+        for each, own in zip((*self._modes, *self._factors), state, strict=True):
+            each.state = own
+        self._asked = -1.0
 
 
 # Modes of the candidates: lowest frequency (Hz), highest as share of the sampling rate, number of spectral peaks.
 LOWEST, HIGHEST, LINES = 10.0, 0.45, 4
 DAMPINGS = (0.02, 0.08)
+# Smallest share of the motion of a fitted mode: smaller ones, near the drive, imitate errors of the hysteresis.
+LEAST_GAIN = 0.01
 
 
 @dataclass(frozen=True)
 class Resonance(EffectBase):
-    """A second-order mode, ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``.
+    """Superposition of second-order modes, ``y = h + sum_k gain_k (M_k[h] - h)``, ``M_k`` a `Mode`.
 
-    The exact inverse of the sampled mode is unstable. This inverse has zeros at the poles of the mode, which cancels
-    the oscillation after reversals; it follows ramps without error and is bounded, as a finite sum of past setpoints.
+    With ``D_k`` the polynomial of mode k, ``y = N / (D_1 D_2 ..) h``. The inverse is the product of ``D_k / N_k``, with
+    the quadratic factors ``N_k`` of ``N`` in order of frequency. Where the zeros of ``N_k`` are near the mode this is
+    `Exact`. Else, as ``1 / N_k`` hardly matters and the exact inverse of the sampled mode is unstable or large, the
+    factor is `Unringing`: it cancels the oscillation, follows ramps without error, and is bounded.
 
     Parameters
     ----------
-    frequency : float, hertz
-        Undamped natural frequency.
-    damping : float
-        Damping ratio ``z``, from above 0 to below 1.
-    uncertainty : mapping of parameter name to standard deviation, optional
+    modes : tuple of Mode
+        Frequencies in hertz, damping ratios from above 0 to below 1, and gains: the shares of the static displacement
+        that the modes carry, 0 or more, at most 1 in sum.
     """
 
     name: ClassVar[str] = "resonance"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
 
-    frequency: float
-    damping: float
+    modes: tuple[Mode, ...]
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters."""
-        require(
-            self,
-            ("frequency", 1e-3 <= self.frequency <= 1e7, "from 0.001 to 1e7 Hz"),
-            ("damping", 1e-6 <= self.damping < 1, "from 1e-6 to below 1"),
-        )
+        rules = [("modes", 1 <= len(self.modes) <= MOST_MODES, f"a list of 1 to {MOST_MODES}")]
+        for k, mode in enumerate(self.modes):
+            rules += [
+                (f"modes.{k}.frequency", 1e-3 <= mode.frequency <= 1e7, "from 0.001 to 1e7 Hz"),
+                (f"modes.{k}.damping", 1e-6 <= mode.damping < 1, "from 1e-6 to below 1"),
+                (f"modes.{k}.gain", mode.gain >= 0, "0 or more"),
+            ]
+        require(self, *rules, ("modes", self.rest >= 0, "of gains that are at most 1 in sum"))
+
+    @property
+    def rest(self) -> float:
+        """Share of the static displacement beside the modes."""
+        rest = 1.0 - sum(mode.gain for mode in self.modes)
+        return rest if abs(rest) > 1e-12 else 0.0
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
@@ -186,48 +239,79 @@ class Resonance(EffectBase):
         grid = around.uniform
         if not grid.dt:
             return np.full_like(signal, signal[0]) if signal.size else signal.copy()
-        numerator, denominator = self.mode.transfer(grid.dt)
-        moved = grid.on(signal)
-        return grid.off(moved[0] + filtered(numerator, denominator, moved - moved[0]))
+        start, moved = signal[0], grid.on(signal) - signal[0]
+        parts = (mode.gain * filtered(*mode.transfer(grid.dt), moved) for mode in self.modes)
+        return grid.off(start + sum(parts, self.rest * moved))
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the input of the mode, shape (N,), metres, for the displacement `signal`, shape (N,), metres."""
+        """Return the input of the modes, shape (N,), metres, for the displacement `signal`, shape (N,), metres."""
         grid = around.uniform
         if not grid.dt:
             return signal.copy()
-        between = max(1, round(Unringing.shortest(self.mode) / grid.dt))
-        taps = Unringing.of(self.mode, between * grid.dt, preview=between * grid.dt).taps
-        desired, left = grid.on(signal), (len(taps) - 2) * between
-        padded = np.pad(desired, (left, 0), mode="edge")
-        # The path is extrapolated by reflection at its end.
-        padded = np.pad(padded, (0, between), mode="reflect", reflect_type="odd")
-        parts = (tap * padded[left + (1 - k) * between :][: desired.size] for k, tap in enumerate(taps))
-        return grid.off(sum(parts, np.zeros_like(desired)))
+        desired = grid.on(signal)
+        for factor in self.factors():
+            desired = factor.invert(desired, grid.dt)
+        return grid.off(desired)
+
+    def factors(self) -> list[Unringing | Exact]:
+        """Return the factors of the inverse, one for each mode, in equilibrium at 0 m."""
+        ordered = sorted(self.modes, key=lambda mode: mode.frequency)
+        found: list[Unringing | Exact] = [
+            Exact(mode, zero)
+            if zero and zero.omega**2 <= NEAR * mode.omega**2
+            else Unringing(mode, zero.lag if zero else 0.0)
+            for mode, zero in zip_longest(ordered, zeros(ordered, self.rest))
+        ]
+        # First those that look ahead.
+        return sorted(found, key=lambda factor: isinstance(factor, Exact))
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield modes at the strongest frequencies of the residual, and on a logarithmic grid."""
+        """Yield single modes at the strongest frequencies of the residual, and on a logarithmic grid."""
         highest = HIGHEST / usual_step(left.t)
         found = [frequency for frequency in rhythms(left, LINES, LOWEST) if frequency < highest]
         for frequency in (*found, *np.geomspace(min(2 * LOWEST, highest), highest, 10).tolist()):
             for damping in DAMPINGS:
-                mode = cls(frequency, damping)
-                column = mode.apply(left.h, left.around) - left.h
+                mode = Mode(frequency, damping)
+                column = cls((mode,)).apply(left.h, left.around) - left.h
                 yield Candidate(column[:, None], partial(cls._if_seen, mode), positive=1)
 
-    @staticmethod
-    def _if_seen(mode: "Resonance", gains: FloatArray) -> "Resonance | None":
-        return mode if gains[0] > 0 else None
+    @classmethod
+    def _if_seen(cls, mode: Mode, gains: FloatArray) -> "Resonance | None":
+        return cls((replace(mode, gain=min(float(gains[0]), 1.0)),)) if gains[0] >= LEAST_GAIN else None
 
     def describe(self) -> str:
-        """Describe frequency and damping."""
-        return f"the stage rings at {self.frequency:.4g} Hz after reversals, with a damping ratio of {self.damping:.3g}"
+        """Describe frequency, damping and share of each mode."""
+        parts = (f"{one.frequency:.4g} Hz (damping {one.damping:.3g}, share {one.gain:.3g})" for one in self.modes)
+        return f"the stage rings after reversals, at {' and '.join(parts)}"
 
     def streaming(self) -> StreamingResonance:
-        """Return the streaming mode."""
-        return StreamingResonance(self.mode)
+        """Return the streaming modes."""
+        return StreamingResonance(self)
 
-    @property
-    def mode(self) -> Mode:
-        """The mode as a differential equation."""
-        return Mode(2 * pi * self.frequency, self.damping)
+
+def within(modes: Sequence[Mode]) -> tuple[Mode, ...]:
+    """Return the modes, with their gains reduced to a sum of at most 1."""
+    total = max(sum(mode.gain for mode in modes), 1.0)
+    return tuple(replace(mode, gain=mode.gain / total) for mode in modes)
+
+
+def zeros(modes: Sequence[Mode], rest: float) -> list[Mode]:
+    """Return the pairs of zeros of a superposition as modes, in order of frequency; one less if `rest` is 0.
+
+    They are the modes of a stage that is held, ``y = 0``. With the forces ``sqrt(gain_k) w_k`` on the modes these are
+    the eigenvalues, but one that is 0, of a skew-symmetric matrix minus the damping: all are stable, and all oscillate,
+    as the modes do.
+    """
+    w, loss = np.array([mode.omega for mode in modes]), np.diag([mode.lag * mode.omega**2 for mode in modes])
+    force = np.sqrt([mode.gain for mode in modes]) * w
+    if rest > LEAST_REST:
+        stiff = np.vstack([np.diag(w), force / np.sqrt(rest)])
+    else:
+        free = np.linalg.svd(force[None])[2][1:].T
+        stiff, loss = w[:, None] * free, free.T @ loss @ free
+    nothing = np.zeros((stiff.shape[0],) * 2)
+    roots = sorted(np.linalg.eigvals(np.block([[nothing, stiff], [-stiff.T, -loss]])), key=abs)[1:]
+    pairs = ((abs(one), -(one + other).real / 2) for one, other in zip(roots[::2], roots[1::2], strict=True))
+    # With rounding errors.
+    return [Mode(float(omega) / (2 * pi), min(max(float(rate / omega), 1e-9), 1 - 1e-9)) for omega, rate in pairs]

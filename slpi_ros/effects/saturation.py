@@ -16,13 +16,12 @@ BINS, STILL = 200, 0.35
 
 @dataclass(frozen=True)
 class Saturation(EffectBase):
-    """Limits of the voltage at the piezo.
+    """Limits of the voltage at the piezo, which the limits of the command keep, see `passes`.
 
     Parameters
     ----------
     lower, upper : float, volts
         Limits; infinite (the default) for no limit.
-    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "saturation"
@@ -34,7 +33,6 @@ class Saturation(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters."""
         require_rules(
             self,
             ("lower", not isnan(self.lower) and self.lower < inf, "a voltage, or -inf for none"),
@@ -76,20 +74,11 @@ class Saturation(EffectBase):
         where = [text for text, limit in ((below, self.lower), (above, self.upper)) if not isinf(limit)]
         return f"the amplifier clips {' and '.join(where) or 'nowhere'}"
 
-    def streaming(self) -> None:
-        """Return None: the limits of the command, which are within `passes`, are the limits of the effect."""
-        return
-
 
 def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the steps away from the middle of the voltage range, which give no displacement beyond a clipping limit.
 
-    Returns
-    -------
-    middle, dv : ndarray, shape (M,), volts
-        Mean voltage and size of each step.
-    dy : ndarray, shape (M,), metres
-        Displacement of each step.
+    Mean voltage (V), change of voltage (V) and displacement (m) of each step, shape (M,) each.
     """
     low, high = float(v.min()), float(v.max())
     # Steps over several samples improve the signal-to-noise ratio.

@@ -42,7 +42,6 @@ class SensorPeriodic(EffectBase):
     amplitude : float, metres
         Less than ``period / 2 pi``, so that the reading increases with the displacement.
     phase : float, radians, at displacement 0
-    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "sensor_periodic"
@@ -55,7 +54,6 @@ class SensorPeriodic(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters, including invertibility."""
         require(
             self,
             ("period", 1e-12 <= self.period <= 1e3, "from 1e-12 to 1000 m"),
@@ -119,9 +117,6 @@ class StreamingSensorError(StreamingBase):
         self._sensor = sensor
         self._k = 2 * pi / sensor.period
 
-    def start(self, x: float) -> None:
-        """Do nothing: the effect has no state."""
-
     def forward(self, dt: float, x: float) -> float:
         """Return the sensor reading (m) at the displacement `x` (m)."""
         return x + self._sensor.amplitude * sin(self._k * x + self._sensor.phase)
@@ -139,10 +134,3 @@ class StreamingSensorError(StreamingBase):
             if not low <= x <= high:
                 x = (low + high) / 2
         return x
-
-    def snapshot(self) -> tuple[()]:
-        """Return nothing: the effect has no state."""
-        return ()
-
-    def restore(self, state: tuple[()]) -> None:
-        """Do nothing: the effect has no state."""

@@ -22,7 +22,6 @@ class ThermalDrift(EffectBase):
     times : tuple of float, length K >= 1, seconds
         Knots from the record's start, strictly increasing.
     values : tuple of float, length K, metres, displacement at the knots
-    uncertainty : mapping of parameter name to standard deviation, optional
     """
 
     name: ClassVar[str] = "thermal_drift"
@@ -34,7 +33,6 @@ class ThermalDrift(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters."""
         rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
         require(
             self,
@@ -69,7 +67,3 @@ class ThermalDrift(EffectBase):
         """Describe the range and the duration."""
         way, span = max(self.values) - min(self.values), self.times[-1] - self.times[0]
         return f"whatever the voltage, the stage drifts by {way * 1e6:.3g} µm within {span:.3g} s of this record"
-
-    def streaming(self) -> None:
-        """Return None: drift is known only for the time of the record and cannot be predicted in operation."""
-        return

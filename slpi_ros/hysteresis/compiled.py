@@ -92,6 +92,12 @@ def interpolated(branches: Branches, s: float, turn: float, knots: FloatArray) -
 
 
 @compiled
+def room(first: FloatArray, branches: Branches) -> FloatArray:
+    """Return an array for the knots of any branch, shape (2, k); `first` are those of the first rise from rest."""
+    return np.empty((2, max(first.shape[1], branches.knots.shape[3], 4 * branches.operators.shape[1] + 2)))
+
+
+@compiled
 def through(
     x: FloatArray,
     coordinate: int,
@@ -103,12 +109,13 @@ def through(
     turns: FloatArray,
     depth: int,
     walk: NDArray[np.int64],
-    piece: FloatArray,
+    ends: FloatArray,
+    knots: FloatArray,
     rest: FloatArray,
     symmetric_rest: bool,
     first: FloatArray,
     branches: Branches,
-) -> tuple[int, float, int]:
+) -> tuple[int, float, int, int]:
     """Move a memory along a path, as `Memory.forward` or `Memory.inverse` does at each sample.
 
     Parameters
@@ -130,9 +137,10 @@ def through(
     walk : ndarray of int, shape (3, depth + N), or (3, 0)
         Rows 0 and 1 are set to each sample's branch: the sample at which it started and its direction. Row 2 holds the
         sample of each reversal. A branch without reversal starts at sample -1.
-    piece : ndarray, shape (2, 4) or (2, 0), volts and metres
-        If the path moves, columns 0 to 3 are set to starting point and closing point of the last branch, and to the
-        knots before and after the last sample, relative to the starting point.
+    ends : ndarray, shape (2, 2) or (2, 0), volts and metres
+        If the path moves, the columns are set to starting point and closing point of the last branch.
+    knots : ndarray, shape (2, k), volts and metres
+        As from `room`: overwritten with the knots of the last branch, relative to its starting point.
     rest : ndarray, shape (2,), volts and metres
     symmetric_rest, branches : bool, Branches
         As in `Shape`.
@@ -145,11 +153,12 @@ def through(
         Number of samples evaluated; less than N if the model cannot reach the next one.
     direction : float
     depth : int
+    knot : int
+        Index of the knot after the last sample, if the path moves.
     """
     s, other = direction, 1 - coordinate
     low, high = (lower, upper) if coordinate else (-inf, inf)
     begin, close = np.empty(2), np.empty(2)
-    knots = np.empty((2, max(first.shape[1], branches.knots.shape[3], 4 * branches.operators.shape[1] + 2)))
     n = last = i = 0
     entered = False
     while n < x.size:
@@ -192,7 +201,7 @@ def through(
                 continue
             u = s * (target - begin[driven])
             if not u < knots[driven, last]:
-                return n, s, depth
+                return n, s, depth, i
             while knots[driven, i] <= u:
                 i += 1
             u_a, f_a = knots[driven, i - 1], knots[1 - driven, i - 1]
@@ -220,10 +229,10 @@ def through(
             point[coordinate], point[other] = now, out[n - 1]
         for k in range(present if walk.size else n, n):
             walk[0, k], walk[1, k] = walk[2, depth - 1] if depth else -1, int(s)
-    if entered and piece.size:
+    if entered and ends.size:
         for c in range(2):
-            piece[c, 0], piece[c, 1], piece[c, 2], piece[c, 3] = begin[c], close[c], knots[c, i - 1], knots[c, i]
-    return n, s, depth
+            ends[c, 0], ends[c, 1] = begin[c], close[c]
+    return n, s, depth, i
 
 
 solved = compiled(rate_law.solved)
@@ -242,14 +251,15 @@ def felt(t: FloatArray, v: FloatArray, threshold: float, onset_rate: float, lead
     lead : float, volts
         Difference of the two voltages, applied minus felt, at the first sample.
     """
-    felt_voltage, w, before = np.empty_like(v), 0.0, 0.0
+    felt_voltage, w, before, earlier = np.empty_like(v), 0.0, 0.0, 0.0
     u = v[0] - lead if v.size else 0.0
     for k in range(v.size):
         scale, way = onset_rate * (t[k] - t[k - 1]) if k else 0.0, v[k] - u
         if scale > 0.0:
             if way != 0.0:
-                # The guess is extrapolated, as steps of a smooth path change smoothly.
-                w, before = solved(scale, threshold, abs(way), 2.0 * w - before), w
+                # Extrapolated from the two samples before the last one: it is computed while that one is being solved.
+                guess = 3.0 * before - 2.0 * earlier
+                w, before, earlier = solved(scale, threshold, abs(way), guess), w, before
                 u = v[k] - threshold * (w if way > 0.0 else -w)
         elif k:
             # In no time the difference between the two voltages stays what it was.
@@ -296,13 +306,16 @@ def through_law(
     done : int
         Number of samples evaluated; less than N if the model cannot reach the next one.
     """
-    threshold, onset_rate, reversible, rise = law[0], law[1], law[2], 0.0
+    threshold, onset_rate, reversible = law[0], law[1], law[2]
     s, shape = direction, (rest, symmetric_rest, first, branches)
     one, other, walk = np.empty(1), np.empty(1), np.empty((3, 0), dtype=np.int64)
-    piece, known = np.empty((2, 4)), False
-    v, w, w_before, kept = point[0], 0.0, 0.0, False
+    ends, knots, known, knot = np.empty((2, 2)), room(first, branches), False, 0
+    # Start of the branch, first knot of its present piece, end (V) and inverse slope (V/m; 0 if flat) of the piece.
+    v_begin, y_begin, u_knot, f_knot, end_piece, rise = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    v, u, y, closes = point[0], point[0], point[1], False
+    w, w_before, w_earlier, kept = 0.0, 0.0, 0.0, False
     for n in range(h.size):
-        scale, u0, y0, s_0, depth_0 = onset_rate * (t[n] - t[n - 1]) if n else 0.0, point[0], point[1], s, depth
+        scale, u0, y0, s_0, depth_0 = onset_rate * (t[n] - t[n - 1]) if n else 0.0, u, y, s, depth
         lead = v - u0
         if kept and not scale > 0.0 and h[n] == h[n - 1]:
             out[n], reached[n] = out[n - 1], reached[n - 1]
@@ -313,45 +326,54 @@ def through_law(
         limit = upper if turn > 0.0 else lower
         if not scale > 0.0:
             limit -= lead
-        guess, w_before, w = 2.0 * w - w_before, w, 0.0
+        guess = 3.0 * w_before - 2.0 * w_earlier
+        w_earlier, w_before, w = w_before, w, 0.0
         if target != y0 and turn * (limit - u0) > 0.0:
-            if not known or turn != s:
-                # The smallest step enters the branch.
-                one[0] = np.nextafter(u0, turn * inf)
-                done, s, depth = through(one, 0, lower, upper, other, s, point, turns, depth, walk, piece, *shape)
-                if not done:
-                    return n
-                known, height = True, piece[1, 3] - piece[1, 2]
-                rise = (piece[0, 3] - piece[0, 2]) / height if height > 0.0 else 0.0
+            # The smallest step enters the branch.
+            enter, known, next_piece = not known or turn != s, True, False
+            step = np.nextafter(u0, turn * inf)
             while True:
-                u = piece[0, 0] + s * (piece[0, 2] + (s * (target - piece[1, 0]) - piece[1, 2]) * rise)
+                if enter:
+                    point[0], point[1], one[0] = u, y, step
+                    done, s, depth, knot = through(
+                        one, 0, lower, upper, other, s, point, turns, depth, walk, ends, knots, *shape
+                    )
+                    if not done:
+                        return n
+                    u, y = point[0], point[1]
+                    if step == limit:
+                        known = False
+                        w = asinh(abs(limit - u0) / scale) if scale > 0.0 else 0.0
+                        break
+                if enter or next_piece:
+                    height = knots[1, knot] - knots[1, knot - 1]
+                    rise = (knots[0, knot] - knots[0, knot - 1]) / height if height > 0.0 else 0.0
+                    v_begin, y_begin, u_knot, f_knot = ends[0, 0], ends[1, 0], knots[0, knot - 1], knots[1, knot - 1]
+                    end_piece = v_begin + s * knots[0, knot]
+                    closes = s * (ends[0, 1] - end_piece) <= 0.0
+                    if closes:
+                        end_piece = ends[0, 1]
+                above = s * (target - y_begin) - f_knot
+                v_line = v_begin + s * (u_knot + above * rise)
                 if rise == 0.0:
                     # On a flat piece only the reversible part moves; without it the piece is passed.
-                    w = max(s * (target - piece[1, 0]) - piece[1, 2], 0.0) / gain if gain > 0.0 else LARGEST
-                    u = u0 + s * (scale * sinh(min(w, LARGEST))) if w < LARGEST else s * inf
+                    w = max(above, 0.0) / gain if gain > 0.0 else LARGEST
+                    v_line = u0 + s * (scale * sinh(min(w, LARGEST))) if w < LARGEST else s * inf
                 elif scale > 0.0:
-                    goal = max(s * (u - u0), 0.0)
-                    w = guess = solved(scale, gain * rise, goal, guess)
-                    u = u0 + s * (goal - gain * rise * w)
-                end = piece[0, 0] + s * piece[0, 3]
-                if s * (piece[0, 1] - end) < 0.0:
-                    end = piece[0, 1]
-                if s * (limit - end) < 0.0:
-                    end = limit
-                if s * (end - u) > 0.0:
-                    point[0], point[1] = u, target - s * (gain * w)
+                    goal = max(s * (v_line - u0), 0.0)
+                    w = guess = solved(scale, rise * gain, goal, guess)
+                    v_line = u0 + s * (goal - rise * gain * w)
+                end = limit if s * (limit - end_piece) < 0.0 else end_piece
+                if s * (end - v_line) > 0.0:
+                    u, y = v_line, target - s * (gain * w)
                     break
-                # A rounding error must not leave it on the piece that ends here.
-                one[0] = limit if end == limit else np.nextafter(end, turn * inf)
-                done, s, depth = through(one, 0, lower, upper, other, s, point, turns, depth, walk, piece, *shape)
-                if not done:
-                    return n
-                height = piece[1, 3] - piece[1, 2]
-                rise = (piece[0, 3] - piece[0, 2]) / height if height > 0.0 else 0.0
                 if end == limit:
-                    w = asinh(abs(limit - u0) / scale) if scale > 0.0 else 0.0
-                    break
-        u = point[0]
+                    enter, step = True, limit
+                elif closes or knots[0, knot] >= END:
+                    # A rounding error must not leave it on the branch that ends here.
+                    enter, step = True, np.nextafter(end, turn * inf)
+                else:
+                    enter, next_piece, knot = False, True, knot + 1
         wanted = u + threshold * (w if turn > 0.0 else -w) if scale > 0.0 else u + lead
         before, v = v, min(max(wanted, lower), upper)
         kept = v == wanted
@@ -361,14 +383,17 @@ def through_law(
             if scale > 0.0:
                 way, u = v - u0, u0
                 if way != 0.0:
-                    w = solved(scale, threshold, abs(way), w)
+                    w = solved(scale, threshold, abs(way), 0.0)
                     u = v - threshold * (w if way > 0.0 else -w)
             else:
                 u = u0 + (v - before)
             if u != u0:
                 one[0] = u
-                done, s, depth = through(one, 0, lower, upper, other, s, point, turns, depth, walk, piece, *shape)
+                done, s, depth, knot = through(
+                    one, 0, lower, upper, other, s, point, turns, depth, walk, ends, knots, *shape
+                )
                 if not done:
                     return n
-        out[n], reached[n] = v, point[1] + reversible * (v - point[0])
+            u, y = point[0], point[1]
+        out[n], reached[n] = v, y + reversible * (v - u)
     return h.size

@@ -26,13 +26,14 @@ def solved(a: float, b: float, goal: float, guess: float) -> float:
     if not 0.0 < w < LARGEST:
         w = min(goal / b, asinh(goal / a))
     for k in range(MOST):
+        # Numerator and denominator of Newton's step times exp(w), so that there is one division.
         grown = exp(w)
-        up, down = half * grown, half / grown
-        bent, inverse_slope = up - down, 1.0 / (up + down + b)
-        step = (goal - bent - b * w) * inverse_slope
+        up = half * grown * grown
+        bent, inverse_slope = up - half, 1.0 / (up + half + b * grown)
+        step = ((goal - b * w) * grown - bent) * inverse_slope
         curvature = 0.5 * step * bent * inverse_slope
         if abs(curvature) < 0.5:
-            step *= 1.0 - curvature
+            step -= step * curvature
         if k < 3 and (step > TOO_FAR or step <= -w):
             # Both terms are at most the goal, so that this bound is above the solution; all steps from it go down.
             w = min(goal / b, asinh(goal / a))

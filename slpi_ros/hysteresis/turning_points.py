@@ -15,7 +15,7 @@ import sys
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import asinh, inf, sinh
+from math import asinh, copysign, inf, sinh
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -324,22 +324,23 @@ class Memory:
         self._v, self._y = v, y
         return v
 
-    def inverse_beside(
-        self, y: float, gain: float, scale: float, lower: float = -inf, upper: float = inf, guess: float = 0.0
+    def inverse_of_law(
+        self, y: float, gain: float, threshold: float, scale: float, lower: float, upper: float, guess: float
     ) -> float:
-        """Move to the voltage at which the displacement plus ``gain w`` is `y` (m), and return the magnitude of ``w``.
+        """Move to the voltage ``u`` at which displacement plus ``gain w`` is `y` (m), and return ``w``.
 
-        Here ``w = asinh(d / scale)`` for the change ``d`` (V) of the voltage; see `slpi_ros.hysteresis.rate_law`.
+        Here ``w = asinh(d / scale)`` for the change ``d`` (V) of ``u``; see `slpi_ros.hysteresis.rate_law`. The applied
+        voltage ``u + threshold w`` stays within its limits: where they hold it back, ``u`` follows it by the law.
 
         Parameters
         ----------
         y, gain : float, metres
-        scale : float, volts
-            More than 0.
+        threshold, scale : float, volts
+            `scale` more than 0.
         lower, upper : float, volts
-            Limits of the voltage; one that is outside goes no further out.
+            Limits of the applied voltage.
         guess : float
-            First value of ``w``.
+            First value of the magnitude of ``w``.
 
         Raises
         ------
@@ -349,42 +350,53 @@ class Memory:
         if not abs(y - self._rest[1]) < self._far[1]:
             raise UsageError(f"displacement {y} m is out of range; leave such samples out")
         start, s = self._v, 1 if y > self._y else -1
-        limit = upper if s > 0 else lower
-        if y == self._y or s * (limit - start) <= 0.0:
-            return 0.0
+        limit, other = (upper, lower) if s > 0 else (lower, upper)
+        if s * (limit - start) <= 0.0:
+            return self._follow_limit(limit, start, threshold, scale)
+        if y == self._y:
+            return 0.0 if start <= upper else self._follow_limit(upper, start, threshold, scale)
         self._turn_to(s)
         i = bisect_right(self._u, s * (start - self._v0), 1)
         while True:
-            v0, y0, u_knots, f_knots = self._v0, self._y0, self._u, self._f
+            v0, u_knots, f_knots, close = self._v0, self._u, self._f, self._close[0]
             if i >= len(u_knots):
                 raise UsageError(f"displacement {y} m cannot be reached by this model; leave such samples out")
             u_a, f_a = u_knots[i - 1], f_knots[i - 1]
-            end, height = v0 + s * u_knots[i], f_knots[i] - f_a
+            end, height, above = v0 + s * u_knots[i], f_knots[i] - f_a, s * (y - self._y0) - f_a
             if height > 0.0:
                 rise = (u_knots[i] - u_a) / height
                 # Way to the voltage without the part of `w`, on the straight line through this piece.
-                goal = max(s * (v0 + s * (u_a + (s * (y - y0) - f_a) * rise) - start), 0.0)
-                w = guess = solved(scale, gain * rise, goal, guess)
-                v = start + s * (goal - gain * rise * w)
+                goal = max(s * (v0 + s * (u_a + above * rise) - start), 0.0)
+                rise *= gain
+                w = guess = solved(scale, rise, goal, guess)
+                v = start + s * (goal - rise * w)
             else:
                 # On a flat piece only the part of `w` moves; without it the piece is passed.
-                w = max(s * (y - y0) - f_a, 0.0) / gain if gain > 0.0 else LARGEST
+                w = max(above, 0.0) / gain if gain > 0.0 else LARGEST
                 v = start + s * (scale * sinh(min(w, LARGEST))) if w < LARGEST else s * inf
-            closing = s * (self._close[0] - end) <= 0.0
-            if closing:
-                end = self._close[0]
-            if s * (limit - end) < 0.0 and s * (v - limit) >= 0.0:
-                self.forward(limit)
-                return asinh(abs(limit - start) / scale)
-            if s * (end - v) > 0.0:
+            if s * (end - v) > 0.0 and s * (close - v) > 0.0:
+                applied = v + s * (threshold * w)
+                if s * (applied - limit) > 0.0:
+                    return self._follow_limit(limit, start, threshold, scale)
                 self._v, self._y = v, y - s * (gain * w)
-                return w
-            if closing:
-                self._v, self._y = self._close
-                self._close_loop()
-                i = bisect_right(self._u, s * (end - self._v0), 1)
-            else:
+                if s * (applied - other) < 0.0:
+                    return self._follow_limit(other, start, threshold, scale)
+                return s * w
+            if s * (close - end) > 0.0:
                 i += 1
+                continue
+            if s * (close - limit) + threshold * asinh(s * (close - start) / scale) > 0.0:
+                return self._follow_limit(limit, start, threshold, scale)
+            self._v, self._y = self._close
+            self._close_loop()
+            i = bisect_right(self._u, s * (close - self._v0), 1)
+
+    def _follow_limit(self, limit: float, start: float, threshold: float, scale: float) -> float:
+        """Move from `start` (V) to the voltage that the hysteresis feels while `limit` (V) is applied; return ``w``."""
+        way = limit - start
+        w = copysign(solved(scale, threshold, abs(way), 0.0), way)
+        self.forward(limit - threshold * w)
+        return w
 
     # Whole paths
 
@@ -420,17 +432,19 @@ class Memory:
         self, x: FloatArray, coordinate: int, lower: float, upper: float, walk: NDArray[np.int64] | None = None
     ) -> FloatArray:
         """Return the other coordinate along `x`; `slpi_ros.hysteresis.compiled.through` describes the arguments."""
-        from slpi_ros.hysteresis.compiled import through
+        from slpi_ros.hysteresis.compiled import room, through
 
         if coordinate and not lower <= self._v <= upper:
             self.forward(min(max(self._v, lower), upper))
         out = np.empty_like(x)
         direction, point, turns, depth = self._arrays(x.size)
-        done, direction, depth = through(
+        shape = self._shape_arrays()
+        done, direction, depth, _ = through(
             *(x, coordinate, float(lower), float(upper), out, direction, point, turns, depth),
             np.empty((3, 0), dtype=np.int64) if walk is None else walk,
             np.empty((2, 0)),
-            *self._shape_arrays(),
+            room(*shape[2:]),
+            *shape,
         )
         v_turns, y_turns = turns[:, :depth].tolist()
         v, y = point.tolist()
@@ -440,7 +454,7 @@ class Memory:
             (self.inverse if coordinate else self.forward)(float(x[done]))
         return out
 
-    def inverse_of_law(
+    def inverse_of_law_array(
         self, t: FloatArray, h: FloatArray, law: FloatArray, limits: tuple[float, float]
     ) -> tuple[FloatArray, FloatArray]:
         """Return the voltages (V) before a rate law, and the displacements (m) that they reach, shape (N,) each.

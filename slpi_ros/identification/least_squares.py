@@ -8,6 +8,7 @@ import numpy as np
 import osqp
 import scipy.linalg
 import scipy.sparse as sp
+import scipy.sparse.linalg
 from numpy.typing import NDArray
 
 from slpi_ros.errors import IdentificationError
@@ -186,8 +187,15 @@ class Problem:
     def penalty(self, smoothness: float, count: float) -> FloatArray:
         """Return the matrix of the roughness penalty with weight `smoothness` for `count` samples, shape (p, p)."""
         matrix = self.rough * (smoothness * count / 1000)
-        matrix[np.diag_indices_from(matrix)] += RIDGE * count
+        matrix[np.diag_indices_from(matrix)] += self._ridge * count
         return matrix
+
+    @cached_property
+    def _ridge(self) -> float:
+        """Regularisation in the units of the design: play operators move by volts, up to thousands of them."""
+        local = self.design.local
+        square: float = float(scipy.sparse.linalg.norm(local)) ** 2 / max(local.shape[0], 1)
+        return RIDGE * max(1.0, square)
 
     def solve(self, smoothness: float) -> FloatArray:
         """Return the parameters, shape (p,), of a fit to all samples in which every branch is monotone."""

@@ -36,17 +36,15 @@ WIPING_CYCLES = 10
 
 @dataclass(frozen=True)
 class Start:
-    """Initial state of the hysteresis memory: `voltage` and `displacement` after `history`.
+    """Initial state of the hysteresis memory: `voltage` (V) and `displacement` (m) after `history`.
 
     Parameters
     ----------
-    voltage : float, volts
-    displacement : float, metres
     history : tuple of float, volts
         Earlier reversal voltages, oldest first. Empty (default): the stage has never moved.
     from_rest : bool
-        True: the stage had never moved before it left the first voltage of `history`. False (default): that voltage was
-        reached by a long fall, which erased the memory.
+        Whether the stage had never moved before it left the first voltage of `history`. False (default): that voltage
+        was reached by a long fall, which erased the memory.
     """
 
     voltage: float
@@ -63,22 +61,16 @@ RESOLUTION = 2e-4
 
 @dataclass(frozen=True)
 class FitQuality:
-    """Free-run error of the model on the record of its identification.
+    """Free-run error of the model on the record, or records, `source` of its identification, at `samples` samples.
 
     Parameters
     ----------
     rms, maximum : float, metres
         Error of the fitted samples.
-    held_out_rms : float, metres
-        Held-out error, from cross-validation.
-    floor_rms : float, metres
-        Repeatability floor, estimated from the record.
-    samples : int
-        Number of fitted samples.
+    held_out_rms, floor_rms : float, metres
+        Held-out error, from cross-validation, and repeatability floor, estimated from the record.
     covered : float
         Share of the cells of the Everett function that the record visited, 0..1.
-    source : str
-        Name of the record or records.
     """
 
     rms: float
@@ -98,26 +90,19 @@ class AxisModel:
     ----------
     kind : str
         Name of the hysteresis model.
-    hysteresis : Hysteresis
     start : Start
         Initial history of the record.
     voltage_range : (float, float), volts
     displacement_range : (float, float), metres
         Ranges covered by the record. `compensate` returns only voltages within the voltage range.
-    quality : FitQuality
     effects : tuple of Effect
-        Effects besides the hysteresis, in the order in which the effects act; default: none. Those of the stage are
-        inverted; those of the sensor are taken out of measurements; those of the record hold for that record only.
+        Effects besides the hysteresis, each at most once; default: none. Those of the stage are inverted; those of the
+        sensor are taken out of measurements; those of the record hold for that record only.
     end : Start, optional
         State of the hysteresis at the end of the (last) record. None (default): unknown, as in older documents and for
         kinds that are not causal.
     sensor : Sensor
         Known delay and lag of the sensor, taken out of measurements; default: none.
-
-    Raises
-    ------
-    ModelError
-        If an effect occurs twice.
     """
 
     kind: str
@@ -131,7 +116,6 @@ class AxisModel:
     sensor: Sensor = IDEAL
 
     def __post_init__(self) -> None:
-        """Put the effects in order."""
         object.__setattr__(self, "effects", in_order(self.effects))
 
     @property
@@ -140,19 +124,11 @@ class AxisModel:
         return not isinstance(self.hysteresis, PathModel)
 
     def initial(self, start_memory: StartMemory) -> Start:
-        """Return the initial history named by `start_memory`.
+        """Return the initial history named by `start_memory`; UsageError if there is none of that name.
 
-        Parameters
-        ----------
-        start_memory : str
-            ``end``: state at the end of the record, or at its start if the end is unknown; ``start``: state at the
-            start of the record; ``wiped``: state after a decaying oscillation over the identified voltage range to 0 V,
-            or to the nearest voltage in that range.
-
-        Raises
-        ------
-        UsageError
-            If `start_memory` is none of these, or it is ``wiped`` and the model is not causal.
+        ``end``: state at the end of the record, or at its start if the end is unknown; ``start``: state at the start of
+        the record; ``wiped``, only for a causal model: state after a decaying oscillation over the identified voltage
+        range to 0 V, or to the nearest voltage in that range.
         """
         match start_memory:
             case "start":
@@ -165,13 +141,7 @@ class AxisModel:
         raise UsageError(f"start_memory is '{start_memory}'; give one of {', '.join(START_MEMORIES)}")
 
     def memory(self, start_memory: StartMemory = "end") -> Memory:
-        """Return a new memory with the initial history `start_memory`, see `initial`.
-
-        Raises
-        ------
-        UsageError
-            If the model is not causal, or `start_memory` is not known.
-        """
+        """Return a new memory with the initial history `start_memory`; UsageError if the model is not causal."""
         if isinstance(self.hysteresis, PathModel):
             raise UsageError(
                 f"kind '{self.kind}' needs the complete path in advance and does not allow streaming; "
@@ -190,24 +160,10 @@ class AxisModel:
         return memory
 
     def after(self, u: FloatArray, start_memory: StartMemory = "start") -> Start:
-        """Return the state of the memory after a voltage signal, reduced to the remembered reversals.
+        """Return the state of the memory after voltages `u`, shape (N,), volts, that reach the hysteresis.
 
-        Parameters
-        ----------
-        u : ndarray, shape (N,), volts
-            Voltages that reach the hysteresis.
-        start_memory : str
-            Initial history, see `initial`; default "start".
-
-        Returns
-        -------
-        Start
-            With at most `MOST_TURNS` reversals; beyond that some of the nested loops are omitted.
-
-        Raises
-        ------
-        UsageError
-            As `memory`.
+        It is reduced to the remembered reversals; of more than `MOST_TURNS` some of the nested loops are omitted.
+        UsageError as in `memory`.
         """
         start, memory = self.initial(start_memory), self.memory(start_memory)
         memory.forward_array(u)
@@ -251,25 +207,20 @@ class AxisModel:
     def _uncoupled_displacement(self, chain: Chain, t: FloatArray, v: FloatArray) -> FloatArray:
         if not self.effects:
             return self._forward_array(v)
-        around = EffectContext(t - t[:1])
+        around = EffectContext.since_start(t)
         u, beside = chain.reaching(v, around)
-        return forward(chain.own, self._forward_array(u) + beside, around)
+        beside += self._forward_array(u)
+        return forward(chain.own, beside, around)
 
     def seen(self, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
-        """Return what the sensor says, shape (N,), metres.
+        """Return what the sensor says, shape (N,), metres, at times `t` (s) for a result of `uncoupled_displacement`.
 
-        Parameters
-        ----------
-        t : ndarray, shape (N,), seconds
-        own : ndarray, shape (N,), metres
-            Result of `uncoupled_displacement`.
-        others : mapping of axis name to ndarray, shape (N,), metres
-            Motion of each other axis from its start, without cross-coupling.
+        `others`: motion of each other axis from its start, without cross-coupling, shape (N,), metres, by name.
         """
         return self._seen(self.chain, t, own, others)
 
     def _seen(self, chain: Chain, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
-        around = EffectContext(t - t[:1], others=others)
+        around = EffectContext.since_start(t, others)
         return self.sensor.apply(t, forward((*chain.shared, *chain.measured), own, around))
 
     @property
@@ -284,15 +235,14 @@ class AxisModel:
 
     def measure(self, t: FloatArray, x: FloatArray) -> FloatArray:
         """Return the readings of the sensor, shape (N,), metres, for the displacement `x` (m) at times `t` (s)."""
-        return self.sensor.apply(t, forward(self.chain.measured, x, EffectContext(t - t[:1])))
+        return self.sensor.apply(t, forward(self.chain.measured, x, EffectContext.since_start(t)))
 
     def correct(self, t: FloatArray, y: FloatArray) -> FloatArray:
         """Return where the stage was, shape (N,), metres, for the readings `y` (m) of its sensor at times `t` (s).
 
-        The inverse of `measure`: delay and lag of the sensor are taken out first, then its periodic error. NaN where
-        there is no reading, or not yet, see `Sensor.undo`.
+        The inverse of `measure`; NaN where there is no reading, or not yet, see `Sensor.undo`.
         """
-        return backward(self.chain.measured, self.sensor.undo(t, y), EffectContext(t - t[:1]))
+        return backward(self.chain.measured, self.sensor.undo(t, y), EffectContext.since_start(t))
 
     def streaming_sensor(self) -> StreamingSensor:
         """Return the sensor for readings that come one by one."""
@@ -314,26 +264,14 @@ class AxisModel:
         """Return the voltage to bring the stage to `y`, shape (N,), metres, and where it is held at a limit.
 
         Effects of the sensor and of the record are not inverted. Other axes are at rest. Time `t`, shape (N,), seconds,
-        is ignored without effects. The initial history is `initial(start_memory)`.
-
-        Raises
-        ------
-        UnreachableError
-            If a displacement lies far outside the identified range.
-        UsageError
-            If a displacement is not finite.
+        is ignored without effects. The initial history is `initial(start_memory)`. UnreachableError if a displacement
+        lies far outside the identified range, UsageError if one is not finite.
         """
         self.require_reachable(y)
         return self.command(t, y, limits, start_memory)
 
     def require_reachable(self, y: FloatArray) -> None:
-        """Raise an error unless the desired displacements, shape (N,), metres, are finite and in the identified range.
-
-        Raises
-        ------
-        SlpiError
-            As `compensate`.
-        """
+        """Raise an error, as `compensate`, unless `y`, (N,), metres, is finite and in the identified range."""
         require_finite(y)
         accepted = accepted_range(self.displacement_range)
         far = (y < accepted[0]) | (y > accepted[1])
@@ -352,7 +290,7 @@ class AxisModel:
             return self._invert_hysteresis(own, allowed)
         chain, (lowest, highest) = self.chain, self.chain.clipped
         between = replace(allowed, lower=max(allowed.lower, lowest), upper=max(min(allowed.upper, highest), lowest))
-        around = EffectContext(t - t[:1])
+        around = EffectContext.since_start(t)
         h = backward(chain.own, own, around)
         if chain.around:
             # The axis may start outside its limits; the first output voltage is inside.

@@ -3,7 +3,7 @@
 import json
 import os
 import textwrap
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from math import isfinite
 from typing import Any
 
@@ -17,25 +17,15 @@ from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.sensor import Sensor
 from slpi_ros.model.stage_model import StageModel
 
-SCHEMA = "slpi_ros/model/1"
+SCHEMA, EARLIER = "slpi_ros/model/2", "slpi_ros/model/1"
+# Effects whose parameters are a list since version 2: name of the list, and what version 1 meant without saying it.
+LISTS: dict[str, tuple[str, dict[str, float]]] = {"resonance": ("modes", {"gain": 1.0}), "hum": ("lines", {})}
+# Names of the fields of `FitQuality`, in order.
+QUALITY = ("rms_m", "maximum_m", "held_out_rms_m", "floor_rms_m", "samples", "covered", "source")
 
 
 def load_model(path: str | os.PathLike[str]) -> StageModel:
-    """Read a model document from a file.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    StageModel
-
-    Raises
-    ------
-    ModelError
-        If there is no such file, or it is not a valid model document of this version.
-    """
+    """Read a model document, of this version or an earlier one, from a file; ModelError if it is none."""
     try:
         text = read_input(path, MODEL_BYTES).decode()
     except (OSError, ValueError) as error:
@@ -45,36 +35,26 @@ def load_model(path: str | os.PathLike[str]) -> StageModel:
 
 
 def save_model(model: StageModel, path: str | os.PathLike[str]) -> None:
-    """Write a model document to a file atomically.
-
-    Raises
-    ------
-    ModelError
-        If the file cannot be written.
-    """
+    """Write a model document to a file atomically; ModelError if the file cannot be written."""
     text = format_model(model)
     with all_or_nothing(path, ModelError) as file:
         file.write(text)
 
 
 def parse_model(text: str, source: str) -> StageModel:
-    """Build a model from the text of a document; `source` names it in messages.
-
-    Raises
-    ------
-    ModelError
-        If the text is not a valid model document of this version.
-    """
+    """Build a model from the text of a document; ModelError, which begins with `source`, if it is not valid."""
     try:
         # Only finite numbers are valid: NaN, Infinity and 1e400 are refused at parsing.
         document = json.loads(text, parse_float=_finite, parse_int=_whole, parse_constant=_finite)
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{source}: not a model document: {error}; give a file written by 'slpi identify'") from None
     schema = document.get("schema") if isinstance(document, dict) else None
-    if schema != SCHEMA:
+    if schema not in (SCHEMA, EARLIER):
         found = textwrap.shorten(repr(schema), 80)
-        raise ModelError(f"{source}: schema is {found}, this version reads {SCHEMA!r}; identify the stage again")
-    _refuse_retired(document, source)
+        raise ModelError(
+            f"{source}: schema is {found}, this version reads {SCHEMA!r} and {EARLIER!r}; identify the stage again"
+        )
+    _update(document, source)
     try:
         validate(document, "model", source)
     except RecursionError:
@@ -82,28 +62,37 @@ def parse_model(text: str, source: str) -> StageModel:
     return model_from(document, source)
 
 
-def _refuse_retired(document: dict[str, Any], source: str) -> None:
-    """Raise ModelError if an effect has a form that this version no longer has."""
-    axes = document.get("axes")
-    for name, axis in axes.items() if isinstance(axes, dict) else ():
-        effects = axis.get("effects", []) if isinstance(axis, dict) else []
+def _update(document: dict[str, Any], source: str) -> None:
+    """Make a document of an earlier version one of the present version; ModelError if an effect has a retired form."""
+    if document.get("schema") != EARLIER:
+        return
+    document["schema"], axes = SCHEMA, document.get("axes")
+    for axis, model in axes.items() if isinstance(axes, dict) else ():
+        effects = model.get("effects") if isinstance(model, dict) else None
         for effect in effects if isinstance(effects, list) else ():
-            given = effect.get("parameters") if isinstance(effect, dict) else None
-            if isinstance(given, dict) and effect.get("name") == "rate_dependence" and "exponent" in given:
+            name, given, spread = (
+                effect.get(key) if isinstance(effect, dict) else None for key in ("name", "parameters", "uncertainty")
+            )
+            if not isinstance(name, str) or not isinstance(given, dict):
+                continue
+            if name == "rate_dependence" and "exponent" in given:
                 raise ModelError(
-                    f"{source}: axis {name[:40]!r}: rate_dependence has a retired form (a power of the rate); diagnose "
+                    f"{source}: axis {axis[:40]!r}: rate_dependence has a retired form (a power of the rate); diagnose "
                     "again from its bags with slpi diagnose"
                 )
+            if name in LISTS and "gain" not in given:
+                key, unsaid = LISTS[name]
+                effect["parameters"] = {key: [given | unsaid]}
+                if isinstance(spread, dict):
+                    effect["uncertainty"] = {f"{key}.0.{part}": deviation for part, deviation in spread.items()}
 
 
 def model_from(document: dict[str, Any], source: str) -> StageModel:
-    """Build a model from a document that follows the schema; `source` names it in messages.
+    """Build a model from a document that follows its schema, of any version, which is updated in place.
 
-    Raises
-    ------
-    ModelError
-        If the numbers are inconsistent.
+    ModelError, which begins with `source`, if the numbers are inconsistent.
     """
+    _update(document, source)
     try:
         axes = {name: _axis_from(axis) for name, axis in document["axes"].items()}
     except (ModelError, OverflowError) as error:
@@ -136,7 +125,6 @@ def _whole(text: str) -> int:
 
 
 def _axis_from(axis: dict[str, Any]) -> AxisModel:
-    quality = axis["quality"]
     ranges = {key: (float(axis[key][0]), float(axis[key][1])) for key in ("voltage_range_V", "displacement_range_m")}
     for key, (low, high) in ranges.items():
         if not low < high:
@@ -148,13 +136,10 @@ def _axis_from(axis: dict[str, Any]) -> AxisModel:
         end=_start_from(axis["end"]) if "end" in axis else None,
         voltage_range=ranges["voltage_range_V"],
         displacement_range=ranges["displacement_range_m"],
-        quality=FitQuality(
-            quality["rms_m"], quality["maximum_m"], quality["held_out_rms_m"], quality["floor_rms_m"],
-            quality["samples"], quality["covered"], quality["source"],
-        ),
+        quality=FitQuality(*(axis["quality"][key] for key in QUALITY)),
         effects=tuple(map(registry.from_document, axis.get("effects", []))),
         sensor=Sensor(**axis.get("sensor", {})),
-    )  # fmt: skip
+    )
 
 
 def _start_from(start: dict[str, Any]) -> Start:
@@ -163,16 +148,11 @@ def _start_from(start: dict[str, Any]) -> Start:
 
 
 def _start_document(start: Start) -> dict[str, Any]:
-    document = {
-        "voltage_V": start.voltage,
-        "displacement_m": start.displacement,
-        "history_V": list(start.history),
-    }
+    document = {"voltage_V": start.voltage, "displacement_m": start.displacement, "history_V": list(start.history)}
     return document | ({"from_rest": True} if start.from_rest else {})
 
 
 def _axis_document(axis: AxisModel) -> dict[str, Any]:
-    quality = axis.quality
     return {
         "kind": axis.kind,
         "voltage_range_V": list(axis.voltage_range),
@@ -182,13 +162,5 @@ def _axis_document(axis: AxisModel) -> dict[str, Any]:
         "hysteresis": kinds.to_document(axis.hysteresis),
         "effects": [registry.to_document(effect) for effect in axis.effects],
         **({"sensor": asdict(axis.sensor)} if axis.sensor else {}),
-        "quality": {
-            "rms_m": quality.rms,
-            "maximum_m": quality.maximum,
-            "held_out_rms_m": quality.held_out_rms,
-            "floor_rms_m": quality.floor_rms,
-            "samples": quality.samples,
-            "covered": quality.covered,
-            "source": quality.source,
-        },
+        "quality": dict(zip(QUALITY, astuple(axis.quality), strict=True)),
     }

@@ -14,7 +14,7 @@ PERIOD = 1e-3
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of voltage, slew rate and acceleration of an axis.
+    """Limits of voltage, slew rate and acceleration of an axis; UsageError if lower > upper or a rate is not positive.
 
     Parameters
     ----------
@@ -23,11 +23,6 @@ class Limits:
         Maximum rate of change; inf (default): no limit.
     acceleration : float, V/s^2
         Maximum change of the rate; inf (default): no limit.
-
-    Raises
-    ------
-    UsageError
-        If lower exceeds upper, or a rate limit is not positive.
     """
 
     lower: float
@@ -36,7 +31,6 @@ class Limits:
     acceleration: float = inf
 
     def __post_init__(self) -> None:
-        """Validate the limits."""
         if not self.lower <= self.upper or not self.slew > 0 or not self.acceleration > 0:
             raise UsageError(
                 f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s and acceleration "
@@ -74,15 +68,7 @@ class RateLimiter:
     period : float, seconds
         Output period; default 1 ms.
     voltage : float, volts
-        Voltage that the amplifier has; default 0.
-
-    Attributes
-    ----------
-    period : float, seconds
-    voltage : float, volts
-        Last output, or the voltage found at the amplifier.
-    rate : float, V/s
-        Rate of the last step.
+        Last output, or the voltage found at the amplifier; default 0. The rate of the last step is `rate` (V/s).
     """
 
     __slots__ = ("_changed_ns", "_goal", "_limits", "_pending", "period", "rate", "voltage")
@@ -133,14 +119,7 @@ class RateLimiter:
         return self.period if self._limits.acceleration < inf else 2.0 * self.period
 
     def reach(self, now_ns: int, fastest: float = inf) -> tuple[float, float]:
-        """Return the lowest and highest voltage (V) that can be output at `now_ns`.
-
-        Parameters
-        ----------
-        now_ns : int, nanoseconds
-        fastest : float, V/s
-            Rate below the slew limit that is not to be exceeded; default: none.
-        """
+        """Return the lowest and highest voltage (V) that can be output at `now_ns`, no faster than `fastest` (V/s)."""
         if self._pending is not None and not (self.in_motion and self._recent(now_ns)):
             self._apply_pending()
         limits, present = self._limits, self.voltage
@@ -244,23 +223,11 @@ class RateLimiter:
 
 
 def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:
-    """Return the reversal voltages (V) of a decaying oscillation, followed by the final voltage.
+    """Return the reversal voltages (V) of a decaying oscillation, followed by the final voltage `final` (V).
 
     The first cycle reaches both limits and so erases every loop between the limits. The amplitude then decreases
     linearly over the cycles; on each side it is proportional to the distance from the final voltage to the limit.
-
-    Parameters
-    ----------
-    limits : Limits
-    final : float, volts
-        Final voltage, within the limits.
-    cycles : int
-        Number of cycles, at least 1.
-
-    Raises
-    ------
-    UsageError
-        If `cycles` is below 1, or `final` is outside the limits.
+    UsageError if `cycles` is below 1, or `final` is outside the limits.
     """
     if cycles < 1 or not limits.lower <= final <= limits.upper:
         raise UsageError(

@@ -35,22 +35,15 @@ class Sensor:
 
     Parameters
     ----------
-    delay : float, seconds
-        Time by which the readings are late, from 0 (default) to `LONGEST`.
-    lag : float, seconds
-        Time constant of the sensor's low-pass filter, from 0 (default) to `LONGEST`.
-
-    Raises
-    ------
-    UsageError
-        If a value is not in its range.
+    delay, lag : float, seconds
+        Time by which the readings are late, and time constant of the sensor's low-pass filter, each from 0 (default) to
+        `LONGEST`; UsageError for any other.
     """
 
     delay: float = 0.0
     lag: float = 0.0
 
     def __post_init__(self) -> None:
-        """Validate the values."""
         for field in fields(self):
             value = getattr(self, field.name)
             if not (isfinite(value) and 0.0 <= value <= LONGEST):
@@ -66,28 +59,17 @@ class Sensor:
 
     def apply(self, t: FloatArray, x: FloatArray) -> FloatArray:
         """Return the readings, shape (N,), metres, for displacements `x` (m) at times `t` (s), at rest before."""
-        around = EffectContext(t - t[:1])
+        around = EffectContext.since_start(t)
         if self.lag:
             x = Lag(self.lag).apply(x, around)
         return Delay(self.delay).apply(x, around) if self.delay else x
 
     def undo(self, t: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the displacements for readings, the inverse of `apply`.
+        """Return the displacements, shape (N,), metres, for readings `y` (m) at times `t` (s): the inverse of `apply`.
 
         A delay is undone by the reading nearest to ``t + delay``, moved to this time along its slope, and a lag by
         ``x = z + lag dz/dt``. Interpolation would lower the noise of the readings instead, by which models are judged.
-
-        Parameters
-        ----------
-        t : ndarray, shape (N,), seconds
-            Not decreasing.
-        y : ndarray, shape (N,), metres
-            NaN where there is no reading.
-
-        Returns
-        -------
-        ndarray, shape (N,), metres
-            NaN where there is no reading, as at the end, which the sensor has not told yet.
+        NaN where there is no reading, as at the end, which the sensor has not told yet.
         """
         known = np.isfinite(y)
         if not self or np.count_nonzero(known) < 2:
@@ -109,21 +91,11 @@ IDEAL = Sensor()
 
 
 class StreamingSensor:
-    """The sensor of an axis for readings that come one by one.
+    """The sensor of an axis for readings that come one by one: its timing, and its effects, which have no memory.
 
-    A delay cannot be undone when the reading comes, and undoing a lag would amplify the noise of each reading. So the
-    reading is compared with what it would be for the setpoint, or for the model: with a `Sensed` signal.
-
-    Parameters
-    ----------
-    timing : Sensor
-    effects : tuple of Effect
-        Effects of the sensor, without memory.
-
-    Attributes
-    ----------
-    late : bool
-        Whether readings are to be compared with `Sensed` signals.
+    A delay cannot be undone when the reading comes, and undoing a lag would amplify the noise of each reading. So, if
+    the sensor is `late`, the reading is compared with what it would be for the setpoint, or for the model: with a
+    `Sensed` signal.
     """
 
     def __init__(self, timing: Sensor, effects: tuple[Effect, ...]) -> None:
@@ -146,14 +118,9 @@ class StreamingSensor:
 class Sensed:
     """A displacement that is held between samples, as corrected readings of it would be: after lag and delay.
 
-    If the stage is where the displacement is, `at` is what `StreamingSensor.correct` makes of the reading, while it
-    moves too: with ``S`` the periodic error and ``L`` the lag, the reading is ``L S x``, and both are ``S^-1 L S x``.
-
-    Parameters
-    ----------
-    sensor : StreamingSensor
-    displacement : float, metres
-        Displacement before the first sample.
+    If the stage is where the displacement is, at first at `displacement` (m), `at` is what `StreamingSensor.correct`
+    makes of the reading, while it moves too: with ``S`` the periodic error and ``L`` the lag, the reading is ``L S x``,
+    and both are ``S^-1 L S x``.
     """
 
     __slots__ = ("_before", "_delay_ns", "_lag_ns", "_samples", "_sensor")
@@ -206,15 +173,10 @@ class Sensed:
 
 
 def corrected(record: Record, corrections: Mapping[str, Callable[[FloatArray, FloatArray], FloatArray]]) -> Record:
-    """Return a record with corrected readings.
+    """Return a record with corrected readings; one whose stamps step back is unchanged: what evaluates it refuses it.
 
-    Parameters
-    ----------
-    record : Record
-        One whose stamps step back is returned unchanged: whatever evaluates it refuses it.
-    corrections : mapping of axis name to callable
-        Returns the displacement of the stage for times (s) and readings (m), shape (N,) each: `AxisModel.correct`, or
-        `Sensor.undo`. Axes that are not in the record are ignored.
+    `corrections` holds by axis what returns the displacement of the stage for times (s) and readings (m), shape (N,)
+    each: `AxisModel.correct`, or `Sensor.undo`. Axes that are not in the record are ignored.
     """
     own = [name for name in corrections if name in record.axes]
     if not own or first_step_back(record.time_ns) is not None:

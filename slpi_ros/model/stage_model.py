@@ -34,10 +34,8 @@ class StageModel:
     Parameters
     ----------
     axes : mapping of axis name to AxisModel
-    hardware_id : str
-        Hardware id of the identified stage; "" (default) if unknown.
-    created : str
-        ISO 8601 time of identification, UTC; "" (default) if unknown.
+    hardware_id, created : str
+        Hardware id of the identified stage, and ISO 8601 time of identification, UTC; "" (default) if unknown.
     """
 
     axes: Mapping[str, AxisModel]
@@ -53,7 +51,8 @@ class StageModel:
     def simulate(self, t: ArrayLike, v: Signal) -> Any:
         """Return what the sensors will say for a voltage signal, free-run from the initial history of the record.
 
-        Effects of the stage and of its sensors act; drift and hum of the record do not.
+        Effects of the stage and of its sensors act; drift and hum of the record do not. SlpiError if axes, lengths or
+        values are not consistent.
 
         Parameters
         ----------
@@ -66,11 +65,6 @@ class StageModel:
         -------
         ndarray, shape (N,), or dict of axis name to ndarray, shape (N,), metres
             In the form of `v`.
-
-        Raises
-        ------
-        SlpiError
-            If axes, lengths or values are not consistent.
         """
         time, voltage = self._signals(t, v, "voltage")
         own: dict[str, FloatArray] = {}
@@ -85,6 +79,7 @@ class StageModel:
         """Return the voltage for a desired displacement of the stage, from an assumed initial history.
 
         Only effects of the stage are inverted. Without effects of sensor and record, this is the inverse of `simulate`.
+        UnreachableError if a displacement lies far outside the identified range; other SlpiErrors as `simulate`.
 
         Parameters
         ----------
@@ -93,21 +88,13 @@ class StageModel:
         y : array_like, shape (N,), or mapping of axis name to array_like, shape (N,), metres
             Where the stage shall be.
         start_memory : str
-            Assumed initial history: ``end`` (default) or ``start`` of the record, or ``wiped``; see
-            `AxisModel.initial`.
+            Assumed initial history, `AxisModel.initial`: ``end`` (default) or ``start`` of the record, or ``wiped``.
 
         Returns
         -------
         ndarray, shape (N,), or dict of axis name to ndarray, shape (N,), volts
             In the form of `y`, within the identified voltage range. For displacements slightly outside the reachable
             range the voltage is held at the limit, with a `HeldAtLimitWarning`.
-
-        Raises
-        ------
-        UnreachableError
-            If a displacement lies far outside the identified range.
-        SlpiError
-            If axes, lengths or values are not consistent.
         """
         answers = self.command(t, y, start_memory=start_memory)
         for _, held in answers.values():
@@ -119,24 +106,10 @@ class StageModel:
     def command(
         self, t: ArrayLike, y: Signal, limits: Limits | None = None, start_memory: StartMemory = "end"
     ) -> dict[str, tuple[FloatArray, Mask]]:
-        """Return the voltage for a desired displacement, and a mask of the samples at which it is held at a limit.
+        """Return by axis the voltage (V), as `compensate`, and where it is held at a limit, shape (N,) each.
 
-        Parameters
-        ----------
-        t, y, start_memory
-            As in `compensate`.
-        limits : Limits, optional
-            Limits of every axis, within the identified voltage range; default: that range. With a slew or acceleration
-            limit the voltage is that of `streams`: it begins at the voltage of the start memory.
-
-        Returns
-        -------
-        dict of axis name to (ndarray, shape (N,), volts, and ndarray of bool, shape (N,))
-
-        Raises
-        ------
-        SlpiError
-            As `compensate`.
+        `limits` are those of every axis, within the identified voltage range; default: that range. With a slew or
+        acceleration limit the voltage is that of `streams`: it begins at the voltage of the start memory.
         """
         time, desired = self._signals(t, y, "displacement")
         if limits is not None and min(limits.slew, limits.acceleration) < math.inf:
@@ -187,19 +160,9 @@ class StageModel:
     def with_sensor(
         self, *, delay: float | None = None, lag: float | None = None, axes: Sequence[str] | None = None
     ) -> "StageModel":
-        """Return the model with another known timing of the sensor.
+        """Return the model with another known delay and lag (s) of the sensor, see `Sensor`; default: those it has.
 
-        Parameters
-        ----------
-        delay, lag : float, seconds, optional
-            See `slpi_ros.model.sensor.Sensor`; default: those of the model.
-        axes : sequence of str, optional
-            Axes with this sensor; default: all.
-
-        Raises
-        ------
-        UsageError
-            If a time is not possible, or there is no such axis.
+        `axes`: axes with this sensor; default: all. UsageError if a time is not possible, or there is no such axis.
         """
         changed = dict(self.axes)
         for name in self.axes if axes is None else axes:
@@ -218,10 +181,7 @@ class StageModel:
     def streams(self, start_memory: StartMemory = "end") -> StageStream:
         """Return a causal compensator of all axes, ``step(t, {axis: y}) -> {axis: v}``, seconds and metres to volts.
 
-        Raises
-        ------
-        UsageError
-            If the model of an axis is not causal.
+        UsageError if the model of an axis is not causal.
         """
         streams = {name: axis.stream(start_memory=start_memory) for name, axis in self.axes.items()}
         return StageStream(streams, self.coupling, self.origins)

@@ -25,16 +25,14 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class StreamState:
-    """Complete state of a `StreamingInverse`.
+    """Complete state of a `StreamingInverse`: of its memory, and of its effects by name.
 
     Parameters
     ----------
-    memory : MemoryState
     voltage, goal : float, volts
         Present command, and the voltage required by the last desired displacement.
     desired, displacement : float, metres
         Last setpoint of the hysteresis, and displacement of the axis without cross-coupling.
-    effects : mapping of effect name to its state
     """
 
     memory: MemoryState
@@ -57,7 +55,7 @@ class StreamingInverse:
     memory : Memory
         Hysteresis memory in its initial state, modified in place. The effects start in equilibrium.
     displacement_range : (float, float), metres
-        Smallest and largest displacement of the identified range.
+        Identified range. Displacements in the wider range `accepted` (m) are accepted.
     limits : Limits
         Limits of the command; further restricted to what passes the effects.
     effects : tuple of Effect
@@ -65,14 +63,11 @@ class StreamingInverse:
 
     Attributes
     ----------
-    memory : Memory
     pace : RateLimiter
         Limits of voltage, slew rate and acceleration; alone, in the time of the samples, of which at most `MAX_DT`
         counts. A compensator gives it that of its output, on the steady clock.
     goal : float, volts
         Voltage that the last sample asked for, before slew rate and acceleration limits.
-    accepted : (float, float), metres
-        Smallest and largest accepted displacement.
     desired : float, metres
         Last setpoint of the hysteresis.
     coupled : float, metres
@@ -88,7 +83,6 @@ class StreamingInverse:
     ) -> None:
         chain = Chain.of(effects)
         self.memory, self._clipped = memory, chain.clipped
-        self._without_effects = not (chain.before or chain.around or chain.own or chain.shared)
         self.accepted = self._lowest, self._highest = accepted_range(displacement_range)
         self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
         self._t = -inf
@@ -96,7 +90,9 @@ class StreamingInverse:
         self._before, self._behind = _streaming(chain.before), _streaming(chain.own)
         self._around: StreamingAround | None = chain.around.streaming() if chain.around else None
         self._around_name = chain.around.name if chain.around else ""
-        self._static = not (self._before or self._around or self._behind)
+        # Only the hysteresis, and what is around it: the command alone determines where the axis is.
+        self._direct = not (self._before or self._behind)
+        self._alone = not (chain.before or chain.own or chain.shared)
         self.pace = RateLimiter(limits, MAX_DT / 2)
         self.limits = limits
         # The axis may start outside its limits; the first output voltage is inside.
@@ -129,8 +125,7 @@ class StreamingInverse:
     def limits(self, limits: Limits) -> None:
         self.pace.limits = limits = self.restricted(limits)
         self._v_min, self._v_max = limits.lower, limits.upper
-        # Only the inverse of the hysteresis is required.
-        self._bare = self._without_effects and limits.slew == limits.acceleration == inf
+        self._free = self._alone and limits.slew == limits.acceleration == inf
 
     def restricted(self, limits: Limits) -> Limits:
         """Return limits, restricted to the voltages that pass the effects."""
@@ -140,7 +135,7 @@ class StreamingInverse:
     @property
     def timeless(self) -> bool:
         """Whether the model does not depend on time."""
-        return self._static
+        return not self._streaming
 
     @property
     def voltage(self) -> float:
@@ -150,20 +145,24 @@ class StreamingInverse:
     @property
     def uncoupled_displacement(self) -> float:
         """Displacement (m) of the model for the present voltage, without cross-coupling."""
-        return self.memory.displacement if self._static else self._displacement
+        return self._inside if self._direct else self._displacement
+
+    @property
+    def _inside(self) -> float:
+        """Displacement (m) of the hysteresis and what goes beside it."""
+        return self.memory.displacement + (self._around.beside if self._around else 0.0)
 
     @property
     def missed(self) -> bool:
         """Whether any limit prevented the model from reaching the last desired displacement."""
-        if not self._static:
-            return self._missing != 0.0
-        return abs(self.desired - self.memory.displacement) > self._rounding
+        return self._beyond_rounding(self.desired) != 0.0 if self._direct else self._missing != 0.0
 
     @property
     def held(self) -> bool:
         """Whether the voltage is held at the limit beyond which the last desired displacement lies."""
-        missing = short = self._beyond_rounding(self.desired)
-        if not self._static:
+        if self._direct:
+            missing = short = self._beyond_rounding(self.desired)
+        else:
             missing, short = self._missing, self._short
         limits, v = self.pace.limits, self.voltage
         # With effects, a limit is reached only up to rounding errors, and their inverse may overshoot.
@@ -174,12 +173,8 @@ class StreamingInverse:
     def check(self, t: float, y: float) -> None:
         """Raise the error that `step` would raise, without a change of state.
 
-        Raises
-        ------
-        UsageError
-            If `t` (s) or `y` (m) is not finite, or time runs backwards.
-        UnreachableError
-            If `y` lies far outside the identified displacement range.
+        UsageError if `t` (s) or `y` (m) is not finite, or time runs backwards; UnreachableError if `y` lies far outside
+        the identified displacement range.
         """
         if not (isfinite(t) and isfinite(y)):
             raise UsageError(f"sample t = {t} s, displacement = {y} m is not finite; omit the sample")
@@ -189,18 +184,16 @@ class StreamingInverse:
             raise UnreachableError(refusal(y, self.accepted))
 
     def step(self, t: float, y: float) -> float:
-        """Return the voltage (V) for the desired displacement `y` (m) at time `t` (s).
-
-        Raises
-        ------
-        SlpiError
-            As in `check`; the state is unchanged.
-        """
+        """Return the voltage (V) for the desired displacement `y` (m) at time `t` (s); errors as in `check`."""
         if not (self._t <= t < inf and self._lowest <= y <= self._highest):
             self.check(t, y)
-        if self._bare:
-            v = self.memory.inverse(y, self._v_min, self._v_max)
+        if self._free:
             self.desired = y
+            if self._around:
+                dt = t - self._t if self._t > -inf else 0.0
+                v = self._command = self._around.inverse(dt, y, self.memory, self._v_min, self._v_max)
+            else:
+                v = self.memory.inverse(y, self._v_min, self._v_max)
         else:
             now_ns, before = nanoseconds(t), t if self._t == -inf else self._t
             # Rate limits count from the last sample, whether the voltage changed or not; before the first, no time.
@@ -214,18 +207,13 @@ class StreamingInverse:
     def move(self, dt: float, y: float, now_ns: int) -> float:
         """Return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last sample, without checks.
 
-        `now_ns` (ns) is the time on the clock of `pace`.
-
-        Raises
-        ------
-        UsageError
-            If the model cannot reach `y`; without effects the state is unchanged.
+        `now_ns` (ns) is the time on the clock of `pace`. UsageError if the model cannot reach `y`; without effects the
+        state is unchanged.
         """
-        if self._static:
-            h = y - self.coupled
-            v = self._move(dt, dt, h, now_ns)
-            self.desired = h
-            return v
+        if self._direct:
+            self.desired = y - self.coupled
+            self._command = self._move(dt, dt, self.desired, now_ns)
+            return self._command
         counted = dt
         if dt > MAX_DT:
             # The voltage was held during the pause; only its last part counts for the new voltage, except in the effect
@@ -248,8 +236,9 @@ class StreamingInverse:
 
         For what a slew or acceleration limit has held back of the last sample.
         """
-        if self._static:
-            return self._move(dt, dt, self.desired, now_ns)
+        if self._direct:
+            self._command = self._move(dt, dt, self.desired, now_ns)
+            return self._command
         desired, goal = self.desired, self.goal
         v = self.pace.step(goal, now_ns)
         self.drive(v, dt)
@@ -267,14 +256,14 @@ class StreamingInverse:
 
     def wait(self, duration: float) -> None:
         """Advance the effects by `duration` (s) at the present voltage; `pace` stays where the amplifier is."""
-        if not self._static:
+        if not self.timeless:
             self._apply(duration, self.voltage)
 
     def _apply(self, dt: float, voltage: float) -> None:
         """Let memory and effects follow a voltage (V), `dt` (s) after the last sample."""
         self._command = self.goal = voltage
         self.memory.forward(self._reaching(dt, voltage))
-        self.desired, self._missing = self.memory.displacement, 0.0
+        self.desired, self._missing = self._inside, 0.0
         self._follow(dt)
 
     def snapshot(self) -> StreamState:
@@ -305,7 +294,7 @@ class StreamingInverse:
             self._around.resume(before._around, before.voltage)
         # The command is set without elapsed time.
         self.memory.forward(self._reaching(0.0, before.voltage))
-        self.desired = self.memory.displacement
+        self.desired = self._inside
         for name, streaming in self._behind.items():
             if name in before._behind:
                 streaming.resume(before._behind[name], self.memory.displacement)
@@ -326,44 +315,49 @@ class StreamingInverse:
         that for the rate limits.
         """
         memory, pace, around = self.memory, self.pace, self._around
-        if not self._before and not around and pace.limits.acceleration == inf:
-            v = self.goal = pace.move(memory.inverse(h, *pace.reach(now_ns)), now_ns)
-            if not self._static:
-                self._missing = self._beyond_rounding(h)
+        if not self._before and pace.limits.acceleration == inf:
+            v = self.goal = pace.move(self._invert(elapsed, h, *pace.reach(now_ns)), now_ns)
+            self._missing = self._beyond_rounding(h)
             return v
-        state, limits = memory.snapshot(), pace.limits
-        if around:
-            goal = around.inverse(elapsed, h, memory, limits.lower, limits.upper)
-        else:
-            goal = memory.inverse(h, limits.lower, limits.upper)
-        u = memory.voltage
-        self._missing = self._beyond_rounding(h - (around.beside if around else 0.0))
+        state, felt, limits = memory.snapshot(), around.snapshot() if around else None, pace.limits
+        goal = inside = self._invert(elapsed, h, limits.lower, limits.upper)
+        self._missing = self._beyond_rounding(h)
         for streaming in reversed(self._before.values()):
             goal = streaming.inverse(dt, goal)
-        v = pace.step(goal, now_ns)
+        v = reached = pace.step(goal, now_ns)
         if not self._missing and abs(goal - v) > ROUNDING * (1.0 + abs(goal)):
             self._missing = goal - v
         self.goal = goal
-        reached = self._reaching(dt, v, elapsed)
-        if reached != u:
+        for streaming in self._before.values():
+            reached = streaming.forward(dt, reached)
+        if reached != inside:
             memory.restore(state)
+            if around:
+                around.restore(felt)
+                reached = around.forward(elapsed, reached)
             memory.forward(reached)
         return v
 
+    def _invert(self, dt: float, h: float, lower: float, upper: float) -> float:
+        """Move the memory towards a displacement (m) and return the voltage (V) for it, within limits (V)."""
+        if self._around:
+            return self._around.inverse(dt, h, self.memory, lower, upper)
+        return self.memory.inverse(h, lower, upper)
+
     def _beyond_rounding(self, h: float) -> float:
-        """Return the setpoint `h` minus the displacement of the hysteresis (m); 0 if it is only a rounding error."""
-        missing = h - self.memory.displacement
+        """Return the setpoint `h` minus the displacement inside (m); 0 if it is only a rounding error."""
+        missing = h - self._inside
         return missing if abs(missing) > self._rounding else 0.0
 
-    def _reaching(self, dt: float, v: float, elapsed: float | None = None) -> float:
-        """Return the voltage (V) that the hysteresis feels for a command `v` (V), with times as in `_move`."""
+    def _reaching(self, dt: float, v: float) -> float:
+        """Return the voltage (V) that the hysteresis feels for a command `v` (V), `dt` (s) later."""
         for streaming in self._before.values():
             v = streaming.forward(dt, v)
-        return self._around.forward(dt if elapsed is None else elapsed, v) if self._around else v
+        return self._around.forward(dt, v) if self._around else v
 
     def _follow(self, dt: float) -> None:
         """Propagate the output of the hysteresis through the effects after it."""
-        y = self.memory.displacement + (self._around.beside if self._around else 0.0)
+        y = self._inside
         for streaming in self._behind.values():
             y = streaming.forward(dt, y)
         self._displacement = y
@@ -403,13 +397,8 @@ class StageStream:
     ----------
     streams : mapping of axis name to StreamingInverse
         Streaming inverse of each axis, modified in place.
-    coupling : Coupling
     origins : mapping of axis name to float, metres
         Displacement of each axis from which its motion is measured for cross-coupling.
-
-    Attributes
-    ----------
-    streams : dict of axis name to StreamingInverse
     """
 
     def __init__(
@@ -421,10 +410,7 @@ class StageStream:
     def step(self, t: float, y: Mapping[str, float]) -> dict[str, float]:
         """Return the voltages (V) for desired displacements `y` (m) at time `t` (s); other axes hold their voltage.
 
-        Raises
-        ------
-        SlpiError
-            As `StreamingInverse.check`, or if an axis is unknown; the state is unchanged.
+        Errors, as in `StreamingInverse.check` or for an axis that there is not, change nothing.
         """
         for name, desired in y.items():
             if name not in self.streams:

@@ -170,15 +170,16 @@ def _parameters(document: Mapping[str, object]) -> str:
 def _value(name: str, value: object, uncertainty: Mapping[str, float]) -> str:
     match value:
         case float() | int():
-            return _estimate(value, uncertainty.get(name), 1.0 if name == "phase" else abs(value))
+            scale = 1.0 if name.rpartition(".")[2] == "phase" else abs(value)
+            return _estimate(value, uncertainty.get(name), scale)
+        case [Mapping(), *_]:
+            return "; ".join(_value(f"{name}.{k}", one, uncertainty) for k, one in enumerate(value))
         case list() | tuple():
             largest = max((abs(one) for one in value), default=0.0)
             shown = (_estimate(one, uncertainty.get(f"{name}.{k}"), largest) for k, one in enumerate(value))
             return f"[{', '.join(shown)}]"
         case Mapping():
-            return ", ".join(
-                f"{key}: {_estimate(one, uncertainty.get(f'{name}.{key}'), abs(one))}" for key, one in value.items()
-            )
+            return ", ".join(f"{key}: {_value(f'{name}.{key}', one, uncertainty)}" for key, one in value.items())
         case _:
             return str(value)
 

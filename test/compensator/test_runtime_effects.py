@@ -13,6 +13,7 @@ from slpi_ros.compensator.model_swap import take_over
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.filters import Mode as FlexureMode
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
@@ -21,7 +22,7 @@ from slpi_ros.model.stage_model import StageModel
 
 MS, START = 1_000_000, 10**18
 DT = 1e-3
-LAG, CREEP, MODE = Lag(0.01), Creep((0.03, 0.3), (0.03, 0.04)), Resonance(150.0, 0.05)
+LAG, CREEP, MODE = Lag(0.01), Creep((0.03, 0.3), (0.03, 0.04)), Resonance((FlexureMode(150.0, 0.05),))
 X = replace(axis_model(FAMILY_CASE), displacement_range=(2e-6, 14e-6), voltage_range=(-10.0, 110.0))
 Y = replace(axis_model(PI_CASE), voltage_range=(-10.0, 90.0))
 COUPLED = StageModel({

@@ -1,6 +1,7 @@
 """The memory in a file: back as it was, or refused in one line."""
 
 import errno
+import hashlib
 import json
 import os
 import struct
@@ -28,7 +29,7 @@ from slpi_ros.compensator.persistence import (
     save_memory,
 )
 from slpi_ros.errors import ModelError
-from slpi_ros.model.document import save_model
+from slpi_ros.model.document import format_model, save_model
 
 MODEL = two_axes()
 SAVED = SavedMemory(
@@ -43,6 +44,11 @@ def test_it_comes_back_to_the_last_bit(tmp_path):
     assert load_memory(path) == SAVED
     SAVED.require_fit(MODEL, ["y", "x"])
     assert load_memory(path).last_voltages == {"x": 1 / 3, "y": -0.1}
+
+
+def test_a_memory_saved_with_version_1_of_the_model_still_belongs_to_it():
+    text = format_model(MODEL).replace("slpi_ros/model/2", "slpi_ros/model/1")
+    assert model_id(MODEL) == hashlib.sha256(text.encode()).hexdigest()
 
 
 def test_it_belongs_to_one_model_and_its_axes():
@@ -90,7 +96,7 @@ def test_another_document_is_not_overwritten(tmp_path, complete):
     save_model(MODEL, path)
     before = path.read_bytes()
     for _ in range(2):
-        with pytest.raises(ModelError, match="slpi_ros/model/1"):
+        with pytest.raises(ModelError, match="slpi_ros/model/2"):
             MemoryFile(str(path)).save(MODEL, SAVED.axes, complete)
     assert path.read_bytes() == before and not (tmp_path / "model.json.last").exists()
     for damaged in ("", "{", '{"schema": "slpi_ros/saved_memory/1"}', "[]", "\0" * 400):

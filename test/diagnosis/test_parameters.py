@@ -17,10 +17,12 @@ def test_every_effect_has_free_parameters():
 
 
 @given(EVERY)
-def test_each_free_parameter_has_a_name_and_a_step(effect):
-    values = free(effect)
-    assert len(names(effect)) == values.size == steps(effect, T, V).size
-    assert np.all(steps(effect, T, V) > 0)
+def test_each_free_parameter_has_a_name_and_a_step_that_changes_it(effect):
+    effect = moved(effect, free(effect))
+    values, own = free(effect), steps(effect, T, V)
+    assert len(names(effect)) == values.size == own.size
+    for k in range(own.size):
+        assert moved(effect, values + own * (np.arange(own.size) == k)) != effect
 
 
 @given(EVERY)

@@ -10,8 +10,9 @@ from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.gain_drift import GainDrift
-from slpi_ros.effects.hum import Hum
+from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
@@ -73,18 +74,29 @@ def rate_laws(most: float = 3.0, leads: int = 0) -> st.SearchStrategy[RateDepend
     )
 
 
+@st.composite
+def resonances(draw: st.DrawFn) -> Resonance:
+    """Draw one to three modes that carry all of the motion, or a part of it."""
+    shares = draw(st.lists(numbers(0.05, 1), min_size=1, max_size=3))
+    total = draw(st.just(1.0) | numbers(0.02, 0.999))
+    gains = (total * np.array(shares) / sum(shares)).tolist()
+    return Resonance(tuple(Mode(draw(powers(20, 2000)), draw(powers(1e-3, 0.5)), gain) for gain in gains))
+
+
+LINES = st.builds(Line, powers(1, 1000), powers(1e-10, 1e-7), numbers(-7, 7))
+
 BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "delay": st.builds(Delay, numbers(-0.2, 0.2)),
     "lag": st.builds(Lag, powers(1e-4, 1)),
     "saturation": saturations(),
     "rate_dependence": rate_laws(),
     "creep": creeps(),
-    "resonance": st.builds(Resonance, powers(20, 2000), powers(1e-3, 0.5)),
+    "resonance": resonances(),
     "gain_drift": gain_drifts(),
     "cross_coupling": st.builds(CrossCoupling, st.dictionaries(st.sampled_from("yz"), numbers(-0.4, 0.4), min_size=1)),
     "thermal_drift": drifts(),
     "sensor_periodic": sensors(),
-    "hum": st.builds(Hum, powers(1, 1000), powers(1e-10, 1e-7), numbers(-7, 7)),
+    "hum": st.builds(Hum, st.lists(LINES, min_size=1, max_size=3).map(tuple)),
 }
 EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__) | rate_laws(leads=3)
 # They change what moves, and leave what rests as it is.

@@ -14,6 +14,7 @@ import slpi_ros
 from benchmarks.paths import scan_path
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
+from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.excitation.drives import calibration_drive
@@ -31,7 +32,7 @@ SLOW = physics.Creep(0.02, 1e-2, 1e3)
 CREEP = Creep(tuple(SLOW.time_constants.tolist()), tuple(SLOW.gains.tolist()))
 CREEPING = {"creep_gain": 0.02, "creep_shortest": 1e-2, "creep_longest": 1e3}
 LAG, LAGGING = Lag(0.015), {"amplifier_lag": 0.015}
-MODE, RINGING = Resonance(80.0, 0.03), {"resonance_frequency": 80.0, "resonance_damping": 0.03}
+MODE, RINGING = Resonance((Mode(80.0, 0.03),)), {"resonance_frequency": 80.0, "resonance_damping": 0.03}
 CASES = {
     "creep": ((CREEP,), CREEPING),
     "lag": ((LAG,), LAGGING),

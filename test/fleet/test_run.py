@@ -132,7 +132,7 @@ def test_the_cause_of_an_error_that_is_no_change_is_named(stages, client, tmp_pa
     assert rows["a-5"].diagnosis == "named" and rows["a-5"].verdict != bags.CHANGED
     (cause,) = rows["a-5"].causes
     assert cause["name"] == "hum" and cause["p_value"] < 0.01 and cause["share_of_residual"] > 0.9
-    assert json.loads(cause["parameters"])["frequency"] == pytest.approx(13.7, abs=0.02)
+    assert json.loads(cause["parameters"])["lines"][0]["frequency"] == pytest.approx(13.7, abs=0.02)
 
 
 def test_a_bag_of_an_unknown_stage_stands_alone(stages, client, tmp_path):

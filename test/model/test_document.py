@@ -9,8 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import assert_same_model, axis_models, two_axes
 
+from slpi_ros.effects.filters import Mode
+from slpi_ros.effects.hum import Hum, Line
+from slpi_ros.effects.resonance import Resonance
 from slpi_ros.errors import ModelError
-from slpi_ros.model.document import SCHEMA, format_model, load_model, parse_model, save_model
+from slpi_ros.model.document import EARLIER, SCHEMA, format_model, load_model, model_from, parse_model, save_model
 from slpi_ros.model.stage_model import StageModel
 
 MODEL = two_axes()
@@ -60,17 +63,89 @@ def test_files_keep_every_bit(tmp_path):
 
 
 def test_units_and_version_stand_in_the_document():
-    assert DOCUMENT["schema"] == SCHEMA == "slpi_ros/model/1"
+    assert DOCUMENT["schema"] == SCHEMA == "slpi_ros/model/2"
     assert DOCUMENT["axes"]["x"]["voltage_range_V"] == [0.0, 100.0]
     assert DOCUMENT["axes"]["x"]["start"] == {"voltage_V": 0.0, "displacement_m": 2e-6, "history_V": [0.0, 60.0, 20.0]}
     assert DOCUMENT["axes"]["y"]["hysteresis"] == {"thresholds_V": [0.0, 4.0], "weights_m_per_V": [1e-7, 2e-8]}
 
 
 @pytest.mark.parametrize(
-    "version", ["slpi_ros/model/2", "slpi_ros/diagnosis/1", "", None, 1, ["slpi_ros/model/1"], {"a": 1}]
+    "version", ["slpi_ros/model/3", "slpi_ros/diagnosis/2", "", None, 1, ["slpi_ros/model/1"], {"a": 1}]
 )
 def test_wrong_version(version):
     refused(changed("schema", to=version), "schema is ")
+
+
+def of_version_1(*effects: object) -> str:
+    document = copy.deepcopy(DOCUMENT) | {"schema": EARLIER}
+    document["axes"]["x"]["effects"] = list(effects)
+    return json.dumps(document)
+
+
+RINGING = {"name": "resonance", "parameters": {"frequency": 100.0, "damping": 0.02}, "uncertainty": {"damping": 1e-3}}
+HUMMING = {"name": "hum", "parameters": {"frequency": 50.0, "amplitude": 1e-9, "phase": 0.5}}
+RATE = {"name": "rate_dependence", "parameters": {"widening": 0.1, "exponent": 0.1}}
+
+
+def test_version_1_is_read_and_version_2_is_written():
+    """Scalars of resonance and hum become lists of one; all else is as it was."""
+    model = parse_model(of_version_1(RINGING, HUMMING), "here.json")
+    ringing = Resonance((Mode(100.0, 0.02, 1.0),), {"modes.0.damping": 1e-3})
+    assert model.axes["x"].effects == (ringing, Hum((Line(50.0, 1e-9, 0.5),)))
+    document = json.loads(format_model(model))
+    assert document["schema"] == SCHEMA
+    assert document["axes"]["x"]["effects"][0] == {
+        "name": "resonance",
+        "parameters": {"modes": [{"frequency": 100.0, "damping": 0.02, "gain": 1.0}]},
+        "uncertainty": {"modes.0.damping": 1e-3},
+    }
+    assert document["axes"]["x"]["effects"][1]["parameters"] == {"lines": [HUMMING["parameters"]]}
+    assert_same_model(parse_model(of_version_1(), "here.json"), MODEL)
+    assert_same_model(model_from(json.loads(of_version_1(RINGING, HUMMING)), "here.json"), model)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        RATE,
+        RINGING | {"parameters": {"modes": [{"frequency": 100.0, "damping": 0.02, "gain": 1.0}]}},
+        RINGING | {"parameters": {"frequency": 100.0, "damping": 0.02, "gain": 1.0}},
+        RINGING | {"parameters": {"frequency": 100.0}},
+        RINGING | {"parameters": {"frequency": [100.0], "damping": 0.02}},
+        RINGING | {"parameters": [100.0, 0.02]},
+        RINGING | {"uncertainty": [1e-3]},
+        RINGING | {"uncertainty": {"damping": -1.0}},
+        HUMMING | {"parameters": HUMMING["parameters"] | {"more": 1.0}},
+        {"name": ["hum"], "parameters": {}},
+        {"name": "hum"},
+        [],
+        None,
+    ],
+    ids=str,
+)
+def test_what_is_no_effect_of_version_1(effect):
+    refused(of_version_1(effect), "diagnose again from its bags" if effect is RATE else "")
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "one"),
+    [
+        ("resonance", "modes", {"frequency": 100.0, "damping": 0.02, "gain": 0.1}),
+        ("hum", "lines", HUMMING["parameters"]),
+    ],
+)
+def test_lists_that_say_what_cannot_be(name, key, one):
+    def text(parameters: object) -> str:
+        return changed("axes", "x", "effects", to=[{"name": name, "parameters": parameters}])
+
+    assert len(parse_model(text({key: [one] * 3}), "here.json").axes["x"].effects) == 1
+    lists = [[], [[]], [None], [1.0], ["a"], {}, one, None, [one] * 101, [one, {}], [one | {"more": 1.0}]]
+    lists += [[one | {each: value}] for each in one for value in (None, [], {}, "1", True, -1e300, 1e300)]
+    lists += [[{each: one[each] for each in one if each != left}] for left in one]
+    for each in lists:
+        refused(text({key: each}))
+    for each in ({}, one, {key: [one], "more": 1.0}, {key.upper(): [one]}):
+        refused(text(each))
 
 
 def test_every_truncation_is_refused():

@@ -12,8 +12,9 @@ from strategies import FAMILY_CASE, PI_CASE, axis_model, two_axes
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.gain_drift import GainDrift
-from slpi_ros.effects.hum import Hum
+from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
@@ -82,7 +83,7 @@ def test_an_independent_stage_goes_where_it_shall_whatever_the_model_knows_of_se
 
 
 def test_what_the_sensor_will_say_has_its_effects_and_none_of_the_record():
-    sensor, hum = SensorPeriodic(3e-7, 5e-9, 1.0), Hum(50.0, 3e-9, 0.0)
+    sensor, hum = SensorPeriodic(3e-7, 5e-9, 1.0), Hum((Line(50.0, 3e-9, 0.0),))
     axis, v = with_effects(CREEP, DRIFT, sensor, hum), X.compensate(T, path())[0]
     there = with_effects(CREEP).simulate(T, v)
     np.testing.assert_allclose(axis.stage_only.simulate(T, v), there, rtol=0, atol=1e-20)
@@ -110,7 +111,9 @@ def test_after_its_record_a_gain_drift_keeps_its_last_value():
         (Lag(0.015), 2e-4),
         (Delay(0.02), 1e-3),
         (Delay(-0.02), 1e-3),
-        (Resonance(150.0, 0.02), 1e-3),
+        (Resonance((Mode(150.0, 0.02),)), 1e-3),
+        (Resonance((Mode(80.0, 0.05, 0.5), Mode(150.0, 0.02, 0.3))), 1e-5),
+        (Resonance((Mode(80.0, 0.05, 0.6), Mode(150.0, 0.02, 0.4))), 1e-4),
         (RateDependence(1.0, 0.1, 2e-8), 1e-12),
         (Saturation(-10.0, 95.0), 1e-9),
     ],
@@ -243,7 +246,7 @@ def test_documents_of_before_there_were_effects():
         {"name": "lag", "parameters": {"time_constant": 1, "more": 1}},
         {"name": "lag", "parameters": {"time_constant": 1}, "uncertainty": {"time_constant": -1}},
         {"name": "lag", "parameters": {"time_constant": 1}, "uncertainty": {"gain": 1}},
-        {"name": "resonance", "parameters": {"frequency": 100, "damping": 2}},
+        {"name": "resonance", "parameters": {"modes": [{"frequency": 100, "damping": 2, "gain": 1}]}},
         {"name": "gremlins", "parameters": {}},
         {"name": "cross_coupling", "parameters": {"gains": {"y": 2}}},
         17,
@@ -265,8 +268,8 @@ def test_a_document_has_each_effect_once():
 
 def test_few_samples():
     axis = with_effects(
-        *(Lag(0.01), CREEP, Resonance(100.0, 0.1), RateDependence(1.0, 0.1, 1e-8), Delay(0.1)),
-        *(SensorPeriodic(1e-7, 1e-9, 0.0), Hum(50.0, 1e-9, 0.0), DRIFT),
+        *(Lag(0.01), CREEP, Resonance((Mode(100.0, 0.1),)), RateDependence(1.0, 0.1, 1e-8), Delay(0.1)),
+        *(SensorPeriodic(1e-7, 1e-9, 0.0), Hum((Line(50.0, 1e-9, 0.0),)), DRIFT),
     )
     model = StageModel({"x": axis})
     assert model.simulate([], []).shape == model.compensate([], []).shape == (0,)

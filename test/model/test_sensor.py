@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from model.test_model_effects import SPAN, T, X, path
 from scipy.signal import lsim
 
-from slpi_ros.effects.hum import Hum
+from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.thermal_drift import ThermalDrift
 from slpi_ros.errors import SlpiError
@@ -34,7 +34,7 @@ def smooth(seed):
 @given(sensors(), st.lists(st.floats(-1e-4, 1e-4), min_size=1, max_size=50))
 def test_the_displacement_is_found_from_the_reading_of_any_periodic_sensor(effect, places):
     places = np.array(places)
-    axis = replace(X, effects=(ThermalDrift((0.0, 1.0), (0.0, 1e-7)), effect, Hum(50.0, 1e-8, 0.0)))
+    axis = replace(X, effects=(ThermalDrift((0.0, 1.0), (0.0, 1e-7)), effect, Hum((Line(50.0, 1e-8, 0.0),))))
     t = np.arange(float(places.size))
     accuracy = 1e-9 * effect.period + 1e-18
     np.testing.assert_allclose(axis.correct(t, axis.measure(t, places)), places, rtol=0, atol=accuracy)

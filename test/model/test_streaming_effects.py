@@ -9,6 +9,7 @@ from model.test_model_effects import CREEP, DT, SPAN, T, X, coupled, path, wishe
 from strategies import FAMILY_CASE
 
 from slpi_ros.effects.cross_coupling import CrossCoupling
+from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
@@ -19,7 +20,7 @@ from slpi_ros.model.limits import MAX_DT, Limits
 from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
 
 MS = 1_000_000
-LAG, MODE = Lag(0.015), Resonance(150.0, 0.02)
+LAG, MODE = Lag(0.015), Resonance((Mode(150.0, 0.02),))
 RATE = RateDependence(1.0, 0.1, 2e-8)
 SENSOR = SensorPeriodic(3e-7, 5e-9, 1.0)
 EVERY = (LAG, RATE, CREEP, MODE)

@@ -19,7 +19,7 @@ from slpi_ros.diagnosis.result import (
     Traces,
 )
 from slpi_ros.effects.creep import Creep
-from slpi_ros.effects.hum import Hum
+from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.diagnosis import PAGE, page_of
 
@@ -42,7 +42,7 @@ def traces(size=6000):
 def found(**changes):
     effects = (
         NamedEffect(Creep((1.0,), (0.02,)), 75.0, 0.85, 0.002, ("thermal_drift",), "Holds go on by 31 nm."),
-        NamedEffect(Hum(50.0, 60e-9, 0.0), 84.0, 0.12, 0.002, (), "A line stands at 50 Hz."),
+        NamedEffect(Hum((Line(50.0, 60e-9, 0.0),)), 84.0, 0.12, 0.002, (), "A line stands at 50 Hz."),
     )
     axis = AxisDiagnosis(
         verdict=NAMED,
@@ -112,13 +112,16 @@ def test_a_parameter_less_certain_than_its_size_is_not_determined(tmp_path):
         replace(named, effect=replace(named.effect, uncertainty=uncertainty))
         for named, uncertainty in zip(
             found().effects,
-            ({"time_constants.0": 0.1, "gains.0": 1e4}, {"frequency": 0.01, "amplitude": 7e-8, "phase": 0.3}),
+            (
+                {"time_constants.0": 0.1, "gains.0": 1e4},
+                {"lines.0.frequency": 0.01, "lines.0.amplitude": 7e-8, "lines.0.phase": 0.3},
+            ),
             strict=True,
         )
     ]
     text = write(tmp_path, {"x": found(effects=tuple(effects))}).read_text(encoding="utf-8")
     assert "time_constants [1 ± 0.1]; gains [not determined]" in text
-    assert "frequency 50 ± 0.01; amplitude not determined; phase 0 ± 0.3" in text
+    assert "lines frequency: 50 ± 0.01, amplitude: not determined, phase: 0 ± 0.3" in text
 
 
 @pytest.mark.parametrize("verdict", [AMBIGUOUS, UNEXPLAINED])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slpi_ros.effects.hum import Hum
+from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.lag import Lag
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
@@ -16,7 +16,7 @@ def test_effects_are_told_one_by_one():
     quality = FitQuality(1e-9, 2e-9, 3e-9, 0.0, 3, 0.1, "test")
     axis = AxisModel("pi", shape, Start(0.0, 0.0), (0.0, 1.0), (0.0, 1e-6), quality)
     assert describe_axis(axis)[-1] == "effects: none"
-    lag, hum = Lag(0.015), Hum(50.0, 20e-9, 0.0)
+    lag, hum = Lag(0.015), Hum((Line(50.0, 20e-9, 0.0),))
     *_, before, one, other = describe_axis(replace(axis, effects=(hum, lag)))
     assert before.startswith("from 3 samples")
     assert one == f"lag: {lag.describe()}" and "15" in one and other == f"hum: {hum.describe()}" and "20 nm" in other

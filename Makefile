@@ -39,7 +39,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs package bench-lies bench-calibrator bench-fleet clean distclean bench-restarts FORCE
+.PHONY: help build test test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs package bench-lies bench-calibrator bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -66,6 +66,9 @@ help:
 	@echo 'make bench-faults   mutated files, node lives under faults, half an hour at 1 kHz, a day at accelerated time; 90 minutes'
 	@echo 'make audit      known vulnerabilities of the pinned dependencies, by pip-audit'
 	@echo 'make bench-lies     eight kinds of sensors that lie, and honest ones: time driven, false alarms; ten minutes'
+	@echo 'make bench-rate-law  the rate law: round trips, cost, and what it predicts of measured records, 15 minutes'
+	@echo 'make bench-foreign   stages whose physics is not that of the package: PI, SLPI, SLPI with causes; 15 minutes'
+	@echo 'make bench-no-harm   the same on measured records that were not fitted, of other actuators too; 15 minutes'
 	@echo 'make bench-calibrator  the calibrator on 20 hidden stages, and 30 faults; an hour'
 	@echo 'make bench-fleet    300 bags of 30 stages on Dask: changes found, one worker beside two, 20 minutes'
 	@echo 'make clean      remove what was built and all caches'
@@ -162,6 +165,15 @@ audit:
 
 bench-lies: build
 	$(VENV) benchmarks/sensor_lies.py
+
+bench-rate-law: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/rate_law.py
+
+bench-foreign: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/foreign.py
+
+bench-no-harm: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/no_harm.py
 
 bench-calibrator: build
 	$(IN_WORKSPACE) OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/calibrator.py

@@ -5,13 +5,14 @@ one specimen to the next. Every record of one specimen needs a generator of the 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.compiled import compiled
+from slpi_ros.hysteresis.compilation import compiler
 
 from .physics import BoucWen
 
@@ -25,6 +26,12 @@ _MOST = 60.0
 _REST_S = 10.0
 # Golden ratio minus 1: the biases of successive relays fill their range evenly.
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+
+
+def compiled(function: Callable[..., FloatArray]) -> Callable[..., FloatArray]:
+    """Return a compiled function, without a cache: benches and tests import this file by different names."""
+    njit = compiler()
+    return njit(nogil=True)(function) if njit else function
 
 
 class Stage(Protocol):

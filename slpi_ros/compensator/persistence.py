@@ -13,7 +13,7 @@ from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing, remove_file
 from slpi_ros.io.input_limits import MEMORY_BYTES, MODEL_BYTES, open_input, read_input
 from slpi_ros.io.schemas import validate
-from slpi_ros.model import document as model_document
+from slpi_ros.model.document import format_model
 from slpi_ros.model.stage_model import StageModel
 
 # States of the memory: taken from the model and not verified; being reset; reset; restored after a restart.
@@ -202,9 +202,7 @@ class SavedMemory:
 
 def model_id(model: StageModel) -> str:
     """Return a fingerprint of a model's document, 64 hexadecimal digits."""
-    # Counted as version 1, so that a memory which an earlier package saved still belongs to its model.
-    text = model_document.format_model(model).replace(model_document.SCHEMA, model_document.EARLIER, 1)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(format_model(model).encode()).hexdigest()
 
 
 def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:

@@ -13,6 +13,7 @@ from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import Evidence, drive_frequency, excited_frequency, one_speed
 from slpi_ros.effects.base import Candidate, Effect, usual_step
 from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.creep import within_bounds as creep_within_bounds
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.hum import Hum
@@ -66,8 +67,11 @@ LEAST_GAIN_BESIDE_DELAY = 0.1
 MAY_BE_OWN = {"sensor_periodic"}
 # Largest difference of the zeros of records, as a share of the period, for a common periodic sensor error.
 IN_PHASE = 0.1
-# Effects that only shift the displacement in time.
-SHIFTS = {"delay", "lag"}
+# Effects that only shift the displacement in time; a shift by less than this number of samples may be either.
+SHIFTS, FEW_SAMPLES = {"delay", "lag"}, 3.0
+# Such a lag stands only if its held-out error is lower than that of a delay by this share: it also rounds off turns
+# that the hysteresis model makes too sharp.
+CLEARLY = 0.2
 # Effects that shift the displacement in time, among other things.
 SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
 # Gauss-Newton steps of a candidate, and of the selected effects in the end.
@@ -230,6 +234,9 @@ def plausible(effect: Effect, now: Explanation) -> bool:
             near = float(y.min()) - ORIGIN * motion <= effect.origin <= float(y.max()) + ORIGIN * motion
             small = max(map(abs, effect.gains)) <= LARGEST_DRIFT
             return near and small and effect.times[-1] >= DRIFT_TAKES
+        case Creep():
+            # At the upper bound of its gains it stands for something else.
+            return creep_within_bounds(effect)
         case Saturation():
             return _stands_still(effect, now)
         case Hum():
@@ -392,7 +399,7 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
     """Return whether the records do not distinguish another effect from the best one.
 
     A single drive frequency cannot distinguish effects that depend on time from those that depend on rate; a better fit
-    then only means a more suitable loop shape. Delay and lag below the sampling period are alike, too. If there are
+    then only means a more suitable loop shape. Delay and lag of a few sampling periods are alike, too. If there are
     several records, the errors on held-out records also decide.
     """
     explained, by_other = before.rms**2 - best.score.rms**2, before.rms**2 - other.score.rms**2
@@ -403,7 +410,7 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
         return False
     if one_speed and {best.name, other.name} <= DYNAMIC:
         return by_other >= ALTERNATIVE_AT_ONE_SPEED * explained
-    if {best.name, other.name} == {"delay", "lag"} and _shift(best.effect) < usual_step(best.explanation.t):
+    if {best.name, other.name} == SHIFTS and _shift(best.effect) < FEW_SAMPLES * usual_step(best.explanation.t):
         return by_other >= ALTERNATIVE * explained
     return by_other >= ALTERNATIVE * explained and chance_of_gain(other.score, best.score) > ALIKE
 
@@ -513,9 +520,26 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     with_structures, now = now, now.bare()
     now = _without_needless(now, set(rivals), restart=now is not with_structures)
     # At their best parameters together, some may no longer be necessary.
-    now = _without_needless(now.refined(CONVERGED), set(rivals), restart=False)
+    now = _without_needless(_plainer(now.refined(CONVERGED), rivals), set(rivals), restart=False)
     named = _named(start, now, rivals)
     return Selection(base, now, named, structures, tuple(sorted(dropped - {one.name for one in named})))
+
+
+def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
+    """Return the fit with a delay for a lag of a few samples, unless clearly worse, and with no creep at its bounds."""
+    effects = {effect.name: effect for effect in now.effects}
+    lag, creep = effects.get(Lag.name), effects.get(Creep.name)
+    if isinstance(lag, Lag) and _shift(lag) < FEW_SAMPLES * usual_step(now.t) and Delay.name not in effects:
+        effects[Lag.name] = Delay(lag.time_constant)
+        other = Explanation(now.evidence, list(effects.values()), now).refined(CONVERGED)
+        if gain(other.held_out, now.held_out) < CLEARLY:
+            rivals[Delay.name] = [lag, *(rival for rival in rivals.pop(Lag.name, []) if rival.name != Delay.name)]
+            now = other
+    if creep and not plausible(now.effect(Creep.name), now):
+        without = now.without(Creep.name)
+        anew = [one for one in contenders(without, [Creep.name]) if one.counts_beside(without)]
+        now = anew[0].explanation if anew else without
+    return now
 
 
 def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
@@ -526,7 +550,10 @@ def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
         for other in found
         if other is found[0] or (other.counts_beside(now) and alike(found[0], other, now.held_out, one_speed=alone))
     ]
-    return min(equal, key=lambda contender: (contender.parameters, contender.score.rms))
+    best = min(equal, key=lambda one: (one.parameters, one.score.rms))
+    # Of delay and lag, where they are alike, the plain shift.
+    shifts = [one for one in found if best.name == Lag.name and one.name == Delay.name and one.counts_beside(now)]
+    return next((one for one in shifts if alike(best, one, now.held_out, one_speed=alone)), best)
 
 
 def _without_needless(now: Explanation, names: Collection[str], *, restart: bool = True) -> Explanation:

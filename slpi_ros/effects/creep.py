@@ -28,6 +28,8 @@ from slpi_ros.effects.filters import Hold, hold
 FASTEST = 0.1
 # Upper bounds on the gains: of each relaxation, and of the sum of those with time constants within a second.
 LARGEST, SOON, LARGEST_SOON = 0.15, 1.0, 0.12
+# A gain is at its bound within this share of it.
+NEAR = 1e-3
 # Candidates: number of single relaxations; sets of several (number, longest time constant as share of the record).
 # Gains below this share of the largest gain are dropped.
 SINGLE, SEVERAL, LEAST_SHARE = 7, ((2, 0.1), (2, 0.5), (3, 0.3), (4, 0.7)), 0.02
@@ -221,6 +223,12 @@ def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[
     soon = sum(gain for tau, gain in zip(time_constants, gains, strict=True) if tau < SOON)
     share = min(1.0, LARGEST_SOON / soon) if soon > 0.0 else 1.0
     return tuple(gain * share if tau < SOON else gain for tau, gain in zip(time_constants, gains, strict=True))
+
+
+def within_bounds(creep: Creep) -> bool:
+    """Return whether no gain, nor the sum of those that settle within a second, is at its upper bound."""
+    soon = sum(gain for tau, gain in zip(creep.time_constants, creep.gains, strict=True) if tau < SOON)
+    return max(creep.gains) < (1.0 - NEAR) * LARGEST and soon < (1.0 - NEAR) * LARGEST_SOON
 
 
 def settling(

@@ -3,6 +3,8 @@
 With ``w = asinh(d / (s0 dt))`` for the change ``d`` of the voltage ``u`` that the hysteresis feels, both directions of
 the law are ``a sinh(w) + b w = goal``, with a unique solution: the forward law with ``a = s0 dt`` and ``b = c``, the
 inverse on a straight piece of a branch with the reversible gain, relative to its slope, times ``c`` as ``b``.
+
+`slpi_ros.hysteresis.compiled` compiles `solved` too, and keeps the machine code until its own file changes.
 """
 
 from math import asinh, exp

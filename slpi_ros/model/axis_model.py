@@ -296,22 +296,22 @@ class AxisModel:
             # The axis may start outside its limits; the first output voltage is inside.
             memory = StreamingInverse(self.memory("start"), self.displacement_range, between).memory
             u, reached = chain.around.command(t, h, memory, (between.lower, between.upper))
-            held = self._held(u, h - reached, between)
+            held = self._held(u, h, reached, between)
             if not chain.before:
                 return u, held
         else:
             u, held = self._invert_hysteresis(h, between)
         return self._kept(backward(chain.before, u, around), held, allowed)
 
-    def _held(self, v: FloatArray, missed: FloatArray, limits: Limits) -> Mask:
-        """Return where voltages (V) are held at the limit beyond which the `missed` part (m) lies, shape (N,) each."""
+    def _held(self, v: FloatArray, h: FloatArray, reached: FloatArray, limits: Limits) -> Mask:
+        """Return where voltages (V) are held at the limit beyond which a displacement `h` (m) lies, shape (N,) each."""
+        above = limits.upper - ROUNDING * (1.0 + abs(limits.upper))
+        below = limits.lower + ROUNDING * (1.0 + abs(limits.lower))
+        if not v.size or (v.max() < above and v.min() > below):
+            return np.zeros(v.size, dtype=bool)
         low, high = self.displacement_range
-        rounding = ROUNDING * (high - low)
-        short, beyond = missed > rounding, missed < -rounding
-        if short.any() or beyond.any():
-            short &= v >= limits.upper - ROUNDING * (1.0 + abs(limits.upper))
-            beyond &= v <= limits.lower + ROUNDING * (1.0 + abs(limits.lower))
-        return np.asarray(short | beyond)
+        missed, rounding = h - reached, ROUNDING * (high - low)
+        return np.asarray(((missed > rounding) & (v >= above)) | ((missed < -rounding) & (v <= below)))
 
     def _kept(self, wanted: FloatArray, held: Mask, allowed: Limits) -> tuple[FloatArray, Mask]:
         v = np.clip(wanted, allowed.lower, allowed.upper)

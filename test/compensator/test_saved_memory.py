@@ -46,9 +46,8 @@ def test_it_comes_back_to_the_last_bit(tmp_path):
     assert load_memory(path).last_voltages == {"x": 1 / 3, "y": -0.1}
 
 
-def test_a_memory_saved_with_version_1_of_the_model_still_belongs_to_it():
-    text = format_model(MODEL).replace("slpi_ros/model/2", "slpi_ros/model/1")
-    assert model_id(MODEL) == hashlib.sha256(text.encode()).hexdigest()
+def test_a_model_is_known_by_the_sum_of_its_document():
+    assert model_id(MODEL) == hashlib.sha256(format_model(MODEL).encode()).hexdigest()
 
 
 def test_it_belongs_to_one_model_and_its_axes():

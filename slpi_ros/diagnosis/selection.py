@@ -12,8 +12,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import Evidence, drive_frequency, excited_frequency, one_speed
 from slpi_ros.effects.base import Candidate, Effect, usual_step
-from slpi_ros.effects.creep import Creep
-from slpi_ros.effects.creep import within_bounds as creep_within_bounds
+from slpi_ros.effects.creep import Creep, within_bounds
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.hum import Hum
@@ -71,7 +70,7 @@ IN_PHASE = 0.1
 SHIFTS, FEW_SAMPLES = {"delay", "lag"}, 3.0
 # Such a lag stands only if its held-out error is lower than that of a delay by this share: it also rounds off turns
 # that the hysteresis model makes too sharp.
-CLEARLY = 0.2
+CLEARLY = 0.1
 # Effects that shift the displacement in time, among other things.
 SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
 # Gauss-Newton steps of a candidate, and of the selected effects in the end.
@@ -234,9 +233,6 @@ def plausible(effect: Effect, now: Explanation) -> bool:
             near = float(y.min()) - ORIGIN * motion <= effect.origin <= float(y.max()) + ORIGIN * motion
             small = max(map(abs, effect.gains)) <= LARGEST_DRIFT
             return near and small and effect.times[-1] >= DRIFT_TAKES
-        case Creep():
-            # At the upper bound of its gains it stands for something else.
-            return creep_within_bounds(effect)
         case Saturation():
             return _stands_still(effect, now)
         case Hum():
@@ -526,19 +522,28 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
 
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
-    """Return the fit with a delay for a lag of a few samples, unless clearly worse, and with no creep at its bounds."""
+    """Return the fit with a delay for a lag of a few samples, unless clearly worse, and without implausible effects."""
     effects = {effect.name: effect for effect in now.effects}
-    lag, creep = effects.get(Lag.name), effects.get(Creep.name)
-    if isinstance(lag, Lag) and _shift(lag) < FEW_SAMPLES * usual_step(now.t) and Delay.name not in effects:
+    lag, several, step = effects.get(Lag.name), len(now.evidence.parts) > 1, usual_step(now.t)
+    # Below a sampling period it may be the hold of commands between samples, which is neither.
+    if isinstance(lag, Lag) and step <= _shift(lag) < FEW_SAMPLES * step and Delay.name not in effects:
         effects[Lag.name] = Delay(lag.time_constant)
         other = Explanation(now.evidence, list(effects.values()), now).refined(CONVERGED)
         if gain(other.held_out, now.held_out) < CLEARLY:
             rivals[Delay.name] = [lag, *(rival for rival in rivals.pop(Lag.name, []) if rival.name != Delay.name)]
             now = other
-    if creep and not plausible(now.effect(Creep.name), now):
-        without = now.without(Creep.name)
-        anew = [one for one in contenders(without, [Creep.name]) if one.counts_beside(without)]
-        now = anew[0].explanation if anew else without
+    for effect in now.effects:
+        if isinstance(effect, Creep) and several and not within_bounds(effect):
+            # At the upper bound of its gains it stands for something else.
+            without = now.without(Creep.name)
+            anew = [
+                one
+                for one in contenders(without, [Creep.name])
+                if one.counts_beside(without) and within_bounds(one.effect)  # type: ignore[arg-type]
+            ]
+            now = anew[0].explanation if anew else without
+        elif isinstance(effect, GainDrift) and not plausible(effect, now):
+            now = now.without(GainDrift.name)
     return now
 
 
@@ -550,10 +555,7 @@ def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
         for other in found
         if other is found[0] or (other.counts_beside(now) and alike(found[0], other, now.held_out, one_speed=alone))
     ]
-    best = min(equal, key=lambda one: (one.parameters, one.score.rms))
-    # Of delay and lag, where they are alike, the plain shift.
-    shifts = [one for one in found if best.name == Lag.name and one.name == Delay.name and one.counts_beside(now)]
-    return next((one for one in shifts if alike(best, one, now.held_out, one_speed=alone)), best)
+    return min(equal, key=lambda one: (one.parameters, one.score.rms))
 
 
 def _without_needless(now: Explanation, names: Collection[str], *, restart: bool = True) -> Explanation:

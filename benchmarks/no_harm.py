@@ -26,7 +26,7 @@ import slpi_ros
 from slpi_ros.diagnosis.result import NamedEffect
 from slpi_ros.errors import SlpiError
 from slpi_ros.identification.initial_history import histories
-from slpi_ros.identification.samples import select_samples
+from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 
@@ -96,7 +96,11 @@ def _named(effects: Sequence[NamedEffect]) -> str:
 def _errors(models: dict[str, slpi_ros.StageModel], record: Record, axis: str) -> dict[str, float]:
     """Return the free-run error (% of range) of each model, from the best of the same initial histories."""
     own = {kind: model.axes[axis] for kind, model in models.items()}
-    starts = {*histories(select_samples(record, axis, None, None)), *(model.start.history for model in own.values())}
+    samples = select_samples(record, axis, None, None)
+    # Before the record the actuator may also have moved over the whole range of the fitted ones.
+    v = np.concatenate([samples.v, *(model.voltage_range for model in own.values())])
+    whole = Samples(v, np.zeros(v.size), np.zeros(v.size, dtype=bool))
+    starts = {*histories(samples), *histories(whole), *(model.start.history for model in own.values())}
     return {kind: free_run(model, record, axis, starts) for kind, model in own.items()}
 
 

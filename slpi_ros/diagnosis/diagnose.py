@@ -36,8 +36,8 @@ REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects with the same predictions wherever they cannot be distinguished: the model may contain either of them.
 SAME_ELSEWHERE = ({"delay", "lag"},)
 # Effects are part of the model if they leave at most this multiple of the repeatability floor, or this share of the
-# error (a third of its mean square).
-LEFT_BY_NOISE, LEFT_OF_ERROR = 1.5, 0.6
+# error (a third of its mean square), and if the free run of the extended model shows this share of the held-out gain.
+LEFT_BY_NOISE, LEFT_OF_ERROR, GAIN_SHOWN = 1.5, 0.6, 0.5
 # Creep from a move before the records is part of the model if all records agree on the move within this share.
 BEGAN_ALIKE = 0.3
 # An initial history is possible up to this multiple of the lowest error; a zero has moved if its shift exceeds this
@@ -139,12 +139,12 @@ def _diagnose_axis(
     given = _given(model, runs, selection)
     source = ", ".join(part.source for part in evidence.parts)
     extension = _extension(model, selection, given, source)
-    if extension and (_of_another_kind(selection) or _worse(extension[0], runs, selection.now)):
+    if extension and (_of_another_kind(selection) or _not_as_judged(extension[0], runs, selection)):
         # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
         selection = _without_causes(selection)
         given = _given(model, runs, selection)
         extension = _extension(model, selection, given, source)
-        if extension and _worse(extension[0], runs, selection.now):
+        if extension and _not_as_judged(extension[0], runs, selection):
             extension = None
     extended, missing = extension or (model, [named.name for named in selection.named])
     outcomes = _outcomes(runs, _runs(extended, selection.now) if extension else runs, selection.now)
@@ -165,10 +165,17 @@ def _extension(model: AxisModel, selection: Selection, given: Given, source: str
 
 def _of_another_kind(selection: Selection) -> bool:
     """Return whether the effects leave so much that the physics is another, where they would not carry over."""
-    if not selection.named:
-        return False
-    before, after = selection.named[0].before.rms_of_records, selection.now.held_out.rms_of_records
-    return after > LEFT_BY_NOISE * _floor(selection.now).rms and after > LEFT_OF_ERROR * before
+    return _more_than_noise(selection) and _left(selection) > LEFT_OF_ERROR
+
+
+def _more_than_noise(selection: Selection) -> bool:
+    """Return whether there are effects, and they leave more than what does not repeat."""
+    return bool(selection.named) and selection.now.held_out.rms_of_records > LEFT_BY_NOISE * _floor(selection.now).rms
+
+
+def _left(selection: Selection) -> float:
+    """Return the share of the held-out error that the effects leave."""
+    return selection.now.held_out.rms_of_records / selection.named[0].before.rms_of_records
 
 
 def _without_causes(selection: Selection) -> Selection:
@@ -184,10 +191,16 @@ def _runs(model: AxisModel, now: Explanation) -> "list[_FreeRun]":
     return [_free_run(model, part, of_record=len(parts) == 1) for part in parts]
 
 
-def _worse(extended: AxisModel, runs: "Sequence[_FreeRun]", now: Explanation) -> bool:
-    """Return whether the free run of an extended model is worse than that of the given one on any of its records."""
-    pairs = zip(runs, _runs(extended, now), strict=True)
-    return any(after.rms > NO_WORSE * before.rms for before, after in pairs)
+def _not_as_judged(extended: AxisModel, runs: "Sequence[_FreeRun]", selection: Selection) -> bool:
+    """Return whether the free run of an extended model shows another gain than the held-out error.
+
+    It may be worse than that of the given model, `runs`, on none of the records. Where the effects leave more than what
+    does not repeat, it also shows at least `GAIN_SHOWN` of their held-out gain.
+    """
+    after = _runs(extended, selection.now)
+    if any(one.rms > NO_WORSE * given.rms for one, given in zip(after, runs, strict=True)):
+        return True
+    return _more_than_noise(selection) and 1.0 - _rms(after) / _rms(runs) < GAIN_SHOWN * (1.0 - _left(selection))
 
 
 def _ambiguous(selection: Selection) -> list[str]:

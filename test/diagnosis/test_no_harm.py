@@ -7,6 +7,7 @@ import pytest
 import slpi_ros
 from benchmarks.hidden import hide
 from slpi_ros.diagnosis import diagnose as module
+from slpi_ros.io.tables import import_table
 
 pytestmark = pytest.mark.slow
 
@@ -47,3 +48,12 @@ def test_no_record_is_worse_with_the_extended_model(hidden):
     record, model = hidden
     (found,) = slpi_ros.diagnose(record, model).axes.values()
     assert all(one.after_rms <= 1.05 * one.before_rms for one in found.records)
+
+
+def test_a_gain_that_a_free_run_does_not_show_extends_nothing(measured_data):
+    record = import_table(measured_data / "hasel_step.csv")
+    model = slpi_ros.identify(record)
+    diagnosis = slpi_ros.diagnose(record, model)
+    (found,) = diagnosis.axes.values()
+    assert (found.effects, found.verdict) == ((), "unexplained")
+    assert diagnosis.extended.axes == model.axes

@@ -21,8 +21,16 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from slpi_ros.dependencies import DependencyError, dependencies_needed
-from slpi_ros.errors import LONGEST_SHOWN, ModelError, RecordError, SlpiError, UsageError, shown
+from slpi_ros.errors import (
+    LONGEST_SHOWN,
+    DependencyError,
+    ModelError,
+    RecordError,
+    SlpiError,
+    UsageError,
+    dependencies_needed,
+    shown,
+)
 from slpi_ros.identification.progress import report_progress, shown_on
 
 # Each command imports its modules when it runs: the numerical and plotting modules load slowly.

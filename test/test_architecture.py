@@ -23,7 +23,6 @@ LAYERS = (
     {"model"},
     {"effects"},
     {"hysteresis", "io", "simulation", "excitation"},
-    {"dependencies"},
     {"errors"},
 )
 

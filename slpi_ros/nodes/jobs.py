@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from slpi_ros.compensator.persistence import model_id
-from slpi_ros.dependencies import DependencyError, dependencies_needed
-from slpi_ros.errors import ModelError, RecordError, SlpiError, shown
+from slpi_ros.errors import DependencyError, ModelError, RecordError, SlpiError, dependencies_needed, shown
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.input_limits import TOPIC_MODEL_CHARACTERS
 from slpi_ros.io.record import Record

@@ -15,16 +15,17 @@ from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, VERIFICATION, CalibrationSettings
-from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.diagnosis.result import AxisDiagnosis, Diagnosis
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.errors import RecordError
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.drives import SWEEP, Drive
-from slpi_ros.identification.fit import identify
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
+from slpi_ros.workflows.identify import IdentifyRequest, identify
+from slpi_ros.workflows.records import Source
 
 FloatArray = NDArray[np.float64]
 
@@ -320,7 +321,7 @@ class _Calibration:
 
     def _identify(self) -> StageModel:
         self._begin("identifying the hysteresis")
-        model = identify(self._records)
+        model = identify(IdentifyRequest(Source(records=self._records))).model
         self._floors = {name: axis.quality.floor_rms for name, axis in model.axes.items()}
         said = "; ".join(
             f"axis {name}: held-out error {axis.quality.held_out_rms * 1e9:.3g} nm rms, "
@@ -369,7 +370,7 @@ def _diagnosed(records: Sequence[Record], model: StageModel) -> Diagnosis:
     found, extended = {}, {}
     for axis in model.axes:
         moving = [_from_first_move(record, axis) for record in records if np.ptp(record.voltage[axis]) > 0.0]
-        one = diagnose(moving, model, axes=[axis])
+        one = diagnose(DiagnoseRequest(Source(records=moving, axes=[axis]), model)).diagnosis
         found[axis], extended[axis] = one.axes[axis], one.extended.axes[axis]
     source = ", ".join(record.source for record in records)
     return Diagnosis(found, replace(one.extended, axes=extended), source)

@@ -8,7 +8,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -183,23 +183,18 @@ def fit(request: FitRequest) -> FitOutcome:
     """Read the bags, identify the model and compare it with the one in use."""
     # Imported here because they load slowly: the compensator uses this module to read models only.
     from slpi_ros.diagnosis.replacement import doubt_about
-    from slpi_ros.identification.fit import identify
-    from slpi_ros.io.bag_reader import read_bag
+    from slpi_ros.model.sensor import Sensor
+    from slpi_ros.workflows.identify import IdentifyRequest, identify
+    from slpi_ros.workflows.records import Source
 
     try:
-        records = [read_bag(bag, request.topic) for bag in request.bags]
+        sensor = Sensor(request.sensor_delay, request.sensor_lag)
+        source = Source(request.bags, request.topic, start=request.start, stop=request.stop)
+        records = source.read()
         if request.stage:
             for record in records:
                 request.stage.require(record)
-        _require_usable(records, request.start, request.stop)
-        model = identify(
-            records,
-            request.kind,
-            start=request.start,
-            stop=request.stop,
-            sensor_delay=request.sensor_delay,
-            sensor_lag=request.sensor_lag,
-        )
+        model = identify(IdentifyRequest(replace(source, records=records), request.kind, sensor=sensor)).model
         document, doubt = format_model(model), ""
         in_use = None if request.unconditional else _in_use(request, records)
         if in_use:
@@ -207,16 +202,6 @@ def fit(request: FitRequest) -> FitOutcome:
     except SlpiError as error:
         return FitOutcome(error=str(error))
     return FitOutcome(document, doubt=doubt and f"{request.source}: {doubt}")
-
-
-def _require_usable(records: Sequence[Record], start: float | None = None, stop: float | None = None) -> None:
-    """Raise IdentificationError for the first record whose quality allows no fit, as the command line does."""
-    from slpi_ros.identification.record_quality import assess, findings, require_usable
-
-    for record in records:
-        for axis in record.axes:
-            found = findings(assess(record, axis, start=start, stop=stop))
-            require_usable(found, f"{record.source}: axis '{axis}'")
 
 
 def _in_use(request: FitRequest, records: Sequence[Record]) -> StageModel | None:
@@ -273,16 +258,15 @@ class DiagnosisOutcome:
 
 def run_diagnosis(request: DiagnosisRequest) -> DiagnosisOutcome:
     """Read the bags, diagnose the model and write the output files."""
-    from slpi_ros.diagnosis.diagnose import diagnose
-    from slpi_ros.io.bag_reader import read_bag
     from slpi_ros.reports.diagnosis import FILES, write_files
+    from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
+    from slpi_ros.workflows.records import Source
 
     folder = Path(request.folder)
     try:
         make_folder(folder, *FILES)
-        records = [read_bag(bag, request.topic) for bag in request.bags]
-        _require_usable(records)
-        diagnosis = diagnose(records, parse_model(request.document, "stage_model"))
+        model = parse_model(request.document, "stage_model")
+        diagnosis = diagnose(DiagnoseRequest(Source(request.bags, request.topic), model)).diagnosis
         write_files(folder, diagnosis)
     except SlpiError as error:
         return DiagnosisOutcome(error=str(error))

@@ -1,0 +1,64 @@
+"""Verification of a model on records that it has not seen: read, check, judge."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from slpi_ros.diagnosis import verify as verification
+from slpi_ros.diagnosis.verify import Verification
+from slpi_ros.io.bag_reader import read_desired
+from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, require_for_model, shared_axes
+
+
+@dataclass(frozen=True)
+class VerifyRequest:
+    """Request of a verification.
+
+    Parameters
+    ----------
+    source : Source
+        Its `start` and `stop` are not used: whole records are judged.
+    model : StageModel
+    tolerance : float, metres, optional
+        Largest rms error that passes; default: as for `slpi_ros.verify`.
+    desired_topic : str, optional
+        Topic of the bags that holds the desired displacement; default: ``desired_displacement``, where a bag has it.
+    """
+
+    source: Source
+    model: StageModel
+    tolerance: float | None = None
+    desired_topic: str | None = None
+
+
+@dataclass(frozen=True)
+class VerifyOutcome:
+    """Verification, the records that it judges, and the findings on each of them."""
+
+    verification: Verification
+    records: Sequence[Record]
+    findings: Sequence[Findings]
+
+
+def verify(request: VerifyRequest) -> VerifyOutcome:
+    """Verify a model.
+
+    Raises
+    ------
+    UsageError
+        If a bag is given twice.
+    RecordError, IdentificationError, ModelError
+        If the records cannot be read, allow no judgement, or do not match the model.
+    """
+    source, model = request.source, request.model
+    records = source.read(coupled=True)
+    desired = None
+    if not source.records:
+        read = zip(source.bags, records, strict=True)
+        desired = [read_desired(bag, record, request.desired_topic) for bag, record in read]
+    with mismatch_in_data():
+        source = source.of_axes(shared_axes(records, model, source))
+        found = require_for_model(records, model, source)
+        told = verification.verify(records, model, request.tolerance, axes=source.axes, desired=desired)
+    return VerifyOutcome(told, records, found)

@@ -217,12 +217,10 @@ def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
     rows, axes = [], {}
     try:
         with _quiet():
-            source = Source((one.bag.path,), topic)
-            (record,) = source.read()
+            (record,) = Source((one.bag.path,), topic).read()
             for axis in one.axes:
                 try:
-                    request = IdentifyRequest(replace(source, records=(record,), axes=(axis,)))
-                    axes[axis] = identify(request).model.axes[axis]
+                    axes[axis] = identify(IdentifyRequest(_examined(record, (axis,)))).model.axes[axis]
                 except SlpiError as error:
                     rows.append(replace(one.row(axis), error=str(error)))
             if axes:
@@ -351,7 +349,12 @@ def _read(one: Examined, topic: str) -> Record:
 
 
 def _verification(record: Record, model: StageModel, axes: Sequence[str]) -> Verification:
-    return verify(VerifyRequest(Source(records=(record,), axes=axes), model)).verification
+    return verify(VerifyRequest(_examined(record, axes), model)).verification
+
+
+def _examined(record: Record, axes: Sequence[str]) -> Source:
+    """Return axes of a record that `examine` has found usable."""
+    return Source(records=(record,), axes=axes, assessed=True)
 
 
 def _of_stage(record: Record, stage: str) -> Record:
@@ -430,7 +433,7 @@ def _refitted(rows: Sequence[Row], record: Record, model: StageModel, output: st
     """Refit the reference to a record; write the model, and note error and reason of a refusal in the rows."""
     try:
         axes = [row.axis for row in rows if row.axis in model.axes]
-        found = refit(RefitRequest(Source(records=(record,), axes=axes), model))
+        found = refit(RefitRequest(_examined(record, axes), model))
     except SlpiError as error:
         return [replace(row, error=row.error or str(error)) for row in rows]
     path = Path(output, name)
@@ -466,7 +469,7 @@ def _like_another(row: Row, record: Record, others: Mapping[str, str], output: s
 def _diagnosed(row: Row, record: Record, model: StageModel) -> Row:
     """Return the row with the causes that a diagnosis names."""
     try:
-        request = DiagnoseRequest(Source(records=(record,), axes=(row.axis,)), model)
+        request = DiagnoseRequest(_examined(record, (row.axis,)), model)
         found = diagnose(request).diagnosis.axes[row.axis]
     except SlpiError as error:
         return replace(row, error=row.error or f"no diagnosis: {error}")

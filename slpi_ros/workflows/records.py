@@ -39,6 +39,8 @@ class Source:
     start, stop : float, seconds, optional
         Part in use, from the first stamp of each record; default: all.
     records : sequence of Record
+    assessed : bool
+        Whether `assess_record` has found the axes in use usable already, so that it is not asked again; default False.
     """
 
     bags: Sequence[str] = ()
@@ -47,6 +49,7 @@ class Source:
     start: float | None = None
     stop: float | None = None
     records: Sequence[Record] = ()
+    assessed: bool = False
 
     def read(self, *, coupled: bool = False) -> tuple[Record, ...]:
         """Return the records.
@@ -134,8 +137,8 @@ def require_records(
     records: Sequence[Record], source: Source, sensors: Mapping[str, Sensor] | None = None
 ) -> tuple[Findings, ...]:
     """Return the findings on each record; SlpiError for the first axis that cannot be used."""
-    found = []
-    for record in records:
+    found: list[Findings] = []
+    for record in () if source.assessed else records:
         assessed = assess_record(record, source, sensors)
         for error in assessed.refused.values():
             raise error

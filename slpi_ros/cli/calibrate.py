@@ -7,15 +7,13 @@ from slpi_ros.cli.command import Command, Result, command_line
 from slpi_ros.cli.options import add_axes, add_limits, require_axis_names, slew_of
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     command.add_argument("-o", "--output", metavar="DIR", required=True, help="folder of bags, model and page")
     add_axes(command, default=("x",), help="default: x")
     add_limits(command, "slew limit")
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.excitation.legs import DriveSpec
 
     require_axis_names(options.axis)
@@ -41,6 +39,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "print how to let a stage calibrate itself",
     "slpi calibrate -o my_stage --voltage-min 0 --voltage-max 100",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

@@ -12,8 +12,7 @@ from slpi_ros.errors import SlpiError, UsageError
 SMALLEST_JUMP = 1e-3
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     from slpi_ros.model.axis_model import START_MEMORIES
 
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
@@ -32,8 +31,7 @@ def add_options(command: ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     import numpy as np
 
     from slpi_ros.io.outputs import allow_table
@@ -89,6 +87,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "compute the voltage for a desired displacement",
     "slpi compensate model.json desired.csv -o voltage.csv --slew 1000",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

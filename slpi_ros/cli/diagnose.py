@@ -4,33 +4,21 @@ import shlex
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import MOST_LINES, Command, Result
-from slpi_ros.cli.options import (
-    add_axes,
-    add_bags,
-    add_output,
-    add_sensor,
-    add_span,
-    add_topics,
-    allow_folder,
-    source_of,
-    with_sensor,
-)
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
-    add_bags(command, "; several records allow cross-validation of each cause")
+def _add_options(command: ArgumentParser) -> None:
+    common.add_bags(command, "; several records allow cross-validation of each cause")
     command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
-    add_output(command, "DIR", "folder of diagnosis.json, extended_model.json and report.html")
-    add_topics(command)
-    add_axes(command, help="default: every axis that bag and model share")
-    add_span(command)
-    add_sensor(command)
+    common.add_output(command, "DIR", "folder of diagnosis.json, extended_model.json and report.html")
+    common.add_topics(command)
+    common.add_axes(command, help="default: every axis that bag and model share")
+    common.add_span(command)
+    common.add_sensor(command)
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.bag_reader import require_different
     from slpi_ros.io.schemas import format_document
@@ -39,11 +27,11 @@ def run(options: Namespace) -> Result:
     from slpi_ros.reports.text import verdict
     from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 
-    source = source_of(options)
+    source = common.source_of(options)
     require_different(options.bags)
-    model = with_sensor(load_model(options.model), options)
+    model = common.with_sensor(load_model(options.model), options)
     # The model is not checked: an extended model may be extended again.
-    allow_folder(options, options.output, *FILES)
+    common.allow_folder(options, options.output, *FILES)
     with output_folder(options.output, *FILES) as folder:
         diagnosis = diagnose(DiagnoseRequest(source, model)).diagnosis
         write_files(folder, diagnosis)
@@ -68,6 +56,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "find the causes of a model's errors on bags and extend the model",
     "slpi diagnose calibration check --model model.json -o diagnosis",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

@@ -14,8 +14,7 @@ COMMANDS_TOPIC = "voltage_command"
 LONGEST_WATCH = 3600.0
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     command.add_argument("bags", metavar="BAG", nargs="*", help="records to be checked; default: none")
     command.add_argument("--model", metavar="MODEL.json", help="model to be checked; default: that on stage_model")
     command.add_argument("--voltage-min", metavar="V", type=float, help="lowest voltage allowed; default: not checked")
@@ -32,8 +31,7 @@ def add_options(command: ArgumentParser) -> None:
     command.add_argument("--no-ros", action="store_true", help="check the files only; default: also a running graph")
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from importlib.util import find_spec
 
     from slpi_ros.io.bag_reader import read_bag
@@ -101,6 +99,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "check bags, a model and a running ROS graph, and say what to mend",
     "slpi doctor calibration --model model.json",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

@@ -6,8 +6,7 @@ from slpi_ros.cli.command import Command, Result
 from slpi_ros.cli.options import add_axes, add_limits, add_output, require_axis_names, slew_of
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     from slpi_ros.excitation.drives import DRIVES
 
     add_output(command, "DRIVE.csv", "columns time_s, <axis>_V")
@@ -22,8 +21,7 @@ def add_options(command: ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.excitation.drives import SLEW_USED, excite
     from slpi_ros.io.outputs import allow_table
     from slpi_ros.io.tables import table_header, write_table
@@ -51,6 +49,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "generate excitation voltages for an identification",
     "slpi excite -o drive.csv --voltage-min 0 --voltage-max 100",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

@@ -8,16 +8,14 @@ from slpi_ros.cli.options import add_output
 from slpi_ros.errors import UsageError
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     add_output(command, "DIR", "folder of index.html")
     command.add_argument(
         "--data", metavar="DIR", help="folder of measured records to include in the comparison; default: none"
     )
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.io.outputs import allow_folder
     from slpi_ros.papers.page import COLUMNS, PAGE, TABLE, write_experiments
 
@@ -32,6 +30,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "reproduce the tables and figures of the two papers",
     "slpi experiments -o experiments",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

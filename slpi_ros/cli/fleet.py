@@ -9,8 +9,7 @@ from slpi_ros.cli.options import add_output, add_topic
 from slpi_ros.errors import UsageError
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "sources", metavar="SOURCE", nargs="+", help="bag, folder of bags (recursively), or CSV list of bag and stage"
     )
@@ -32,8 +31,7 @@ def add_options(command: ArgumentParser) -> None:
     add_topic(command)
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.fleet.pages import DOCUMENT, PAGE, report_fleet
     from slpi_ros.fleet.results import JOURNAL, TABLE
     from slpi_ros.io.outputs import allow_folder
@@ -62,6 +60,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "identify, verify and follow many stages from many bags, on Dask",
     "slpi fleet bags -o fleet --workers 4",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

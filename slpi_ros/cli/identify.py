@@ -4,36 +4,25 @@ import shlex
 from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line, finding_lines, say
-from slpi_ros.cli.options import (
-    add_axes,
-    add_bags,
-    add_output,
-    add_sensor,
-    add_span,
-    add_topics,
-    allow_model_and_report,
-    same_record,
-    source_of,
-)
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     from slpi_ros.identification.fit import KINDS
 
-    add_bags(command)
-    add_output(command, "MODEL.json", "model document to write")
+    common.add_bags(command)
+    common.add_output(command, "MODEL.json", "model document to write")
     command.add_argument("--kind", choices=KINDS, default="slpi", help="kind of model; default: slpi")
     command.add_argument(
         "--loops-at-rest",
         action="store_true",
         help="slpi-published: operators start at rest, as published; default: no",
     )
-    add_topics(command)
-    add_axes(command, help="default: every axis of the bag")
-    add_span(command)
-    add_sensor(command, "0")
+    common.add_topics(command)
+    common.add_axes(command, help="default: every axis of the bag")
+    common.add_span(command)
+    common.add_sensor(command, "0")
     command.add_argument(
         "--report", metavar="DIR", help="also write a report with plots of the first bag; default: none"
     )
@@ -42,8 +31,7 @@ def add_options(command: ArgumentParser) -> None:
     )
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.model.document import format_model, save_model
     from slpi_ros.model.sensor import Sensor
@@ -51,11 +39,11 @@ def run(options: Namespace) -> Result:
     from slpi_ros.workflows.identify import IdentifyRequest, identify
     from slpi_ros.workflows.records import UnusableRecordError
 
-    source = source_of(options)
+    source = common.source_of(options)
     sensor = Sensor(options.sensor_delay or 0.0, options.sensor_lag or 0.0)
     request = IdentifyRequest(source, options.kind, options.loops_at_rest, sensor)
     request.require_possible()
-    allow_model_and_report(options)
+    common.allow_model_and_report(options)
     request.require_possible(uncertainty=options.uncertainty)
     lines = []
     with output_folder(options.report) if options.report else nullcontext() as folder:
@@ -81,7 +69,14 @@ def run(options: Namespace) -> Result:
     told = [line for one in found for line in finding_lines(one)]
     if limits:
         next_command = command_line(
-            "slpi", "diagnose", *options.bags, "--model", options.output, "-o", "diagnosis", *same_record(options)
+            "slpi",
+            "diagnose",
+            *options.bags,
+            "--model",
+            options.output,
+            "-o",
+            "diagnosis",
+            *common.same_record(options),
         )
     else:
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.output)}"
@@ -97,6 +92,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "identify the model of a stage from a bag",
     "slpi identify calibration -o model.json --report report",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

@@ -8,8 +8,7 @@ from slpi_ros.cli.command import Command, Result, command_line
 from slpi_ros.cli.options import add_output
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "table", metavar="DATA.csv|DATA.mat",
         help="columns separated by comma, semicolon or tab; names include the unit: x_nm, x (nm), x [nm] or x in nm",
@@ -36,8 +35,7 @@ def add_options(command: ArgumentParser) -> None:
     )
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.io.bag_writer import write_bag
     from slpi_ros.io.columns import ColumnOptions
     from slpi_ros.io.outputs import allow_bag
@@ -66,6 +64,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "turn a table of measured data into a bag",
     "slpi import data.csv -o calibration",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

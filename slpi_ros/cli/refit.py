@@ -6,46 +6,35 @@ from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result
-from slpi_ros.cli.options import (
-    add_axes,
-    add_output,
-    add_sensor,
-    add_span,
-    add_topic,
-    allow_model_and_report,
-    source_of,
-    with_sensor,
-)
 
 if TYPE_CHECKING:
     from slpi_ros.identification.refit import AxisChange
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     command.add_argument("model", metavar="MODEL.json", help="model to be corrected")
     command.add_argument("bags", metavar="BAG", nargs="+", help="in any order; the oldest record is used first")
-    add_output(command, "MODEL.json", "may be the input model file")
-    add_topic(command)
-    add_axes(command, help="default: every axis that bag and model share")
-    add_span(command)
-    add_sensor(command)
+    common.add_output(command, "MODEL.json", "may be the input model file")
+    common.add_topic(command)
+    common.add_axes(command, help="default: every axis that bag and model share")
+    common.add_span(command)
+    common.add_sensor(command)
     command.add_argument(
         "--report", metavar="DIR", help="also write a report with plots of the last bag; default: none"
     )
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.model.document import load_model, save_model
     from slpi_ros.reports.text import change_limits, describe_change, verdict
     from slpi_ros.workflows.refit import RefitRequest, refit
 
-    allow_model_and_report(options)
-    source = source_of(options)
-    done = refit(RefitRequest(source, with_sensor(load_model(options.model), options)))
+    common.allow_model_and_report(options)
+    source = common.source_of(options)
+    done = refit(RefitRequest(source, common.with_sensor(load_model(options.model), options)))
     model, last, lines = done.model, done.steps[-1], []
     for step in done.steps:
         of_record = f"{step.record.source}: " if len(done.steps) > 1 else ""
@@ -88,6 +77,6 @@ def _numbers(change: "AxisChange") -> dict[str, float | bool | None]:
 COMMAND = Command(
     "update a model with new bags, keeping regions that these do not visit",
     "slpi refit model.json monday -o model.json",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

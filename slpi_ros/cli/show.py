@@ -6,13 +6,11 @@ from argparse import ArgumentParser, Namespace
 from slpi_ros.cli.command import Command, Result
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     command.add_argument("model", metavar="MODEL.json", help="model to be shown")
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.model.document import format_model, load_model
     from slpi_ros.reports.text import describe_model, model_limits, verdict
 
@@ -30,6 +28,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "print the contents of a model",
     "slpi show model.json",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

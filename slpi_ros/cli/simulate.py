@@ -6,15 +6,13 @@ from slpi_ros.cli.command import Command, Result, command_line
 from slpi_ros.cli.options import add_output, model_columns, require_another_file
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
     command.add_argument("table", metavar="VOLTAGE.csv", help="columns time_s, <axis>_V")
     add_output(command, "DISPLACEMENT.csv", "columns time_s, <axis>_m")
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.io.outputs import allow_table
     from slpi_ros.io.tables import read_table, table_header, write_table
     from slpi_ros.model.document import load_model
@@ -45,6 +43,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "compute the displacement for a voltage",
     "slpi simulate model.json voltage.csv -o displacement.csv",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

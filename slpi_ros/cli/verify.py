@@ -5,44 +5,32 @@ import shlex
 from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
-from slpi_ros.cli.options import (
-    add_axes,
-    add_bags,
-    add_output,
-    add_sensor,
-    add_topics,
-    allow_folder,
-    same_record,
-    source_of,
-    with_sensor,
-)
 from slpi_ros.errors import UsageError
 
 
-def add_options(command: ArgumentParser) -> None:
-    """Add the options of the command."""
+def _add_options(command: ArgumentParser) -> None:
     from slpi_ros.io.bag_reader import DESIRED
 
-    add_bags(command)
+    common.add_bags(command)
     command.add_argument("--model", metavar="MODEL.json", required=True, help="model of the same stage")
     command.add_argument(
         "--tolerance", metavar="UM", type=float,
         help="largest rms error that passes, micrometres; default: three times the repeatability floor of the record, "
         "at least 0.02 %% of the stroke",
     )  # fmt: skip
-    add_output(command, "DIR", "folder of verification.json and report.html; default: none", required=False)
+    common.add_output(command, "DIR", "folder of verification.json and report.html; default: none", required=False)
     command.add_argument(
         "--desired-topic", metavar="TOPIC",
         help=f"also evaluate the tracking error against this topic; default: {DESIRED}, if present in the bag",
     )  # fmt: skip
-    add_topics(command)
-    add_axes(command, help="default: every axis that bags and model share")
-    add_sensor(command)
+    common.add_topics(command)
+    common.add_axes(command, help="default: every axis that bags and model share")
+    common.add_sensor(command)
 
 
-def run(options: Namespace) -> Result:
-    """Run the command."""
+def _run(options: Namespace) -> Result:
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
@@ -56,14 +44,14 @@ def run(options: Namespace) -> Result:
     )
     from slpi_ros.workflows.verify import VerifyRequest, verify
 
-    source, tolerance = source_of(options), None
+    source, tolerance = common.source_of(options), None
     if options.tolerance is not None:
         if not 0.0 < options.tolerance < math.inf:
             raise UsageError(f"--tolerance {options.tolerance:g}: give a positive number of micrometres")
         tolerance = 1e-6 * options.tolerance
-    model = with_sensor(load_model(options.model), options)
+    model = common.with_sensor(load_model(options.model), options)
     if options.output is not None:
-        allow_folder(options, options.output, *FILES, inputs=[options.model])
+        common.allow_folder(options, options.output, *FILES, inputs=[options.model])
     with nullcontext() if options.output is None else output_folder(options.output, *FILES) as folder:
         found = verify(VerifyRequest(source, model, tolerance, options.desired_topic)).verification
         if folder:
@@ -72,7 +60,7 @@ def run(options: Namespace) -> Result:
         next_command = f"slpi compensate {shlex.quote(options.model)} DESIRED.csv -o VOLTAGE.csv"
     else:
         next_command = command_line(
-            "slpi", "diagnose", *options.bags, "--model", options.model, "-o", "diagnosis", *same_record(options)
+            "slpi", "diagnose", *options.bags, "--model", options.model, "-o", "diagnosis", *common.same_record(options)
         )
     return Result(
         describe_verification(found, details=False),
@@ -87,6 +75,6 @@ def run(options: Namespace) -> Result:
 COMMAND = Command(
     "test a model on bags not used to identify it: pass or fail",
     "slpi verify check --model model.json --tolerance 0.05",
-    add_options,
-    run,
+    _add_options,
+    _run,
 )

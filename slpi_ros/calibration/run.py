@@ -44,13 +44,8 @@ MOST_ROUNDS = 3
 class Recording:
     """What the stage did during one drive.
 
-    Parameters
-    ----------
-    record : Record
-    desired : mapping of axis name to ndarray, shape (N,), metres
-        Desired displacement at the samples of the record, NaN where there was none; empty without compensator.
-    kept : bool
-        Whether it is a recording of an earlier run; default False.
+    `desired` (m, shape (N,)): desired displacement at the samples of the record, NaN where there was none; empty
+    without compensator. `kept`: whether it is a recording of an earlier run; default False.
     """
 
     record: Record
@@ -62,13 +57,8 @@ class Recording:
 class Request:
     """A drive to be recorded.
 
-    Parameters
-    ----------
-    name : str
-        Name of the record, unique within a calibration.
-    drive : Drive
-    desired : mapping of axis name to ndarray, shape (N,), metres
-        Desired displacement at the samples of the drive; empty without compensator.
+    `name`: name of the record, unique within a calibration. `desired` (m, shape (N,)): desired displacement at the
+    samples of the drive; empty without compensator.
     """
 
     name: str
@@ -80,20 +70,10 @@ class Request:
 class TrackingError:
     """Error of the compensated stage on one path, measured - desired without its median.
 
-    Parameters
-    ----------
-    mean, rms, maximum : float, metres
-        Of the magnitude.
-    offset : float, metres
-        Median that was removed.
-    stroke : float, metres
-        Displacement range of the model.
-    goal : float, metres
-        Largest mean error that meets the target.
-    t : ndarray, shape (N,), seconds
-        Time of the samples along the path, from the first stamp of the record.
-    desired, error : ndarray, shape (N,), metres
-        Desired displacement, and measured - desired without the offset.
+    `mean`, `rms`, `maximum` (m): of the magnitude. `offset` (m): median that was removed. `stroke` (m): displacement
+    range of the model. `goal` (m): largest mean error that meets the target. `t` (s, shape (N,)): time of the samples
+    along the path, from the first stamp of the record. `desired`, `error` (m, shape (N,)): desired displacement, and
+    measured - desired without the offset.
     """
 
     mean: float
@@ -116,18 +96,8 @@ class TrackingError:
 class Step:
     """One step of a calibration.
 
-    Parameters
-    ----------
-    name : str
-        Name of the record, or of the computation.
-    seconds : float
-        Duration of the drive; 0 for a computation.
-    why : str
-        Why this step.
-    finding : str
-        What the step showed.
-    errors : mapping of axis name to TrackingError
-        Errors if the step was a verification, else empty.
+    `name`: name of the record, or of the computation. `seconds`: duration of the drive; 0 for a computation. `why`: why
+    this step. `finding`: what the step showed. `errors`: errors if the step was a verification, else empty.
     """
 
     name: str
@@ -141,18 +111,9 @@ class Step:
 class Outcome:
     """Result of a calibration.
 
-    Parameters
-    ----------
-    settings : CalibrationSettings
-    model : StageModel
-        Model with the lowest verified error.
-    errors : mapping of axis name to TrackingError
-        Its verified errors.
-    diagnosis : Diagnosis
-        Last diagnosis, of all records before the last verification.
-    steps : tuple of Step
-    why : str
-        Why the target is met or not, and why the calibration ended, in one line.
+    `model`: model with the lowest verified error. `errors`: its verified errors. `diagnosis`: last diagnosis, of all
+    records before the last verification. `why`: why the target is met or not, and why the calibration ended, in one
+    line.
     """
 
     settings: CalibrationSettings
@@ -177,16 +138,8 @@ class Outcome:
 class Progress:
     """Progress of a calibration.
 
-    Parameters
-    ----------
-    doing : str
-        Present step.
-    step : int
-        Its number, from 1.
-    seconds_left : float
-        Time left for drives.
-    error : float or None, metres
-        Largest verified mean error so far; None before the first verification.
+    `doing`: present step. `step`: its number, from 1. `seconds_left`: time left for drives. `error` (m): largest
+    verified mean error so far; None before the first verification.
     """
 
     doing: str
@@ -203,22 +156,8 @@ def calibrate(
 ) -> Outcome:
     """Calibrate a stage by itself.
 
-    Parameters
-    ----------
-    settings : CalibrationSettings
-    record : callable
-        Drives the stage and returns what it did; an exception ends the calibration.
-    report : callable, optional
-        Called at the beginning of each step.
-
-    Returns
-    -------
-    Outcome
-
-    Raises
-    ------
-    SlpiError
-        If the stage does not follow the voltages, or the records allow no model.
+    `record`: drives the stage and returns what it did; an exception ends the calibration. `report`: called at the
+    beginning of each step. Raises SlpiError if the stage does not follow the voltages, or the records allow no model.
     """
     return _Calibration(settings, record, report).run()
 
@@ -430,20 +369,9 @@ def _follows(axis: str, drive: Drive, record: Record) -> str:
 def tracking_error(recording: Recording, axis: str, model: StageModel, goal: float) -> TrackingError:
     """Return the error of an axis along the path of a recording.
 
-    Parameters
-    ----------
-    recording : Recording
-        With desired displacements.
-    axis : str
-    model : StageModel
-        Model that the compensator used; what it knows of the sensor is taken out of the readings.
-    goal : float, metres
-        Largest mean error that meets the target.
-
-    Raises
-    ------
-    RecordError
-        If there are no readings along the path.
+    `recording`: with desired displacements. `model`: model that the compensator used; what it knows of the sensor is
+    taken out of the readings. `goal` (m): largest mean error that meets the target. Raises RecordError if there are no
+    readings along the path.
     """
     record, desired = recording.record, recording.desired[axis]
     error = model.axis(axis).correct(record.t, record.displacement[axis]) - desired
@@ -474,14 +402,8 @@ def aligned(
     Commands take some time to the stage and readings some time back. The delay between commanded and applied voltages
     is removed, so that only what the stage itself does is left.
 
-    Parameters
-    ----------
-    record : Record
-    sent_ns : ndarray of int64, shape (M,), nanoseconds
-        Stamps of the commands, on the clock of the record.
-    commands : mapping of axis name to ndarray, shape (M,), volts
-    desired : mapping of axis name to ndarray, shape (M,), metres
-        NaN where there was none.
+    `sent_ns` (ns, shape (M,)): stamps of the commands, on the clock of the record. `commands` (V, shape (M,)).
+    `desired` (m, shape (M,)): NaN where there was none.
     """
     if not desired:
         return Recording(record, {})

@@ -102,22 +102,10 @@ class Row:
 class Examined:
     """What is known of a bag without a model.
 
-    Parameters
-    ----------
-    bag : Bag
-    stage : str
-        Name of the stage: of the list, else the bag's hardware id, else "".
-    hardware_id : str
-    date_ns : int or None, nanoseconds
-        First time stamp, Unix time; None if the bag cannot be read.
-    axes : tuple of str
-        Axes that can be used.
-    findings : mapping of axis name to tuple of str
-        Findings on the quality of the record, other than "ok".
-    refused : mapping of axis name to str
-        Reason for each axis that cannot be used; axis "" if that is the whole bag.
-    seconds : float
-        Computing time.
+    `stage`: name of the stage: of the list, else the bag's hardware id, else "". `date_ns` (ns): first time stamp, Unix
+    time; None if the bag cannot be read. `axes`: axes that can be used. `findings`: findings on the quality of the
+    record, other than "ok". `refused`: reason for each axis that cannot be used; axis "" if that is the whole bag.
+    `seconds`: computing time.
     """
 
     bag: Bag
@@ -168,11 +156,7 @@ class Judged:
 def examine(bag: Bag, topic: str) -> Examined:
     """Read a bag and assess the quality of its record.
 
-    Parameters
-    ----------
-    bag : Bag
-    topic : str
-        Topic with voltage and displacement.
+    `topic`: topic with voltage and displacement.
     """
     began = time.process_time()
     try:
@@ -200,18 +184,8 @@ def examine(bag: Bag, topic: str) -> Examined:
 def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
     """Identify the reference model of a stage from a bag, and write it to the file `name` in the folder `output`.
 
-    Parameters
-    ----------
-    one : Examined
-        Examination of the bag.
-    topic : str
-    output, name : str
-        Folder of the results, and path of the model within it.
-
-    Returns
-    -------
-    Judged
-        Its `model` is `name`, or "" if no axis can be identified.
+    `one`: examination of the bag. `output`, `name`: folder of the results, and path of the model within it. Returned:
+    its `model` is `name`, or "" if no axis can be identified.
     """
     began = time.process_time()
     rows, axes = [], {}
@@ -239,13 +213,8 @@ def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
 def compare(one: Examined, topic: str, output: str, reference: str, name: str) -> Judged:
     """Verify the reference model of the stage on a bag, and refit it where it is beyond the limit.
 
-    Parameters
-    ----------
-    one : Examined
-        Examination of the bag.
-    topic, output : str
-    reference, name : str
-        Paths of the reference model and of the refitted one within the folder of the results.
+    `one`: examination of the bag. `reference`, `name`: paths of the reference model and of the refitted one within the
+    folder of the results.
     """
     began = time.process_time()
     try:
@@ -285,17 +254,9 @@ def explain(
 ) -> Judged:
     """Explain the error of a bag that neither the reference model nor a changed gain, width or zero describes.
 
-    Parameters
-    ----------
-    one : Examined
-    rows : sequence of Row
-        Rows from `identify_bag` or `compare`.
-    topic, output, reference, name : str
-        As for `compare`.
-    others : mapping of str to str
-        Paths of the reference models of all other stages.
-    diagnosed : bool
-        Whether a diagnosis names the causes if no other stage's model describes the record.
+    `rows`: rows from `identify_bag` or `compare`. `topic`, `output`, `reference`, `name`: as for `compare`. `others`:
+    paths of the reference models of all other stages. `diagnosed`: whether a diagnosis names the causes if no other
+    stage's model describes the record.
     """
     began = time.process_time()
     told = []

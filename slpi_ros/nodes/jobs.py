@@ -28,15 +28,9 @@ Outcome = TypeVar("Outcome")
 class WorkerProcess(Generic[Request, Outcome]):
     """Run a function in a worker process and return its outcome without blocking.
 
-    Parameters
-    ----------
-    work : callable
-        Module-level function that returns the outcome of a request.
-    request : object
-    outcome : type
-        Dataclass of plain values; it is created with only `error` set if the process ends without a result.
-    what : str
-        Description of the work for this error message.
+    `work`: module-level function that returns the outcome of a request. `outcome`: dataclass of plain values; it is
+    created with only `error` set if the process ends without a result. `what`: description of the work for this error
+    message.
     """
 
     def __init__(
@@ -94,11 +88,7 @@ def _run(sender: Connection, work: Callable[[Any], Any], request: Any) -> None:
 class StageIdentity:
     """Identity of a stage: hardware id and axes.
 
-    Parameters
-    ----------
-    hardware_id : str
-        "" if unknown.
-    axes : tuple of str
+    `hardware_id`: "" if unknown.
     """
 
     hardware_id: str
@@ -128,25 +118,12 @@ class StageIdentity:
 class FitRequest:
     """Request of an identification.
 
-    Parameters
-    ----------
-    bags : tuple of str
-        Paths of the bags, all used in one fit.
-    topic : str
-    kind : str
-        Kind of hysteresis model.
-    start, stop : float or None, seconds
-        Start and end of the fitted part of the record; None: first stamp, or last stamp.
-    output : str
-        File for the model document; "" if none.
-    stage : StageIdentity, optional
-        Stage that the bags must belong to; default: any.
-    in_use : str
-        Document of the model in use, with which the new one is compared; "" (default): that in `output`, if any.
-    unconditional : bool
-        Whether the new model is published whatever the comparison says. Default False.
-    sensor_delay, sensor_lag : float, seconds
-        Known delay and lag of the sensor; default 0.
+    `bags`: paths of the bags, all used in one fit. `kind`: kind of hysteresis model. `start`, `stop` (s): start and end
+    of the fitted part of the record; None: first stamp, or last stamp. `output`: file for the model document; "" if
+    none. `stage`: stage that the bags must belong to; default: any. `in_use`: document of the model in use, with which
+    the new one is compared; "" (default): that in `output`, if any. `unconditional`: whether the new model is published
+    whatever the comparison says. Default False. `sensor_delay`, `sensor_lag` (s): known delay and lag of the sensor;
+    default 0.
     """
 
     bags: tuple[str, ...]
@@ -224,16 +201,8 @@ def _in_use(request: FitRequest, records: Sequence[Record]) -> StageModel | None
 class DiagnosisRequest:
     """Request of a diagnosis.
 
-    Parameters
-    ----------
-    bags : tuple of str
-        Paths of the bags, diagnosed together.
-    topic : str
-        Topic of the recorded voltages and displacements.
-    document : str
-        Model document.
-    folder : str
-        Output folder; "" (default) if not chosen yet.
+    `bags`: paths of the bags, diagnosed together. `topic`: topic of the recorded voltages and displacements.
+    `document`: model document. `folder`: output folder; "" (default) if not chosen yet.
     """
 
     bags: tuple[str, ...]
@@ -305,15 +274,8 @@ def check(request: tuple[str, str]) -> CheckOutcome:
 class Reading:
     """Validation of a model document in the background.
 
-    Parameters
-    ----------
-    document, source : str
-        Text of the document, and its name in messages.
-
-    Raises
-    ------
-    ModelError
-        If the document is too large.
+    `document`, `source`: text of the document, and its name in messages. Raises ModelError if the document is too
+    large.
     """
 
     def __init__(self, document: str, source: str) -> None:
@@ -332,10 +294,7 @@ class Reading:
     def read(self) -> Read | None:
         """Return the model and its fingerprint; None if canceled.
 
-        Raises
-        ------
-        ModelError
-            If the document is not valid.
+        Raises ModelError if the document is not valid.
         """
         if self._unwanted.is_set():
             return None

@@ -30,12 +30,8 @@ class DiagnoseOutcome:
 def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
     """Find the causes of the errors of a model.
 
-    Raises
-    ------
-    UsageError
-        If a bag is given twice.
-    RecordError, IdentificationError, ModelError
-        If the records cannot be read, do not allow a diagnosis, or do not match the model.
+    Raises UsageError if a bag is given twice. Raises RecordError, IdentificationError, ModelError if the records cannot
+    be read, do not allow a diagnosis, or do not match the model.
     """
     source, model = request.source, request.model
     records = source.read(coupled=True)

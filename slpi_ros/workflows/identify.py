@@ -16,15 +16,8 @@ from slpi_ros.workflows.records import Findings, Source, require_records
 class IdentifyRequest:
     """Request of an identification: one model from all records.
 
-    Parameters
-    ----------
-    source : Source
-    kind : str
-        Kind of hysteresis model.
-    loops_at_rest : bool
-        For ``slpi-published``: whether its operators start at rest; default False.
-    sensor : Sensor
-        Known delay and lag of the sensors; default: none.
+    `kind`: kind of hysteresis model. `loops_at_rest`: for ``slpi-published``: whether its operators start at rest;
+    default False. `sensor`: known delay and lag of the sensors; default: none.
     """
 
     source: Source
@@ -79,12 +72,8 @@ class IdentifyOutcome:
 def identify(request: IdentifyRequest) -> IdentifyOutcome:
     """Identify a model.
 
-    Raises
-    ------
-    UsageError
-        If the kind or an option is unknown, or a bag is given twice.
-    RecordError, IdentificationError
-        If the records cannot be read, or do not allow a fit.
+    Raises UsageError if the kind or an option is unknown, or a bag is given twice. Raises RecordError,
+    IdentificationError if the records cannot be read, or do not allow a fit.
     """
     request.require_possible()
     source, sensor = request.source, request.sensor

@@ -28,19 +28,10 @@ class UnusableRecordError(IdentificationError):
 class Source:
     """Records of one stage: the bags that hold them, or the records themselves.
 
-    Parameters
-    ----------
-    bags : sequence of str
-        Paths of the bags; not read if there are `records`.
-    topic : str or SeparateTopics
-        Where the bags hold voltage and displacement.
-    axes : sequence of str, optional
-        Axes in use; default: all.
-    start, stop : float, seconds, optional
-        Part in use, from the first stamp of each record; default: all.
-    records : sequence of Record
-    assessed : bool
-        Whether `assess_record` has found the axes in use usable already, so that it is not asked again; default False.
+    `bags`: paths of the bags; not read if there are `records`. `topic`: where the bags hold voltage and displacement.
+    `axes`: axes in use; default: all. `start`, `stop` (s): part in use, from the first stamp of each record; default:
+    all. `assessed`: whether `assess_record` has found the axes in use usable already, so that it is not asked again;
+    default False.
     """
 
     bags: Sequence[str] = ()
@@ -54,17 +45,9 @@ class Source:
     def read(self, *, coupled: bool = False) -> tuple[Record, ...]:
         """Return the records.
 
-        Parameters
-        ----------
-        coupled : bool
-            Whether axes that are not in use are read as well, since they may couple into the others; default False.
-
-        Raises
-        ------
-        UsageError
-            If there is no bag, or one is given twice.
-        RecordError
-            If a bag cannot be read, or they are of several stages.
+        `coupled`: whether axes that are not in use are read as well, since they may couple into the others; default
+        False. Raises UsageError if there is no bag, or one is given twice. Raises RecordError if a bag cannot be read,
+        or they are of several stages.
         """
         if self.records:
             return tuple(self.records)

@@ -15,15 +15,9 @@ from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, requi
 class VerifyRequest:
     """Request of a verification.
 
-    Parameters
-    ----------
-    source : Source
-        Its `start` and `stop` are not used: whole records are judged.
-    model : StageModel
-    tolerance : float, metres, optional
-        Largest rms error that passes; default: as for `slpi_ros.verify`.
-    desired_topic : str, optional
-        Topic of the bags that holds the desired displacement; default: ``desired_displacement``, where a bag has it.
+    `source`: its `start` and `stop` are not used: whole records are judged. `tolerance` (m): largest rms error that
+    passes; default: as for `slpi_ros.verify`. `desired_topic`: topic of the bags that holds the desired displacement;
+    default: ``desired_displacement``, where a bag has it.
     """
 
     source: Source
@@ -44,12 +38,8 @@ class VerifyOutcome:
 def verify(request: VerifyRequest) -> VerifyOutcome:
     """Verify a model.
 
-    Raises
-    ------
-    UsageError
-        If a bag is given twice.
-    RecordError, IdentificationError, ModelError
-        If the records cannot be read, allow no judgement, or do not match the model.
+    Raises UsageError if a bag is given twice. Raises RecordError, IdentificationError, ModelError if the records cannot
+    be read, allow no judgement, or do not match the model.
     """
     source, model = request.source, request.model
     records = source.read(coupled=True)

@@ -1,7 +1,7 @@
 """Diagnosis of the errors of a model on records: read, check, find the causes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from slpi_ros.diagnosis import diagnose as diagnosis
 from slpi_ros.diagnosis.result import Diagnosis
@@ -36,7 +36,7 @@ def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
     source, model = request.source, request.model
     records = source.read(coupled=True)
     with mismatch_in_data():
-        source = source.of_axes(shared_axes(records, model, source))
+        source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)
         told = diagnosis.diagnose(records, model, axes=source.axes, start=source.start, stop=source.stop)
     return DiagnoseOutcome(told, records, found)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
@@ -54,10 +54,6 @@ class Source:
         records = tuple(self._read(str(bag), coupled) for bag in require_different(self.bags))
         require_one_stage(records)
         return records
-
-    def of_axes(self, axes: Sequence[str]) -> "Source":
-        """Return the source with these axes in use."""
-        return replace(self, axes=tuple(axes))
 
     def _read(self, bag: str, coupled: bool) -> Record:
         # Separate topics may not name their axes; their names are then those of the request.

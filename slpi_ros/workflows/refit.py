@@ -1,7 +1,7 @@
 """Correction of a model with new records: read, check, refit, the oldest record first."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from slpi_ros.identification import refit as correction
 from slpi_ros.identification.progress import report_progress
@@ -44,7 +44,7 @@ def refit(request: RefitRequest) -> RefitOutcome:
     source, model, steps = request.source, request.model, []
     records = sorted(source.read(coupled=True), key=lambda record: int(record.time_ns[0]))
     for record in records:
-        require_for_model([record], model, source.of_axes(shared_axes([record], model, source)))
+        require_for_model([record], model, replace(source, axes=shared_axes([record], model, source)))
     for record in records:
         report_progress(f"refit to {record.source}")
         model, changes = correction.refit(model, record, axes=source.axes, start=source.start, stop=source.stop)

@@ -1,7 +1,7 @@
 """Verification of a model on records that it has not seen: read, check, judge."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from slpi_ros.diagnosis import verify as verification
 from slpi_ros.diagnosis.verify import Verification
@@ -15,7 +15,7 @@ from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, requi
 class VerifyRequest:
     """Request of a verification.
 
-    `source`: its `start` and `stop` are not used: whole records are judged. `tolerance` (m): largest rms error that
+    `source`: whole records are judged, whatever its `start` and `stop`. `tolerance` (m): largest rms error that
     passes; default: as for `slpi_ros.verify`. `desired_topic`: topic of the bags that holds the desired displacement;
     default: ``desired_displacement``, where a bag has it.
     """
@@ -48,7 +48,7 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
         read = zip(source.bags, records, strict=True)
         desired = [read_desired(bag, record, request.desired_topic) for bag, record in read]
     with mismatch_in_data():
-        source = source.of_axes(shared_axes(records, model, source))
+        source = replace(source, axes=shared_axes(records, model, source), start=None, stop=None)
         found = require_for_model(records, model, source)
         told = verification.verify(records, model, request.tolerance, axes=source.axes, desired=desired)
     return VerifyOutcome(told, records, found)

@@ -3,21 +3,21 @@
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
-from slpi_ros.cli.options import add_axes, add_limits, require_axis_names, slew_of
 
 
 def _add_options(command: ArgumentParser) -> None:
     command.add_argument("-o", "--output", metavar="DIR", required=True, help="folder of bags, model and page")
-    add_axes(command, default=("x",), help="default: x")
-    add_limits(command, "slew limit")
+    common.add_axes(command, default=("x",), help="default: x")
+    common.add_limits(command, "slew limit")
 
 
 def _run(options: Namespace) -> Result:
     from slpi_ros.excitation.legs import DriveSpec
 
-    require_axis_names(options.axis)
-    slew = slew_of(options)
+    common.require_axis_names(options.axis)
+    slew = common.slew_of(options)
     DriveSpec(options.voltage_min, options.voltage_max, duration=1.0, rate=1.0, slew_limit=slew)
     given = {
         "axes": "['" + "', '".join(options.axis) + "']",

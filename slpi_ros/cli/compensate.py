@@ -4,8 +4,8 @@ import math
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
-from slpi_ros.cli.options import add_output, model_columns, require_another_file
 from slpi_ros.errors import SlpiError, UsageError
 
 # A first voltage that differs by more than this share of the range is told as a jump.
@@ -17,7 +17,7 @@ def _add_options(command: ArgumentParser) -> None:
 
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
     command.add_argument("table", metavar="DESIRED.csv", help="columns time_s, <axis>_m")
-    add_output(command, "VOLTAGE.csv", "columns time_s, <axis>_V")
+    common.add_output(command, "VOLTAGE.csv", "columns time_s, <axis>_V")
     command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
     command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
     command.add_argument(
@@ -41,11 +41,11 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.model.stage_model import check_time, held_message
     from slpi_ros.reports.text import describe_start
 
-    require_another_file(options.output, options.model, options.table)
+    common.require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
     t, desired = read_table(options.table, "m")
     check_time(t)
-    known = model_columns(desired, model, options.table)
+    known = common.model_columns(desired, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "V"), overwrite=options.overwrite)
     if options.slew < 0.0 or math.isnan(options.slew):
         raise UsageError(f"--slew {options.slew:g}: give a positive number of V/s, or 0 for no limit")

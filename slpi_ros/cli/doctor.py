@@ -4,8 +4,8 @@ import math
 import shlex
 from argparse import ArgumentParser, Namespace
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
-from slpi_ros.cli.options import add_topic, seconds
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.progress import report_progress
 
@@ -19,14 +19,14 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("--model", metavar="MODEL.json", help="model to be checked; default: that on stage_model")
     command.add_argument("--voltage-min", metavar="V", type=float, help="lowest voltage allowed; default: not checked")
     command.add_argument("--voltage-max", metavar="V", type=float, help="highest voltage allowed; default: not checked")
-    add_topic(command)
+    common.add_topic(command)
     command.add_argument(
         "--command-topic", metavar="TOPIC", default=COMMANDS_TOPIC,
         help=f"topic of the voltage commands; default: {COMMANDS_TOPIC}",
     )  # fmt: skip
     command.add_argument("--namespace", metavar="NAME", default="", help="namespace of the stage; default: none")
     command.add_argument(
-        "--seconds", metavar="S", type=seconds, default=3.0, help="time to watch a running graph; default: 3 s"
+        "--seconds", metavar="S", type=common.seconds, default=3.0, help="time to watch a running graph; default: 3 s"
     )
     command.add_argument("--no-ros", action="store_true", help="check the files only; default: also a running graph")
 

@@ -2,16 +2,16 @@
 
 from argparse import ArgumentParser, Namespace
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result
-from slpi_ros.cli.options import add_axes, add_limits, add_output, require_axis_names, slew_of
 
 
 def _add_options(command: ArgumentParser) -> None:
     from slpi_ros.excitation.drives import DRIVES
 
-    add_output(command, "DRIVE.csv", "columns time_s, <axis>_V")
-    add_axes(command, default=("x",), help="axes to excite, one after the other; default: x")
-    add_limits(command, "slew limit, of which the drive uses 80 %%")
+    common.add_output(command, "DRIVE.csv", "columns time_s, <axis>_V")
+    common.add_axes(command, default=("x",), help="axes to excite, one after the other; default: x")
+    common.add_limits(command, "slew limit, of which the drive uses 80 %%")
     command.add_argument("--duration", metavar="S", type=float, default=30.0, help="duration; default: 30 s")
     command.add_argument("--rate", metavar="HZ", type=float, default=200.0, help="sample rate; default: 200 Hz")
     command.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the random sequence; default: 0")
@@ -26,13 +26,13 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.io.outputs import allow_table
     from slpi_ros.io.tables import table_header, write_table
 
-    require_axis_names(options.axis)
+    common.require_axis_names(options.axis)
     options.remarks += allow_table(options.output, table_header(options.axis, "V"), overwrite=options.overwrite)
     drive = excite(
         options.axis,
         voltage_min=options.voltage_min,
         voltage_max=options.voltage_max,
-        slew_limit=SLEW_USED * slew_of(options),
+        slew_limit=SLEW_USED * common.slew_of(options),
         duration=options.duration,
         rate=options.rate,
         seed=options.seed,

@@ -3,13 +3,13 @@
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result
-from slpi_ros.cli.options import add_output
 from slpi_ros.errors import UsageError
 
 
 def _add_options(command: ArgumentParser) -> None:
-    add_output(command, "DIR", "folder of index.html")
+    common.add_output(command, "DIR", "folder of index.html")
     command.add_argument(
         "--data", metavar="DIR", help="folder of measured records to include in the comparison; default: none"
     )

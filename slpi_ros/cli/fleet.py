@@ -4,8 +4,8 @@ import os
 import sys
 from argparse import ArgumentParser, Namespace
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result
-from slpi_ros.cli.options import add_output, add_topic
 from slpi_ros.errors import UsageError
 
 
@@ -13,7 +13,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "sources", metavar="SOURCE", nargs="+", help="bag, folder of bags (recursively), or CSV list of bag and stage"
     )
-    add_output(
+    common.add_output(
         command, "DIR", "folder of results.parquet, index.html and models; an interrupted run is continued there"
     )
     command.add_argument("--models", metavar="DIR", help="reference models; default: of the first bag of each stage")
@@ -28,7 +28,7 @@ def _add_options(command: ArgumentParser) -> None:
     )
     command.add_argument("--no-diagnose", action="store_true", help="no search for causes of errors; default: search")
     command.add_argument("--watch", action="store_true", help="go on with bags that are completed later; default: end")
-    add_topic(command)
+    common.add_topic(command)
 
 
 def _run(options: Namespace) -> Result:

@@ -4,8 +4,8 @@ import os
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
-from slpi_ros.cli.options import add_output
 
 
 def _add_options(command: ArgumentParser) -> None:
@@ -13,7 +13,7 @@ def _add_options(command: ArgumentParser) -> None:
         "table", metavar="DATA.csv|DATA.mat",
         help="columns separated by comma, semicolon or tab; names include the unit: x_nm, x (nm), x [nm] or x in nm",
     )  # fmt: skip
-    add_output(command, "BAG", "folder of the new bag")
+    common.add_output(command, "BAG", "folder of the new bag")
     command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
     command.add_argument(
         "--voltage", metavar="COLUMN", nargs="+", default=(),

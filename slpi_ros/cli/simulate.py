@@ -2,14 +2,14 @@
 
 from argparse import ArgumentParser, Namespace
 
+from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
-from slpi_ros.cli.options import add_output, model_columns, require_another_file
 
 
 def _add_options(command: ArgumentParser) -> None:
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
     command.add_argument("table", metavar="VOLTAGE.csv", help="columns time_s, <axis>_V")
-    add_output(command, "DISPLACEMENT.csv", "columns time_s, <axis>_m")
+    common.add_output(command, "DISPLACEMENT.csv", "columns time_s, <axis>_m")
 
 
 def _run(options: Namespace) -> Result:
@@ -17,10 +17,10 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.io.tables import read_table, table_header, write_table
     from slpi_ros.model.document import load_model
 
-    require_another_file(options.output, options.model, options.table)
+    common.require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
     t, voltage = read_table(options.table, "V")
-    known = model_columns(voltage, model, options.table)
+    known = common.model_columns(voltage, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "m"), overwrite=options.overwrite)
     reached = model.simulate(t, known)
     write_table(options.output, t, reached, "m")

@@ -26,8 +26,16 @@ AT_FLOOR = 1.5
 class Choice:
     """The next drive.
 
-    `drive`: one of `slpi_ros.excitation.drives.DRIVES`. `axes`: axes that move. `seconds`: duration. `why`: what is
-    open and how this record helps.
+    Parameters
+    ----------
+    drive : str
+        One of `slpi_ros.excitation.drives.DRIVES`.
+    axes : tuple of str
+        Axes that move.
+    seconds : float
+        Duration.
+    why : str
+        What is open and how this record helps.
     """
 
     drive: str
@@ -47,8 +55,15 @@ def next_drive(
     The promise of a drive is the share of the mean square error of an axis that it may explain. One axis moves in each,
     so that the others need not be diagnosed on it; only coupling takes them all.
 
-    `found`: diagnosis of all records so far; None if there is none yet. `recorded`: name and axes of each drive
-    recorded so far. `left` (s): time left for drives.
+    Parameters
+    ----------
+    settings : CalibrationSettings
+    found : mapping of axis name to AxisDiagnosis, or None
+        Diagnosis of all records so far; None if there is none yet.
+    recorded : sequence of (str, sequence of str)
+        Name and axes of each drive recorded so far.
+    left : float, seconds
+        Time left for drives.
     """
     best, chosen = 0.0, None
     for axis in settings.axes:

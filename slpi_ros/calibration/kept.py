@@ -31,10 +31,22 @@ def require_kept(
 ) -> None:
     """Check a kept record before anything is computed from it.
 
-    `drive`: what this calibration would have driven instead. `before`: first record of this calibration, of the same
-    stage; None if this is the first. `fitted`: whether a model is fitted to the record, so that its quality matters.
-    Raises RecordError if it is of other limits, of another stage, or of a quality that allows no fit; the message names
-    the record, what is wrong, and what to do.
+    Parameters
+    ----------
+    record : Record
+    drive : Drive
+        What this calibration would have driven instead.
+    settings : CalibrationSettings
+    before : Record or None
+        First record of this calibration, of the same stage; None if this is the first.
+    fitted : bool
+        Whether a model is fitted to the record, so that its quality matters.
+
+    Raises
+    ------
+    RecordError
+        If it is of other limits, of another stage, or of a quality that allows no fit; the message names the record,
+        what is wrong, and what to do.
     """
     with naming(record):
         lasts, whole = float(np.ptp(record.time_ns)) * 1e-9, float(drive.t[-1])

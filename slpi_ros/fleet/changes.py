@@ -25,10 +25,17 @@ DRIFT, STEP = "drift", "step"
 class Change:
     """A change of a series.
 
-    `date_ns` (ns): Unix time of the first bag after a step, or at which a drift has become significant. `before_ns`
-    (ns): time of the bag before it. `size`, `uncertainty`: change by the step, or by the drift from the first to the
-    last bag, and its standard deviation. `chance`: probability that noise alone shows such a change anywhere in the
-    series.
+    Parameters
+    ----------
+    kind : {"step", "drift"}
+    date_ns : int, nanoseconds
+        Unix time of the first bag after a step, or at which a drift has become significant.
+    before_ns : int, nanoseconds
+        Time of the bag before it.
+    size, uncertainty : float
+        Change by the step, or by the drift from the first to the last bag, and its standard deviation.
+    chance : float
+        Probability that noise alone shows such a change anywhere in the series.
     """
 
     kind: str
@@ -46,8 +53,18 @@ def find_changes(date_ns: IntArray, values: FloatArray, deviations: FloatArray) 
     one after the other; then those are removed that noise may explain, with a correction for the number of possible
     steps. Noise is estimated from the given deviations and from what the largest set of terms leaves.
 
-    `date_ns` (ns, shape (N,)): Unix times, increasing. `values` (shape (N,)). `deviations` (shape (N,)): standard
-    deviations of the values. Returned: in order of time; empty if there are fewer than `FEWEST` values.
+    Parameters
+    ----------
+    date_ns : ndarray of int, shape (N,), nanoseconds
+        Unix times, increasing.
+    values : ndarray, shape (N,)
+    deviations : ndarray, shape (N,)
+        Standard deviations of the values.
+
+    Returns
+    -------
+    list of Change
+        In order of time; empty if there are fewer than `FEWEST` values.
     """
     if values.size < FEWEST:
         return []

@@ -57,7 +57,10 @@ class Pages:
     def write(self, results: Results) -> None:
         """Write ``fleet.json``, ``index.html`` and the pages of the stages with new rows.
 
-        Raises SlpiError if a file cannot be written.
+        Raises
+        ------
+        SlpiError
+            If a file cannot be written.
         """
         rows, folder = results.state.rows(), results.folder
         stages = summarise(rows)
@@ -77,8 +80,19 @@ def report_fleet(
 ) -> tuple[list[str], bool]:
     """Run `slpi_ros.fleet.run` with its `options`, write the pages, and summarise the results.
 
-    `sources`, `output`: as for `slpi_ros.fleet.run`. `as_document`: whether the text is that of ``fleet.json``. Default
-    False: sentences. `lines`: the summary. `usable`: whether any bag could be used.
+    Parameters
+    ----------
+    sources, output
+        As for `slpi_ros.fleet.run`.
+    as_document : bool
+        Whether the text is that of ``fleet.json``. Default False: sentences.
+
+    Returns
+    -------
+    lines : list of str
+        The summary.
+    usable : bool
+        Whether any bag could be used.
     """
     pages = Pages()
     rows: list[Row] = []

@@ -30,8 +30,13 @@ TABLE, JOURNAL, LOCK = "results.parquet", "journal.jsonl", ".lock"
 class State:
     """What is known of all bags.
 
-    `judged`: rows of each bag that has been processed. `references`: path of the reference model of each stage, within
-    the folder of the results.
+    Attributes
+    ----------
+    examined : dict of path to Examined
+    judged : dict of path to Judged
+        Rows of each bag that has been processed.
+    references : dict of stage to str
+        Path of the reference model of each stage, within the folder of the results.
     """
 
     examined: dict[str, Examined] = field(default_factory=dict)
@@ -47,9 +52,19 @@ class State:
 class Results:
     """The folder of the results, locked against other runs while it is open.
 
-    `folder`: created if missing. `options`: options on which the rows depend; a folder is continued only with the same
-    ones. Raises SlpiError if the folder cannot be written, or another run writes into it. Raises UsageError if the
-    folder holds results of other options.
+    Parameters
+    ----------
+    folder : path
+        Created if missing.
+    options : mapping
+        Options on which the rows depend; a folder is continued only with the same ones.
+
+    Raises
+    ------
+    SlpiError
+        If the folder cannot be written, or another run writes into it.
+    UsageError
+        If the folder holds results of other options.
     """
 
     def __init__(self, folder: str | os.PathLike[str], options: Mapping[str, Any]) -> None:

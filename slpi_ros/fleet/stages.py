@@ -28,8 +28,14 @@ QUANTITIES = {
 class Exchange:
     """Bags that belong to another stage than named.
 
-    `like_stage`: stage whose model describes them. `date_ns`, `before_ns` (ns): times of the first of them and of the
-    last bag before it. `mutual`: whether that stage has bags that belong to this one.
+    Parameters
+    ----------
+    like_stage : str
+        Stage whose model describes them.
+    date_ns, before_ns : int or None, nanoseconds
+        Times of the first of them and of the last bag before it.
+    mutual : bool
+        Whether that stage has bags that belong to this one.
     """
 
     like_stage: str
@@ -42,10 +48,22 @@ class Exchange:
 class StageSummary:
     """Summary of one axis of a stage.
 
-    `health`: `GOOD`, `REFITTED`, `EXCHANGED` or `CALIBRATE`. `bags`, `refused`: number of bags, and of those that
-    cannot be used. `date_ns` (ns): time of the latest usable bag. `model`: path of the model that describes the latest
-    usable bag; "" if there is none. `changes`: changes of ``gain`` and ``width`` (relative to the reference model) and
-    of ``offset`` (m). `rows`: by date.
+    Parameters
+    ----------
+    stage, axis : str
+    health : str
+        `GOOD`, `REFITTED`, `EXCHANGED` or `CALIBRATE`.
+    bags, refused : int
+        Number of bags, and of those that cannot be used.
+    date_ns : int or None, nanoseconds
+        Time of the latest usable bag.
+    model : str
+        Path of the model that describes the latest usable bag; "" if there is none.
+    changes : mapping of quantity to tuple of Change
+        Changes of ``gain`` and ``width`` (relative to the reference model) and of ``offset`` (m).
+    exchanges : tuple of Exchange
+    rows : tuple of Row
+        By date.
     """
 
     stage: str
@@ -83,7 +101,10 @@ class StageSummary:
 def summarise(rows: Sequence[Row]) -> list[StageSummary]:
     """Return the summary of each axis of each stage, by name; bags without a stage have none.
 
-    `rows`: in any order.
+    Parameters
+    ----------
+    rows : sequence of Row
+        In any order.
     """
     named = sorted((row for row in rows if row.stage), key=lambda row: (row.stage, row.date_ns or 0, row.bag))
     pairs = {(row.stage, row.like_stage) for row in named if row.verdict == FOREIGN}

@@ -127,7 +127,10 @@ class _Job:
 def settings_of(values: Values) -> CalibrationSettings:
     """Return the settings of a calibration from the parameters of the node.
 
-    Raises UsageError if a value is not valid.
+    Raises
+    ------
+    UsageError
+        If a value is not valid.
     """
     checked, axes = validated(DECLARATIONS, values), tuple(values["axes"])
     if not checked["output"]:
@@ -165,7 +168,12 @@ class Calibrator(Node):
     voltages cannot have caused (`slpi_ros.calibration.drive_watch`), another publisher appears or a bag cannot be
     written, the voltages return to rest within the limits. An interrupted drive is kept as ``interrupted_NAME``.
 
-    Raises UsageError if a parameter is not valid. Raises RecordError if the folder cannot be used.
+    Raises
+    ------
+    UsageError
+        If a parameter is not valid.
+    RecordError
+        If the folder cannot be used.
     """
 
     def __init__(self) -> None:
@@ -206,7 +214,10 @@ class Calibrator(Node):
     def destroy_node(self) -> None:
         """Return to rest, keep what was recorded, then destroy the node.
 
-        Raises Interrupted if the calibration was ended by a signal.
+        Raises
+        ------
+        Interrupted
+            If the calibration was ended by a signal.
         """
         ended = self._outcome is not None or self._failure is not None
         if self._worker is not None:

@@ -54,7 +54,12 @@ def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
 class DeferredService:
     """Trigger service with a deferred response that does not block the executor.
 
-    `start`: starts the requested action; returns the reason if this is not possible, else "".
+    Parameters
+    ----------
+    node : Node
+    name : str
+    start : callable
+        Starts the requested action; returns the reason if this is not possible, else "".
     """
 
     def __init__(self, node: Node, name: str, start: Callable[[], str]) -> None:
@@ -135,9 +140,16 @@ ERROR: bytes = DiagnosticStatus.ERROR
 class Health:
     """Diagnostic status of a node.
 
-    `problems`: problems with their levels, in any order; empty if there are none. `summary`: message if there are no
-    problems. `values`: counters and states, shown as text. `hardware_id`: hardware id of the stage; "" (default) if
-    unknown.
+    Parameters
+    ----------
+    problems : sequence of (level, str)
+        Problems with their levels, in any order; empty if there are none.
+    summary : str
+        Message if there are no problems.
+    values : mapping of str to object
+        Counters and states, shown as text.
+    hardware_id : str
+        Hardware id of the stage; "" (default) if unknown.
     """
 
     problems: tuple[tuple[bytes, str], ...]
@@ -215,7 +227,10 @@ def request_stop(failure: SlpiError | None = None) -> None:
 
     An exception raised out of a callback would make the events executor print a traceback.
 
-    `failure`: error that causes the stop: ``run`` prints its message and returns its exit code.
+    Parameters
+    ----------
+    failure : SlpiError, optional
+        Error that causes the stop: ``run`` prints its message and returns its exit code.
     """
     _stop.requested = True
     _stop.failure = _stop.failure or failure
@@ -224,9 +239,20 @@ def request_stop(failure: SlpiError | None = None) -> None:
 def make_executor(kind: str) -> Executor:
     """Return a new executor.
 
-    `kind`: the events executor needs much less processor time; if rclpy lacks it, the default executor is returned.
-    Returned: call only its ``spin_once``, with a timeout: its ``spin`` may miss SIGINT and SIGTERM. Raises UsageError
-    if `kind` has another value.
+    Parameters
+    ----------
+    kind : {"events", "default"}
+        The events executor needs much less processor time; if rclpy lacks it, the default executor is returned.
+
+    Returns
+    -------
+    rclpy.executors.Executor
+        Call only its ``spin_once``, with a timeout: its ``spin`` may miss SIGINT and SIGTERM.
+
+    Raises
+    ------
+    UsageError
+        If `kind` has another value.
     """
     if kind not in ("events", "default"):
         raise UsageError(f"no executor '{kind}'; choose events or default")
@@ -244,9 +270,17 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
     The ROS context stays valid until the node's ``destroy_node`` has returned, so that the node may still publish in
     that method.
 
-    `make_node`: creates the node; if it raises a SlpiError, the message is printed and the exit code of the error
-    returned. `executor`: executor that spins the node; a node with an attribute `executor_kind` chooses its executor
-    itself. Returned: exit code of the process: 0 after a signal, a shutdown of ROS or a stop without an error.
+    Parameters
+    ----------
+    make_node : callable
+        Creates the node; if it raises a SlpiError, the message is printed and the exit code of the error returned.
+    executor : {"events", "default"}
+        Executor that spins the node; a node with an attribute `executor_kind` chooses its executor itself.
+
+    Returns
+    -------
+    int
+        Exit code of the process: 0 after a signal, a shutdown of ROS or a stop without an error.
     """
     global _stop
     _stop = start.of_process or Stop()

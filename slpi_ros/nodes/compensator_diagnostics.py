@@ -19,11 +19,28 @@ Problem = tuple[bool, bytes, str]
 class Reporter:
     """Collect and publish the diagnostics of the compensator.
 
-    `finalized`: whether the node has been shut down. `timing`: latency of messages. `lateness`: deadline error of
-    trajectory points. `last_rejection`, `model_error`: reason for the last rejected message and model; `model_error` is
-    "" after a newer model was accepted. `model_id`: fingerprint of the model in use. `lost`, `worked_off`,
-    `largest_backlog`: messages that the middleware has lost; messages of a backlog that were answered in one go, and
-    the most of them. `age` (s): age of the last answered command by its stamp; None without a stamp.
+    Parameters
+    ----------
+    node : Node
+    controller : Controller
+
+    Attributes
+    ----------
+    finalized : bool
+        Whether the node has been shut down.
+    timing : Timing
+        Latency of messages.
+    lateness : Timing
+        Deadline error of trajectory points.
+    last_rejection, model_error : str
+        Reason for the last rejected message and model; `model_error` is "" after a newer model was accepted.
+    models_refused : int
+    model_id : str
+        Fingerprint of the model in use.
+    lost, worked_off, largest_backlog : int
+        Messages that the middleware has lost; messages of a backlog that were answered in one go, and the most of them.
+    age : float or None, seconds
+        Age of the last answered command by its stamp; None without a stamp.
     """
 
     def __init__(self, node: Node, controller: Controller) -> None:

@@ -78,8 +78,14 @@ DECLARATIONS = (
 class ExciterSettings:
     """Validated settings of the exciter.
 
-    `values`: all parameters by name. `limits`: limits of each axis. `rest` (V): voltage of each axis before and after
-    the excitation; None: as reported by ``stage_state``.
+    Parameters
+    ----------
+    values : mapping of str to object
+        All parameters by name.
+    limits : tuple of Limits
+        Limits of each axis.
+    rest : list of float or None, volts
+        Voltage of each axis before and after the excitation; None: as reported by ``stage_state``.
     """
 
     values: Values
@@ -90,7 +96,10 @@ class ExciterSettings:
     def of(cls, given: Values) -> "ExciterSettings":
         """Return the settings from a mapping of parameter names to values.
 
-        Raises UsageError if a value is not valid, or the values do not allow an excitation.
+        Raises
+        ------
+        UsageError
+            If a value is not valid, or the values do not allow an excitation.
         """
         values, axes = validated(DECLARATIONS, given), given["axes"]
         low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
@@ -109,7 +118,10 @@ class ExciterSettings:
     def drawn(self, found: Sequence[float]) -> Drive:
         """Return the excitation, from and to rest: `rest`, or the voltages (V) at which the amplifier was found.
 
-        Raises UsageError if the settings do not allow an excitation.
+        Raises
+        ------
+        UsageError
+            If the settings do not allow an excitation.
         """
         rest = self.rest or [limits.clip(v) for limits, v in zip(self.limits, found, strict=True)]
         given = {name: self.values[name] for name in ("axes", "duration", "rate", "seed", "drive")}
@@ -149,7 +161,10 @@ class Exciter(Node):
     with exit code 1 (without ``autostart`` it stays). A trajectory is not watched: the device plays it by itself.
     Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
 
-    Raises UsageError if the parameters are not valid.
+    Raises
+    ------
+    UsageError
+        If the parameters are not valid.
     """
 
     def __init__(self) -> None:

@@ -33,9 +33,19 @@ DEPTH = 1000
 def probe(state_topic: str, command_topic: str, namespace: str, seconds: float) -> Graph:
     """Watch a running graph for some seconds, without publishing anything.
 
-    `state_topic`, `command_topic`: topics of the stage state and of the voltages, relative to `namespace`. `namespace`:
-    namespace of the stage; "" : the root. `seconds`: time for which the state is received. Raises UsageError if ROS
-    refuses the names.
+    Parameters
+    ----------
+    state_topic, command_topic : str
+        Topics of the stage state and of the voltages, relative to `namespace`.
+    namespace : str
+        Namespace of the stage; "" : the root.
+    seconds : float
+        Time for which the state is received.
+
+    Raises
+    ------
+    UsageError
+        If ROS refuses the names.
     """
     context = Context()
     try:

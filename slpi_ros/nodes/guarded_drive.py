@@ -33,10 +33,30 @@ class GuardedDrive:
 
     Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock.
 
-    `node`: its name begins the messages of errors. `axes`: in the order of the voltages. `rate` (Hz): rate at which
-    `move` is called. `timeout` (s): longest time without a valid state during a drive. `on_state`: called with each
-    serialized state and its time on the clock of the node. `publisher`: publisher of the voltages; default: a new one
-    of ``voltage_command``. `reported`: voltages of the last valid state, volts. `hardware_id`: of the last valid state.
+    Parameters
+    ----------
+    node : Node
+        Its name begins the messages of errors.
+    axes : sequence of str
+        In the order of the voltages.
+    limits : sequence of Limits
+    rate : float, hertz
+        Rate at which `move` is called.
+    timeout : float, seconds
+        Longest time without a valid state during a drive.
+    on_state : callable, optional
+        Called with each serialized state and its time on the clock of the node.
+    publisher : rclpy publisher, optional
+        Publisher of the voltages; default: a new one of ``voltage_command``.
+
+    Attributes
+    ----------
+    publisher : rclpy publisher
+    watch : DriveWatch
+    reported : list of float or None
+        Voltages of the last valid state, volts.
+    hardware_id : str
+        Of the last valid state.
     """
 
     def __init__(
@@ -127,7 +147,10 @@ class GuardedDrive:
     def start(self, voltages: Sequence[float]) -> None:
         """Start from voltages (V) at which the amplifier is.
 
-        Raises RecordError if one is outside the limits by more than `TOLERATED_SHARE` of the range.
+        Raises
+        ------
+        RecordError
+            If one is outside the limits by more than `TOLERATED_SHARE` of the range.
         """
         for axis, limits, v in zip(self._axes, self._limits, voltages, strict=True):
             slack = TOLERATED_SHARE * (limits.upper - limits.lower)

@@ -21,8 +21,14 @@ WIDEST = 110
 def help_asked(name: str, node: type[Node], declarations: Sequence[Declaration]) -> bool:
     """Print the help of a node program if the command line asks for it; return whether it does.
 
-    `name`: name of the program. `node`: class of the node; its docstring says what it does. `declarations`: its
-    parameters.
+    Parameters
+    ----------
+    name : str
+        Name of the program.
+    node : type
+        Class of the node; its docstring says what it does.
+    declarations : sequence of Declaration
+        Its parameters.
     """
     if not {"-h", "--help"} & set(sys.argv[1:]):
         return False

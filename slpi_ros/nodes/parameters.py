@@ -19,11 +19,23 @@ Values = Mapping[str, Any]
 class Declaration:
     """Declaration of one node parameter.
 
-    `default`: default value; its type is the parameter's type. `description`: text shown by ``ros2 param describe``.
-    `read_only`: whether the value can only be set at the start of the node; default False. `between`: smallest and
-    largest value of a number; default: any value. `number`: whether a double may also be given as an integer or as one
-    value for each axis. Not for integer parameters. `each_axis`: whether each axis may have its own value. `choices`:
-    allowed values of a string; empty (default): any.
+    Parameters
+    ----------
+    name : str
+    default : object
+        Default value; its type is the parameter's type.
+    description : str
+        Text shown by ``ros2 param describe``.
+    read_only : bool
+        Whether the value can only be set at the start of the node; default False.
+    between : (float, float), optional
+        Smallest and largest value of a number; default: any value.
+    number : bool
+        Whether a double may also be given as an integer or as one value for each axis. Not for integer parameters.
+    each_axis : bool
+        Whether each axis may have its own value.
+    choices : tuple of str
+        Allowed values of a string; empty (default): any.
     """
 
     name: str
@@ -40,7 +52,10 @@ class Declaration:
 
         None stands for NaN, if that is the default: it depends on other parameters.
 
-        Raises UsageError if the value is not valid; the message names the parameter and the allowed values.
+        Raises
+        ------
+        UsageError
+            If the value is not valid; the message names the parameter and the allowed values.
         """
         given = values[self.name]
         if self._is_nan(given) and self._is_nan(self.default):
@@ -78,7 +93,10 @@ class Declaration:
 def validated(declarations: Sequence[Declaration], values: Values) -> dict[str, Any]:
     """Return all parameters by name, each validated.
 
-    Raises UsageError if a value is not valid, or the parameter ``axes`` is empty or holds a name twice.
+    Raises
+    ------
+    UsageError
+        If a value is not valid, or the parameter ``axes`` is empty or holds a name twice.
     """
     # An empty list is given as None.
     axes = values.get("axes") or ()
@@ -90,8 +108,17 @@ def validated(declarations: Sequence[Declaration], values: Values) -> dict[str, 
 class Parameters(Generic[Settings]):
     """Node parameters and the settings derived from them, changed atomically.
 
-    `make`: returns the settings from a mapping of names to values; raises SlpiError if they are not valid. Raises
-    UsageError if the initial values are not valid.
+    Parameters
+    ----------
+    node : Node
+    declarations : sequence of Declaration
+    make : callable
+        Returns the settings from a mapping of names to values; raises SlpiError if they are not valid.
+
+    Raises
+    ------
+    UsageError
+        If the initial values are not valid.
     """
 
     def __init__(self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]) -> None:
@@ -131,7 +158,10 @@ class Parameters(Generic[Settings]):
 def number(values: Values, name: str, low: float, high: float) -> float:
     """Return the parameter `name` as a float.
 
-    Raises UsageError if it is not one finite number from `low` to `high`.
+    Raises
+    ------
+    UsageError
+        If it is not one finite number from `low` to `high`.
     """
     return numbers(values, name, ("",), low, high)[0]
 
@@ -139,7 +169,10 @@ def number(values: Values, name: str, low: float, high: float) -> float:
 def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: float) -> list[float]:
     """Return the parameter `name` as floats, one for each axis; a single value applies to all axes.
 
-    Raises UsageError if not all are finite numbers from `low` to `high`, or there is not one for each axis.
+    Raises
+    ------
+    UsageError
+        If not all are finite numbers from `low` to `high`, or there is not one for each axis.
     """
     given = values[name]
     if isinstance(given, Sequence) and not isinstance(given, str):

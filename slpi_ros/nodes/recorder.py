@@ -42,7 +42,12 @@ class Recorder(Node):
     publishers offer; messages are not deserialized. An incomplete bag is kept in ``.NAME.partial`` in
     the folder of the output. Parameters in `DECLARATIONS`.
 
-    Raises UsageError if a parameter is not valid. Raises RecordError if the bag cannot be created.
+    Raises
+    ------
+    UsageError
+        If a parameter is not valid.
+    RecordError
+        If the bag cannot be created.
     """
 
     def __init__(self) -> None:
@@ -72,7 +77,10 @@ class Recorder(Node):
     def destroy_node(self) -> None:
         """Complete the bag, then destroy the node.
 
-        Raises RecordError if nothing was recorded, or the bag cannot be completed.
+        Raises
+        ------
+        RecordError
+            If nothing was recorded, or the bag cannot be completed.
         """
         try:
             self._finish()

@@ -24,7 +24,13 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class Stop:
     """Stop request for the running node, with its reason.
 
-    `signals`: number of signals received. `failure`: error that is the reason.
+    Attributes
+    ----------
+    requested : bool
+    signals : int
+        Number of signals received.
+    failure : SlpiError or None
+        Error that is the reason.
     """
 
     def __init__(self) -> None:

@@ -61,8 +61,13 @@ PID = "PID"
 class Outcome:
     """Desired, measured and true displacement along a path.
 
-    `desired` (m, shape (N,)). `measured` (m, shape (N,)): sensor readings. `displacement` (m, shape (N,)): true
-    displacement, without sensor errors.
+    Parameters
+    ----------
+    desired : ndarray, shape (N,), metres
+    measured : ndarray, shape (N,), metres
+        Sensor readings.
+    displacement : ndarray, shape (N,), metres
+        True displacement, without sensor errors.
     """
 
     desired: FloatArray
@@ -103,8 +108,16 @@ class Outcome:
 class AxisStudy:
     """Results of the experiments on one axis.
 
-    `gains`: controller gains. `feedforward`: feedforward alone, Fig. 11. `compound`: segments of Table 6, Fig. 13; ""
-    is no feedforward. `rested`: the same with PID, with a rest at 0 V between warm-up and zeroing of the sensor.
+    Parameters
+    ----------
+    gains : PidGains
+        Controller gains.
+    feedforward : mapping of model to Outcome
+        Feedforward alone, Fig. 11.
+    compound : mapping of (model or "", whether with PID) to Outcome
+        Segments of Table 6, Fig. 13; "" is no feedforward.
+    rested : mapping of model to Outcome
+        The same with PID, with a rest at 0 V between warm-up and zeroing of the sensor.
     """
 
     gains: PidGains
@@ -156,8 +169,12 @@ def tune(stage: StageParameters, gain: float) -> PidGains:
     ``K_i = 2 z w / g``, or proportional action alone of ``K_p = 2 z / g``. With one third of the former and one tenth
     of the latter it is below 0.35 for any phase, so for any lag and delay. Derivative action would increase it.
 
-    `stage`: only the frequency and damping of the mode are used, which could be measured by a ring-down test. `gain`:
-    static gain ``g``.
+    Parameters
+    ----------
+    stage : StageParameters
+        Only the frequency and damping of the mode are used, which could be measured by a ring-down test.
+    gain : float, metres per volt
+        Static gain ``g``.
     """
     omega, double_damping = 2.0 * math.pi * stage.resonance_frequency, 2.0 * stage.resonance_damping
     return PidGains(PROPORTIONAL_SHARE * double_damping / gain, INTEGRAL_SHARE * double_damping * omega / gain)
@@ -175,9 +192,18 @@ def follow(
 
     A voltage is reached one sample after its command. The path is known, so the feedforward is one sample ahead.
 
-    `desired` (m, shape (N,)): desired displacement, starting at 0. `feedforward` (V, shape (N,)). `gains`: controller
-    gains; None for no feedback. `warm_up` (V): amplitude of the warm-up cycles. `rest` (s): time at 0 V between warm-up
-    and zeroing of the sensor.
+    Parameters
+    ----------
+    axis : PreisachStage
+    desired : ndarray, shape (N,), metres
+        Desired displacement, starting at 0.
+    feedforward : ndarray, shape (N,), volts
+    gains : PidGains or None
+        Controller gains; None for no feedback.
+    warm_up : float, volts
+        Amplitude of the warm-up cycles.
+    rest : float, seconds
+        Time at 0 V between warm-up and zeroing of the sensor.
     """
     axis.rest()
     v = np.append(triangles(warm_up, 1.0, WARM_UP, round(RATE))[1], np.zeros(1 + round(rest * RATE)))

@@ -30,8 +30,18 @@ class Picture:
 class Exhibit:
     """Comparison of a result of a paper with the reproduced one; a section of the page.
 
-    `title`: figure or table of the paper. `paper`: result of the paper, in words or numbers. `ours`: reproduced result.
-    `remark`: explanation of differences.
+    Parameters
+    ----------
+    title : str
+        Figure or table of the paper.
+    paper : str
+        Result of the paper, in words or numbers.
+    ours : str
+        Reproduced result.
+    remark : str
+        Explanation of differences.
+    tables : tuple of Table
+    pictures : tuple of Picture
     """
 
     title: str

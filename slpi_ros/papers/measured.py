@@ -21,9 +21,14 @@ from slpi_ros.papers.exhibit import Exhibit, Table
 class Case:
     """The parts of a record that are fitted and predicted.
 
-    `name`: the record is the file ``<name>.csv``. `fitted` (s): start and end of the fitted part; values up to 1 are
-    shares of the record. `predicted` (s): start and end of each predicted part, by name; values up to 1 are shares of
-    the record.
+    Parameters
+    ----------
+    name : str
+        The record is the file ``<name>.csv``.
+    fitted : (float, float), seconds
+        Start and end of the fitted part; values up to 1 are shares of the record.
+    predicted : mapping of str to (float, float), seconds
+        Start and end of each predicted part, by name; values up to 1 are shares of the record.
     """
 
     name: str
@@ -59,7 +64,10 @@ class Scores:
 def score(folder: Path, case: Case, kind: str) -> Scores:
     """Fit a kind of model to one part of a record and predict the others, free-run from the record's start.
 
-    Raises SlpiError if the record cannot be read.
+    Raises
+    ------
+    SlpiError
+        If the record cannot be read.
     """
     record = import_table(folder / f"{case.name}.csv")
     end = float(record.t[-1]) + 1e-9

@@ -72,7 +72,11 @@ ONE_MPI, OWN_MPI, SCALED_MPI = "MPI of 120 V", "MPI of each amplitude", "and of 
 class Drive:
     """Drive with equal triangles from rest, and the sensor readings.
 
-    `t` (s, shape (N,)). `v` (V, shape (N,)). `y` (m, shape (N,)).
+    Parameters
+    ----------
+    t : ndarray, shape (N,), seconds
+    v : ndarray, shape (N,), volts
+    y : ndarray, shape (N,), metres
     """
 
     t: FloatArray
@@ -113,8 +117,13 @@ class Drive:
 class CycleFit:
     """A model fitted to the settled cycle of a drive.
 
-    `simulated` (m, shape (n,)): displacement of the model on the fitted cycle. `fitted`, `following`: errors on the
-    fitted cycle, and on the next one.
+    Parameters
+    ----------
+    model : AxisModel
+    simulated : ndarray, shape (n,), metres
+        Displacement of the model on the fitted cycle.
+    fitted, following : ErrorMetrics
+        Errors on the fitted cycle, and on the next one.
     """
 
     model: AxisModel
@@ -135,9 +144,15 @@ class ScaledFit:
 class VariablePath:
     """The path of Fig. 8.
 
-    `t` (s, shape (N,)). `y` (m, shape (N,)): sensor readings. `parts`: the samples of each amplitude and frequency, as
-    in `VARIABLE`. `models` (m, shape (N,)): displacements of the models, with an offset such that the mean error in the
-    first part is 0.
+    Parameters
+    ----------
+    t : ndarray, shape (N,), seconds
+    y : ndarray, shape (N,), metres
+        Sensor readings.
+    parts : tuple of slice
+        The samples of each amplitude and frequency, as in `VARIABLE`.
+    models : mapping of name to ndarray, shape (N,), metres
+        Displacements of the models, with an offset such that the mean error in the first part is 0.
     """
 
     t: FloatArray
@@ -150,8 +165,17 @@ class VariablePath:
 class Study:
     """All measurements and fits.
 
-    `peaks`: eq. 1, fitted to the peaks of the first cycles. `ringing` (m): largest displacement due to the flexure
-    mode, at the highest amplitude. `fits`: fits at the highest frequency.
+    Parameters
+    ----------
+    drives : mapping of (amplitude (V), frequency (Hz)) to Drive
+    peaks : mapping of amplitude (V) to PeakFrequency
+        Eq. 1, fitted to the peaks of the first cycles.
+    ringing : mapping of frequency (Hz) to float, metres
+        Largest displacement due to the flexure mode, at the highest amplitude.
+    fits : mapping of kind's name to mapping of amplitude (V) to CycleFit
+        Fits at the highest frequency.
+    scaled : mapping of amplitude (V) to ScaledFit
+    variable : VariablePath
     """
 
     drives: Mapping[tuple[float, float], Drive]
@@ -176,8 +200,15 @@ def run_study(
 ) -> Study:
     """Measure an axis and fit the models.
 
-    `amplitudes` (V): in ascending order; the SMPI model is scaled from the last one. `frequencies` (Hz): in ascending
-    order. `samples`: samples per cycle, an even number.
+    Parameters
+    ----------
+    axis : PreisachStage
+    amplitudes : sequence of float, volts
+        In ascending order; the SMPI model is scaled from the last one.
+    frequencies : sequence of float, hertz
+        In ascending order.
+    samples : int
+        Samples per cycle, an even number.
     """
     drives = {(a, f): _drive(axis, a, f, samples) for f in frequencies for a in amplitudes}
     fastest = {a: drives[a, frequencies[-1]] for a in amplitudes}
@@ -198,8 +229,18 @@ def run_study(
 def triangles(amplitude: float, frequency: float, cycles: int, samples: int = 2000) -> tuple[FloatArray, FloatArray]:
     """Return a triangle wave from 0 to `amplitude` and back.
 
-    `frequency` (Hz). `samples`: samples per cycle, an even number. `t` (s, shape (cycles * samples,)). `x` (shape
-    (cycles * samples,)).
+    Parameters
+    ----------
+    amplitude : float, volts or metres
+    frequency : float, hertz
+    cycles : int
+    samples : int
+        Samples per cycle, an even number.
+
+    Returns
+    -------
+    t : ndarray, shape (cycles * samples,), seconds
+    x : ndarray, shape (cycles * samples,), in the unit of `amplitude`
     """
     k = np.arange(cycles * samples)
     phase = (k % samples) / samples

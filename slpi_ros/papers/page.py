@@ -21,8 +21,17 @@ COLUMNS = "k,voltage_V,displacement_m,tr,lv,sp"
 def write_experiments(folder: Path, data: Path | None) -> Path:
     """Run all experiments, write ``index.html`` and ``separation.csv`` into `folder`, and return the page's path.
 
-    `folder`: created if it does not exist. `data`: folder of measured records. Raises SlpiError if a file cannot be
-    read or written.
+    Parameters
+    ----------
+    folder : Path
+        Created if it does not exist.
+    data : Path or None
+        Folder of measured records.
+
+    Raises
+    ------
+    SlpiError
+        If a file cannot be read or written.
     """
     make_folder(folder)
     random = study(RANDOM_PATH)

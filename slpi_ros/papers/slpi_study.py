@@ -63,7 +63,11 @@ Drive = Memory | KnownPath
 class LoopErrors:
     """Errors of one model along a path, metres.
 
-    `error` (shape (N,)). `means`, `maxima`: mean and largest absolute error on each loop, the outer one first.
+    Parameters
+    ----------
+    error : ndarray, shape (N,)
+    means, maxima : tuple of float
+        Mean and largest absolute error on each loop, the outer one first.
     """
 
     error: FloatArray
@@ -95,12 +99,27 @@ class LoopErrors:
 class Study:
     """One path on the stage, and the errors of the models along it.
 
-    `turns` (V): reversals of the path. `separation`: voltage and displacement, separated into loops. `at_rest`,
-    `closing`: published model with play operators that start at rest in every loop, and primed, so that loops close.
-    `modelled`: model - measured. `compensated`: achieved - desired displacement; the desired one consists of straight
-    lines between the measured reversals. `straight`: the same for a desired displacement proportional to the voltage
-    (section 4.1 of the SLPI paper). `desired` (m, shape (N,)): desired displacement of `compensated`. `voltages` (V,
-    shape (N,)): voltages of `compensated`. `drives`: function that makes the model anew in its initial state.
+    Parameters
+    ----------
+    turns : tuple of float, volts
+        Reversals of the path.
+    separation : Separation
+        Voltage and displacement, separated into loops.
+    classical : PrandtlIshlinskii
+    at_rest, closing : SeparatedLoops
+        Published model with play operators that start at rest in every loop, and primed, so that loops close.
+    modelled : dict of model name to LoopErrors
+        Model - measured.
+    compensated : dict of model name to LoopErrors
+        Achieved - desired displacement; the desired one consists of straight lines between the measured reversals.
+    straight : dict of model name to LoopErrors
+        The same for a desired displacement proportional to the voltage (section 4.1 of the SLPI paper).
+    desired : ndarray, shape (N,), metres
+        Desired displacement of `compensated`.
+    voltages : dict of model name to ndarray, shape (N,), volts
+        Voltages of `compensated`.
+    drives : dict of model name to callable
+        Function that makes the model anew in its initial state.
     """
 
     turns: tuple[float, ...]
@@ -165,8 +184,14 @@ def study(turns: tuple[float, ...]) -> Study:
 class UnseenPaths:
     """Errors of the models of one study along other paths.
 
-    `turns` (V): reversals of the paths. `mean_errors` (m): mean absolute free-run error, model - stage, for each path.
-    `loops`, `replaced`: number of inner loops of all paths, and number of those that were never identified.
+    Parameters
+    ----------
+    turns : tuple of tuple of float, volts
+        Reversals of the paths.
+    mean_errors : dict of model name to tuple of float, metres
+        Mean absolute free-run error, model - stage, for each path.
+    loops, replaced : int
+        Number of inner loops of all paths, and number of those that were never identified.
     """
 
     turns: tuple[tuple[float, ...], ...]
@@ -223,8 +248,16 @@ def classical_model(v: FloatArray, y: FloatArray) -> PrandtlIshlinskii:
 def ramps(turns: Sequence[float], step: float) -> FloatArray:
     """Return straight ramps between reversals, with a sample every `step` and at every reversal.
 
-    `turns`: reversals; successive values must differ. `step`: distance of the samples, in the unit of `turns`. Returned
-    (shape (N,)).
+    Parameters
+    ----------
+    turns : sequence of float
+        Reversals; successive values must differ.
+    step : float
+        Distance of the samples, in the unit of `turns`.
+
+    Returns
+    -------
+    ndarray, shape (N,)
     """
     parts = [np.append(np.arange(a, b, step if b > a else -step)[1:], b) for a, b in pairwise(turns)]
     return np.concatenate([np.array([turns[0]], dtype=np.float64), *parts])

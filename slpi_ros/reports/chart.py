@@ -50,8 +50,17 @@ def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
 
     Of NaN sequences at least as long as an interval, one NaN is kept, so that the line is interrupted.
 
-    `*signals` (shape (N,)): signals with a common horizontal axis; NaN for missing values. `most`: approximate largest
-    number of samples to be kept. Returned (shape (K,)): indices in increasing order.
+    Parameters
+    ----------
+    *signals : ndarray, shape (N,)
+        Signals with a common horizontal axis; NaN for missing values.
+    most : int
+        Approximate largest number of samples to be kept.
+
+    Returns
+    -------
+    ndarray of int, shape (K,)
+        Indices in increasing order.
     """
     size = signals[0].size
     if size <= most:
@@ -93,7 +102,14 @@ def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArr
 class Quantity:
     """Quantity, unit and number format of a panel axis.
 
-    `scale`: factor from SI to the displayed unit; 1 by default. `digits`: number format of values, as in d3-format.
+    Parameters
+    ----------
+    name, unit : str, as displayed
+    scale : float
+        Factor from SI to the displayed unit; 1 by default.
+    digits : str
+        Number format of values, as in d3-format.
+    logarithmic : bool, whether the axis is logarithmic
     """
 
     name: str
@@ -124,7 +140,11 @@ SAMPLES = Quantity("samples", "", digits=",d")
 class Panel:
     """One pair of axes.
 
-    `share`: share of the width (in a row) or height (in a column), relative to the other panels.
+    Parameters
+    ----------
+    x, y : Quantity
+    share : float
+        Share of the width (in a row) or height (in a column), relative to the other panels.
     """
 
     x: Quantity
@@ -136,8 +156,14 @@ class Panel:
 class Chart:
     """Panels in a row or a column with a common legend; a legend entry shows or hides its curves in all panels.
 
-    `arrangement`: panels in a row share the vertical axis, panels in a column the horizontal one, if they show the same
-    quantity, so that they zoom together. `height`: height of the chart, pixels.
+    Parameters
+    ----------
+    panels : sequence of Panel
+    arrangement : {"row", "column"}
+        Panels in a row share the vertical axis, panels in a column the horizontal one, if they show the same quantity,
+        so that they zoom together.
+    height : int
+        Height of the chart, pixels.
     """
 
     panels: Sequence[Panel]

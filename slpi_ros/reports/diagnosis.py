@@ -40,7 +40,16 @@ FILES = (_, _, PAGE) = "diagnosis.json", "extended_model.json", "report.html"
 def write_files(folder: Path, diagnosis: Diagnosis) -> None:
     """Write ``diagnosis.json``, ``extended_model.json`` and ``report.html`` into `folder`, each atomically.
 
-    `folder`: created if it does not exist. Raises SlpiError if a file cannot be written, or a value is not finite.
+    Parameters
+    ----------
+    folder : Path
+        Created if it does not exist.
+    diagnosis : Diagnosis, the result to be written
+
+    Raises
+    ------
+    SlpiError
+        If a file cannot be written, or a value is not finite.
     """
     make_folder(folder, *FILES)
     try:

@@ -31,7 +31,11 @@ FEWEST = 10
 class Check:
     """One statement.
 
-    `text`: what was found; for "mend" also what to do.
+    Parameters
+    ----------
+    level : {"ok", "note", "mend"}
+    text : str
+        What was found; for "mend" also what to do.
     """
 
     level: str
@@ -46,12 +50,28 @@ class Check:
 class Graph:
     """What was seen of a running ROS graph.
 
-    `state_topic`, `command_topic`: names of the topics after namespace and remapping. `seconds`: time for which the
-    state was received. `nodes`: all other nodes. `state_publishers`, `command_publishers`, `command_subscribers`: type
-    of the topic by name of the node. `stamps`, `arrivals` (s, shape (N,)): stamps of the states, and the time of the
-    node's clock at which they came. `axes`: axes of the last state. `displacement`, `voltage` (m, V): last state.
-    `hardware_id`: of the last state. `limits` (V): limits of the node that publishes the voltages; empty if it does not
-    tell. `model`: model on the topic ``stage_model``; None: none.
+    Parameters
+    ----------
+    state_topic, command_topic : str
+        Names of the topics after namespace and remapping.
+    seconds : float
+        Time for which the state was received.
+    nodes : sequence of str
+        All other nodes.
+    state_publishers, command_publishers, command_subscribers : mapping of str to str
+        Type of the topic by name of the node.
+    stamps, arrivals : ndarray, shape (N,), seconds
+        Stamps of the states, and the time of the node's clock at which they came.
+    axes : sequence of str
+        Axes of the last state.
+    displacement, voltage : mapping of axis name to float, metres, volts
+        Last state.
+    hardware_id : str
+        Of the last state.
+    limits : mapping of axis name to (float, float), volts
+        Limits of the node that publishes the voltages; empty if it does not tell.
+    model : StageModel, optional
+        Model on the topic ``stage_model``; None: none.
     """
 
     state_topic: str
@@ -115,7 +135,11 @@ def check_model(model: StageModel, limits: Range | None = None) -> list[Check]:
 def check_graph(graph: Graph, model: StageModel | None = None) -> list[Check]:
     """Check a running graph: discovery, the state of the stage, who commands, and whether the model fits the stage.
 
-    `model`: model of the stage; default: that on ``stage_model``, if any.
+    Parameters
+    ----------
+    graph : Graph
+    model : StageModel, optional
+        Model of the stage; default: that on ``stage_model``, if any.
     """
     if not graph.nodes:
         text = "ROS: no other node; start the driver of the stage, and use its ROS_DOMAIN_ID and discovery range"

@@ -37,10 +37,24 @@ def write_report(
 ) -> Path:
     """Write ``report.html`` into `folder` and return its path.
 
-    `folder`: created if it does not exist. `record`: record on which the model is shown; the first one of several bags.
-    `held_out`: held-out errors by axis. `found`: findings on the quality of the record; determined from the record by
-    default. `start`, `stop` (s): fitted part of the record, as for `slpi_ros.identify`; the rest is drawn but not
-    evaluated. Raises SlpiError if the file cannot be written, or the record does not contain the model's axes.
+    Parameters
+    ----------
+    folder : Path
+        Created if it does not exist.
+    record : Record
+        Record on which the model is shown; the first one of several bags.
+    model : StageModel, the identified model
+    held_out : mapping of axis name to CrossValidationReport, optional
+        Held-out errors by axis.
+    found : mapping of axis name to sequence of Finding, optional
+        Findings on the quality of the record; determined from the record by default.
+    start, stop : float, seconds, optional
+        Fitted part of the record, as for `slpi_ros.identify`; the rest is drawn but not evaluated.
+
+    Raises
+    ------
+    SlpiError
+        If the file cannot be written, or the record does not contain the model's axes.
     """
     page = Page(f"Model of {record.source}")
     page.contents(tuple(model.axes))

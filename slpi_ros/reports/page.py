@@ -48,7 +48,12 @@ class Share:
 
 @dataclass
 class Page:
-    """A page to which elements are appended from top to bottom."""
+    """A page to which elements are appended from top to bottom.
+
+    Parameters
+    ----------
+    title : str
+    """
 
     title: str
     _parts: list[str] = field(default_factory=list, init=False)
@@ -168,7 +173,10 @@ class Page:
     def write(self, path: Path) -> None:
         """Write the page atomically.
 
-        Raises SlpiError if the file cannot be written.
+        Raises
+        ------
+        SlpiError
+            If the file cannot be written.
         """
         title = _text(self.title)
         scripts = ("plotly-cartesian.min.js", "page.js") if self._has_charts else ()

@@ -10,7 +10,7 @@ import numpy as np
 from slpi_ros.fleet.bags import CHANGED, FAILED, FOREIGN, IDENTIFIED, PASSED, REFUSED, Row
 from slpi_ros.fleet.changes import Change, find_changes
 from slpi_ros.fleet.results import SCHEMA
-from slpi_ros.identification.initial_history import BEYOND_CHANCE
+from slpi_ros.identification.free_run import BEYOND_CHANCE
 
 # Health by the latest usable bag. GOOD: the reference model holds; REFITTED: a model refitted to this bag does;
 # EXCHANGED: the bag is of another stage; CALIBRATE: neither model holds, or no bag is usable.

@@ -17,7 +17,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.identification.drive import smallest_turn
 from slpi_ros.identification.fit import FITS, fit_of
-from slpi_ros.identification.initial_history import InitialHistoryWarning
+from slpi_ros.identification.free_run import InitialHistoryWarning
 from slpi_ros.identification.repeatability_floor import Floor, floor_of
 from slpi_ros.identification.samples import Samples, select_thinned
 from slpi_ros.identification.signal_statistics import noise

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
-from slpi_ros.identification.initial_history import InitialHistory, choose_start, warn_of_initial_history, warn_of_rest
+from slpi_ros.identification.free_run import InitialHistory, choose_start, warn_of_initial_history, warn_of_rest
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Fitted, Problem
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import MultiSlopeBasis

@@ -20,7 +20,7 @@ from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
-from slpi_ros.identification.initial_history import Match, match
+from slpi_ros.identification.free_run import Match, match
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples

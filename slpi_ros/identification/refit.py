@@ -50,22 +50,12 @@ EXCESS_SHARE = 0.01
 class AxisChange:
     """Changes of one axis by an update.
 
-    Parameters
-    ----------
-    error_before, error_after : float, metres
-        Rms error on the new record, free-run, of the old and of the new model, each with the best-fitting initial
-        history and without the constant offset from the record.
-    repeatability : float, metres
-        Held-out error of the old model, or the noise of the sensor if larger.
-    drifted : bool
-        Whether gain, width or shape of the loops has changed: whether initial history, offset, lag and slow drift
-        cannot explain the error of the old model.
-    gain : float
-        Relative change of the height of the outermost loop.
-    largest : float, metres
-        Largest change of a branch.
-    match : Match
-        Comparison of the old model with the new record: offset, changes of gain and width, and their uncertainties.
+    `error_before` and `error_after` are the rms errors (m) on the new record, free-run, of the old and of the new
+    model, each with the best-fitting initial history and without the constant offset from the record; `repeatability`
+    (m) is the held-out error of the old model, or the noise of the sensor if larger. If `drifted`, gain, width or shape
+    of the loops has changed: initial history, offset, lag and slow drift cannot explain the error of the old model.
+    `gain` is the relative change of the height of the outermost loop, `largest` (m) the largest change of a branch;
+    `match` compares the old model with the new record: offset, changes of gain and width, and their uncertainties.
     """
 
     error_before: float
@@ -232,12 +222,8 @@ def _within(samples: Samples, low: float, high: float) -> Samples:
 def require_own(error: float, fitted_anew: float, span: float) -> None:
     """Raise IdentificationError if a model does not belong to the stage of a record.
 
-    Parameters
-    ----------
-    error, fitted_anew : float, metres
-        Rms errors on the record, of the model and of a model fitted to this record.
-    span : float, metres
-        Displacement range.
+    `error` and `fitted_anew` (m) are the rms errors on the record, of the model and of a model fitted to this record;
+    `span` (m) is the displacement range.
     """
     if error > FOREIGN_SHARE * span and error > FOREIGN_TIMES * fitted_anew:
         raise IdentificationError(

@@ -145,6 +145,9 @@ def _diagnose_axis(
         extension = _extension(model, selection, given, source)
         if extension and _not_as_judged(extension[0], runs, selection):
             extension = None
+    if not (extension or selection.named):
+        # Nothing is explained, so that nothing is fitted beside the hysteresis of the given kind.
+        selection = replace(selection, now=selection.base)
     extended, missing = extension or (model, [named.name for named in selection.named])
     outcomes = _outcomes(runs, _runs(extended, selection.now) if extension else runs, selection.now)
     floor = _floor(selection.now)
@@ -185,9 +188,11 @@ def _without_causes(selection: Selection) -> Selection:
 
 
 def _runs(model: AxisModel, now: Explanation) -> list[FreeRun]:
-    """Return the free run of an extended model on each of its records."""
-    parts = now.evidence.parts
-    return [_run(model, part, of_record=len(parts) == 1) for part in parts]
+    """Return the free run of an extended model on each of its records, as the effects began there."""
+    return [
+        _run(replace(model, effects=tuple(effect.of_record(k) for effect in model.effects)), part, of_record=True)
+        for k, part in enumerate(now.evidence.parts)
+    ]
 
 
 def _not_as_judged(extended: AxisModel, runs: "Sequence[FreeRun]", selection: Selection) -> bool:
@@ -396,7 +401,7 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
             source=source,
         ),
     )
-    return replace(extended, end=extended.after(now.u))
+    return replace(extended, end=extended.at_rest(now.u, float(evidence.v[-1])))
 
 
 def _creeping_on(effect: Effect, now: Explanation) -> Effect:

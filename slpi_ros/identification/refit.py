@@ -110,7 +110,7 @@ def refit(
     shared = [axis for axis in model.axes if axis in (axes or record.axes)]
     if not shared:
         raise UsageError(f"{record.source} holds none of the model's axes {', '.join(model.axes)}")
-    record = _without_effects(model.stage_only, model.correct(record), shared)
+    applied, record = record, _without_effects(model.stage_only, model.correct(record), shared)
     updated, changes = dict(model.axes), {}
     for name in shared:
         where = f"{record.source}: axis '{name}': "
@@ -119,7 +119,12 @@ def refit(
             with threadpool_limits(1):
                 old = model.axes[name]
                 new, changes[name] = _refit_axis(old.hysteresis_only, samples, record.source)
-            updated[name] = replace(new, effects=lasting(old.effects), sensor=old.sensor)
+            new = replace(new, effects=lasting(old.effects), sensor=old.sensor)
+            if new.end:
+                v = applied.voltage[name]
+                last = float(v[np.isfinite(v)][samples.v.size - 1])
+                new = replace(new, end=new.at_rest(np.empty(0), last, "end"))
+            updated[name] = new
         except SlpiError as error:
             raise type(error)(where + str(error).removeprefix(where)) from None
     return replace(model, axes=updated, created=datetime.now(UTC).isoformat(timespec="seconds")), changes

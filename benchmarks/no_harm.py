@@ -25,7 +25,7 @@ from records import free_run, measured_folder, splits
 import slpi_ros
 from slpi_ros.diagnosis.result import NamedEffect
 from slpi_ros.errors import SlpiError
-from slpi_ros.identification.initial_history import histories
+from slpi_ros.identification.free_run import histories
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table

@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 
 import slpi_ros
 from slpi_ros.effects.base import EffectContext
+from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
@@ -206,7 +207,7 @@ def _refitted(model: AxisModel, record: Record) -> AxisModel:
 
     def fitted(one: AxisModel) -> AxisModel:
         around = EffectContext(t)
-        u, beside = one.chain.reaching(v, around)
+        u, _ = Chain.of(one.effects).reaching(v, around)
         h = y - (one.simulate(t, v, of_record=True) - one.hysteresis_only.simulate(t, u))
         felt = Record(record.time_ns, {axis: u}, {axis: h}, source=record.source)
         return replace(slpi_ros.identify(felt).axes[axis], effects=one.effects)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.identification.initial_history import match
+from slpi_ros.identification.free_run import match
 from slpi_ros.identification.samples import select_samples
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage

@@ -117,19 +117,9 @@ class DriveWatch:
     All times are nanoseconds on the steady clock. Of the time between two calls at most 0.05 s count: a process that
     was held up does not take what it has not read yet for silence.
 
-    Parameters
-    ----------
-    axes : sequence of str
-    limits : sequence of Limits
-    timeout : float, seconds
-        Longest time without a valid state, and that the reported voltages may be late.
-    simulated : bool
-        Whether stamps are of a simulated clock, which is coarse. Default False.
-
-    Attributes
-    ----------
-    fault : str
-        What the first fault is, with axis, value and limit; "" while there is none.
+    `timeout` (s) is the longest time without a valid state, and that the reported voltages may be late; `simulated`
+    tells whether stamps are of a simulated clock, which is coarse. `fault` says what the first fault is, with axis,
+    value and limit; "" while there is none.
     """
 
     def __init__(
@@ -199,15 +189,9 @@ class DriveWatch:
         return ""
 
     def state(self, stamp_ns: int, clock_ns: int, v: Sequence[float], y: Sequence[float], now_ns: int) -> bool:
-        """Take a state; return whether it is valid.
+        """Take a state with reported voltages `v` (V) and displacements `y` (m); return whether it is valid.
 
-        Parameters
-        ----------
-        stamp_ns, clock_ns : int, nanoseconds
-            Stamp of the state, and the clock of the node when it arrives.
-        v, y : sequence of float
-            Reported voltages (V) and displacements (m); NaN for an axis that the state does not name.
-        now_ns : int, nanoseconds
+        `clock_ns` is the clock of the node when the state arrives; NaN stands for an axis that the state does not name.
         """
         self._attend(now_ns)
         self._refused = self.refusal(v, y)

@@ -36,23 +36,10 @@ FIRST_STAMP = SECOND_NS
 
 
 def exciting(settings: CalibrationSettings, drive: str, duration: float, axes: Sequence[str], seed: int) -> Drive:
-    """Return an excitation drive of some axes, while the others rest.
+    """Return a `drive` of `slpi_ros.excitation.drives.DRIVES` that excites some axes, while the others rest.
 
-    Parameters
-    ----------
-    settings : CalibrationSettings
-    drive : str
-        One of `slpi_ros.excitation.drives.DRIVES`.
-    duration : float, seconds
-        Duration of the whole drive, which the axes share; longer if the slew limit requires it.
-    axes : sequence of str
-        Axes that move.
-    seed : int
-
-    Returns
-    -------
-    Drive
-        Voltages of all axes of the settings.
+    `duration` (s) is that of the whole drive, which the moving `axes` share; longer if the slew limit requires it. The
+    result has the voltages of all axes of the settings.
     """
     places = [settings.axes.index(axis) for axis in axes]
     limits = [settings.limits[place] for place in places]
@@ -80,16 +67,7 @@ def exciting(settings: CalibrationSettings, drive: str, duration: float, axes: S
 
 
 def checking(settings: CalibrationSettings) -> Drive:
-    """Return a drive that moves one axis after the other a little, to see whether the stage follows and in which sense.
-
-    Parameters
-    ----------
-    settings : CalibrationSettings
-
-    Returns
-    -------
-    Drive
-    """
+    """Return a drive that moves each axis a little in turn, to see whether the stage follows and in which sense."""
     moves = []
     for limits, rest in zip(settings.limits, settings.rest, strict=True):
         spec = _spec(limits, CHECK, settings.rate)
@@ -111,19 +89,8 @@ def checking(settings: CalibrationSettings) -> Drive:
 def compensated(settings: CalibrationSettings, model: StageModel, seed: int) -> tuple[Drive, dict[str, FloatArray]]:
     """Return a drive along a random path through the compensator, after a sweep that makes the memory known.
 
-    Parameters
-    ----------
-    settings : CalibrationSettings
-    model : StageModel
-        Model that the compensator uses.
-    seed : int
-        Seed of the path.
-
-    Returns
-    -------
-    drive : Drive
-    desired : dict of axis name to ndarray, shape (N,), metres
-        Desired displacement at the samples of the drive; NaN in the sweep before and the return after the path.
+    The compensator uses `model`; `seed` is that of the path. Return also the desired displacement (m) of each axis at
+    the samples of the drive, shape (N,): NaN in the sweep before and the return after the path.
     """
     sweep = exciting(settings, SWEEP, _sweep_seconds(settings), settings.axes, seed)
     swept = np.column_stack(list(sweep.voltage.values()))

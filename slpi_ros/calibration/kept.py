@@ -31,22 +31,10 @@ def require_kept(
 ) -> None:
     """Check a kept record before anything is computed from it.
 
-    Parameters
-    ----------
-    record : Record
-    drive : Drive
-        What this calibration would have driven instead.
-    settings : CalibrationSettings
-    before : Record or None
-        First record of this calibration, of the same stage; None if this is the first.
-    fitted : bool
-        Whether a model is fitted to the record, so that its quality matters.
-
-    Raises
-    ------
-    RecordError
-        If it is of other limits, of another stage, or of a quality that allows no fit; the message names the record,
-        what is wrong, and what to do.
+    `drive` is what this calibration would have driven instead, and `before` its first record, of the same stage, None
+    if this is the first; if `fitted`, a model is fitted to the record, so that its quality matters. RecordError if it
+    is of other limits, of another stage, or of a quality that allows no fit; the message names the record, what is
+    wrong, and what to do.
     """
     with naming(record):
         lasts, whole = float(np.ptp(record.time_ns)) * 1e-9, float(drive.t[-1])

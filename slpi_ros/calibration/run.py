@@ -333,7 +333,7 @@ def _left_at(model: StageModel, last: Record) -> StageModel:
         v = last.voltage[name]
         known = np.isfinite(v)
         u, _ = axis.chain.reaching(v[known], EffectContext(last.t[known]))
-        axes[name] = replace(axis, end=axis.after(u, "end"))
+        axes[name] = replace(axis, end=axis.at_rest(u, float(v[known][-1]), "end"))
     return replace(model, axes=axes)
 
 

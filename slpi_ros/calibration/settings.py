@@ -14,29 +14,11 @@ CALIBRATION, EFFECT, CHECK, VERIFICATION = 40.0, 25.0, 1.5, 20.0
 class CalibrationSettings:
     """What a calibration may do and what it shall reach.
 
-    Parameters
-    ----------
-    axes : tuple of str
-        Names of the axes, in the order of the voltages.
-    limits : tuple of Limits
-        Limits of voltage, slew rate and acceleration of each axis.
-    rest : tuple of float, volts
-        Voltage of each axis before and after every drive.
-    rate : float, hertz
-        Samples per second.
-    budget : float, seconds
-        Largest sum of the durations of all drives.
-    target : float, metres
-        Largest mean error on a path not used for the model; 0 (default): `floors` times the repeatability floor.
-    floors : float
-        Target in multiples of the repeatability floor, if `target` is 0. Default 3.
-    seed : int
-        Seed of the random parts of all drives. Default 0.
-
-    Raises
-    ------
-    UsageError
-        If a value is invalid, or the budget is too short for a calibration drive and a verification.
+    Tuples are in the order of the voltages; `rest` is the voltage (V) of each axis before and after every drive. `rate`
+    is in samples per second, `budget` (s) is the largest sum of the durations of all drives, and `seed` is that of
+    their random parts. `target` (m) is the largest mean error on a path not used for the model; 0: `floors` times the
+    repeatability floor. UsageError if a value is invalid, or the budget is too short for a calibration drive and a
+    verification.
     """
 
     axes: tuple[str, ...]

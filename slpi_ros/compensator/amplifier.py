@@ -46,13 +46,7 @@ NORMAL_BEND = 0.6745 * 6**0.5
 
 @dataclass(frozen=True)
 class Calibration:
-    """Constant relation of a reported voltage to the voltage that was output: ``gain * voltage + offset``.
-
-    Parameters
-    ----------
-    gain : float
-    offset : float, volts
-    """
+    """Constant relation of a reported voltage to the voltage that was output (V): ``gain * voltage + offset``."""
 
     gain: float = 1.0
     offset: float = 0.0
@@ -65,22 +59,10 @@ class Calibration:
 class Amplifier:
     """Reports of the voltage of one axis: where it starts, and whether somebody else moves it.
 
-    All times are nanoseconds on the steady clock.
-
-    Parameters
-    ----------
-    span : float, volts
-        Voltage range of the node.
-
-    Attributes
-    ----------
-    calibration : Calibration
-        Relation of reports to voltages that was found; at first that of equal ones.
-    foreign : str
-        How the reports contradict the voltages that were output; "" while they agree.
-    window_ns : int, nanoseconds
-        Time for which an output voltage may still be reported.
-    span : float, volts
+    All times are nanoseconds on the steady clock. `span` (V) is the voltage range of the node; `calibration` is the
+    relation of reports to voltages that was found, at first that of equal ones. `foreign` says how the reports
+    contradict the voltages that were output, "" while they agree; an output voltage may still be reported for the time
+    `window_ns`.
     """
 
     def __init__(self, span: float) -> None:
@@ -185,11 +167,7 @@ class Amplifier:
     def found(self, now_ns: int, since_ns: int) -> float | None:
         """Return the voltage (V) at which the axis starts; None if more reports are needed.
 
-        Parameters
-        ----------
-        now_ns : int, nanoseconds
-        since_ns : int, nanoseconds
-            Time since which reports are awaited.
+        `since_ns` is the time since which reports are awaited.
         """
         recent = [v for t, v in list(self._reports)[-MOST_REPORTS:] if now_ns - t <= REPORT_AGE_NS]
         if len(recent) >= REPORTS:

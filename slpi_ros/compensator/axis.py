@@ -38,49 +38,20 @@ REST_SHARE, REST_NS, RESTING_NS = 1e-5, SECOND_NS // 10, SECOND_NS
 class Axis:
     """Inverse hysteresis compensation, with optional feedback, of one axis.
 
-    All times are nanoseconds on the steady clock of the process unless stated otherwise.
+    All times are nanoseconds on the steady clock of the process unless stated otherwise. A loaded model cannot relax
+    the `limits`; `place` is the index of the axis in the voltage command, and `period` the output period (s).
 
-    Parameters
-    ----------
-    name : str
-    place : int
-        Index of the axis in the voltage command.
-    limits : Limits
-        Voltage limits. A loaded model cannot relax these limits.
-    loop_settings : LoopSettings
-        Settings of the feedback.
-    period : float, seconds
-        Output period; default 1 ms.
+    The feedforward `stream` is available once a model is loaded. Its memory follows the setpoint, not the corrected
+    voltage, so that sensor noise causes no reversals. `output` is the last place before publishing: the present
+    voltage, and where it may go next; `amplifier` is what is reported of the voltage. `driven` tells whether a model
+    has ever been loaded; before that, the voltage is unknown. `ramp` is an active motion without desired displacements.
+    `held` and `slewing` tell whether the last sample is held at a voltage limit, or slew limited. `start_memory` is the
+    assumed initial history; None after the first output voltage or when the memory was restored. `tracking` has the
+    statistics of measured - desired displacement, and `fault` is the fault of the sensor for which the feedback was
+    switched off.
 
-    Attributes
-    ----------
-    model : AxisModel or None
-    stream : StreamingInverse
-        Feedforward; available once a model is loaded. Its memory follows the setpoint, not the corrected voltage, so
-        that sensor noise causes no reversals.
-    output : RateLimiter
-        The last place before publishing: the present voltage, and where it may go next.
-    amplifier : Amplifier
-        What is reported of the voltage.
-    confidence : MemoryConfidence
-    driven : bool
-        Whether a model has ever been loaded; before that, the voltage is unknown.
-    ramp : Ramp or Brake or None
-        Active motion without desired displacements.
-    held, slewing : bool
-        Whether the last sample is held at a voltage limit, or slew limited.
-    start_memory : str or None
-        Assumed initial history; None after the first output voltage or when the memory was restored.
-    given_ns : int, nanoseconds
-        Time of the last sample or step.
-    due_ns : int or None, nanoseconds
-        Time of the next `tick`; None if nothing follows.
-    point_ns : int or None, nanoseconds
-        Deadline of the last sample on the trajectory clock; None if it was not a trajectory point.
-    tracking : TrackingError
-        Statistics of measured - desired displacement.
-    fault : Fault or None
-        Fault of the sensor for which the feedback was switched off.
+    `given_ns` is the time of the last sample or step, `due_ns` that of the next `tick`, None if nothing follows, and
+    `point_ns` the deadline of the last sample on the trajectory clock, None if it was not a trajectory point.
     """
 
     stream: StreamingInverse
@@ -173,18 +144,9 @@ class Axis:
     ) -> StreamingInverse:
         """Return the streaming inverse of a new model, for `use`.
 
-        Parameters
-        ----------
-        model : AxisModel
-        reversal_voltages : sequence of float, volts
-            Voltages of the reversals to replay, oldest first, then the present one; default: those of this axis.
-        start_memory : str
-            Initial history of an axis without known reversals; default "end".
-
-        Raises
-        ------
-        SlpiError
-            If the model cannot be used within the limits, see `take_over`, or at the present voltage.
+        The `reversal_voltages` (V) to replay are oldest first, then the present one; default: those of this axis.
+        `start_memory` is the initial history of an axis without known reversals. SlpiError if the model cannot be used
+        within the limits, see `take_over`, or at the present voltage.
         """
         if reversal_voltages is None:
             reversal_voltages = turning_voltages(self.stream.memory) if self.driven else ()
@@ -239,20 +201,14 @@ class Axis:
     def check_limits(self, limits: Limits) -> Limits:
         """Return new limits, restricted to the identified voltages of the model.
 
-        Raises
-        ------
-        UsageError
-            If the model was identified entirely outside the limits.
+        UsageError if the model was identified entirely outside the limits.
         """
         return limits.within(self.model.voltage_range) if self.model else limits
 
     def use_limits(self, limits: Limits, period: float) -> None:
         """Replace limits and output period (s); hysteresis memory and voltage are unchanged.
 
-        Raises
-        ------
-        UsageError
-            As `check_limits`; the old limits remain in force.
+        UsageError as in `check_limits`; the old limits remain in force.
         """
         allowed = self.check_limits(limits)
         self.limits = limits
@@ -298,25 +254,17 @@ class Axis:
     def check(self, y: float, kind: str = "desired") -> None:
         """Reject a displacement (m; `kind` "desired" or "measured") that is not finite or far outside the model range.
 
-        Raises
-        ------
-        RejectedError
-            With the cause `not_finite` or `out_of_range`.
+        RejectedError with the cause `not_finite` or `out_of_range`.
         """
         low, high = self.stream.accepted
         if not low <= y <= high:
             raise implausible(y, (low, high), kind)
 
     def update(self, ahead: float | None, y: float, now_ns: int) -> float:
-        """Return the voltage (V) for the desired displacement `y`, `ahead` after the last sample.
+        """Return the voltage (V) for the desired displacement `y` (m), `ahead` (s) after the last sample.
 
-        Parameters
-        ----------
-        ahead : float or None, seconds
-            Time since the last sample by their stamps, of which the ticks since then have used up a part: a sample that
-            is not later counts as one output period later. None: the time on the steady clock since the last step.
-        y : float, metres
-        now_ns : int, nanoseconds
+        `ahead` is the time by the stamps, of which the ticks since the last sample have used up a part: a sample that
+        is not later counts as one output period later. None: the time on the steady clock since the last step.
         """
         if ahead is None:
             dt = max((now_ns - self.given_ns) * 1e-9, 0.0)
@@ -370,10 +318,7 @@ class Axis:
     def tick(self, now_ns: int) -> bool:
         """Do what is due without a sample: a step of a ramp, what the limits held back, or a hold.
 
-        Returns
-        -------
-        bool
-            Whether the voltage, or its rate, has changed.
+        Return whether the voltage, or its rate, has changed.
         """
         before, rate = self.voltage, self.output.rate
         if self.ramp:
@@ -454,19 +399,9 @@ class Axis:
     def measure(self, displacement: float, now_ns: int, fresh: bool = True) -> None:
         """Store a measured displacement (m).
 
-        Parameters
-        ----------
-        displacement : float, metres
-        now_ns : int, nanoseconds
-        fresh : bool
-            Whether its stamp is that of the present; others do not count for the initial history. Default True.
-
         What the model knows of the sensor is taken out first; all that follows refers to the displacement of the stage.
-
-        Raises
-        ------
-        RejectedError
-            As `check`; the measurement is not used.
+        `fresh` tells whether the stamp is that of the present; others do not count for the initial history.
+        RejectedError as in `check`; the measurement is not used.
         """
         if not self.driven:
             return

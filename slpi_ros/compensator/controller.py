@@ -58,38 +58,14 @@ class Mode(Enum):
 class Controller:
     """Inverse hysteresis compensation, with optional feedback, for all axes of a stage.
 
-    Parameters
-    ----------
-    axes : sequence of str
-        Axis names, in the order of `voltages`.
-    limits : sequence of Limits
-        Voltage limits of each axis, in the order of `axes`. A loaded model cannot relax these limits.
-    hardware_id : str
-        Hardware id of the stage; a model with a different one is refused. An empty string (default) accepts any.
-    time : TimestampRules, optional
-        Rules for message time stamps; default `TimestampRules()`.
-    loops : sequence of LoopSettings, optional
-        Feedback settings of each axis; default: feedback is disabled.
-    period : float, seconds
-        Output period; default 1 ms.
-    starts : sequence of str or float, optional
-        Where the voltage of each axis starts: `AUTO` (default), `MEASURED`, `SAVED`, or a voltage (V).
+    Sequences are in the order of `axes`. A loaded model cannot relax the `limits`; a model with another `hardware_id`
+    is refused, "" accepts any. Without `loops`, feedback is disabled; `period` is the output period (s). The voltage of
+    each axis starts (`starts`) at `AUTO` (default), `MEASURED`, `SAVED`, or a voltage (V).
 
-    Attributes
-    ----------
-    axes : list of Axis
-    voltages : array of float, shape (axes,), volts
-        Present output voltages, updated in place. An axis that a message does not name keeps its voltage.
-    mode : Mode
-    counts : Counts
-    model : StageModel or None
-        Model in use; None before the first one.
-    trajectory : TrajectoryExecutor
-    watchdog : CommandWatchdog
-    ownership : Ownership
-        Whether this controller may output voltages.
-    too_fast : str
-        What is said of the first point of the present trajectory that will be late; "" if none is known to be.
+    The output `voltages` (V), shape (axes,), are updated in place; an axis that a message does not name keeps its
+    voltage. `model` is None before the first one; `ownership` tells whether this controller may output voltages.
+    `too_fast` is what is said of the first point of the present trajectory that will be late, "" if none is known to
+    be.
     """
 
     def __init__(
@@ -169,20 +145,10 @@ class Controller:
     ) -> None:
         """Replace the model in use; the voltages are unchanged.
 
-        Parameters
-        ----------
-        model : StageModel
-        saved : mapping of axis name to SavedAxis, optional
-            Hysteresis state saved at the last shutdown; only used with the first model. Default: no saved state.
-        start_memory : str
-            Initial history of an axis without saved state, see `AxisModel.initial`; default "end".
-        last_voltages : mapping of axis name to float, volts, optional
-            Last output voltages of an axis whose saved state belongs to another model; only used with the first model.
-
-        Raises
-        ------
-        SlpiError
-            If the model is of another stage, lacks an axis or cannot be used within the limits; the old model is kept.
+        Only with the first model are used: `saved`, the hysteresis state saved at the last shutdown, and
+        `last_voltages` (V), the last output voltages of axes whose saved state belongs to another model. `start_memory`
+        is the initial history of an axis without saved state, see `AxisModel.initial`. SlpiError if the model is of
+        another stage, lacks an axis or cannot be used within the limits; the old model is kept.
         """
         if self._hardware_id and model.hardware_id and model.hardware_id != self._hardware_id:
             raise UsageError(
@@ -214,10 +180,7 @@ class Controller:
     def report(self, names: Sequence[str], voltages: Sequence[float], now_ns: int) -> bool:
         """Take the voltages (V) that the amplifiers report at `now_ns` (ns); names of other joints are ignored.
 
-        Returns
-        -------
-        bool
-            Whether the reports now show that somebody else moves an axis: nothing is output until `arm`.
+        Return whether the reports now show that somebody else moves an axis: nothing is output until `arm`.
         """
         for name, voltage in zip(names, voltages, strict=False):
             axis = self._by_name.get(name)
@@ -282,12 +245,8 @@ class Controller:
     def use_limits(self, limits: Sequence[Limits], now_ns: int, period: float = PERIOD) -> None:
         """Replace the voltage limits of all axes and the output period (s); memory and voltages are unchanged.
 
-        A voltage outside the new limits goes to the nearest one at the slew limit.
-
-        Raises
-        ------
-        UsageError
-            If the model was identified entirely outside the new limits.
+        A voltage outside the new limits goes to the nearest one at the slew limit. UsageError if the model was
+        identified entirely outside the new limits.
         """
         self.check_limits(limits)
         for axis, new in zip(self.axes, limits, strict=True):
@@ -317,28 +276,12 @@ class Controller:
     def update(
         self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float], now_ns: int, arrival_ns: int = 0
     ) -> bool:
-        """Move the named axes to their desired displacements and update `voltages`.
+        """Move the named axes to their desired displacements (m) and update `voltages`.
 
-        Parameters
-        ----------
-        stamp_ns : int, nanoseconds
-            Time stamp of the message; if it is 0 (no stamp), `arrival_ns` is used instead.
-        names : sequence of str
-        displacements : sequence of float, length of names, metres
-            Desired displacement of each named axis.
-        now_ns : int, nanoseconds
-        arrival_ns : int, nanoseconds
-            Arrival time on the clock of the stamps; required if there is no stamp, or if `needs_arrival`. Default 0.
-
-        Returns
-        -------
-        bool
-            Whether an axis cannot reach its desired displacement and is held at a voltage limit.
-
-        Raises
-        ------
-        RejectedError
-            If the message is rejected as a whole; the rejection is counted and no axis has moved.
+        Return whether an axis cannot reach its desired displacement and is held at a voltage limit. `arrival_ns`, on
+        the clock of the stamps, is used instead of a `stamp_ns` of 0 (no stamp), and is required then or if
+        `needs_arrival`. RejectedError if the message is rejected as a whole; the rejection is counted and no axis has
+        moved.
         """
         counts = self.counts
         counts.received += 1
@@ -370,18 +313,8 @@ class Controller:
     def measure(self, names: Sequence[str], displacements: Sequence[float], now_ns: int, fresh: bool = True) -> None:
         """Store measured displacements (m) at `now_ns` (ns); names of other joints are ignored.
 
-        Parameters
-        ----------
-        names : sequence of str
-        displacements : sequence of float, metres
-        now_ns : int, nanoseconds
-        fresh : bool
-            Whether the stamp is that of the present. Default True.
-
-        Raises
-        ------
-        RejectedError
-            If a displacement is not finite or out of range; it is counted but not used, the other axes are processed.
+        `fresh` tells whether the stamp is that of the present. RejectedError if a displacement is not finite or out of
+        range; it is counted but not used, the other axes are processed.
         """
         rejected: RejectedError | None = None
         for name, y in zip(names, displacements, strict=False):
@@ -488,19 +421,9 @@ class Controller:
     ) -> None:
         """Start a trajectory at once, or when its first point is due; an empty one cancels the current trajectory.
 
-        Parameters
-        ----------
-        names : sequence of str, length K
-        time_from_start_ns : array_like of int, shape (N,), nanoseconds
-        positions : array_like, shape (N, K), metres
-        start_ns : int, nanoseconds
-            Start time on the trajectory clock; 0 starts at once.
-        now_ns, clock_ns : int, nanoseconds
-
-        Raises
-        ------
-        RejectedError
-            If the trajectory is not valid; the rejection is counted and the current trajectory continues.
+        For K `names`, `time_from_start_ns` has shape (N,) and `positions` (m) shape (N, K); `start_ns` is on the
+        trajectory clock, 0 starts at once. RejectedError if the trajectory is not valid; the rejection is counted and
+        the current trajectory continues.
         """
         self.counts.trajectories += 1
         try:
@@ -631,10 +554,7 @@ class Controller:
     def ramp(self, voltages: Sequence[float], rate: float, now_ns: int) -> None:
         """Start a ramp to `voltages` (V, one per axis, clipped to the limits) at `rate` (V/s).
 
-        Raises
-        ------
-        RejectedError
-            If the present voltages are not known, or somebody else moves the stage.
+        RejectedError if the present voltages are not known, or somebody else moves the stage.
         """
         self._begin_output(now_ns)
         self._start_ramps([Ramp([voltage], rate) for voltage in voltages], Mode.RAMPING, now_ns)
@@ -649,20 +569,9 @@ class Controller:
     ) -> None:
         """Start the decaying voltage oscillation that resets the hysteresis memory of all axes.
 
-        Parameters
-        ----------
-        cycles : int
-        rate : float, V/s
-        finals : sequence of float, length of axes, volts
-            Final voltage of each axis, clipped to its limits.
-        now_ns : int, nanoseconds
-        spans : sequence of (float, float), volts
-            Lowest and highest voltage of the oscillation of each axis; default: the limits.
-
-        Raises
-        ------
-        RejectedError
-            If the present voltages are not known, or somebody else moves the stage.
+        `rate` is in V/s; `finals` are the final voltages (V) of all axes, clipped to the limits, and `spans` the lowest
+        and highest voltage (V) of the oscillation of each axis, by default the limits. RejectedError if the present
+        voltages are not known, or somebody else moves the stage.
         """
         self._begin_output(now_ns)
         ramps = []

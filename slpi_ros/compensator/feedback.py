@@ -18,19 +18,9 @@ ENOUGH = 50
 class PidGains:
     """PID gains, for a stage whose displacement increases with its voltage.
 
-    Parameters
-    ----------
-    proportional : float, V/m
-    integral : float, V/(m s)
-    derivative : float, V s/m
-        Acts on the measured displacement only, not on the setpoint.
-    derivative_filter : float, seconds
-        Time constant of the low-pass filter on the derivative; 0 (default) disables it.
-
-    Raises
-    ------
-    UsageError
-        If a gain is negative or not finite.
+    The gains are in V/m, V/(m s) and V s/m; UsageError if one is negative or not finite. The `derivative` acts on the
+    measured displacement only, not on the setpoint. `derivative_filter` (s) is the time constant of the low-pass filter
+    on the derivative; 0 disables it.
     """
 
     proportional: float
@@ -59,34 +49,15 @@ class Feedback:
     old. The error refers to the setpoint at the time of the measurement, not to the present setpoint, and for a sensor
     with a known delay or lag to the setpoint as that sensor would tell it, see `slpi_ros.model.sensor.Sensed`.
 
-    Parameters
-    ----------
-    gains : PidGains
-    limits : Limits
-        Limits of the total voltage. They may be replaced at any time; a voltage outside new limits returns within
-        the slew and acceleration limits.
-    voltage : float, volts
-        Voltage of the axis at the start; default 0.
-    release_time : float, seconds
-        Time constant of the decay of the offset, and of the correction after disabling; inf keeps both. Default 0.1.
-    longest_gap : float, seconds
-        Longer intervals between samples count as this long in the integration and in the decay; default 0.1.
-    correction_limit : float, volts
-        Largest correction in each direction; default: no limit.
+    The `limits` of the total voltage may be replaced at any time; a voltage outside new limits returns within the slew
+    and acceleration limits. `voltage` (V) is that of the axis at the start. `release_time` (s) is the time constant of
+    the decay of the offset, and of the correction after disabling; inf keeps both. Intervals between samples longer
+    than `longest_gap` (s) count as this long in the integration and in the decay. `correction_limit` (V) is the largest
+    correction in each direction. UsageError if `voltage` is not finite, or a time is not positive.
 
-    Attributes
-    ----------
-    pace : RateLimiter
-        Rate limiter of the total voltage; alone, in the time of the samples, of which at most `MAX_DT` counts. A
-        compensator gives it that of its output, on the steady clock.
-    acting : bool
-        Whether a measurement within the timeout corrected the last `step`.
-    correction_limit : float, volts
-
-    Raises
-    ------
-    UsageError
-        If `voltage` is not finite, or a time is not positive.
+    `pace` is the rate limiter of the total voltage; alone, in the time of the samples, of which at most `MAX_DT`
+    counts. A compensator gives it that of its output, on the steady clock. `acting` tells whether a measurement within
+    the timeout corrected the last `step`.
     """
 
     def __init__(
@@ -179,10 +150,7 @@ class Feedback:
     def retune(self, gains: PidGains) -> None:
         """Replace the gains without a voltage step.
 
-        Raises
-        ------
-        UsageError
-            If the gains give no finite voltage; the previous gains remain in use.
+        UsageError if the gains give no finite voltage; the previous gains remain in use.
         """
         before, after = (self._direct(each, self._error, self._rate) for each in (self._gains, gains))
         offset = self._offset + (before - after)
@@ -193,27 +161,12 @@ class Feedback:
     def correct(
         self, t: float, desired: float, measured: float, feedforward: float, now_ns: int | None = None
     ) -> float:
-        """Return the voltage for a sample with a measurement.
+        """Return the voltage (V) for a sample with a measurement, within the voltage, slew and acceleration limits.
 
-        Parameters
-        ----------
-        t : float, seconds
-            Time of the sample, not before the last one.
-        desired, measured : float, metres
-        feedforward : float, volts
-            Voltage of the inverse model for `desired`.
-        now_ns : int, nanoseconds, optional
-            Time on the clock of `pace`; default: `t`.
-
-        Returns
-        -------
-        float, volts
-            Total voltage, within the voltage, slew and acceleration limits.
-
-        Raises
-        ------
-        UsageError
-            If time runs backwards, or a value is not finite; the state is unchanged, and `hold` may be called instead.
+        The time `t` (s) is not before the last one, `desired` and `measured` are in metres, and `feedforward` (V) is
+        the voltage of the inverse model for `desired`; `now_ns` is the time on the clock of `pace`, by default `t`.
+        UsageError if time runs backwards, or a value is not finite; the state is unchanged, and `hold` may be called
+        instead.
         """
         now_ns = self._check(t, feedforward, now_ns)
         elapsed = t - self._measured_at
@@ -238,10 +191,7 @@ class Feedback:
     def hold(self, t: float, feedforward: float, now_ns: int | None = None) -> float:
         """Return the voltage (V) for a sample without measurement: the correction is kept, or decays if disabled.
 
-        Raises
-        ------
-        UsageError
-            If time (s) runs backwards, or a value is not finite; the state is unchanged.
+        UsageError if time `t` (s) runs backwards, or a value is not finite; the state is unchanged.
         """
         now_ns = self._check(t, feedforward, now_ns)
         self._output(t, feedforward, self._without_measurement(t), now_ns)
@@ -257,16 +207,9 @@ class Feedback:
     def step(self, dt: float, desired: float, feedforward: float, now_ns: int, timeout: float) -> float:
         """Return the voltage (V) for a sample, corrected by the last measurement if it is recent enough.
 
-        Parameters
-        ----------
-        dt : float, seconds
-            Time since the last sample.
-        desired : float, metres
-        feedforward : float, volts
-        now_ns : int, nanoseconds
-            Time of the sample on the clock of `measure` and of `pace`.
-        timeout : float, seconds
-            Measurements older than this are ignored; the correction is then held.
+        `dt` (s) is the time since the last sample; `desired` is in metres, `feedforward` in volts, and `now_ns` on the
+        clock of `measure` and of `pace`. Measurements older than `timeout` (s) are ignored; the correction is then
+        held.
         """
         t = self._t + dt if self._t > -inf else 0.0
         latest, self._latest = self._latest, None
@@ -349,17 +292,7 @@ def part_within(step: float, low: float, high: float) -> float:
 
 @dataclass(frozen=True)
 class Drift:
-    """Statistics of the residual measured - model.
-
-    Parameters
-    ----------
-    rms : float, metres
-        Root mean square of the residual over the last `WINDOW` measurements.
-    mean : float, metres
-        Mean of the residual.
-    samples : int
-        Number of measurements in the window.
-    """
+    """Rms and mean (m) of the residual measured - model over the last `WINDOW` measurements, and their number."""
 
     rms: float
     mean: float
@@ -370,12 +303,8 @@ class ResidualWindow:
     """Residuals measured - model of the last `WINDOW` measurements.
 
     Because the stage responds with a delay, the residual is the signed distance of a measurement from the interval
-    between the model displacements of the last two samples; at rest it is measured - model.
-
-    Parameters
-    ----------
-    expected : float, metres
-        Model displacement at the start.
+    between the model displacements of the last two samples; at rest it is measured - model. `expected` is the model
+    displacement at the start (m).
     """
 
     __slots__ = ("_before", "_expected", "_next", "_residuals", "_samples")
@@ -420,15 +349,8 @@ class ResidualWindow:
 class LoopSettings:
     """Settings of the feedback of one axis.
 
-    Parameters
-    ----------
-    enabled : bool
-        Whether measurements correct the voltage; if False, they are used for the diagnostics only.
-    gains : PidGains
-    timeout : float, seconds
-        Measurements older than this are ignored.
-    correction_limit : float, volts
-        Largest correction; default: no limit.
+    If not `enabled`, measurements are used for the diagnostics only. Measurements older than `timeout` (s) are ignored;
+    `correction_limit` (V) is the largest correction.
     """
 
     enabled: bool

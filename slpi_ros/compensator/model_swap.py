@@ -16,23 +16,11 @@ def take_over(
 ) -> StreamingInverse:
     """Return the streaming inverse of a new model, with its memory in the present hysteresis state of the axis.
 
-    Parameters
-    ----------
-    axis : AxisModel
-        The new model.
-    limits : Limits
-        Limits of the node; the inverse is further limited to the identified voltages.
-    reversal_voltages : sequence of float, volts
-        Voltages of the reversals, oldest first, followed by the present voltage; they are replayed on the initial
-        history "start". Empty (default): the reversals are unknown, and the initial history is `start_memory`.
-    start_memory : str
-        Initial history, see `AxisModel.initial`; default "end".
-
-    Raises
-    ------
-    SlpiError
-        If the model is not causal, was identified entirely outside the limits or far from the present voltage, or its
-        inverse gives a voltage outside the limits.
+    `limits` are those of the node; the inverse is further limited to the identified voltages. The `reversal_voltages`
+    (V), oldest first, followed by the present voltage, are replayed on the initial history "start". If they are empty,
+    the reversals are unknown, and the initial history is `start_memory`, see `AxisModel.initial`. SlpiError if the
+    model is not causal, was identified entirely outside the limits or far from the present voltage, or its inverse
+    gives a voltage outside the limits.
     """
     if not axis.causal:
         raise UsageError(
@@ -83,10 +71,7 @@ def replay(memory: Memory, voltages: Sequence[float]) -> None:
 def check_inverse(axis: AxisModel, allowed: Limits) -> None:
     """Check the inverse at both ends of the accepted displacements, starting from both voltage limits.
 
-    Raises
-    ------
-    SlpiError
-        If a displacement has no voltage within the limits.
+    SlpiError if a displacement has no voltage within the limits.
     """
     low, high = axis.displacement_range
     margin = TOLERATED_SHARE * (high - low) * (1.0 - 1e-9)
@@ -103,10 +88,7 @@ def check_inverse(axis: AxisModel, allowed: Limits) -> None:
 def require_near(present: float, allowed: Limits) -> None:
     """Refuse a model if the present voltage (V) is far outside its identified range: it would extrapolate.
 
-    Raises
-    ------
-    UsageError
-        If `present` is outside `allowed` by more than `TOLERATED_SHARE` of its span.
+    UsageError if `present` is outside `allowed` by more than `TOLERATED_SHARE` of its span.
     """
     margin = TOLERATED_SHARE * (allowed.upper - allowed.lower)
     if not allowed.lower - margin <= present <= allowed.upper + margin:

@@ -16,24 +16,10 @@ BEYOND = 2.0
 class Ownership:
     """Whether voltages may be output: the amplifiers are where they are known to be, and nobody else moves them.
 
-    All times are nanoseconds on the steady clock.
-
-    Parameters
-    ----------
-    axes : sequence of Axis
-    starts : sequence of str or float
-        Where the voltage of each axis starts: `AUTO`, `MEASURED`, `SAVED`, or a voltage (V). Empty: `AUTO`.
-
-    Attributes
-    ----------
-    reporting : bool
-        Whether ``stage_state`` has a publisher.
-    started : bool
-        Whether a voltage has been output since the activation.
-    obstacle : (str, str) or None
-        Cause of rejection, and reason, if no voltage may be output.
-    notes : dict of axis name to str
-        What is not certain about the voltage at the start; "" if nothing.
+    All times are nanoseconds on the steady clock. The voltage of each axis starts (`starts`) at `AUTO`, `MEASURED`,
+    `SAVED`, or a voltage (V); empty: `AUTO`. `reporting` tells whether ``stage_state`` has a publisher, `started`
+    whether a voltage has been output since the activation. `obstacle` is cause of rejection and reason if no voltage
+    may be output, else None; `notes` say by axis what is not certain about the voltage at the start, "" if nothing.
     """
 
     def __init__(self, axes: Sequence[Axis], starts: Sequence[str | float] = ()) -> None:
@@ -106,10 +92,7 @@ class Ownership:
     def begin_output(self, now_ns: int) -> None:
         """Find the voltages at the start once more, and take them to be those of the amplifiers.
 
-        Raises
-        ------
-        RejectedError
-            If they are not known, or somebody else moves the stage.
+        RejectedError if they are not known, or somebody else moves the stage.
         """
         if not self.started and self.armed:
             self.locate(now_ns)

@@ -24,18 +24,11 @@ TOLERATED_SHARE = 0.01
 
 @dataclass(frozen=True)
 class MemoryConfidence:
-    """Confidence in the hysteresis memory of an axis.
+    """Confidence in the hysteresis memory of an axis: `ASSUMED`, `RESETTING`, `KNOWN` or `RESTORED`.
 
-    Parameters
-    ----------
-    state : str
-        `ASSUMED` (default), `RESETTING`, `KNOWN` or `RESTORED`.
-    doubt : str
-        Reason for the state `ASSUMED`; "" (default) if the only reason is that the memory has not been verified.
-    spanned : (float, float), volts
-        Lowest and highest voltage of the reset.
-    contradicted : bool
-        Whether a measured displacement contradicts every initial history of the model.
+    `doubt` is the reason for the state `ASSUMED`, "" if the only reason is that the memory has not been verified;
+    `spanned` are the lowest and highest voltage (V) of the reset. If `contradicted`, a measured displacement
+    contradicts every initial history of the model.
     """
 
     state: str = ASSUMED
@@ -70,17 +63,9 @@ class LastVoltages:
     Two entries with checksums are written alternately, so one of them is intact after a crash of the process. The data
     is not flushed to the disk: it survives the end of the process, but may be lost at a power failure.
 
-    Parameters
-    ----------
-    path : path-like
-        File of the saved memory; the voltages go to `path`.last, which is truncated.
-    mark : int
-        Identifier (32 bits) of the saved memory that the entries belong to; may be changed at any time.
-
-    Raises
-    ------
-    ModelError
-        If the file cannot be written.
+    The voltages go to `path`.last, which is truncated, for the file `path` of the saved memory. `mark` is the
+    identifier (32 bits) of the saved memory that the entries belong to, and may be changed at any time. ModelError if
+    the file cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], mark: int) -> None:
@@ -98,10 +83,7 @@ class LastVoltages:
     def note(self, voltages: bytes) -> None:
         """Write the voltages (V) of all axes, each as a double in native byte order.
 
-        Raises
-        ------
-        ModelError
-            If the file cannot be written.
+        ModelError if the file cannot be written.
         """
         self._number = number = self._number + 1
         record = HEAD.pack(self.mark, number) + voltages
@@ -143,14 +125,9 @@ CRASHED = "restored from before a crash: the last voltage is correct, the latest
 class SavedAxis:
     """Saved hysteresis state of one axis.
 
-    Parameters
-    ----------
-    reversal_voltages : tuple of float, length >= 1, volts
-        Voltages of the remembered reversals, oldest first, followed by the last voltage.
-    certain : bool
-        Whether the memory was known (reset or restored) when it was saved.
-    doubt : str
-        Reason why the saved state may be incomplete; "" (default) if none. Not written to the file.
+    `reversal_voltages` (V), at least one, are those of the remembered reversals, oldest first, followed by the last
+    voltage. `certain` tells whether the memory was known (reset or restored) when it was saved; `doubt` is the reason
+    why the saved state may be incomplete, "" if none, and is not written to the file.
     """
 
     reversal_voltages: tuple[float, ...]
@@ -171,15 +148,9 @@ class SavedAxis:
 
 @dataclass(frozen=True)
 class SavedMemory:
-    """Saved hysteresis state of all axes of a stage.
+    """Saved hysteresis state of all axes of a stage; `model` is the `model_id` of the model that it belongs to.
 
-    Parameters
-    ----------
-    model : str
-        `model_id` of the model that the state belongs to.
-    complete : bool
-        Whether the node was shut down cleanly after saving; if False (crash), reversals may be missing.
-    axes : mapping of axis name to SavedAxis
+    `complete` tells whether the node was shut down cleanly after saving; if False (crash), reversals may be missing.
     """
 
     model: str
@@ -208,10 +179,7 @@ def model_id(model: StageModel) -> str:
 def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
     """Write a saved memory atomically; return its identifier for `LastVoltages`.
 
-    Raises
-    ------
-    ModelError
-        If the file cannot be written.
+    ModelError if the file cannot be written.
     """
     document = {
         "schema": SCHEMA,
@@ -231,10 +199,7 @@ def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
 def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
     """Read a saved memory, updated with the last voltages after a crash; None if the file does not exist.
 
-    Raises
-    ------
-    ModelError
-        If the file cannot be read or is not a valid document.
+    ModelError if the file cannot be read or is not a valid document.
     """
     try:
         text = read_input(path, MEMORY_BYTES).decode()
@@ -262,15 +227,8 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
 class MemoryFile:
     """Save and restore the hysteresis memory of a stage, including the voltages output since the last save.
 
-    Parameters
-    ----------
-    path : str
-        File of the memory; the voltages go to `path`.last. With an empty string all methods do nothing.
-
-    Attributes
-    ----------
-    last_voltages : dict of axis name to float, volts
-        Last output voltages that `find` has read, also where the rest of the file was not usable.
+    The voltages go to `path`.last; with an empty `path` all methods do nothing. `last_voltages` (V) are those by axis
+    that `find` has read, also where the rest of the file was not usable.
     """
 
     def __init__(self, path: str) -> None:
@@ -282,10 +240,7 @@ class MemoryFile:
     def find(self, model: StageModel, names: Sequence[str]) -> Mapping[str, SavedAxis] | None:
         """Return the saved hysteresis state of each axis, or None if no file exists.
 
-        Raises
-        ------
-        ModelError
-            If the file cannot be read, or does not match `model` or the axes `names`.
+        ModelError if the file cannot be read, or does not match `model` or the axes `names`.
         """
         saved = load_memory(self._path) if self._path else None
         if saved is None:
@@ -297,10 +252,7 @@ class MemoryFile:
     def save(self, model: StageModel | None, axes: Mapping[str, SavedAxis], complete: bool) -> None:
         """Write the state of `axes` if it has changed; `complete` means that no further voltage is output afterwards.
 
-        Raises
-        ------
-        ModelError
-            If the file cannot be written, or is another document.
+        ModelError if the file cannot be written, or is another document.
         """
         if not self._path or model is None:
             return
@@ -328,10 +280,7 @@ class MemoryFile:
     def note(self, voltages: bytes) -> None:
         """Store the voltages just output (V, native doubles), for recovery after a crash; called for each command.
 
-        Raises
-        ------
-        ModelError
-            If the file cannot be written.
+        ModelError if the file cannot be written.
         """
         if self._last:
             self._last.note(voltages)

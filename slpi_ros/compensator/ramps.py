@@ -17,16 +17,8 @@ PLANNED_SHARE = 0.8
 class Safety:
     """Reaction to a command timeout and to deactivation.
 
-    Parameters
-    ----------
-    command_timeout : float, seconds
-        Timeout of the command watchdog; 0 disables the watchdog.
-    ramps_on_timeout, ramps_on_deactivate : bool
-        Whether to ramp to the safe voltages at a timeout, and at deactivation; if False, the voltages are held.
-    voltages : tuple of float, length of axes, volts
-        Safe voltage of each axis.
-    rate : float, V/s
-        Rate of the ramp to the safe voltages.
+    A `command_timeout` (s) of 0 disables the watchdog. With `ramps_on_timeout` and `ramps_on_deactivate` the axes ramp
+    to the safe `voltages` (V, one per axis) at `rate` (V/s), otherwise the voltages are held.
     """
 
     command_timeout: float
@@ -39,16 +31,8 @@ class Safety:
 class Ramp:
     """Voltage ramp through a sequence of target voltages, each reached before the next one is approached.
 
-    Parameters
-    ----------
-    goals : iterable of float, volts
-    rate : float, V/s
-        Maximum rate of change, further limited to `PLANNED_SHARE` of the slew limit; inf: at the slew limit.
-
-    Raises
-    ------
-    UsageError
-        If the rate is not positive, or a target voltage is not finite.
+    The `goals` are in volts. `rate` (V/s) is the maximum rate of change, further limited to `PLANNED_SHARE` of the slew
+    limit; inf: at the slew limit. UsageError if the rate is not positive, or a target voltage is not finite.
     """
 
     def __init__(self, goals: Iterable[float], rate: float) -> None:
@@ -74,13 +58,7 @@ class Ramp:
 
 
 class Brake:
-    """Deceleration to rest within the acceleration limit.
-
-    Attributes
-    ----------
-    done : bool
-        Whether the voltage is at rest.
-    """
+    """Deceleration to rest within the acceleration limit; `done` once the voltage is at rest."""
 
     def __init__(self) -> None:
         self.done = False

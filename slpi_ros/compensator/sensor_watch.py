@@ -27,15 +27,7 @@ KEPT = 4096
 
 @dataclass(frozen=True)
 class Fault:
-    """Fault of a sensor.
-
-    Parameters
-    ----------
-    kind : str
-        "silent", "stuck", "inverted" or "noisy".
-    reason : str
-        What was seen, with numbers.
-    """
+    """Fault of a sensor: "silent", "stuck", "inverted" or "noisy", and what was seen, with numbers."""
 
     kind: str
     reason: str
@@ -44,14 +36,8 @@ class Fault:
 class SensorWatch:
     """Hold the readings of a sensor against the displacement of the model for the voltages that were output.
 
-    All times are nanoseconds on the steady clock.
-
-    Parameters
-    ----------
-    span : float, metres
-        Displacement range of the model.
-    noise : float, metres
-        Noise of the sensor, rms, in the record of the model; default 0.
+    All times are nanoseconds on the steady clock. `span` (m) is the displacement range of the model, and `noise` (m)
+    the rms noise of the sensor in the record of the model.
     """
 
     def __init__(self, span: float, noise: float = 0.0) -> None:

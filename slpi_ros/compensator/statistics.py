@@ -12,28 +12,13 @@ from slpi_ros.compensator.validation import CAUSES, MEASURED_CAUSES
 class Counts:
     """Message counters of a compensator.
 
-    Parameters
-    ----------
-    received, accepted : int
-        Messages with desired displacements.
-    held_at_limit : int
-        Accepted messages for which an axis was held at a voltage limit.
-    slew_limited : int
-        Accepted messages for which the slew or acceleration limit kept an axis from its setpoint.
-    excursions : int
-        Number of times that an axis began to be held at a voltage limit.
-    gaps : int
-        Accepted messages stamped more than `time_jump` after the previous message.
-    time_jumps : int
-        Accepted messages stamped earlier than the previous message because the clock had been set back.
-    by_cause : dict of str to int
-        Rejected messages by cause.
-    measured_by_cause : dict of str to int
-        Rejected measured displacements by cause.
-    trajectories, trajectories_rejected : int
-        Received and rejected trajectories.
-    points_held, points_slewing : int
-        Trajectory points that were held at a voltage limit, or slew limited.
+    `received` and `accepted` count messages with desired displacements. Of the accepted messages, `held_at_limit`
+    counts those for which an axis was held at a voltage limit, `slew_limited` those for which the slew or acceleration
+    limit kept an axis from its setpoint, `gaps` those stamped more than `time_jump` after the previous message, and
+    `time_jumps` those stamped earlier than the previous message because the clock had been set back. `excursions`
+    counts how often an axis began to be held at a voltage limit. `by_cause` and `measured_by_cause` count rejected
+    messages and rejected measured displacements. `trajectories` counts those received, and `points_held` and
+    `points_slewing` count trajectory points that were held at a voltage limit, or slew limited.
     """
 
     received: int = 0
@@ -73,12 +58,8 @@ WINDOW = 8192
 class TimingReport:
     """Timing of the messages since the last `Timing.restart`, at most of the last `WINDOW` messages.
 
-    Parameters
-    ----------
-    jitter : float, seconds
-        Standard deviation of the time between messages.
-    latency : (float, float, float), seconds
-        Time from arrival of a message to the published voltages: median, 99th percentile, maximum.
+    `jitter` (s) is the standard deviation of the time between messages; `latency` (s) is the time from arrival of a
+    message to the published voltages: median, 99th percentile, maximum.
     """
 
     jitter: float
@@ -120,14 +101,7 @@ TRACKED = 500
 
 @dataclass(frozen=True)
 class TrackingReport:
-    """Tracking error, measured - desired, over the last `TRACKED` measurements.
-
-    Parameters
-    ----------
-    latest, mean, rms : float, metres
-    maximum : float, metres
-        Largest absolute value.
-    """
+    """Tracking error (m), measured - desired, over the last `TRACKED` measurements; `maximum` is absolute."""
 
     latest: float
     mean: float
@@ -138,12 +112,8 @@ class TrackingReport:
 class TrackingError:
     """Collect the tracking error, measured - desired, of one axis.
 
-    Attributes
-    ----------
-    desired : float or None, metres
-        Present setpoint; None while the axis does not follow desired displacements.
-    fresh : bool
-        Whether there was a measurement since the last report.
+    `desired` (m) is the present setpoint, None while the axis does not follow desired displacements; `fresh` tells
+    whether there was a measurement since the last report.
     """
 
     __slots__ = ("_count", "_errors", "desired", "fresh")

@@ -34,16 +34,9 @@ BLOCK = 256
 class Trajectory:
     """Desired displacements of some axes at given times, validated by `Trajectory.of`.
 
-    Parameters
-    ----------
-    names : tuple of str, length K
-    time_from_start_ns : ndarray of int64, shape (N,), nanoseconds
-        Strictly increasing, N >= 1.
-    positions : ndarray, shape (N, K), metres
-    start_ns : int, nanoseconds
-        Start time; 0 starts at once. May be negative on a clock that counts from the start of the machine.
-    cut : int
-        Number of earlier points discarded because their time had passed; default 0.
+    For K `names`, `time_from_start_ns`, shape (N,), is strictly increasing, N >= 1, and `positions` (m) has shape
+    (N, K). A `start_ns` of 0 starts at once; it may be negative on a clock that counts from the start of the machine.
+    `cut` is the number of earlier points discarded because their time had passed.
     """
 
     names: tuple[str, ...]
@@ -64,20 +57,8 @@ class Trajectory:
     ) -> "Trajectory":
         """Return a validated trajectory; arrays are not copied.
 
-        Parameters
-        ----------
-        names : sequence of str, length K
-            A subset of `axes`, in any order.
-        time_from_start_ns : array_like of int, shape (N,), nanoseconds
-        positions : array_like, shape (N, K), metres
-        start_ns : int, nanoseconds
-        axes : sequence of str
-            Names of all axes.
-
-        Raises
-        ------
-        RejectedError
-            If names, shapes, times or positions are not valid; the message names the first invalid point.
+        `names` is a subset of `axes`, the names of all axes, in any order. RejectedError if names, shapes, times or
+        positions are not valid; the message names the first invalid point.
         """
         require_names(names, axes)
         times, places = _as_array(time_from_start_ns), _as_array(positions, np.float64)
@@ -110,10 +91,7 @@ class Trajectory:
     def useful_at(self, now_ns: int) -> "Trajectory":
         """Return the trajectory without the points before `now_ns` (ns), or with all points if `start_ns` is 0.
 
-        Raises
-        ------
-        RejectedError
-            If all points are in the past.
+        RejectedError if all points are in the past.
         """
         first = int(np.searchsorted(self.time_from_start_ns, now_ns - self.start_ns)) if self.start_ns else 0
         if first == len(self):
@@ -150,16 +128,9 @@ def _check_times(times: NDArray[Any], start_ns: int) -> None:
 
 
 class Point(NamedTuple):
-    """The sample of a trajectory to output now.
+    """The sample of a trajectory to output now: `displacements` (m) of the axes `names`, due at `deadline_ns`.
 
-    Parameters
-    ----------
-    names : tuple of str, length K
-    displacements : list of float, length K, metres
-    deadline_ns : int, nanoseconds
-        Time at which the sample was due.
-    between : bool
-        Whether it is interpolated; False (default): it is a point of the trajectory.
+    If not `between`, it is a point of the trajectory, else it is interpolated.
     """
 
     names: tuple[str, ...]
@@ -171,21 +142,10 @@ class Point(NamedTuple):
 class _Track:
     """Points of one trajectory for all axes with the same delay, executed in order.
 
-    Parameters
-    ----------
-    names : tuple of str, length K
-    positions : ndarray, shape (N, K), metres
-    deadlines_ns : ndarray of int64, shape (N,), nanoseconds
-    first : int
-        Index of the first point to execute.
-    counted : bool
-        Whether `TrajectoryExecutor.remaining` counts the points: only one track of each trajectory is counted.
-    begin_ns : int, nanoseconds
-        Time at which the way to the first point begins.
-    period_ns : int, nanoseconds
-        Output period.
-    place : callable, optional
-        As in `TrajectoryExecutor`.
+    For K `names`, `positions` (m) has shape (N, K) and `deadlines_ns` shape (N,). `first` is the index of the first
+    point to execute, and `begin_ns` the time at which the way to it begins; `place` is as in `TrajectoryExecutor`.
+    `counted` tells whether `TrajectoryExecutor.remaining` counts the points: only one track of each trajectory is
+    counted.
     """
 
     def __init__(
@@ -282,19 +242,9 @@ class TrajectoryExecutor:
 
     All times are nanoseconds on the same clock, which the caller chooses.
 
-    Parameters
-    ----------
-    period : float, seconds
-        Output period; default 1 ms.
-    place : callable, optional
-        Returns the present displacement (m) of an axis, from which the first point is approached. Default: an axis
-        stays until the first point.
-
-    Attributes
-    ----------
-    period : float, seconds
-    skipped : int
-        Number of points skipped so far because a later point was already due.
+    `period` is the output period (s). `place` returns the present displacement (m) of an axis, from which the first
+    point is approached; by default an axis stays until the first point. `skipped` counts the points skipped so far
+    because a later point was already due.
     """
 
     def __init__(self, period: float = PERIOD, place: Callable[[str], float] | None = None) -> None:
@@ -341,18 +291,9 @@ class TrajectoryExecutor:
     def start(self, trajectory: Trajectory, now_ns: int, delays: Mapping[str, float] | None = None) -> None:
         """Start a trajectory at once, or when its first point is due.
 
-        Parameters
-        ----------
-        trajectory : Trajectory
-        now_ns : int, nanoseconds
-        delays : mapping of axis name to float, seconds, optional
-            Delay of each axis, by which its deadlines are advanced; default 0. Of the points with deadlines in the past
-            only the last one is executed.
-
-        Raises
-        ------
-        RejectedError
-            If all points are in the past; the current trajectory continues.
+        `delays` (s), 0 by default, are those of each axis, by which its deadlines are advanced; of the points with
+        deadlines in the past only the last one is executed. RejectedError if all points are in the past; the current
+        trajectory continues.
         """
         useful = trajectory.useful_at(now_ns)
         due = useful.time_from_start_ns + (trajectory.start_ns or now_ns)
@@ -401,21 +342,9 @@ CHECKED_FIRST, CHECKED_LATER = 500, 50
 class PaceCheck:
     """Find the first point of a trajectory that the slew limit makes late; the stage is not moved.
 
-    Parameters
-    ----------
-    axis : str
-    stream : StreamingInverse
-        In the state at the begin of the trajectory; it is copied.
-    trajectory : Trajectory
-    wait : float, seconds
-        Time from the present to the start of the trajectory.
-    period : float, seconds
-        Output period: a point is late by more than that.
-
-    Attributes
-    ----------
-    done : bool
-        Whether all points have been looked at, or a late one was found.
+    `stream`, in the state at the begin of the trajectory, is copied; `wait` (s) is the time from the present to the
+    start of the trajectory. A point counts as late if it is late by more than the output `period` (s). `done` tells
+    whether all points have been looked at, or a late one was found.
     """
 
     def __init__(self, axis: str, stream: StreamingInverse, trajectory: Trajectory, wait: float, period: float) -> None:

@@ -36,13 +36,7 @@ MEASURED_CAUSES = (NOT_FINITE, OUT_OF_RANGE)
 
 
 class RejectedError(SlpiError):
-    """A message was rejected as a whole; no axis has moved.
-
-    Attributes
-    ----------
-    cause : str
-        One of `CAUSES`.
-    """
+    """A message was rejected as a whole, for one `cause` of `CAUSES`; no axis has moved."""
 
     def __init__(self, cause: str, message: str) -> None:
         super().__init__(message)
@@ -52,10 +46,7 @@ class RejectedError(SlpiError):
 def require_names(names: Sequence[str], axes: Collection[str]) -> None:
     """Reject an empty list of axis names, duplicates, and names that are not in `axes`.
 
-    Raises
-    ------
-    RejectedError
-        With the cause `empty`, `duplicate_axis` or `unknown_axis`.
+    RejectedError with the cause `empty`, `duplicate_axis` or `unknown_axis`.
     """
     if not names:
         raise RejectedError(EMPTY, "the message names no axis; name the axes to move")
@@ -77,12 +68,8 @@ def implausible(y: float, accepted: tuple[float, float], kind: str) -> RejectedE
 class TimestampRules:
     """Rules for message time stamps.
 
-    Parameters
-    ----------
-    jump : float, seconds
-        Largest backward step of a late stamp; a larger one means a clock set back, a larger forward step a gap.
-    max_age : float, seconds
-        Messages stamped longer ago than this are rejected as stale; 0 (default) disables the check.
+    `jump` (s) is the largest backward step of a late stamp; a larger one means a clock set back, a larger forward step
+    a gap. Messages stamped longer ago than `max_age` (s) are rejected as stale; 0 disables the check.
     """
 
     jump: float = 1.0
@@ -92,11 +79,8 @@ class TimestampRules:
 class Stamps:
     """Check the order of the sample time stamps of one axis and compute elapsed times.
 
-    Parameters
-    ----------
-    jump_ns : int, nanoseconds
-        A stamp that is older than the last one by at most this is late. If it is older by more than this, the clock
-        was set back, and the elapsed time restarts. Default 1 s.
+    A stamp that is older than the last one by at most `jump_ns` is late. If it is older by more than this, the clock
+    was set back, and the elapsed time restarts.
     """
 
     __slots__ = ("_last_ns", "_restarted", "jump_ns")
@@ -110,10 +94,7 @@ class Stamps:
     def check(self, stamp_ns: int) -> None:
         """Reject a stamp (ns) that is not newer than the last one, unless the clock was set back.
 
-        Raises
-        ------
-        RejectedError
-            With the cause `duplicate` or `time_backwards`.
+        RejectedError with the cause `duplicate` or `time_backwards`.
         """
         last = self._last_ns
         if last is None or stamp_ns > last or stamp_ns < last - self.jump_ns:

@@ -6,14 +6,9 @@ from slpi_ros.compensator.ramps import Safety
 class CommandWatchdog:
     """Detect that no command has arrived within the command timeout.
 
-    Attributes
-    ----------
-    commanded : bool
-        Whether a command has been executed since the activation. Before the first command, a timeout moves no axis.
-    expired : bool
-        Whether the timeout had elapsed at the last call of `update`.
-    safe_voltages : tuple of float, length of axes, volts, or None
-        Target voltages of the ramp started at expiry; None if the voltages are held.
+    `commanded` tells whether a command has been executed since the activation; before the first command, a timeout
+    moves no axis. `expired` tells whether the timeout had elapsed at the last call of `update`. `safe_voltages` (V, one
+    per axis) are the targets of the ramp started at expiry; None if the voltages are held.
     """
 
     def __init__(self) -> None:
@@ -33,13 +28,7 @@ class CommandWatchdog:
     def update(self, safety: Safety, now_ns: int, waiting: bool) -> bool:
         """Update `expired`; return True at expiry, and again if the reaction in `safety` changes afterwards.
 
-        Parameters
-        ----------
-        safety : Safety
-            Command timeout, and the reaction to it.
-        now_ns : int, nanoseconds
-        waiting : bool
-            Whether commands are expected; if False, the watchdog does not expire.
+        If not `waiting`, no commands are expected and the watchdog does not expire.
         """
         before = self.expired, self.safe_voltages
         self.expired = waiting and 0.0 < safety.command_timeout < self.silence(now_ns)

@@ -1,7 +1,7 @@
 """Diagnosis of a model on records: its errors, their causes, and the model extended by them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -18,11 +18,10 @@ from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
-from slpi_ros.identification.initial_history import histories
+from slpi_ros.identification.free_run import FreeRun, free_run, likely_starts, rms_of
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.repeatability_floor import Floor, floor_of
-from slpi_ros.identification.samples import Samples
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, Start
 from slpi_ros.model.sensor import IDEAL, corrected
@@ -40,9 +39,9 @@ SAME_ELSEWHERE = ({"delay", "lag"},)
 LEFT_BY_NOISE, LEFT_OF_ERROR, GAIN_SHOWN = 1.5, 0.6, 0.5
 # Creep from a move before the records is part of the model if all records agree on the move within this share.
 BEGAN_ALIKE = 0.3
-# An initial history is possible up to this multiple of the lowest error; a zero has moved if its shift exceeds this
-# multiple of the error; number of parts for the uncertainty of a gain; fewest samples of a comparison.
-AS_WELL, ZERO, STRETCHES, FEWEST = 1.1, 4.0, 8, 50
+# A zero has moved if its shift exceeds this multiple of the error; number of parts for the uncertainty of a gain;
+# fewest samples of a comparison.
+ZERO, STRETCHES, FEWEST = 4.0, 8, 50
 
 
 def diagnose(
@@ -132,8 +131,8 @@ def _diagnose_axis(
     fitted = model.kind in REFITTED
     family = evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None
     selection = _selected(base, family) if fitted else select(base, None)
-    runs = [_free_run(model, part, of_record=same) for part in selection.now.evidence.parts]
-    before = base.held_out.rms_of_records if fitted else _rms(runs)
+    runs = [_run(model, part, of_record=same) for part in selection.now.evidence.parts]
+    before = base.held_out.rms_of_records if fitted else rms_of(runs)
     if not fitted and before > WRONG_KIND * base.held_out.rms:
         selection = replace(selection, structures=(BIAS, *selection.structures))
     given = _given(model, runs, selection)
@@ -146,6 +145,9 @@ def _diagnose_axis(
         extension = _extension(model, selection, given, source)
         if extension and _not_as_judged(extension[0], runs, selection):
             extension = None
+    if not (extension or selection.named):
+        # Nothing is explained, so that nothing is fitted beside the hysteresis of the given kind.
+        selection = replace(selection, now=selection.base)
     extended, missing = extension or (model, [named.name for named in selection.named])
     outcomes = _outcomes(runs, _runs(extended, selection.now) if extension else runs, selection.now)
     floor = _floor(selection.now)
@@ -185,13 +187,15 @@ def _without_causes(selection: Selection) -> Selection:
     return replace(selection, now=now, named=(), dropped=tuple(sorted({*selection.dropped, *causes})))
 
 
-def _runs(model: AxisModel, now: Explanation) -> "list[_FreeRun]":
-    """Return the free run of an extended model on each of its records."""
-    parts = now.evidence.parts
-    return [_free_run(model, part, of_record=len(parts) == 1) for part in parts]
+def _runs(model: AxisModel, now: Explanation) -> list[FreeRun]:
+    """Return the free run of an extended model on each of its records, as the effects began there."""
+    return [
+        _run(replace(model, effects=tuple(effect.of_record(k) for effect in model.effects)), part, of_record=True)
+        for k, part in enumerate(now.evidence.parts)
+    ]
 
 
-def _not_as_judged(extended: AxisModel, runs: "Sequence[_FreeRun]", selection: Selection) -> bool:
+def _not_as_judged(extended: AxisModel, runs: "Sequence[FreeRun]", selection: Selection) -> bool:
     """Return whether the free run of an extended model shows another gain than the held-out error.
 
     It may be worse than that of the given model, `runs`, on none of the records. Where the effects leave more than what
@@ -200,7 +204,7 @@ def _not_as_judged(extended: AxisModel, runs: "Sequence[_FreeRun]", selection: S
     after = _runs(extended, selection.now)
     if any(one.rms > NO_WORSE * given.rms for one, given in zip(after, runs, strict=True)):
         return True
-    return _more_than_noise(selection) and 1.0 - _rms(after) / _rms(runs) < GAIN_SHOWN * (1.0 - _left(selection))
+    return _more_than_noise(selection) and 1.0 - rms_of(after) / rms_of(runs) < GAIN_SHOWN * (1.0 - _left(selection))
 
 
 def _ambiguous(selection: Selection) -> list[str]:
@@ -243,47 +247,13 @@ def _floor(now: Explanation) -> Floor:
     return replace(worst, rms=min(max(worst.rms, now.evidence.rounding), now.held_out.rms))
 
 
-@dataclass(frozen=True)
-class _FreeRun:
-    """Free-run simulation of a model on a record, from the initial history with the lowest error.
-
-    Parameters
-    ----------
-    errors : ndarray, shape (N,), metres
-        Measured - model.
-    rms : float, metres
-        Rms of the errors without their mean.
-    offsets : (float, float), metres
-        Smallest and largest offset (median error) over all possible initial histories.
-    """
-
-    errors: FloatArray
-    rms: float
-    offsets: tuple[float, float]
-
-    @property
-    def offset(self) -> float:
-        """Offset with the smallest magnitude, metres."""
-        return min(self.offsets, key=abs)
-
-    @property
-    def moved(self) -> float:
-        """Shift of the zero (m) that remains for every possible initial history; 0 if a history can explain it."""
-        return 0.0 if self.offsets[0] <= 0.0 <= self.offsets[1] else self.offset
+def _run(model: AxisModel, part: Part, *, of_record: bool) -> FreeRun:
+    known, starts = _known(part), _starts(model, part)
+    return free_run(model, part.t, part.v, part.y, part.used, known, starts, others=part.others, of_record=of_record)
 
 
-def _free_run(model: AxisModel, part: Part, *, of_record: bool) -> _FreeRun:
-    """Simulate a model on a record from all candidate initial histories and return the best free run."""
-    errors = [
-        part.y - replace(model, start=start).simulate(part.t, part.v, part.others, of_record=of_record)
-        for start in _starts(model, part)
-    ]
-    chosen = _known(part)
-    rms = np.array([np.std(each[part.used]) for each in errors])
-    as_well = [each for each in errors if np.std(each[chosen]) <= AS_WELL * min(np.std(one[chosen]) for one in errors)]
-    offsets = [float(np.median(each[chosen])) for each in as_well]
-    best = int(np.argmin(rms))
-    return _FreeRun(errors[best], float(rms[best]), (min(offsets), max(offsets)))
+def _starts(model: AxisModel, part: Part) -> list[Start]:
+    return likely_starts(model, float(part.v[0]), part.history)
 
 
 def _known(part: Part) -> NDArray[np.bool_]:
@@ -292,34 +262,13 @@ def _known(part: Part) -> NDArray[np.bool_]:
     return known if np.count_nonzero(known) >= FEWEST else part.used
 
 
-def _starts(model: AxisModel, part: Part) -> list[Start]:
-    """Return the initial states for all candidate histories, with the displacement that the model predicts for each."""
-    if not model.causal:
-        return [model.start]
-    v0, (low, high) = float(part.v[0]), model.voltage_range
-    ends = np.array([min(low, v0), max(high, v0)])
-    whole = Samples(np.append(v0, ends), np.zeros(3), np.ones(3, dtype=bool))
-    # A sweep over the whole range ends at the same displacement for every history.
-    swept = model.memory("start").forward_array(ends)[-1]
-    found = [model.start] if model.start.voltage == v0 else []
-    for history in dict.fromkeys((part.history, model.start.history, *histories(whole))):
-        way = replace(model, start=Start(v0, 0.0, history)).memory("start").forward_array(ends)[-1]
-        found.append(Start(v0, float(swept - way), history))
-    return found
-
-
-def _rms(runs: Sequence[_FreeRun]) -> float:
-    """Return the rms (m) of the errors of several free runs, each without its mean."""
-    return float(np.sqrt(np.mean([run.rms**2 for run in runs])))
-
-
-def _given(model: AxisModel, runs: Sequence[_FreeRun], selection: Selection) -> Given:
+def _given(model: AxisModel, runs: Sequence[FreeRun], selection: Selection) -> Given:
     """Compare the given model with the records; raise IdentificationError if it belongs to another stage."""
     evidence = selection.now.evidence
     motion = float(np.ptp(evidence.y[evidence.used]))
     sources = model.quality.source.split(", ")
     own = np.array([part.source in sources for part in evidence.parts])
-    rms = _rms(runs)
+    rms = rms_of(runs)
     if own.any() and not own.all():
         # A gain drift within each record would also explain a gain that has changed between records.
         steady = selection.now.without(GainDrift.name)
@@ -417,7 +366,7 @@ def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:
     return whole, float(np.sqrt(np.sum(np.square(parts))) / max(float(moved @ moved), 1e-300))
 
 
-def _outcomes(runs: Sequence[_FreeRun], runs_after: Sequence[_FreeRun], now: Explanation) -> tuple[RecordOutcome, ...]:
+def _outcomes(runs: Sequence[FreeRun], runs_after: Sequence[FreeRun], now: Explanation) -> tuple[RecordOutcome, ...]:
     """Return the errors of each record in the free runs of the given and of the extended model."""
     left_out = [error if np.isfinite(error) else None for error in np.sqrt(now.held_out.records).tolist()] or [None]
     return tuple(
@@ -452,7 +401,7 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
             source=source,
         ),
     )
-    return replace(extended, end=extended.after(now.u))
+    return replace(extended, end=extended.at_rest(now.u, float(evidence.v[-1])))
 
 
 def _creeping_on(effect: Effect, now: Explanation) -> Effect:

@@ -15,7 +15,7 @@ from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, SurfaceBasis
 from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.drive import Runs
-from slpi_ros.identification.initial_history import choose_start
+from slpi_ros.identification.free_run import choose_start
 from slpi_ros.identification.least_squares import Problem, solve_free
 from slpi_ros.identification.linear_kinds import SELECTION_SAMPLES, SMOOTHNESS
 from slpi_ros.identification.published_kinds import voltage_dead_band

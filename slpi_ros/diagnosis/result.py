@@ -424,7 +424,7 @@ def _not_in_model(now: Explanation, left_out: Sequence[str], dropped: Sequence[s
     if left_out:
         said += f" The extended model does without {', '.join(left_out)}: these data do not say what that is elsewhere."
     if dropped:
-        said += f" Dropped, as other records get worse with what one record shows of it: {', '.join(dropped)}."
+        said += f" Dropped, as what is gained does not hold elsewhere: {', '.join(dropped)}."
     return said
 
 

@@ -70,7 +70,7 @@ IN_PHASE = 0.1
 SHIFTS, FEW_SAMPLES = {"delay", "lag"}, 3.0
 # Such a lag stands only if its held-out error is lower than that of a delay by this share: it also rounds off turns
 # that the hysteresis model makes too sharp.
-CLEARLY = 0.1
+CLEARLY = 0.25
 # Effects that shift the displacement in time, among other things.
 SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
 # Gauss-Newton steps of a candidate, and of the selected effects in the end.

@@ -22,7 +22,7 @@ from slpi_ros.identification.cross_validation import (
     speed_classes,
     speeds,
 )
-from slpi_ros.identification.initial_history import Match, match
+from slpi_ros.identification.free_run import Match, match
 from slpi_ros.identification.repeatability_floor import floor_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage

@@ -149,6 +149,10 @@ class EffectBase(Protocol):
         """The effect as it is after its record; None if it ends with it."""
         return None if self.side == "record" else self  # type: ignore[return-value]
 
+    def of_record(self, k: int) -> "Effect":
+        """Return the effect as it is on the record of number `k` of those that it was fitted to."""
+        return self  # type: ignore[return-value]
+
     @property
     def passes(self) -> tuple[float, float]:
         """Lowest and highest voltage (V) that the effect lets through."""

@@ -53,8 +53,8 @@ class RateDependence(EffectBase):
         Rate above which they widen.
     reversible_gain : float, m/V, ``g``
     initial : tuple of float, volts
-        ``v - u`` at the start of each record, other than 0 after a step just before it. Only `apply` uses it; without
-        an entry a record starts at equilibrium, as streaming does. Default: none.
+        ``v - u`` at the start of each record of the fit, other than 0 after a step just before it. It belongs to these
+        records; any other one starts at equilibrium, as streaming does. Default: none.
     uncertainty : mapping of parameter name to standard deviation, optional
 
     References
@@ -81,6 +81,15 @@ class RateDependence(EffectBase):
             ("reversible_gain", 0 <= self.reversible_gain <= 1e3, "from 0 to 1000 m/V"),
             ("initial", all(abs(lead) <= 1e5 for lead in self.initial), "within 1e5 V"),
         )
+
+    @property
+    def lasting(self) -> "RateDependence":
+        """The law without the starts of its records."""
+        return replace(self, initial=())
+
+    def of_record(self, k: int) -> "RateDependence":
+        """Return the law with the start of the record of number `k` of those that it was fitted to."""
+        return replace(self, initial=self.initial[k : k + 1])
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the voltage that the hysteresis feels, shape (N,), volts."""
@@ -182,7 +191,9 @@ class StreamingRateDependence(StreamingBase):
             way = x - self._u
             if way:
                 self._w = solved(scale, self._c, abs(way), self._w)
-                self._u = x - copysign(self._c * self._w, way)
+                u = x - copysign(self._c * self._w, way)
+                # It follows without overshoot, whatever the rounding: a reversal would be remembered.
+                self._u = min(max(u, self._u), x) if way > 0.0 else max(min(u, self._u), x)
         else:
             # In no time the difference between the two voltages stays what it was.
             self._u += x - self._v

@@ -24,22 +24,12 @@ NESTS = (0.3, 0.7)
 
 
 def calibration(spec: DriveSpec, rng: np.random.Generator) -> Path:
-    """Cover the Preisach plane uniformly, at several speeds and with holds.
+    """Cover the Preisach plane uniformly, at several speeds and with holds, from the low end and back to it.
 
     A sweep over the whole range comes first, to set a known hysteresis state. Reversal curves follow in random order,
     rising from minima and falling from maxima over the whole range, so that drift is not correlated with voltage; then
-    nested loops. A longer duration gives more of each.
-
-    Parameters
-    ----------
-    spec : DriveSpec
-    rng : numpy.random.Generator
-        Random generator for the position of each reversal within its part of the range, and for the order.
-
-    Returns
-    -------
-    Path
-        Path that starts and ends at the low end.
+    nested loops. A longer duration gives more of each. `rng` draws the position of each reversal within its part of the
+    range, and the order.
     """
     seed = int(rng.integers(2**63))
 

@@ -28,16 +28,9 @@ _WHY = {
 class Drive:
     """Voltage signals of all axes of a stage.
 
-    Parameters
-    ----------
-    t : ndarray, shape (N,), seconds
-        From 0, evenly spaced.
-    voltage : dict of axis name to ndarray, shape (N,), volts
-        Voltages, which start and end at the rest voltage of the axis.
-    specs : dict of axis name to DriveSpec
-        Limits and rate of each axis, with the duration of the whole drive.
-    why : str
-        Purpose of the drive in one sentence.
+    The times `t` (s), shape (N,), are evenly spaced from 0. `voltage` (V), shape (N,) for each axis, starts and ends at
+    the rest voltage of the axis. `specs` are the limits and the rate of each axis, with the duration of the whole
+    drive; `why` is the purpose of the drive in one sentence.
     """
 
     t: FloatArray
@@ -73,33 +66,11 @@ def excite(
     The axes move one after the other and share the duration: the cross coupling, which would resemble hysteresis during
     simultaneous motion, appears on the axes at rest.
 
-    Parameters
-    ----------
-    axes : sequence of str
-        Names of the axes in the order of their motion.
-    voltage_min, voltage_max : float or sequence of float, volts
-        Voltage limits; one value, or one for each axis.
-    slew_limit : float or sequence of float, V/s
-        Largest rate of change; 0 for no limit.
-    start : float or sequence of float, volts, optional
-        Rest voltage before and after the motion; by default `voltage_min`.
-    duration : float, seconds
-        Time of the last sample.
-    rate : float, hertz
-        Samples per second.
-    seed : int
-        The same seed gives the same drive.
-    drive : str
-        One of `DRIVES`: ``calibration``, ``sweep``, or the name of the effect to be identified.
-
-    Returns
-    -------
-    Drive
-
-    Raises
-    ------
-    UsageError
-        If a value is invalid, or the duration is too short.
+    `axes` are in the order of their motion. `voltage_min` and `voltage_max` (V), `slew_limit` (V/s) and `start` (V) are
+    one value, or one for each axis. `slew_limit` is the largest rate of change, 0 for no limit; `start` is the rest
+    voltage before and after the motion, by default `voltage_min`. `duration` (s) is the time of the last sample, `rate`
+    is in hertz, and the same `seed` gives the same drive. `drive` is one of `DRIVES`: ``calibration``, ``sweep``, or
+    the name of the effect to be identified. UsageError if a value is invalid, or the duration is too short.
     """
     _check(axes, drive)
     lows, highs, slews = (
@@ -200,18 +171,8 @@ def _why(drive: str) -> str:
 class Playback:
     """Playback of a drive sample by sample, within the limits of the drive.
 
-    Parameters
-    ----------
-    drive : Drive
-    repeat : bool
-        Whether to restart at the end until stopped; False by default.
-
-    Attributes
-    ----------
-    drive : Drive
-        As given.
-    stopping : bool
-        Whether the axes are returning to their rest voltages after `stop`.
+    With `repeat`, it restarts at the end until stopped. `stopping` tells whether the axes are returning to their rest
+    voltages after `stop`.
     """
 
     def __init__(self, drive: Drive, *, repeat: bool = False) -> None:

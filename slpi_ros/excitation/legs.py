@@ -24,14 +24,9 @@ MOST_VOLTAGE = 10_000.0
 class Leg:
     """One move, or a hold if the target is the current position.
 
-    Parameters
-    ----------
-    to : float
-        Target as a share of the voltage range, 0..1.
-    seconds : float
-        Desired duration, which the slew limit may extend.
-    straight : bool
-        True: constant speed with sharp corners. False: a raised cosine, with zero speed at both ends.
+    The target `to` is a share of the voltage range, 0..1; `seconds` is the desired duration, which the slew limit may
+    extend. A `straight` move has constant speed with sharp corners; otherwise it is a raised cosine, with zero speed at
+    both ends.
     """
 
     to: float
@@ -41,23 +36,10 @@ class Leg:
 
 @dataclass(frozen=True)
 class DriveSpec:
-    """Voltage limits, duration, sampling rate and slew limit of one axis.
+    """Voltage limits (V), duration (s), sampling rate (Hz) and slew limit (V/s) of one axis.
 
-    Parameters
-    ----------
-    low, high : float, volts
-        Voltage limits.
-    duration : float, seconds
-        Time of the last sample; the first is at 0.
-    rate : float, hertz
-        Samples per second.
-    slew_limit : float, V/s
-        Largest rate of change between samples; 0 for no limit.
-
-    Raises
-    ------
-    UsageError
-        If a value is invalid.
+    The first sample is at 0, the last at `duration`. `slew_limit` is the largest rate of change between samples, 0 for
+    no limit. UsageError if a value is invalid.
     """
 
     low: float
@@ -103,22 +85,7 @@ class DriveSpec:
 
 
 class Path:
-    """A sequence of legs.
-
-    Parameters
-    ----------
-    start : float
-        Initial position as a share of the voltage range.
-
-    Attributes
-    ----------
-    start : float
-        As given.
-    at : float
-        Position at the end of the last leg.
-    legs : list of Leg
-        Legs in order.
-    """
+    """A sequence of legs; `start` and `at`, the position after the last leg, are shares of the voltage range."""
 
     def __init__(self, start: float = 0.0) -> None:
         self.start = self.at = start
@@ -148,23 +115,11 @@ class Path:
         return np.array(fewest, dtype=np.int64)
 
     def voltages(self, spec: DriveSpec) -> FloatArray:
-        """Return the voltages along all legs, with the duration of the drive.
+        """Return the voltages (V) along all legs, shape (spec.steps + 1,), with the duration of the drive.
 
-        The time beyond the shortest durations is distributed in proportion to desired minus shortest duration.
-
-        Parameters
-        ----------
-        spec : DriveSpec
-
-        Returns
-        -------
-        ndarray, shape (spec.steps + 1,), volts
-            Voltages; every reversal coincides with a sample.
-
-        Raises
-        ------
-        UsageError
-            If the duration is too short for the legs at this slew limit and rate.
+        The time beyond the shortest durations is distributed in proportion to desired minus shortest duration; every
+        reversal coincides with a sample. UsageError if the duration is too short for the legs at this slew limit and
+        rate.
         """
         fewest = self.fewest_steps(spec)
         spare = spec.steps - int(fewest.sum())

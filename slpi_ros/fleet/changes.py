@@ -23,19 +23,12 @@ DRIFT, STEP = "drift", "step"
 
 @dataclass(frozen=True)
 class Change:
-    """A change of a series.
+    """A change of a series, a "step" or a "drift".
 
-    Parameters
-    ----------
-    kind : {"step", "drift"}
-    date_ns : int, nanoseconds
-        Unix time of the first bag after a step, or at which a drift has become significant.
-    before_ns : int, nanoseconds
-        Time of the bag before it.
-    size, uncertainty : float
-        Change by the step, or by the drift from the first to the last bag, and its standard deviation.
-    chance : float
-        Probability that noise alone shows such a change anywhere in the series.
+    `date_ns` is the Unix time of the first bag after a step, or at which a drift has become significant, and
+    `before_ns` that of the bag before it. `size` is the change by the step, or by the drift from the first to the last
+    bag, `uncertainty` its standard deviation, and `chance` the probability that noise alone shows such a change
+    anywhere in the series.
     """
 
     kind: str
@@ -47,24 +40,12 @@ class Change:
 
 
 def find_changes(date_ns: IntArray, values: FloatArray, deviations: FloatArray) -> list[Change]:
-    """Find the steps and the drift of a series.
+    """Find the steps and the drift of a series, in order of time; none if there are fewer than `FEWEST` values.
 
     The series is a constant, plus a linear drift, plus steps. The terms that reduce the sum of squares most are added
     one after the other; then those are removed that noise may explain, with a correction for the number of possible
-    steps. Noise is estimated from the given deviations and from what the largest set of terms leaves.
-
-    Parameters
-    ----------
-    date_ns : ndarray of int, shape (N,), nanoseconds
-        Unix times, increasing.
-    values : ndarray, shape (N,)
-    deviations : ndarray, shape (N,)
-        Standard deviations of the values.
-
-    Returns
-    -------
-    list of Change
-        In order of time; empty if there are fewer than `FEWEST` values.
+    steps. Noise is estimated from the given deviations and from what the largest set of terms leaves. The Unix times
+    `date_ns` are increasing; `deviations` are the standard deviations of the `values`, all of shape (N,).
     """
     if values.size < FEWEST:
         return []

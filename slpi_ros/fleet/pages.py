@@ -57,10 +57,7 @@ class Pages:
     def write(self, results: Results) -> None:
         """Write ``fleet.json``, ``index.html`` and the pages of the stages with new rows.
 
-        Raises
-        ------
-        SlpiError
-            If a file cannot be written.
+        SlpiError if a file cannot be written.
         """
         rows, folder = results.state.rows(), results.folder
         stages = summarise(rows)
@@ -80,19 +77,7 @@ def report_fleet(
 ) -> tuple[list[str], bool]:
     """Run `slpi_ros.fleet.run` with its `options`, write the pages, and summarise the results.
 
-    Parameters
-    ----------
-    sources, output
-        As for `slpi_ros.fleet.run`.
-    as_document : bool
-        Whether the text is that of ``fleet.json``. Default False: sentences.
-
-    Returns
-    -------
-    lines : list of str
-        The summary.
-    usable : bool
-        Whether any bag could be used.
+    Return the summary, as sentences or as the text of ``fleet.json``, and whether any bag could be used.
     """
     pages = Pages()
     rows: list[Row] = []

@@ -30,13 +30,8 @@ TABLE, JOURNAL, LOCK = "results.parquet", "journal.jsonl", ".lock"
 class State:
     """What is known of all bags.
 
-    Attributes
-    ----------
-    examined : dict of path to Examined
-    judged : dict of path to Judged
-        Rows of each bag that has been processed.
-    references : dict of stage to str
-        Path of the reference model of each stage, within the folder of the results.
+    `examined` and `judged`, the rows of each bag that has been processed, are by path; `references` holds by stage the
+    path of the reference model, within the folder of the results.
     """
 
     examined: dict[str, Examined] = field(default_factory=dict)
@@ -52,19 +47,8 @@ class State:
 class Results:
     """The folder of the results, locked against other runs while it is open.
 
-    Parameters
-    ----------
-    folder : path
-        Created if missing.
-    options : mapping
-        Options on which the rows depend; a folder is continued only with the same ones.
-
-    Raises
-    ------
-    SlpiError
-        If the folder cannot be written, or another run writes into it.
-    UsageError
-        If the folder holds results of other options.
+    `folder` is created if missing. The rows depend on `options`; UsageError if the folder holds results of others.
+    SlpiError if the folder cannot be written, or another run writes into it.
     """
 
     def __init__(self, folder: str | os.PathLike[str], options: Mapping[str, Any]) -> None:

@@ -19,18 +19,11 @@ _MCAP_END = b"\x89MCAP0\r\n"
 
 @dataclass(frozen=True)
 class Bag:
-    """A bag on disk.
+    """A bag on disk, with the absolute `path` of its folder or file.
 
-    Parameters
-    ----------
-    path : str
-        Absolute path of the folder or file.
-    stage : str
-        Name of the stage from a CSV list; "" if the bag's hardware id names it.
-    size : int, bytes
-    modified : int, nanoseconds
-        Time of the last change of its files. Size and time tell a changed bag from a processed one; both are 0 if
-        there is no such bag.
+    `stage` is the name of the stage from a CSV list, "" if the bag's hardware id names it. `size` (bytes) and
+    `modified` (ns), the time of the last change of its files, tell a changed bag from a processed one; both are 0 if
+    there is no such bag.
     """
 
     path: str
@@ -42,18 +35,9 @@ class Bag:
 def find_bags(sources: Sequence[_Path]) -> list[Bag]:
     """Return the bags of all sources, each once, sorted by path.
 
-    Parameters
-    ----------
-    sources : sequence of path
-        Bags, folders that are searched recursively (hidden entries are skipped), and CSV files with the columns
-        ``bag`` and ``stage``; relative paths in a list start at its folder.
-
-    Raises
-    ------
-    UsageError
-        If there is no source, or a list has other columns or two stages for one bag.
-    RecordError
-        If a source does not exist.
+    Sources are bags, folders that are searched recursively (hidden entries are skipped), and CSV files with the columns
+    ``bag`` and ``stage``; relative paths in a list start at its folder. UsageError if there is no source, or a list has
+    other columns or two stages for one bag; RecordError if a source does not exist.
     """
     if not sources:
         raise UsageError("no source given; name bags, folders of bags or CSV lists of bags")
@@ -92,12 +76,7 @@ def is_complete(bag: Bag, now: float, patience: float) -> bool:
 def load_models(folder: _Path | None) -> dict[str, StageModel]:
     """Return the newest model document of each stage in a folder, searched recursively; files that name no stage fail.
 
-    Raises
-    ------
-    UsageError
-        If there is no such folder, or a model has no hardware id.
-    ModelError
-        If a document cannot be read.
+    UsageError if there is no such folder, or a model has no hardware id; ModelError if a document cannot be read.
     """
     if folder is None:
         return {}

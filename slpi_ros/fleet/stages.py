@@ -10,7 +10,7 @@ import numpy as np
 from slpi_ros.fleet.bags import CHANGED, FAILED, FOREIGN, IDENTIFIED, PASSED, REFUSED, Row
 from slpi_ros.fleet.changes import Change, find_changes
 from slpi_ros.fleet.results import SCHEMA
-from slpi_ros.identification.initial_history import BEYOND_CHANCE
+from slpi_ros.identification.free_run import BEYOND_CHANCE
 
 # Health by the latest usable bag. GOOD: the reference model holds; REFITTED: a model refitted to this bag does;
 # EXCHANGED: the bag is of another stage; CALIBRATE: neither model holds, or no bag is usable.
@@ -26,16 +26,10 @@ QUANTITIES = {
 
 @dataclass(frozen=True)
 class Exchange:
-    """Bags that belong to another stage than named.
+    """Bags that belong to another stage than named; the model of `like_stage` describes them.
 
-    Parameters
-    ----------
-    like_stage : str
-        Stage whose model describes them.
-    date_ns, before_ns : int or None, nanoseconds
-        Times of the first of them and of the last bag before it.
-    mutual : bool
-        Whether that stage has bags that belong to this one.
+    `date_ns` and `before_ns` are the times of the first of them and of the last bag before it, if any; `mutual` tells
+    whether that stage has bags that belong to this one.
     """
 
     like_stage: str
@@ -46,24 +40,11 @@ class Exchange:
 
 @dataclass(frozen=True)
 class StageSummary:
-    """Summary of one axis of a stage.
+    """Summary of one axis of a stage; its health is `GOOD`, `REFITTED`, `EXCHANGED` or `CALIBRATE`.
 
-    Parameters
-    ----------
-    stage, axis : str
-    health : str
-        `GOOD`, `REFITTED`, `EXCHANGED` or `CALIBRATE`.
-    bags, refused : int
-        Number of bags, and of those that cannot be used.
-    date_ns : int or None, nanoseconds
-        Time of the latest usable bag.
-    model : str
-        Path of the model that describes the latest usable bag; "" if there is none.
-    changes : mapping of quantity to tuple of Change
-        Changes of ``gain`` and ``width`` (relative to the reference model) and of ``offset`` (m).
-    exchanges : tuple of Exchange
-    rows : tuple of Row
-        By date.
+    Of the `bags`, `refused` ones cannot be used. `date_ns` is the time of the latest usable bag, and `model` the path
+    of the model that describes it, "" if there is none. `changes` are those of ``gain`` and ``width`` (relative to the
+    reference model) and of ``offset`` (m); the `rows` are by date.
     """
 
     stage: str
@@ -99,13 +80,7 @@ class StageSummary:
 
 
 def summarise(rows: Sequence[Row]) -> list[StageSummary]:
-    """Return the summary of each axis of each stage, by name; bags without a stage have none.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        In any order.
-    """
+    """Return the summary of each axis of each stage, by name, of rows in any order; bags without a stage have none."""
     named = sorted((row for row in rows if row.stage), key=lambda row: (row.stage, row.date_ns or 0, row.bag))
     pairs = {(row.stage, row.like_stage) for row in named if row.verdict == FOREIGN}
     found = []

@@ -260,7 +260,8 @@ def felt(t: FloatArray, v: FloatArray, threshold: float, onset_rate: float, lead
                 # Extrapolated from the two samples before the last one: it is computed while that one is being solved.
                 guess = 3.0 * before - 2.0 * earlier
                 w, before, earlier = solved(scale, threshold, abs(way), guess), w, before
-                u = v[k] - threshold * (w if way > 0.0 else -w)
+                # It follows without overshoot, whatever the rounding: a reversal would be remembered.
+                u = min(max(v[k] - threshold * w, u), v[k]) if way > 0.0 else max(min(v[k] + threshold * w, u), v[k])
         elif k:
             # In no time the difference between the two voltages stays what it was.
             u += v[k] - v[k - 1]

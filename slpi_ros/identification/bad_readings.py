@@ -47,15 +47,7 @@ _WINDOW, _END_WINDOWS = 2 * _TURN_REACH + 1, 3
 
 @dataclass(frozen=True)
 class Repeats:
-    """Runs of equal consecutive readings.
-
-    Parameters
-    ----------
-    first : ndarray of int, shape (M,)
-        Index of the first reading of each run.
-    length : ndarray of int, shape (M,)
-        Number of readings in each run, at least 2.
-    """
+    """Runs of equal consecutive readings: index of the `first` one and number (`length`, at least 2), shape (M,)."""
 
     first: NDArray[np.int64]
     length: NDArray[np.int64]
@@ -92,16 +84,8 @@ def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: fl
     """Return the runs of equal displacement readings that indicate a frozen sensor.
 
     Either the voltage changed so much that the displacement must have moved, or a run of this length is improbable
-    given the noise.
-
-    Parameters
-    ----------
-    y, v : ndarray, shape (N,), metres and volts
-        Displacement and voltage.
-    gain : float, metres per volt
-        Mean gain of the stage.
-    noise_rms, step : float, metres
-        Noise and resolution of the displacement.
+    given the noise. Displacement `y` (m) and voltage `v` (V) have shape (N,); `gain` (m/V) is the mean gain of the
+    stage, and `noise_rms` and `step` (m) are the noise and the resolution of the displacement.
     """
     repeats = Repeats.within(y)
     moved = repeats.spans(v)
@@ -149,18 +133,10 @@ def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repe
 
 
 def far_outliers(v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices of large outliers in voltage and displacement that the other signal does not explain.
+    """Return the indices of large outliers in `v` (V) and `y` (m), shape (N,), that the other signal does not explain.
 
     Unlike `lone_outliers`, this needs no noise estimate, which such large outliers would distort. Readings where both
     signals are suddenly 0 are outliers of both: a lost message, and no motion that the other signal explains.
-
-    Parameters
-    ----------
-    v, y : ndarray, shape (N,), volts and metres
-
-    Returns
-    -------
-    tuple of ndarray of int, shapes (M,) and (K,)
     """
     found = np.zeros((2, v.size), dtype=bool)
     zero = (v == 0.0) & (y == 0.0)
@@ -216,14 +192,11 @@ def _running_median(x: FloatArray) -> FloatArray:
 
 
 def outliers_by_model(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the displacement readings with a sudden deviation from a model that no reversal explains.
+    """Return the indices of displacement readings with a sudden deviation from a model that no reversal explains.
 
     This includes groups of outliers and outliers at kinks, which cannot be distinguished from motion without a model.
-
-    Parameters
-    ----------
-    path, y, v : ndarray, shape (N,), metres, metres and volts
-        Displacement of the model, measured displacement, and voltage.
+    `path` is the displacement of the model (m), `y` the measured displacement (m) and `v` the voltage (V), shape (N,)
+    each.
     """
     kept = np.arange(y.size)
     for _ in range(_PASSES):
@@ -288,16 +261,11 @@ def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:
 def lone_of(
     t: FloatArray, v: FloatArray, y: FloatArray, at_kinks: bool = True
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the isolated outliers of a voltage and of a displacement.
+    """Return the indices of the isolated outliers of a voltage and of a displacement.
 
-    An outlier of both signals at the same sample is attributed to the voltage, which the displacement follows.
-
-    Parameters
-    ----------
-    t, v, y : ndarray, shape (N,), seconds, volts and metres
-        Time, voltage and displacement; neither signal is constant.
-    at_kinks : bool
-        As for `lone_outliers`; applies to the displacement.
+    An outlier of both signals at the same sample is attributed to the voltage, which the displacement follows. Times
+    `t` (s), voltage `v` (V) and displacement `y` (m) have shape (N,), and neither signal is constant. `at_kinks`
+    applies to the displacement, as in `lone_outliers`.
     """
     gain, noise_v, noise_y = spread(y) / spread(v), noise(v, t), noise(y, v, t)
     if noise_y < ROUND_OFF * spread(y):
@@ -314,19 +282,8 @@ def lone_outliers(
 ) -> NDArray[np.int64]:
     """Return the readings that deviate from a line through their four neighbours although the voltage does not.
 
-    Parameters
-    ----------
-    y, v : ndarray, shape (N,), metres and volts
-        Displacement and voltage.
-    gain : float, metres per volt
-    noise_y, noise_v : float, metres and volts
-        Rms noise of displacement and voltage.
-    at_kinks : bool
-        Whether to include readings that a kink in the displacement plus noise could explain. Default True.
-
-    Returns
-    -------
-    ndarray of int, shape (M,)
+    Return indices into displacement `y` (m) and voltage `v` (V), shape (N,); `noise_y` and `noise_v` are their rms
+    noise, and `gain` is in m/V. `at_kinks` includes readings that a kink in the displacement plus noise could explain.
     """
     if not noise_y:
         return np.empty(0, np.int64)
@@ -353,14 +310,8 @@ def _outliers_at_start(
 ) -> NDArray[np.int64]:
     """Return which of the first two readings deviate from a line through the next five although the voltage does not.
 
-    Parameters
-    ----------
-    y, v, gain
-        As for `lone_outliers`.
-    limit : float, metres
-        Largest deviation of a reading from the mean of four others by noise.
-    follows : bool
-        Whether one signal may jump at the start and the other follow later. Default True.
+    `y`, `v` and `gain` as for `lone_outliers`; `limit` (m) is the largest deviation of a reading from the mean of four
+    others by noise. If `follows`, one signal may jump at the start and the other follow later.
     """
     at, inner = np.arange(2), np.arange(2, 7)
     off = np.abs(y[at] - np.polyval(np.polyfit(inner, y[inner], 1), at))
@@ -442,14 +393,8 @@ _MIXED_MOST = 1.3
 class Mixed(NamedTuple):
     """Readings of a displacement that are early, late or a mixture of two neighbouring values.
 
-    Parameters
-    ----------
-    readings : ndarray of int, shape (M,)
-        Indices of these readings.
-    judged : int
-        Number of readings tested; readings next to a reversal are not tested.
-    side : int
-        1 if they are mixed with the next reading, -1 if with the preceding one, 0 if no mixed readings were found.
+    `readings`, shape (M,), are their indices; `judged` is the number of readings tested, which are those not next to a
+    reversal. `side` is 1 if they are mixed with the next reading, -1 if with the preceding one, 0 if none were found.
     """
 
     readings: NDArray[np.int64]
@@ -458,15 +403,11 @@ class Mixed(NamedTuple):
 
 
 def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
-    """Find the readings of a displacement that are early, late or a mixture of two neighbouring values.
+    """Find the readings of a displacement `y` (m) that are early, late or a mixture of two neighbouring values.
 
     Such a reading lies between its true value and that of a neighbour: a data link has delivered an old value or parts
     of two values. Unlike noise and outliers, all deviate towards the next reading, or all towards the preceding one.
-
-    Parameters
-    ----------
-    y, v : ndarray, shape (N,), metres and volts
-        Displacement and voltage.
+    The voltage `v` (V) and `y` have shape (N,).
     """
     off, way = _beside_lines(y[:ENOUGH], v[:ENOUGH])
     clear = np.abs(way) * _MIXED_NOISE > median_rms(off[way != 0.0]) if way.any() else way != 0.0
@@ -490,13 +431,8 @@ def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
 def mixed_by_model(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> NDArray[np.int64]:
     """Return the mixed readings among the `fitted` ones by comparison with a model, including those near reversals.
 
-    Parameters
-    ----------
-    path, y : ndarray, shape (N,), metres
-        Displacement of the model, and measured displacement.
-    fitted : ndarray of bool, shape (N,)
-    side : int
-        As in `Mixed`.
+    `path` and `y` are the displacement of the model and the measured one (m), shape (N,); `fitted` is a mask of shape
+    (N,), and `side` is as in `Mixed`.
     """
     at = np.flatnonzero(fitted)
     off = (y - path)[at]

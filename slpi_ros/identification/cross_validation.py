@@ -17,7 +17,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.identification.drive import smallest_turn
 from slpi_ros.identification.fit import FITS, fit_of
-from slpi_ros.identification.initial_history import InitialHistoryWarning
+from slpi_ros.identification.free_run import InitialHistoryWarning
 from slpi_ros.identification.repeatability_floor import Floor, floor_of
 from slpi_ros.identification.samples import Samples, select_thinned
 from slpi_ros.identification.signal_statistics import noise
@@ -41,18 +41,10 @@ _SPEED_REACH = 2
 
 @dataclass(frozen=True)
 class Slice:
-    """Held-out errors of one class of samples.
+    """Held-out errors (m) of one class of samples.
 
-    Parameters
-    ----------
-    name : str
-        Name of the class.
-    samples : int
-        Number of samples in the class.
-    rms, maximum : float, metres
-        Rms and largest absolute held-out error of the model.
-    classical_rms : float, metres
-        Rms held-out error of the classical PI model; NaN where it could not be fitted.
+    `rms` and `maximum` (absolute) are of the model; `classical_rms` is of the classical PI model, NaN where it could
+    not be fitted.
     """
 
     name: str
@@ -71,23 +63,10 @@ class Slice:
 class CrossValidationReport:
     """Held-out errors of a model, free-run, in total and by class.
 
-    Parameters
-    ----------
-    axis, kind : str
-        Name of the axis and kind of the model.
-    floor : Floor
-        Repeatability floor of the record; for several records, the median of their floors.
-    overall : Slice
-        Errors of all held-out samples.
-    by_level : tuple of Slice
-        Errors by nesting level of the loop; 0 is the outer loop.
-    by_region : tuple of Slice
-        Errors by voltage region, in ascending order.
-    by_speed : tuple of Slice
-        Errors by the magnitude of dv/dt, in ascending order from rest.
-    t, v, error, classical : ndarray, shape (M,), seconds, volts, metres and metres
-        Time from the first stamp of each record, voltage, and held-out errors (model minus measured) of the model and
-        of the classical PI model.
+    `floor` is the repeatability floor of the record, for several records the median of their floors. The slices are by
+    nesting level of the loop (0 is the outer loop), by voltage region in ascending order, and by the magnitude of dv/dt
+    in ascending order from rest. The arrays hold the held-out samples, shape (M,): time from the first stamp of each
+    record (s), voltage (V), and the errors (m, model minus measured) of the model and of the `classical` PI model.
     """
 
     axis: str
@@ -134,23 +113,8 @@ def cross_validate(
 ) -> CrossValidationReport:
     """Cross-validate a kind of model on a thinned record: fit all folds but one, evaluate the error on that fold.
 
-    Parameters
-    ----------
-    record : Record or sequence of Record
-        One record, or several that are fitted together.
-    axis : str
-        Name of the axis.
-    kind, start, stop, loops_at_rest
-        As for `slpi_ros.identify`.
-
-    Returns
-    -------
-    CrossValidationReport
-
-    Raises
-    ------
-    SlpiError
-        If the record does not allow a fit.
+    Several records are fitted together; `kind`, `start`, `stop` and `loops_at_rest` are as for `slpi_ros.identify`.
+    SlpiError if the record does not allow a fit.
     """
     records = [record] if isinstance(record, Record) else list(record)
     fit = fit_of(kind, loops_at_rest=loops_at_rest)

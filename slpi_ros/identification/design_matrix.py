@@ -22,18 +22,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Walk:
-    """Hysteresis branch of each sample of a voltage.
+    """Hysteresis branch of each sample of a voltage `v` (V); all arrays have shape (N,).
 
-    Parameters
-    ----------
-    v : ndarray, shape (N,), volts
-        Voltage.
-    origin : ndarray of int, shape (N,)
-        Sample at which the branch started, or `AT_REST` or `LONG_FALL`.
-    direction : ndarray of int, shape (N,)
-        +1 for rising, -1 for falling, 0 for samples before the first motion.
-    first : ndarray of int, shape (N,)
-        Index of the first sample of the record to which the sample belongs.
+    `origin` is the sample at which the branch started, or `AT_REST` or `LONG_FALL`; `direction` is +1 for rising, -1
+    for falling, 0 for samples before the first motion. `first` is the index of the first sample of the record to which
+    the sample belongs.
     """
 
     v: FloatArray
@@ -88,14 +81,8 @@ class Walk:
 class Design:
     """Design matrix of the linear prediction: one column per parameter, then each record's displacement at rest.
 
-    Parameters
-    ----------
-    local : sparse array, shape (N, p)
-        Increments along the branch of each sample.
-    turns : ndarray of int
-        Samples at which branches start (reversals), in ascending order.
-    walk : Walk
-        Branches of the samples.
+    `local`, shape (N, p), holds the increments along the branch of each sample; `turns` are the samples at which
+    branches start (reversals), in ascending order.
     """
 
     local: sp.csr_array
@@ -164,14 +151,7 @@ class Design:
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows ``A = local + pick at_turns`` of a design matrix for n samples.
-
-    Parameters
-    ----------
-    local : sparse array, shape (n, p)
-    pick : sparse array, shape (n, turns)
-    at_turns : sparse array, shape (turns, p)
-    """
+    """Rows ``A = local + pick at_turns`` of a design matrix for n samples: shapes (n, p), (n, turns) and (turns, p)."""
 
     local: sp.csr_array
     pick: sp.csr_array

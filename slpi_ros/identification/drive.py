@@ -26,14 +26,8 @@ _SMALLEST_TURN, _LARGEST_DEAD_BAND = 0.005, 0.1
 class Runs:
     """Monotone runs of the voltage between reversals.
 
-    Parameters
-    ----------
-    ends : ndarray of int, shape (M + 1,)
-        Samples at which the runs begin and end, as from `reversals`.
-    swing : ndarray, shape (M,), volts
-        Signed voltage change of each run.
-    duration : ndarray, shape (M,), seconds
-        Duration of each run.
+    `ends`, shape (M + 1,), are the samples at which the runs begin and end, as from `reversals`; `swing` (V, signed)
+    and `duration` (s) of the runs have shape (M,).
     """
 
     ends: IntArray
@@ -111,10 +105,7 @@ def hold_band(v: FloatArray, noise: float, digit: float) -> float:
 def resting(t: FloatArray, v: FloatArray, band: float) -> tuple[IntArray, IntArray]:
     """Find the holds: 0.5 s or more in which the voltage `v`, shape (N,), at times `t` (s) varies by up to `band` (V).
 
-    Returns
-    -------
-    starts, stops : ndarray of int, shape (H,)
-        Samples ``start:stop`` of each hold.
+    Return the samples ``start:stop`` of each hold, as two arrays of shape (H,).
     """
     period = float(np.median(np.diff(t)))
     width = max(5, round(_SHORTEST_HOLD / period)) if period > 0.0 else 5

@@ -24,24 +24,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Fitted:
-    """Fitted hysteresis model and its errors.
+    """Fitted hysteresis model, the initial state of each record (`starts`) and the errors.
 
-    Parameters
-    ----------
-    hysteresis : Hysteresis
-        Fitted model.
-    starts : tuple of Start
-        Initial state of each record.
-    y : ndarray, shape (number fitted,), metres
-        Fitted displacements.
-    voltage_range : (float, float), volts
-        Lowest and highest voltage of the fitted samples.
-    errors : ndarray, shape (number fitted,), metres
-        Model minus measured, free-run, of the fitted samples.
-    held_out : ndarray, shape (N,), metres
-        Held-out error of every sample, model minus measured, free-run; NaN for samples that are in every fit.
-    covered : float
-        Share of the model's parameters or loops that the samples determine, 0..1.
+    `y` and `errors` (m, model minus measured, free-run) hold the fitted samples; `voltage_range` (V) is theirs.
+    `held_out` (m, model minus measured, free-run), shape (N,), is the held-out error of every sample, NaN for samples
+    that are in every fit. `covered` is the share, 0..1, of the model's parameters or loops that the samples determine.
     """
 
     hysteresis: Hysteresis
@@ -72,30 +59,11 @@ def solve_qp(
     *,
     least_iterations: int = CHECKED_EVERY,
 ) -> FloatArray:
-    """Minimise ``x' M x / 2 - b' x`` subject to ``C x >= bound``.
+    """Return the x, shape (p,), that minimises ``x' M x / 2 - b' x`` subject to ``C x >= bound``.
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (p, p)
-        Matrix M, positive definite.
-    vector : ndarray, shape (p,)
-        Vector b.
-    constraints : sparse array, shape (m, p)
-        Matrix C.
-    bound : ndarray, shape (m,)
-        Lower bounds of C x.
-    least_iterations : int
-        Least number of iterations, and interval of the convergence checks. Default `CHECKED_EVERY`.
-
-    Returns
-    -------
-    ndarray, shape (p,)
-        Minimiser x.
-
-    Raises
-    ------
-    IdentificationError
-        If the solver does not converge.
+    M is the positive definite `matrix`, shape (p, p), b the `vector`, and C the `constraints`, shape (m, p).
+    `least_iterations` is also the interval of the convergence checks; IdentificationError if the solver does not
+    converge.
     """
     free = solve_free(matrix, vector)
     if np.all(constraints @ free >= bound):
@@ -294,14 +262,8 @@ def held_out_errors(
 ) -> FloatArray:
     """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit.
 
-    Parameters
-    ----------
-    samples : Samples
-        Samples of the record.
-    allowed : ndarray of bool, shape (N,)
-        Samples that may be held out.
-    predict : callable
-        Function from the mask of samples to be fitted, shape (N,), to the displacement of all, shape (N,), metres.
+    `allowed` is the mask of samples that may be held out; `predict` takes the mask of samples to be fitted, and returns
+    the displacement of all (m). All have shape (N,).
     """
     errors = np.full(samples.v.size, np.nan)
     for fold, chosen in enumerate(blocked_folds(allowed), 1):

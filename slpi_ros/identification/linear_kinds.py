@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
-from slpi_ros.identification.initial_history import InitialHistory, choose_start, warn_of_initial_history, warn_of_rest
+from slpi_ros.identification.free_run import InitialHistory, choose_start, warn_of_initial_history, warn_of_rest
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Fitted, Problem
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import MultiSlopeBasis
@@ -69,26 +69,9 @@ def fit_linear(
 ) -> Fitted:
     """Fit the basis and roughness weight with the lowest held-out error.
 
-    Parameters
-    ----------
-    samples : sequence of Samples
-        Samples of each record.
-    bases : sequence of Basis
-        Candidate bases, the simplest first.
-    smoothness : sequence of float
-        Candidate roughness weights; by default the smallest.
-    share : float
-        Factor on `SELECTION_SAMPLES` and `FIT_SAMPLES`, 0..1. Default 1.
-
-    Raises
-    ------
-    IdentificationError
-        If the samples do not determine the model.
-
-    Warns
-    -----
-    InitialHistoryWarning
-        If the first samples of a record do not agree with the rest.
+    `bases` are the candidates, the simplest first, `smoothness` the candidate roughness weights, and `share`, 0..1, a
+    factor on `SELECTION_SAMPLES` and `FIT_SAMPLES`. IdentificationError if the samples do not determine the model;
+    InitialHistoryWarning if the first samples of a record do not agree with the rest.
     """
     chosen = choose(samples, bases, smoothness, share=share)
     warn_of_rest(samples, chosen.beginnings)

@@ -117,30 +117,11 @@ def _predict(loops: SeparatedLoops, offset: float, v: FloatArray) -> FloatArray:
 def fit_loops(
     samples: Samples, fitted: NDArray[np.bool_], *, at_rest: bool, thresholds: FloatArray | None = None
 ) -> tuple[SeparatedLoops, float]:
-    """Fit a PI model to each separated loop of a record.
+    """Fit a PI model to each separated loop of a record; return the loops and the displacement at rest (m).
 
-    Parameters
-    ----------
-    samples : Samples
-        Samples of the record.
-    fitted : ndarray of bool, shape (N,)
-        Samples whose displacement is fitted.
-    at_rest : bool
-        Whether play operators start at rest, as published, instead of in their state after a reversal.
-    thresholds : ndarray, shape (n,), volts, optional
-        Thresholds of every loop; by default those of `default_thresholds`.
-
-    Returns
-    -------
-    SeparatedLoops
-        Identified loops.
-    float, metres
-        Displacement at rest.
-
-    Raises
-    ------
-    IdentificationError
-        If the outer loop has too few samples.
+    `fitted` is the mask of the samples to be fitted, shape (N,). Play operators start in their state after a reversal
+    or, as published, `at_rest`; their `thresholds` (V), shape (n,), are those of `default_thresholds` by default.
+    IdentificationError if the outer loop has too few samples.
     """
     dead_band = voltage_dead_band(samples.v)
     separation = separate(samples.v, dead_band=dead_band)
@@ -178,18 +159,10 @@ def _run_ins(level: int, thresholds: FloatArray, at_rest: bool) -> list[float | 
 
 
 class Plays(NamedTuple):
-    """Play operators fitted to one loop.
+    """Play operators fitted to one loop, with the rms error (m).
 
-    Parameters
-    ----------
-    weights : ndarray, shape (n,), metres per volt
-        Weights of the operators.
-    start : float, metres
-        Displacement at the vertex.
-    run_in : float or None, volts
-        Initial state of the operators, as in `SingleLoop`.
-    rms : float, metres
-        Rms error of the fit.
+    `weights` (m/V) have shape (n,), `start` is the displacement at the vertex (m), and `run_in` (V) is the initial
+    state of the operators, as in `SingleLoop`.
     """
 
     weights: FloatArray
@@ -210,22 +183,10 @@ def fit_plays(
 ) -> Plays:
     """Fit a PI model (Eq. 8) by a quadratic program: least squares, no weight negative, the first one positive.
 
-    Parameters
-    ----------
-    drive : ndarray, shape (m,), volts
-        Voltage relative to the vertex of the loop.
-    y : ndarray, shape (m,), metres
-        Displacement relative to the vertex.
-    used : ndarray of bool, shape (m,)
-        Samples whose displacement is fitted.
-    thresholds : ndarray, shape (n,), volts
-        Thresholds of the operators.
-    run_in : float or None, volts
-        Initial state of the operators, as in `SingleLoop`.
-    through_zero : bool
-        Whether the displacement at the vertex is 0; otherwise it is a parameter of the fit.
-    iterations : int
-        Minimum number of iterations; see `least_iterations`.
+    `drive` (V) and `y` (m), shape (m,), are relative to the vertex of the loop; `used` is the mask of the samples to be
+    fitted, and `thresholds` (V) have shape (n,). `run_in` (V) is the initial state of the operators, as in
+    `SingleLoop`. If `through_zero`, the displacement at the vertex is 0, otherwise it is a parameter of the fit;
+    `iterations` is the minimum number, see `least_iterations`.
     """
     plays = [at_vertex(play(r), run_in).forward_array(drive)[used] for r in thresholds.tolist()]
     design = np.column_stack(plays if through_zero else [*plays, np.ones(np.count_nonzero(used))])
@@ -333,24 +294,12 @@ class MultiSlopeBasis(OperatorWeights):
 
 
 def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the amplitude and the peak displacement of each cycle of a record, in chronological order.
+    """Return amplitude (V) and peak displacement (m) of each cycle of a record, shape (c,), in chronological order.
 
     A cycle starts at a voltage within 1 % of the range above the lowest voltage, and rises above that band. It is
     omitted if its displacement is unknown at its start, or at all voltages within 1 % of the range below its peak.
-
-    Parameters
-    ----------
-    v : ndarray, shape (N,), volts
-        Voltage.
-    y : ndarray, shape (N,), metres
-        Displacement; not finite where unknown.
-
-    Returns
-    -------
-    amplitudes : ndarray, shape (c,), volts
-        Largest voltage of each cycle, relative to the lowest of the record.
-    peaks : ndarray, shape (c,), metres
-        Largest displacement of each cycle, relative to the start of the cycle.
+    Amplitudes are relative to the lowest voltage of the record, peaks to the start of the cycle. `v` (V) and `y` (m,
+    not finite where unknown) have shape (N,).
     """
     if not v.size:
         return np.empty(0), np.empty(0)
@@ -366,22 +315,10 @@ def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return amplitudes and mean peak displacements of the cycles, for the simplified multi-slope PI model (SMPI).
+    """Return amplitudes (V) and mean peak displacements (m) of cycles, for the simplified multi-slope PI model (SMPI).
 
-    Parameters
-    ----------
-    v, y : ndarray, shape (N,), volts and metres
-        Voltage and displacement; the latter not finite where unknown.
-
-    Returns
-    -------
-    voltages, displacements : ndarray, shape (m,), volts and metres
-        Amplitudes in ascending order, and their mean peak displacements.
-
-    Raises
-    ------
-    IdentificationError
-        If the record contains no cycle, or the peaks do not rise with the amplitude.
+    Both have shape (m,), the amplitudes in ascending order; `v` (V) and `y` (m, not finite where unknown) have shape
+    (N,). IdentificationError if the record contains no cycle, or the peaks do not rise with the amplitude.
     """
     amplitudes, peaks = cycle_peaks(v, y)
     if not amplitudes.size:
@@ -409,12 +346,7 @@ def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 class PeakFrequency:
     """Peak displacement as a function of excitation frequency, ``X_p = a f^b`` (MPI paper, Eq. 1).
 
-    Parameters
-    ----------
-    a : float, metres
-        Peak displacement at 1 Hz.
-    b : float
-        Exponent; negative if the peak decreases with frequency.
+    `a` (m) is the peak displacement at 1 Hz; `b` is negative if the peak decreases with frequency.
     """
 
     a: float
@@ -426,17 +358,9 @@ class PeakFrequency:
 
 
 def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
-    """Fit ``X_p = a f^b`` to peak displacements by nonlinear least squares.
+    """Fit ``X_p = a f^b`` to peak displacements (m) at frequencies (Hz), shape (n,) each, by nonlinear least squares.
 
-    Parameters
-    ----------
-    frequency, peak : array_like, shape (n,), hertz and metres
-        Excitation frequencies, at least two of them different, and peak displacements.
-
-    Raises
-    ------
-    IdentificationError
-        If fewer than two frequencies differ, or a value is not positive and finite.
+    IdentificationError if fewer than two frequencies differ, or a value is not positive and finite.
     """
     f, x = np.asarray(frequency, dtype=np.float64), np.asarray(peak, dtype=np.float64)
     if f.ndim != 1 or f.shape != x.shape or np.unique(f).size < 2:
@@ -459,12 +383,8 @@ def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
 def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
     """Fit the simplified multi-slope PI model (SMPI) to one record, given as a sequence of one element.
 
-    Raises
-    ------
-    UsageError
-        If several records are given.
-    IdentificationError
-        If too few samples belong to cycles of the largest amplitude.
+    UsageError if several records are given; IdentificationError if too few samples belong to cycles of the largest
+    amplitude.
     """
     samples = only_one(records, "smpi")
     largest = in_largest_cycles(samples.v)

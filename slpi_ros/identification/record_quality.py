@@ -26,26 +26,12 @@ _CATCHES_UP = 51
 
 @dataclass(frozen=True)
 class ClockQuality:
-    """Quality of the time stamps of a record.
+    """Quality of the time stamps of a record; times in seconds.
 
-    Parameters
-    ----------
-    samples : int
-        Number of samples.
-    duration, period : float, seconds
-        Time from the first to the last sample, and median sampling period.
-    jitter : float, seconds
-        Standard deviation of the time steps, without those at missing samples.
-    lost : int
-        Number of missing samples.
-    gaps : int
-        Number of steps of more than five periods.
-    longest_gap : float, seconds
-        Longest step.
-    duplicates : int
-        Number of samples with the same stamp as the preceding sample.
-    unseen : int
-        Number of gaps within which the voltage moved, so that reversals may be missing.
+    `period` is the median sampling period, and `jitter` the standard deviation of the time steps, without those at
+    missing samples, which `lost` counts. `gaps` counts the steps of more than five periods, and `unseen` those of them
+    within which the voltage moved, so that reversals may be missing; `longest_gap` is the longest step. `duplicates`
+    counts the samples with the same stamp as the preceding one.
     """
 
     samples: int
@@ -63,31 +49,13 @@ class ClockQuality:
 class SignalQuality:
     """Quality of the readings of a voltage (V) or a displacement (m).
 
-    Parameters
-    ----------
-    low, high : float
-        Lowest and highest reading.
-    noise : float
-        Rms of the noise from reading to reading.
-    digit : float
-        Resolution; 0 if none was found.
-    missing : int
-        Number of readings that are NaN.
-    stuck : int
-        Number of repeated readings in runs of three or more, while the other signal moves.
-    longest_stuck : int
-        Length of the longest such run.
-    clipped : int
-        Number of stuck readings at the lowest or the highest value.
-    stale : int
-        Number of single readings that repeat an earlier one, while the other signal moves.
-    spikes : int
-        Number of other single outliers.
-    mixed, mixed_share : int, float
-        Number of readings that are early, late or a mixture of two neighbouring values, and their share of the
-        readings tested, which are those not next to a reversal.
-    mixed_size : float
-        Typical largest error of these readings: half of the change between their neighbours.
+    `noise` is the rms from reading to reading, `digit` the resolution (0 if none was found), `missing` the number of
+    NaN. `stuck` counts repeated readings in runs of three or more while the other signal moves, `longest_stuck` is the
+    length of the longest run, and `clipped` counts the stuck readings at the lowest or the highest value. `stale`
+    counts single readings that repeat an earlier one while the other signal moves, and `spikes` other single outliers.
+    `mixed` counts readings that are early, late or a mixture of two neighbouring values, `mixed_share` is their share
+    of the readings tested, which are those not next to a reversal, and `mixed_size` their typical largest error: half
+    of the change between their neighbours.
     """
 
     low: float
@@ -114,24 +82,12 @@ class SignalQuality:
 class DriveQuality:
     """Properties of the excitation voltage.
 
-    Parameters
-    ----------
-    turns : int
-        Number of reversals.
-    covered : float
-        Share of all pairs of last reversal voltage and present voltage that were visited, 0..1.
-    samples_per_run : float
-        Median number of samples between reversals.
-    speeds : tuple of float, V/s
-        Distinct speeds of runs with about equal voltage change, as in `slpi_ros.identification.drive.Runs`.
-    speed_range : (float, float), V/s
-        Speeds of the slowest and the fastest run between reversals.
-    holds : tuple of float, seconds
-        Duration of each hold.
-    begins_at_end : bool
-        Whether the record begins at an end of its voltage range, so that the initial history is known.
-    wiped : float or None, seconds
-        Time by which both ends of the range have been visited, which resets the hysteresis state; None if never.
+    `turns` is the number of reversals, `samples_per_run` the median number of samples between them, and `covered` the
+    share, 0..1, of all pairs of last reversal voltage and present voltage that were visited. `speeds` (V/s) are those
+    of runs with about equal voltage change, as in `slpi_ros.identification.drive.Runs`, and `speed_range` (V/s) those
+    of the slowest and the fastest run; `holds` are durations (s). If `begins_at_end`, the record begins at an end of
+    its voltage range, so that the initial history is known. By the time `wiped` (s) both ends have been visited, which
+    resets the hysteresis state; None if never.
     """
 
     turns: int
@@ -148,18 +104,7 @@ class DriveQuality:
 class Quality:
     """Quality of the record of one axis; `findings` describes it in sentences.
 
-    Parameters
-    ----------
-    axis : str
-        Name of the axis.
-    clock : ClockQuality
-        Time stamps.
-    voltage, displacement : SignalQuality
-        Readings of both signals.
-    drive : DriveQuality
-        Excitation voltage.
-    notes : tuple of str
-        Remarks on how the record was made.
+    `notes` are remarks on how the record was made.
     """
 
     axis: str
@@ -373,15 +318,7 @@ _USELESS_DIGIT, _USELESS_RUN = 0.05, 4.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One statement about a record.
-
-    Parameters
-    ----------
-    level : {"ok", "warn", "stop"}
-        "stop" if no fit is possible; the text then names the remedy.
-    text : str
-        Statement with numbers.
-    """
+    """One statement about a record, with numbers; at level "stop" no fit is possible and the text names the remedy."""
 
     level: Level
     text: str

@@ -20,7 +20,7 @@ from slpi_ros.errors import IdentificationError, SlpiError, UsageError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
-from slpi_ros.identification.initial_history import Match, match
+from slpi_ros.identification.free_run import Match, match
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
@@ -50,22 +50,12 @@ EXCESS_SHARE = 0.01
 class AxisChange:
     """Changes of one axis by an update.
 
-    Parameters
-    ----------
-    error_before, error_after : float, metres
-        Rms error on the new record, free-run, of the old and of the new model, each with the best-fitting initial
-        history and without the constant offset from the record.
-    repeatability : float, metres
-        Held-out error of the old model, or the noise of the sensor if larger.
-    drifted : bool
-        Whether gain, width or shape of the loops has changed: whether initial history, offset, lag and slow drift
-        cannot explain the error of the old model.
-    gain : float
-        Relative change of the height of the outermost loop.
-    largest : float, metres
-        Largest change of a branch.
-    match : Match
-        Comparison of the old model with the new record: offset, changes of gain and width, and their uncertainties.
+    `error_before` and `error_after` are the rms errors (m) on the new record, free-run, of the old and of the new
+    model, each with the best-fitting initial history and without the constant offset from the record; `repeatability`
+    (m) is the held-out error of the old model, or the noise of the sensor if larger. If `drifted`, gain, width or shape
+    of the loops has changed: initial history, offset, lag and slow drift cannot explain the error of the old model.
+    `gain` is the relative change of the height of the outermost loop, `largest` (m) the largest change of a branch;
+    `match` compares the old model with the new record: offset, changes of gain and width, and their uncertainties.
     """
 
     error_before: float
@@ -120,7 +110,7 @@ def refit(
     shared = [axis for axis in model.axes if axis in (axes or record.axes)]
     if not shared:
         raise UsageError(f"{record.source} holds none of the model's axes {', '.join(model.axes)}")
-    record = _without_effects(model.stage_only, model.correct(record), shared)
+    applied, record = record, _without_effects(model.stage_only, model.correct(record), shared)
     updated, changes = dict(model.axes), {}
     for name in shared:
         where = f"{record.source}: axis '{name}': "
@@ -129,7 +119,12 @@ def refit(
             with threadpool_limits(1):
                 old = model.axes[name]
                 new, changes[name] = _refit_axis(old.hysteresis_only, samples, record.source)
-            updated[name] = replace(new, effects=lasting(old.effects), sensor=old.sensor)
+            new = replace(new, effects=lasting(old.effects), sensor=old.sensor)
+            if new.end:
+                v = applied.voltage[name]
+                last = float(v[np.isfinite(v)][samples.v.size - 1])
+                new = replace(new, end=new.at_rest(np.empty(0), last, "end"))
+            updated[name] = new
         except SlpiError as error:
             raise type(error)(where + str(error).removeprefix(where)) from None
     return replace(model, axes=updated, created=datetime.now(UTC).isoformat(timespec="seconds")), changes
@@ -232,12 +227,8 @@ def _within(samples: Samples, low: float, high: float) -> Samples:
 def require_own(error: float, fitted_anew: float, span: float) -> None:
     """Raise IdentificationError if a model does not belong to the stage of a record.
 
-    Parameters
-    ----------
-    error, fitted_anew : float, metres
-        Rms errors on the record, of the model and of a model fitted to this record.
-    span : float, metres
-        Displacement range.
+    `error` and `fitted_anew` (m) are the rms errors on the record, of the model and of a model fitted to this record;
+    `span` (m) is the displacement range.
     """
     if error > FOREIGN_SHARE * span and error > FOREIGN_TIMES * fitted_anew:
         raise IdentificationError(

@@ -31,14 +31,9 @@ NO_NOISE = 1e-9
 
 @dataclass(frozen=True)
 class Floor:
-    """Repeatability floor of a record.
+    """Repeatability floor of a record: rms of the differences between repetitions, per reading (m).
 
-    Parameters
-    ----------
-    rms : float, metres
-        Rms of the differences between repetitions, per reading.
-    source : str
-        Data from which it was estimated, with numbers.
+    `source` names the data from which it was estimated, with numbers.
     """
 
     rms: float
@@ -49,27 +44,10 @@ def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray |
     """Estimate the repeatability floor of a record: noise and all other differences between repetitions of a motion.
 
     Estimated from repeated moves between the same reversals if there are enough; else from holds; else from the
-    sample-to-sample noise. Slow and smooth differences (drift, creep) do not count.
-
-    Parameters
-    ----------
-    t, v : ndarray, shape (N,), seconds and volts
-        Time and voltage.
-    y : ndarray, shape (N,), metres
-        Displacement; NaN where unknown.
-    residual : ndarray, shape (N,), metres, optional
-        Residual of a model. It replaces `y` in the estimate, so that drift and hum described by the model do not
-        count.
-
-    Returns
-    -------
-    Floor
-        Rms per reading (m), without outliers, and the data from which it was estimated.
-
-    Raises
-    ------
-    RecordError
-        If there are fewer than 5 samples.
+    sample-to-sample noise. Slow and smooth differences (drift, creep) do not count. Neither do outliers. Time `t` (s),
+    voltage `v` (V), displacement `y` (m, NaN where unknown) and `residual` (m) have shape (N,). The residual of a model
+    replaces `y` in the estimate, so that drift and hum described by the model do not count. RecordError if there are
+    fewer than 5 samples.
     """
     signal = y if residual is None else residual
     usable = np.isfinite(v) & np.isfinite(signal)

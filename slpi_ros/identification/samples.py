@@ -41,20 +41,11 @@ NEAR_END = 0.02
 class Samples:
     """Samples of one axis, in time order, with a finite voltage.
 
-    Parameters
-    ----------
-    v : ndarray, shape (N,), volts
-        Voltage, including samples that are not fitted, with measurement noise removed.
-    y : ndarray, shape (N,), metres
-        Displacement; finite where `fitted`.
-    fitted : ndarray of bool, shape (N,)
-        Samples whose displacement is to be fitted.
-    history : int
-        Number of leading samples that form an assumed initial history. Before the first of them the voltage falls from
-        far above, which erases the hysteresis memory. Default 0: the axis starts at rest.
-    mixed, side : int
-        Number of samples that are not fitted because their displacement belongs to a neighbouring sample or is a
-        mixture with it, and the side of that neighbour, as in `slpi_ros.identification.bad_readings.Mixed`. Default 0.
+    The voltage `v` (V, measurement noise removed) includes samples that are not fitted, the displacement `y` (m) is
+    finite where the mask `fitted` is set; all have shape (N,). The first `history` samples form an assumed initial
+    history, and before them the voltage falls from far above, which erases the hysteresis memory; 0: the axis starts at
+    rest. `mixed` samples are not fitted because their displacement belongs to a neighbouring sample or is a mixture
+    with it, and `side` is that of the neighbour, as in `slpi_ros.identification.bad_readings.Mixed`.
     """
 
     v: FloatArray
@@ -173,14 +164,8 @@ class Samples:
 def select_samples(record: Record, axis: str, start: float | None, stop: float | None) -> Samples:
     """Select the samples of one axis for a fit, ``start <= t < stop`` (s), preceded by all earlier voltages.
 
-    Raises
-    ------
-    UsageError
-        If the record has no such axis.
-    RecordError
-        If the samples are too few or unordered, or a signal is constant, implausibly large or of the wrong sign.
-    IdentificationError
-        If the voltage has no reversal.
+    UsageError if the record has no such axis; RecordError if the samples are too few or unordered, or a signal is
+    constant, implausibly large or of the wrong sign; IdentificationError if the voltage has no reversal.
     """
     record.require_axis(axis)
     _require_order(record)
@@ -203,12 +188,7 @@ def select_thinned(
     """Return what `thinned` returns for the samples of `select_samples`, and their indices in the record.
 
     A record longer than `WINDOW` is examined in windows, which need little memory: noise, resolution and outliers are
-    those of each window.
-
-    Raises
-    ------
-    SlpiError
-        As `select_samples`.
+    those of each window. Errors as in `select_samples`.
     """
     if len(record) <= WINDOW:
         samples = select_samples(record, axis, start, stop)
@@ -289,13 +269,9 @@ def _require_enough(record: Record, axis: str, count: int, start: float | None, 
 def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> Samples:
     """Return samples with a finite voltage without outliers, stuck and mixed readings, and noise of the voltage.
 
-    Parameters
-    ----------
-    t, v, y : ndarray, shape (N,), seconds, volts and metres
-    fitted : ndarray of bool, shape (N,)
-        Samples to be fitted, at least `FEWEST`; modified in place.
-    where : str
-        Name of the record for the error of signals without motion; "" for a part of a record, which is not tested.
+    Times `t` (s), `v` (V), `y` (m) and the mask `fitted` have shape (N,); the mask has at least `FEWEST` samples and is
+    modified in place. `where` names the record in the error of signals without motion; "" for a part of a record, which
+    is not tested.
     """
     if not fitted.all():
         y = np.where(fitted, y, 0.0)

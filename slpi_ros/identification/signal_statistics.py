@@ -19,18 +19,8 @@ class ErrorMetrics:
     square cannot exceed the product of maximum and mean absolute error, but the values in Table 2 from 20 to 100 V, in
     Table 4 at 20 and 40 V, and 0.1201 do. The value at 120 V matches R² = 0.9996 (Table 3) only as an rms.
 
-    Parameters
-    ----------
-    maximum : float, metres
-        Maximum absolute error.
-    mean : float, metres
-        Mean absolute error.
-    root_mean_square : float, metres
-        Root mean square error; the paper calls it mean square error.
-    mean_square : float, square metres
-        Mean square error.
-    r_squared : float
-        ``R² = 1 - SSE / SST``, MPI paper, Eq. 3.
+    Errors are in metres, `mean` is that of the absolute errors, `mean_square` is in square metres; `r_squared` is
+    ``R² = 1 - SSE / SST``, MPI paper, Eq. 3.
     """
 
     maximum: float
@@ -43,17 +33,8 @@ class ErrorMetrics:
 def error_metrics(measured: ArrayLike, model: ArrayLike) -> ErrorMetrics:
     """Compute the error metrics of a model against a measurement, or of a measurement against a setpoint.
 
-    Parameters
-    ----------
-    measured : array_like, shape (N,), metres
-        The reference; R² is relative to its variation.
-    model : array_like, shape (N,), metres
-        Values to compare with the reference.
-
-    Raises
-    ------
-    UsageError
-        If the two are not equally long, not finite, or `measured` does not vary.
+    Both have shape (N,), metres; R² is relative to the variation of `measured`. UsageError if the two are not equally
+    long, not finite, or `measured` does not vary.
     """
     y, y_model = np.asarray(measured, dtype=np.float64), np.asarray(model, dtype=np.float64)
     if y.ndim != 1 or y.shape != y_model.shape or y.size == 0:
@@ -111,18 +92,12 @@ def median_rms(deviation: FloatArray) -> float:
 
 
 def noise(x: FloatArray, *drivers: FloatArray) -> float:
-    """Return the robust rms of the noise from reading to reading.
+    """Return the robust rms of the noise from reading to reading, in the unit of `x`, shape (N,), N >= 5.
 
     The smallest of several estimates: deviations from a line or a cubic through the neighbours, and from a line over
     each of the `drivers`, which allows for uneven sampling. Curvature of the signal increases each estimate; medians
-    reduce this effect. Noise correlated over several samples is not detected.
-
-    Parameters
-    ----------
-    x : ndarray, shape (N,), N >= 5
-        Readings.
-    *drivers : ndarray, shape (N,)
-        Signals that the readings follow: time, or a voltage.
+    reduce this effect. Noise correlated over several samples is not detected. The `drivers`, shape (N,) each, are
+    signals that the readings follow: time, or a voltage.
     """
     every = max(1, x.size // ENOUGH)
     far_before, before, own, after, far_after = (x[first : x.size - 4 + first : every] for first in range(5))

@@ -36,20 +36,10 @@ class CurveUncertainty:
     Computed from a thinned record, and therefore an upper bound for long records. The uncertainty of regions that no
     sample visits is not included: there the roughness penalty determines the curves.
 
-    Parameters
-    ----------
-    axis, kind : str
-        Name of the axis and kind of the model.
-    resamples : int
-        Number of bootstrap fits.
-    v : ndarray, shape (n,), volts
-        Voltages of the branches.
-    rising, falling : ndarray, shape (n,), metres
-        Branches of the outermost loop, relative to the displacement at its low end.
-    rising_std, falling_std : ndarray, shape (n,), metres
-        Standard deviations of these branches.
-    rms, maximum : float, metres
-        Rms and maximum standard deviation of the displacement predicted for the record's samples.
+    `rising` and `falling` (m) are the branches of the outermost loop at the voltages `v` (V), relative to the
+    displacement at its low end, `rising_std` and `falling_std` (m) their standard deviations, shape (n,) each. `rms`
+    and `maximum` (m) are the rms and the largest standard deviation of the displacement predicted for the record's
+    samples; `resamples` is the number of bootstrap fits.
     """
 
     axis: str
@@ -83,26 +73,8 @@ def curve_uncertainty(
 ) -> CurveUncertainty:
     """Estimate the uncertainty of a model's curves by bootstrap fits to a thinned record.
 
-    Parameters
-    ----------
-    record : Record or sequence of Record
-        One record, or several that are fitted together.
-    axis, kind, start, stop
-        As for `slpi_ros.identify`; kinds ``slpi`` and ``pi`` only.
-    resamples : int
-        Number of bootstrap fits. Default 50.
-
-    Returns
-    -------
-    CurveUncertainty
-        Standard deviations of the outermost loop and of the predicted displacement.
-
-    Raises
-    ------
-    UsageError
-        If the uncertainty of this kind is not available.
-    SlpiError
-        If the record does not allow a fit.
+    Several records are fitted together; `axis`, `kind`, `start` and `stop` are as for `slpi_ros.identify`. UsageError
+    for a kind other than ``slpi`` and ``pi``; SlpiError if the record does not allow a fit.
     """
     require_known_uncertainty(kind)
     records = [record] if isinstance(record, Record) else list(record)

@@ -24,19 +24,11 @@ _AXES = ("x", "y", "z")
 class Signals:
     """Decoded messages of one topic.
 
-    Parameters
-    ----------
-    logged : ndarray of int64, shape (N,), nanoseconds
-        Times of recording, in ascending order.
-    stamp : ndarray of int64, shape (N,), nanoseconds, or None
-        Header stamps; None if no message is stamped.
-    frame_id : str
-        First frame id that is not empty.
-    fields : mapping of field to mapping of name to ndarray, shape (N,)
-        Columns by name, for each field: ``position``, ``effort``, ``data`` or ``vector``. NaN where a message does not
-        contain the column. Names are in the order of their first occurrence.
-    named : bool
-        Whether the message type gives names to the columns; otherwise they are ``0``, ``1``, ...
+    `logged` (ns), ascending, are the recording times and `stamp` (ns) the header stamps, shape (N,) each; `stamp` is
+    None if no message is stamped. `frame_id` is the first one that is not empty. `fields` holds the columns, shape
+    (N,), by name for each of the fields ``position``, ``effort``, ``data`` or ``vector``, in the order of their first
+    occurrence; NaN where a message does not contain the column. `named` tells whether the message type gives names to
+    the columns; otherwise they are ``0``, ``1``, ...
     """
 
     logged: NDArray[np.int64]
@@ -94,25 +86,9 @@ class _Series:
 def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axes: Sequence[str], path: Path) -> Record:
     """Combine the signals of two topics into a record.
 
-    Parameters
-    ----------
-    voltage, displacement : Signals
-        Decoded messages of both topics.
-    topics : SeparateTopics
-        Topic names, clock and interpretation of the voltage.
-    axes : sequence of str
-        Axes to read, by name, or in the order of columns without names; empty for all.
-    path : Path
-        Path of the bag, for messages.
-
-    Returns
-    -------
-    Record
-
-    Raises
-    ------
-    RecordError
-        If a topic has no signal, the topics do not overlap in time, or their axes do not match.
+    `axes` are the axes to read, by name, or in the order of columns without names; empty for all. `path` is that of the
+    bag, for messages. RecordError if a topic has no signal, the topics do not overlap in time, or their axes do not
+    match.
     """
     where = f"{path}: voltage on '{topics.voltage}', displacement on '{topics.displacement}'"
     v_columns = _filled(voltage, ("effort", "position", "data", "vector"), where)
@@ -136,25 +112,11 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
 
 
 def held_at(desired: Signals, record: Record, where: str) -> dict[str, FloatArray]:
-    """Return displacements (m), each held until the next message, at the samples of a record.
+    """Return displacements (m), shape (N,), each held until the next message, at the samples of a record.
 
-    Parameters
-    ----------
-    desired : Signals
-        Decoded messages of a topic with desired displacements.
-    record : Record
-    where : str
-        Bag and topic, named in error messages.
-
-    Returns
-    -------
-    dict of axis name to ndarray, shape (N,), metres
-        Axes of the record that the messages contain; NaN before the first message.
-
-    Raises
-    ------
-    RecordError
-        If topic and record do not overlap in time, or the columns do not match the axes of the record.
+    `desired` are messages with desired displacements, `where` is the bag and the topic in error messages. The result
+    has the axes of the record that the messages contain; NaN before the first message. RecordError if topic and record
+    do not overlap in time, or the columns do not match the axes of the record.
     """
     time = desired.logged if desired.stamp is None else desired.stamp
     if not _overlap(time, record.time_ns):

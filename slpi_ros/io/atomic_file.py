@@ -11,24 +11,9 @@ from slpi_ros.errors import SlpiError
 
 @contextmanager
 def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = SlpiError) -> Iterator[TextIO]:
-    """Open a text file for writing; it replaces `path` only if the ``with`` block ends without an error.
+    """Open a UTF-8 text file for writing; it replaces `path` only if the ``with`` block ends without an error.
 
-    Parameters
-    ----------
-    path : path-like
-        File to write; an existing file is replaced.
-    failure : type
-        Exception type to raise. Default `SlpiError`.
-
-    Yields
-    ------
-    file
-        Text file with UTF-8 encoding.
-
-    Raises
-    ------
-    SlpiError
-        Of the type `failure`, if the file cannot be written.
+    An error of the type `failure` is raised if the file cannot be written.
     """
     if not str(path) or not is_replaceable(Path(path)):
         raise failure(f"'{path}': cannot be written: no regular file; choose another place")
@@ -82,18 +67,9 @@ def output_folder(path: str | os.PathLike[str], *names: str) -> Iterator[Path]:
 
 
 def make_folder(path: str | os.PathLike[str], *names: str) -> None:
-    """Create a folder and its parents if missing, and check that files can be written there.
+    """Create a folder and its parents if missing, and check that files with these `names` can be written there.
 
-    Parameters
-    ----------
-    path : path-like
-    *names : str
-        Names of files that will be written into the folder.
-
-    Raises
-    ------
-    SlpiError
-        If the folder cannot be created or written to, or contains a folder with one of these names.
+    SlpiError if the folder cannot be created or written to, or contains a folder with one of these names.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)

@@ -46,13 +46,7 @@ def partial_path(path: str | os.PathLike[str]) -> Path:
 
 
 def locate(path: Path) -> list[Path]:
-    """Return the paths to open for a bag: a folder with metadata, or its bag files in order.
-
-    Raises
-    ------
-    RecordError
-        If there is no bag at this path.
-    """
+    """Return the paths to open for a bag: a folder with metadata, or its bag files in order; RecordError if none."""
     if not path.exists():
         hint = _WANTED
         if path.name and partial_path(path).exists():
@@ -197,23 +191,10 @@ def one_line(error: Exception) -> str:
 
 
 def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str], source: Path) -> str:
-    """Resolve a topic name to the full name of a topic in the bag.
+    """Resolve a full topic name, or its last parts if they are unambiguous, to the full name of a topic in the bag.
 
-    Parameters
-    ----------
-    topics : mapping of str to str
-        Full name and type of each topic in the bag.
-    topic : str
-        Full name, or its last parts if they are unambiguous.
-    msgtypes : collection of str
-        Accepted message types.
-    source : Path
-        Path of the bag, for messages.
-
-    Raises
-    ------
-    RecordError
-        If no topic or several topics match, or the type is not accepted.
+    `topics` maps full names to types, `msgtypes` are the accepted types, and `source` is the path of the bag, for
+    messages. RecordError if no topic or several topics match, or the type is not accepted.
     """
     contents = ", ".join(f"{name} ({topics[name]})" for name in sorted(topics)) or "no topics"
     wanted = absolute_name(topic)
@@ -243,22 +224,9 @@ class BagWatch:
     A rosbag2 folder is complete when it contains ``metadata.yaml``, which its writer adds last; a single mcap file when
     it ends with the magic bytes of a complete file. Single sqlite3 files are ignored, as they have no such mark.
 
-    Parameters
-    ----------
-    folder : path
-        Folder to watch. Bags that are complete from the beginning are not reported, except the newest one.
-    patience : float, seconds
-        An incomplete bag that has not grown for this time counts as abandoned.
-
-    Attributes
-    ----------
-    abandoned : tuple of Path
-        Bags found to be abandoned at the last `poll`, sorted by name; they are still watched.
-
-    Raises
-    ------
-    UsageError
-        If the folder does not exist.
+    Bags that are complete from the beginning are not reported, except the newest one. An incomplete bag that has not
+    grown for `patience` (s) counts as abandoned; `abandoned` are those found at the last `poll`, sorted by name, which
+    are still watched. UsageError if the folder does not exist.
     """
 
     def __init__(self, folder: str | os.PathLike[str], patience: float = PATIENCE) -> None:

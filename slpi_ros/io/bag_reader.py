@@ -74,26 +74,10 @@ def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: 
 def read_bags(
     paths: Iterable[_Path], topic: str | SeparateTopics = "stage_state", *, axes: Sequence[str] | None = None
 ) -> list[Record]:
-    """Read several bags of one stage.
+    """Read several bags of one stage, each as `read_bag` does, in the order of the paths.
 
-    Parameters
-    ----------
-    paths : iterable of path
-        Paths of the bags: at least one, without duplicates.
-    topic, axes
-        As for `read_bag`.
-
-    Returns
-    -------
-    list of Record
-        In the order of the paths.
-
-    Raises
-    ------
-    UsageError
-        If there is no path, or one is given twice.
-    RecordError
-        As for `read_bag`; also if the bags are of different stages.
+    UsageError if there is no path, or one is given twice; RecordError as for `read_bag`, and if the bags are of
+    different stages.
     """
     places = require_different(paths)
     records = [read_bag(place, topic, axes=axes) for place in places]
@@ -127,26 +111,11 @@ def _stage_of(record: Record) -> str:
 
 
 def read_desired(path: _Path, record: Record, topic: str | None = None) -> dict[str, NDArray[np.float64]] | None:
-    """Read the desired displacement that belongs to a record of the same bag.
+    """Read the desired displacement (m) of each axis, shape (N,), at the samples of a record of the same bag.
 
-    Parameters
-    ----------
-    path : path
-        The bag that `record` was read from.
-    record : Record
-    topic : str, optional
-        Topic of one of the `MESSAGE_TYPES`; default ``desired_displacement``.
-
-    Returns
-    -------
-    dict of axis name to ndarray, shape (N,), metres, or None
-        Values at the samples of the record: each message is held until the next one; NaN before the first one. None if
-        `topic` is not given and the bag has no message on the default topic.
-
-    Raises
-    ------
-    RecordError
-        If the bag cannot be read, or the times or axes of the topic do not match those of the record.
+    Each message is held until the next one; NaN before the first one. The topic is of one of the `MESSAGE_TYPES`, by
+    default ``desired_displacement``; None if `topic` is not given and the bag has no message on that one. RecordError
+    if the bag cannot be read, or the times or axes of the topic do not match those of the record.
     """
     path = Path(path)
     with _Bag(locate(path), path) as bag:
@@ -236,21 +205,10 @@ def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tupl
 
 
 def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int = 0) -> Signals | None:
-    """Decode the messages of a topic; blocks of messages with equal layout are decoded at once.
+    """Decode the messages of a topic, None if there is none; blocks of messages with equal layout are decoded at once.
 
-    Parameters
-    ----------
-    blocks : iterable of MessageBlock
-        Blocks of serialised messages; each is released after decoding.
-    msgtype : str
-        One of `MESSAGE_TYPES`.
-    expected : int
-        Approximate total number of messages.
-
-    Returns
-    -------
-    Signals or None
-        None if there is no message.
+    `msgtype` is one of the `MESSAGE_TYPES`, `expected` the approximate total number of messages. Each block is released
+    after decoding.
     """
     columns, frame_id = _Columns(expected), ""
     for block in blocks:

@@ -31,14 +31,9 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 @dataclass(frozen=True)
 class MessageBlock:
-    """Block of consecutive serialised messages of one topic.
+    """Block of consecutive serialised messages of one topic; `logged` (ns), shape (n,), is their recording time.
 
-    Parameters
-    ----------
-    logged : ndarray of int64, shape (n,), nanoseconds
-        Recording time of each message.
-    messages : ndarray of uint8, shape (n, L), or list of bytes, length n
-        An array if all messages have the same length L, else a list.
+    `messages` are an array, shape (n, L), if all have the same length L, else a list of length n.
     """
 
     logged: NDArray[np.int64]
@@ -86,14 +81,7 @@ def _unpacked(messages: Iterable[bytes]) -> Iterator[bytes]:
 def decompressed(data: bytes, compression: str, most: int) -> bytes:
     """Decompress data of an MCAP or rosbag2 file to at most `most` bytes; `compression` is "", "zstd" or "lz4".
 
-    Raises
-    ------
-    ValueError
-        If `compression` has another value.
-    LimitError
-        If there are more bytes.
-    EOFError
-        If the data are cut off.
+    ValueError if `compression` has another value, LimitError if there are more bytes, EOFError if the data are cut off.
     """
     unpacked = b""
     while data:
@@ -143,19 +131,9 @@ _HEAD_IN_LENGTH = _MESSAGE_HEAD.itemsize - _RECORD.size
 
 
 def read_mcap(path: Path, topic: str) -> Iterator[MessageBlock]:
-    """Yield the messages of a topic, in the order in which they were written.
+    """Yield the messages of a topic, given by its full name, in the order in which they were written.
 
-    Parameters
-    ----------
-    path : Path
-        Complete MCAP file.
-    topic : str
-        Full name of the topic.
-
-    Raises
-    ------
-    Exception
-        Of any type if the file is damaged.
+    The file must be complete; an exception of any type is raised if it is damaged.
     """
     with open_input(path, BAG_BYTES) as file:
         yield from _McapFile(file, topic).blocks()
@@ -333,19 +311,10 @@ def _rows(data: ByteArray, starts: NDArray[np.int64], length: int) -> ByteArray:
 
 
 def read_sqlite(storage: Any, topic: str) -> Iterator[MessageBlock]:
-    """Yield the messages of a topic in the order in which they were recorded.
+    """Yield the messages of a topic, given by its full name, in the order in which they were recorded.
 
-    Parameters
-    ----------
-    storage : rosbags.rosbag2.storage_sqlite3.Sqlite3Reader
-        Reader of the open file.
-    topic : str
-        Full name of the topic.
-
-    Raises
-    ------
-    Exception
-        Of any type if the file is damaged.
+    `storage` is the ``rosbags.rosbag2.storage_sqlite3.Sqlite3Reader`` of the open file; an exception of any type is
+    raised if the file is damaged.
     """
     connections = [connection for connection in storage.connections if connection.topic == topic]
     messages = _bounded(storage, connections) if connections else iter(())

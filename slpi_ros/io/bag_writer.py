@@ -30,36 +30,14 @@ _WRITE_ERRORS = (OSError, sqlite3.Error, WriterError)
 class BagWriter:
     """Write a rosbag2 folder; a context manager.
 
-    An incomplete bag is in ``.NAME.partial`` next to the final path, so a folder at the final path is always a
-    complete bag. An exception inside ``with`` discards the bag; without ``with``, call ``close`` or ``discard``.
+    An incomplete bag is in ``.NAME.partial`` (`partial`) next to the final `path`, so a folder at the final path is
+    always a complete bag. An exception inside ``with`` discards the bag; without ``with``, call ``close`` or
+    ``discard``.
 
-    Parameters
-    ----------
-    path : path
-        The rosbag2 folder to create, with its parent folders if missing.
-    storage : {"mcap", "sqlite3"}
-        File format.
-    topic : str, optional
-        Topic of type ``sensor_msgs/JointState`` to which ``write`` writes by default; None if all topics
-        are added with ``add_topic``.
-    replace : bool
-        Whether a folder at this path is deleted once the new bag is complete. Default False: an error.
-
-    Attributes
-    ----------
-    path : Path
-        Final path of the bag.
-    partial : Path
-        Folder that contains the bag until it is complete.
-    message_count : int
-        Number of messages written so far.
-
-    Raises
-    ------
-    RecordError
-        If the path or an unfinished bag of the same name exists, or the bag cannot be written.
-    UsageError
-        If `storage` is not one of these formats.
+    Missing parent folders are created. `storage` is "mcap" or "sqlite3". `topic`, of type ``sensor_msgs/JointState``,
+    is the one to which ``write`` writes by default; None if all topics are added with ``add_topic``. With `replace`, a
+    folder at this path is deleted once the new bag is complete. RecordError if the path exists and is not replaced, an
+    unfinished bag of the same name exists, or the bag cannot be written; UsageError if `storage` is another format.
     """
 
     def __init__(
@@ -96,19 +74,10 @@ class BagWriter:
             self.add_topic(topic)
 
     def add_topic(self, topic: str, msgtype: str = JOINT_STATE) -> None:
-        """Add a topic to the bag.
+        """Add a topic to the bag; a missing leading slash is added.
 
-        Parameters
-        ----------
-        topic : str
-            Name of the topic; a missing leading slash is added.
-        msgtype : str
-            Message type, written like ``sensor_msgs/msg/JointState``, from a package that is part of ROS 2 Jazzy.
-
-        Raises
-        ------
-        RecordError
-            If the definition of the type is not known, or the bag cannot be written.
+        `msgtype` is written like ``sensor_msgs/msg/JointState``, from a package that is part of ROS 2 Jazzy.
+        RecordError if its definition is not known, or the bag cannot be written.
         """
         name = absolute_name(topic)
         try:
@@ -121,16 +90,9 @@ class BagWriter:
             raise self._failure(error) from error
 
     def write(self, stamp_ns: int, message: bytes, topic: str | None = None) -> None:
-        """Write a serialised message.
+        """Write a serialised message, CDR data with encapsulation header, with its log time (ns).
 
-        Parameters
-        ----------
-        stamp_ns : int, nanoseconds
-            Log time of the message.
-        message : bytes
-            CDR data with encapsulation header.
-        topic : str, optional
-            A topic of the bag; default: the topic given to the constructor.
+        `topic` is one of the bag, by default that given to the constructor.
         """
         name = absolute_name(topic or self._topic or "")
         if name not in self._connections:
@@ -144,10 +106,7 @@ class BagWriter:
     def close(self) -> None:
         """Complete the bag and move it to its final path.
 
-        Raises
-        ------
-        RecordError
-            If the bag cannot be written; the data written so far remain in the partial folder.
+        RecordError if the bag cannot be written; the data written so far remain in the partial folder.
         """
         try:
             self._writer.close()
@@ -200,23 +159,8 @@ def write_bag(
 ) -> None:
     """Write a record as a new rosbag2 folder that `slpi_ros.read_bag` reads back without loss.
 
-    Parameters
-    ----------
-    path : path
-        The folder to create.
-    record : Record
-        Record to write; its hardware id becomes the ``frame_id`` of the messages.
-    storage : {"mcap", "sqlite3"}
-        File format.
-    topic : str
-        Name of the topic.
-    replace : bool
-        Whether a folder at this path is replaced. Default False: an error.
-
-    Raises
-    ------
-    RecordError
-        If the path exists, or the bag cannot be written.
+    `storage` is "mcap" or "sqlite3"; the hardware id becomes the ``frame_id`` of the messages. RecordError if the path
+    exists, unless `replace` is given, or the bag cannot be written.
     """
     displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
     voltage = np.column_stack([record.voltage[axis] for axis in record.axes])

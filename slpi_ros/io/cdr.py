@@ -30,15 +30,9 @@ _DTYPES = {"i": "i4", "I": "u4"}
 class CdrLayout:
     """Offsets of the numbers in messages of one layout.
 
-    Parameters
-    ----------
-    template : ndarray of uint8, shape (M,)
-        One message of this layout.
-    fixed : ndarray of bool, shape (M,)
-        True for bytes that are the same in all messages of this layout; False for numbers, and for padding bytes,
-        which are undefined.
-    fields : mapping of str to (dtype, int)
-        NumPy type and offset of each named field.
+    `template`, shape (M,), is one message of this layout. `fixed`, shape (M,), is True for bytes that are the same in
+    all messages of this layout; False for numbers, and for padding bytes, which are undefined. `fields` holds the NumPy
+    type and the offset of each named field.
     """
 
     template: ByteArray
@@ -46,17 +40,10 @@ class CdrLayout:
     fields: Mapping[str, tuple[Any, int]]
 
     def decode(self, rows: ByteArray) -> NDArray[np.void] | None:
-        """Return the fields of all messages, or None if one of them has another layout.
+        """Return the fields of all messages, shape (N,), a view of `rows`; None if one of them has another layout.
 
-        Parameters
-        ----------
-        rows : ndarray of uint8, shape (N, L)
-            Serialised messages; bytes after the end of the message are ignored, as some writers append undefined bytes.
-
-        Returns
-        -------
-        structured ndarray, shape (N,)
-            A view of `rows`.
+        `rows`, shape (N, L), are the serialised messages; bytes after the end of the message are ignored, as some
+        writers append undefined bytes.
         """
         if rows.shape[1] < self.template.size or not self._alike(rows):
             return None
@@ -98,22 +85,9 @@ def _words(begin: int, end: int) -> Iterator[tuple[int, int]]:
 class CdrReader:
     """Reader of one serialised message, value by value, which also determines its layout.
 
-    Parameters
-    ----------
-    data : bytes
-        Serialised message with encapsulation header.
-
-    Attributes
-    ----------
-    order : str
-        Byte order, as a format character of the module ``struct``.
-    at : int
-        Offset of the next byte to read.
-
-    Raises
-    ------
-    struct.error
-        If the data are not plain CDR. Methods raise it if the message is truncated.
+    `data` include the encapsulation header. `order` is the byte order, as a format character of the module ``struct``,
+    and `at` the offset of the next byte to read. struct.error if the data are not plain CDR; methods raise it if the
+    message is truncated.
     """
 
     def __init__(self, data: bytes) -> None:

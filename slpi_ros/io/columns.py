@@ -13,18 +13,10 @@ from slpi_ros.io.input_limits import MOST_AXES
 class Quantity:
     """A physical quantity that a column can hold.
 
-    Parameters
-    ----------
-    name : str
-        Name in messages, and name of the option that selects its columns.
-    default : str
-        Unit if neither the column name nor an option gives one.
-    units : mapping of str to float
-        Known units and their values in SI units.
-    prefixes : tuple of str
-        Beginnings of the names of its columns, in lower case.
-    others : frozenset of str
-        Units that are recognized in a column name but are not valid for this quantity, in lower case.
+    `name` is that in messages, and of the option that selects its columns. `default` is the unit if neither the column
+    name nor an option gives one, and `units` are the known units with their values in SI units. `prefixes` are the
+    beginnings of the names of its columns, `others` the units that are recognized in a column name but are not valid
+    for this quantity, both in lower case.
     """
 
     name: str
@@ -101,18 +93,8 @@ _PARTS = re.compile(r"[^\s_.,-]+")
 class Column:
     """Column of a table, with the axis and unit from its name.
 
-    Parameters
-    ----------
-    name : str
-        Name in the table.
-    axis : str
-        Part of the name that is neither quantity nor unit; ``x`` if there is none.
-    unit : str
-        Unit of its values.
-    scale : float
-        Value of the unit in SI units.
-    assumed : bool
-        Whether neither the name nor an option gives the unit.
+    `axis` is the part of the name that is neither quantity nor unit, ``x`` if there is none. `scale` is the value of
+    the unit in SI units. `assumed` tells whether neither the name nor an option gives the unit.
     """
 
     name: str
@@ -125,23 +107,8 @@ class Column:
 def parse_column(name: str, quantity: Quantity, *, given_unit: str | None = None, source: str = "table") -> Column:
     """Parse the name of a column; units as in ``x_nm``, ``x (nm)``, ``x [nm]``, ``x in nm``, ``x / nm``.
 
-    Parameters
-    ----------
-    name : str
-        Name of the column.
-    quantity : Quantity
-        Quantity of the column.
-    given_unit : str, optional
-        Unit given by an option, for a name without a unit.
-    source : str
-        Name of the table, for messages.
-
-    Raises
-    ------
-    RecordError
-        If the name contains an unknown unit.
-    UsageError
-        If the units of the name and the option differ.
+    `given_unit` is that of an option, for a name without a unit; `source` is the name of the table, for messages.
+    RecordError if the name contains an unknown unit, UsageError if the units of the name and the option differ.
     """
     stem, written = _split(name, quantity)
     unit = quantity.unit(written)
@@ -251,15 +218,7 @@ class ColumnOptions:
 
 @dataclass(frozen=True)
 class ColumnChoice:
-    """The columns of a record.
-
-    Parameters
-    ----------
-    time : Column
-        Time column.
-    voltage, displacement : mapping of axis name to Column
-        Columns of each axis; both mappings have the same axes.
-    """
+    """The columns of a record; `voltage` and `displacement` have the same axes."""
 
     time: Column
     voltage: Mapping[str, Column]
@@ -271,23 +230,11 @@ class ColumnChoice:
 
 
 def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) -> ColumnChoice:
-    """Choose the columns of a record by option, else by name.
+    """Choose the columns of a record among the `names` of all columns of the table, by option, else by name.
 
-    Parameters
-    ----------
-    names : sequence of str
-        All columns of the table.
-    options : ColumnOptions
-        Options given by the caller.
-    source : str
-        Name of the table, for messages.
-
-    Raises
-    ------
-    RecordError
-        If a column is missing, the numbers of columns do not match, or a name contains an unknown unit.
-    UsageError
-        If an option is invalid, contradicts a name, or gives one column two roles.
+    `source` is the name of the table, for messages. RecordError if a column is missing, the numbers of columns do not
+    match, or a name contains an unknown unit; UsageError if an option is invalid, contradicts a name, or gives one
+    column two roles.
     """
     given_unit = options.displacement_unit
     if given_unit is not None and not DISPLACEMENT.unit(given_unit):

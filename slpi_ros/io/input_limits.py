@@ -62,14 +62,8 @@ def most_unpacked(packed: int) -> int:
 def open_input(path: str | os.PathLike[str], most: int) -> BinaryIO:
     """Open a regular file of at most `most` bytes for reading.
 
-    Raises
-    ------
-    LimitError
-        If it is a device, pipe or socket, or larger.
-    OSError
-        If it cannot be opened, or is a folder.
-    ValueError
-        If no file can have this name.
+    LimitError if it is a device, pipe or socket, or larger; OSError if it cannot be opened, or is a folder; ValueError
+    if no file can have this name.
     """
     # A device is not even opened; the second check is of what has been opened, should the name have changed hands.
     _require(os.stat(path), most)

@@ -52,16 +52,9 @@ def _read_vector(reader: CdrReader) -> tuple[str, ...]:
 class MessageType:
     """Rules for decoding one message type.
 
-    Parameters
-    ----------
-    stamped : bool
-        Whether the message begins with a header.
-    named : bool
-        Whether the columns have names, such as joint names; otherwise they are numbered.
-    fields : tuple of str
-        Fields that contain the numbers.
-    read : callable
-        Reads everything after the header and returns the name of each column.
+    `stamped` tells whether the message begins with a header, `named` whether the columns have names, such as joint
+    names; otherwise they are numbered. `fields` are those that contain the numbers. `read` reads everything after the
+    header and returns the name of each column.
     """
 
     stamped: bool
@@ -82,18 +75,10 @@ MESSAGE_TYPES = {
 class Message:
     """Decoded message.
 
-    Parameters
-    ----------
-    stamp_ns : int, nanoseconds
-        Header stamp; 0 if there is no header.
-    frame_id : str
-        Frame id of the header; "" if there is no header.
-    names : tuple of str, length K
-        Names of the columns.
-    values : mapping of field to ndarray, shape (n,)
-        ``position`` (m), ``effort`` (V), ``data`` or ``vector``; an array with n < K lacks the last columns.
-    layout : CdrLayout
-        Layout of all messages with the same strings and array lengths.
+    `stamp_ns` (ns) and `frame_id` are those of the header; 0 and "" if there is no header. `names`, length K, are those
+    of the columns. `values` are arrays of shape (n,) by field: ``position`` (m), ``effort`` (V), ``data`` or
+    ``vector``; an array with n < K lacks the last columns. `layout` is that of all messages with the same strings and
+    array lengths.
     """
 
     stamp_ns: int
@@ -111,12 +96,8 @@ class Message:
 def read_message(data: bytes, msgtype: str) -> Message:
     """Decode a serialised message of one of the `MESSAGE_TYPES`.
 
-    Raises
-    ------
-    struct.error, UnicodeDecodeError
-        If the data are not a valid message of this type.
-    LimitError
-        If the message has more columns than a stage has axes.
+    struct.error or UnicodeDecodeError if the data are not a valid message of this type, LimitError if the message has
+    more columns than a stage has axes.
     """
     kind, reader = MESSAGE_TYPES[msgtype], CdrReader(data)
     stamp_ns, frame_id = 0, ""
@@ -134,24 +115,10 @@ def encode_joint_states(
     names: tuple[str, ...],
     frame_id: str = "",
 ) -> list[bytes]:
-    """Return one serialised message for each stamp.
+    """Return one serialised message for each header stamp (ns), shape (N,).
 
-    Parameters
-    ----------
-    stamp_ns : ndarray of int64, shape (N,), nanoseconds
-        Header stamps.
-    position : ndarray, shape (N, K), metres
-    effort : ndarray, shape (N, K), volts
-        Applied voltages.
-    names : tuple of str, length K
-        Joint names.
-    frame_id : str
-        Frame id of the header.
-
-    Raises
-    ------
-    RecordError
-        If there is no name, or a stamp does not fit into a header (before 1970 or after 2038).
+    `position` (m) and `effort`, the applied voltages (V), have the shape (N, K), `names` of the joints the length K.
+    RecordError if there is no name, or a stamp does not fit into a header (before 1970 or after 2038).
     """
     if not names:
         raise RecordError("a stage_state message needs at least one axis name")
@@ -221,18 +188,10 @@ SMALLEST_POINT = 24
 
 @dataclass(frozen=True)
 class TrajectoryArrays:
-    """Decoded JointTrajectory.
+    """Decoded JointTrajectory; `start_ns` (ns) is the header stamp.
 
-    Parameters
-    ----------
-    start_ns : int, nanoseconds
-        Header stamp.
-    names : tuple of str, length K
-        Joint names.
-    time_from_start_ns : ndarray of int64, shape (N,), nanoseconds
-        Time of each point from the start.
-    positions : ndarray, shape (N, K), metres
-        Positions of the joints at each point.
+    `time_from_start_ns` (ns), shape (N,), is the time of each point from the start, and `positions` (m), shape (N, K),
+    are those of the joints at each point; `names` of the joints have the length K.
     """
 
     start_ns: int

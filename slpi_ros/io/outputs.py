@@ -31,28 +31,12 @@ _ASK = "give another output, or --overwrite to replace it"
 
 
 def allow_document(path: _Path, kind: str, *, overwrite: bool = False) -> list[str]:
-    """Check that a document may be written to a file.
+    """Check that a document may be written to a file; return remarks on what it replaces that slpi did not write.
 
-    Parameters
-    ----------
-    path : path
-        A missing or empty file, or a document of the same kind.
-    kind : str
-        Kind of document: the middle part of its schema id, for example ``"model"``.
-    overwrite : bool
-        Whether any other regular file may be replaced as well. Default False.
-
-    Returns
-    -------
-    list of str
-        Remarks on what will be replaced although slpi did not write it.
-
-    Raises
-    ------
-    UsageError
-        If the file is no such document, or lies in a recording.
-    SlpiError
-        If no file can be written there: it is a folder or a device, or its folder is missing or write-protected.
+    The file may be missing, empty, or a document of the same `kind`, the middle part of the schema id, for example
+    ``"model"``; with `overwrite`, also any other regular file. UsageError if it is no such document, or lies in a
+    recording. SlpiError if no file can be written there: it is a folder or a device, or its folder is missing or
+    write-protected.
     """
     return _allow_file(Path(path), f"no {kind} document of slpi", overwrite, is_own=_kind(_ends(path)[0]) == kind)
 
@@ -60,19 +44,7 @@ def allow_document(path: _Path, kind: str, *, overwrite: bool = False) -> list[s
 def allow_table(path: _Path, header: str, *, overwrite: bool = False) -> list[str]:
     """Check that a table may be written to a file: like `allow_document`, for a CSV file with the first line `header`.
 
-    Parameters
-    ----------
-    path : path
-        A missing or empty file, or a table with this very header.
-    header : str
-        Names of the columns, without the end of the line.
-    overwrite : bool
-        Whether any other regular file may be replaced as well. Default False.
-
-    Returns
-    -------
-    list of str
-        Remarks, as for `allow_document`.
+    `header` are the names of the columns, without the end of the line; a table with this very header may be replaced.
     """
     first = _ends(path)[0].split(b"\n", 1)[0]
     return _allow_file(Path(path), f"no table with the columns {header}", overwrite, is_own=first == header.encode())
@@ -81,30 +53,13 @@ def allow_table(path: _Path, header: str, *, overwrite: bool = False) -> list[st
 def allow_folder(
     path: _Path, *names: str, tables: Mapping[str, str] | None = None, overwrite: bool = False
 ) -> list[str]:
-    """Check that files may be written into a folder.
+    """Check that files may be written into a folder; return remarks, as `allow_document` does.
 
-    Parameters
-    ----------
-    path : path
-        A missing folder, one without anything but empty files, or one that holds a document or a page of slpi.
-    *names : str
-        Documents and pages that will be written into it. Those that exist must be slpi's as well.
-    tables : mapping of name to str, optional
-        Tables that will be written into it, with the names of their columns.
-    overwrite : bool
-        Whether the folder and these files may be any others. Default False.
-
-    Returns
-    -------
-    list of str
-        Remarks, as for `allow_document`.
-
-    Raises
-    ------
-    UsageError
-        If the folder or one of the files is not slpi's, or the folder is a recording or lies in one.
-    SlpiError
-        If the folder cannot be read, or holds a folder with one of these names.
+    The folder may be missing, be without anything but empty files, or hold a document or a page of slpi. `names` are
+    the documents and pages that will be written into it, `tables` the tables with the names of their columns; those
+    that exist must be slpi's as well. With `overwrite`, the folder and these files may be any others. UsageError if the
+    folder or one of the files is not slpi's, or the folder is a recording or lies in one; SlpiError if the folder
+    cannot be read, or holds a folder with one of these names.
     """
     folder = Path(path)
     with _told(folder):
@@ -132,22 +87,8 @@ def allow_folder(
 def allow_bag(path: _Path, *, overwrite: bool = False) -> list[str]:
     """Check that a bag may be written as a folder; a recording is replaced only when asked to.
 
-    Parameters
-    ----------
-    path : path
-        What does not exist, or, to be replaced, a rosbag2 folder with nothing else in it.
-    overwrite : bool
-        Whether a bag may be replaced. Default False.
-
-    Returns
-    -------
-    list of str
-        Remarks, as for `allow_document`.
-
-    Raises
-    ------
-    UsageError
-        If there is something else, or `overwrite` is False.
+    At `path` there may be nothing or, with `overwrite`, a rosbag2 folder with nothing else in it; UsageError otherwise.
+    Remarks are returned as by `allow_document`.
     """
     bag = Path(path)
     _refuse_recording(bag, Path(os.path.realpath(bag)).parent)

@@ -154,16 +154,8 @@ class Record:
 def common_stage(records: Sequence[Record], hardware_id: str = "") -> str:
     """Return the hardware id of the stage that all records, and optionally a model, belong to; "" if unknown.
 
-    Parameters
-    ----------
-    records : sequence of Record
-    hardware_id : str
-        Hardware id of the model; "" (default) if unknown. Records and models without an id may belong to any stage.
-
-    Raises
-    ------
-    UsageError
-        If there is no record, or there are several hardware ids.
+    `hardware_id` is that of the model, "" if unknown; records and models without an id may belong to any stage.
+    UsageError if there is no record, or there are several hardware ids.
     """
     if not records:
         raise UsageError("no record given; give at least one")

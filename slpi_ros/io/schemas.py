@@ -13,23 +13,7 @@ from slpi_ros.io.input_limits import LONGEST_NAME, MOST_AXES, MOST_ERRORS
 
 
 def load_schema(name: str) -> dict[str, Any]:
-    """Read the schema ``msg_schemas/NAME.schema.json``.
-
-    Parameters
-    ----------
-    name : str
-        Kind of document, for example ``"model"``.
-
-    Returns
-    -------
-    dict
-        The schema.
-
-    Raises
-    ------
-    UsageError
-        If there is no schema of that name.
-    """
+    """Read the schema ``msg_schemas/NAME.schema.json``, for example of ``"model"``; UsageError if there is none."""
     # In the source tree slpi_ros/msg_schemas is a link to the top-level folder, in an installation a copy of it.
     folder = files("slpi_ros") / "msg_schemas"
     try:
@@ -43,21 +27,10 @@ def load_schema(name: str) -> dict[str, Any]:
 
 
 def validate(document: object, name: str, source: str) -> None:
-    """Check a document against the schema of its kind.
+    """Check a document, as returned by ``json.loads``, against the schema `name`, for example ``"model"``.
 
-    Parameters
-    ----------
-    document : object
-        Parsed document, as returned by ``json.loads``.
-    name : str
-        Name of the schema, for example ``"model"``.
-    source : str
-        Origin of the document, for error messages.
-
-    Raises
-    ------
-    ModelError
-        If the document does not conform to the schema; the message names the location and the reason.
+    `source` is the origin of the document, for messages. ModelError if the document does not conform to the schema; the
+    message names the location and the reason.
     """
     axes = document.get("axes") if isinstance(document, dict) else None
     if isinstance(axes, dict):
@@ -86,12 +59,7 @@ def validate(document: object, name: str, source: str) -> None:
 def format_document(document: Mapping[str, Any], name: str) -> str:
     """Return the JSON text of a new document of the kind `name`.
 
-    Raises
-    ------
-    ModelError
-        If the document does not conform to its schema.
-    ValueError
-        If a value is not finite.
+    ModelError if the document does not conform to its schema, ValueError if a value is not finite.
     """
     validate(document, name, f"the new {name}")
     return json.dumps(document, allow_nan=False, indent=1)

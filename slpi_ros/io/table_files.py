@@ -49,18 +49,8 @@ _MAT_NUMERIC, _MAT_COMPLEX = range(6, 16), 0x800
 class CsvTable:
     """Table in a text file.
 
-    Parameters
-    ----------
-    path : Path
-        Path of the file, for messages.
-    columns : tuple of str
-        Names of the columns.
-    body : str
-        Text below the line of column names.
-    separator : str
-        Separator of the cells. If it is not a comma, numbers may have a decimal comma.
-    header_line : int
-        Number of the line of column names.
+    `body` is the text below the line of column names, and `header_line` the number of that line. If the `separator` of
+    the cells is not a comma, numbers may have a decimal comma. `path` is that of the file, for messages.
     """
 
     path: Path
@@ -76,10 +66,7 @@ class CsvTable:
     def read(self, wanted: Sequence[str]) -> dict[str, FloatArray]:
         """Return the wanted columns as numbers, each of shape (N,), N >= 2; an empty cell is NaN.
 
-        Raises
-        ------
-        RecordError
-            If a column is missing or not unique, a cell is not a number, or there are fewer than two rows.
+        RecordError if a column is missing or not unique, a cell is not a number, or there are fewer than two rows.
         """
         for column in wanted:
             if self.columns.count(column) != 1:
@@ -151,18 +138,9 @@ class CsvTable:
             ) from error
 
     def require(self, good: NDArray[np.bool_], column: str, values: FloatArray, rule: str) -> None:
-        """Raise RecordError for the first value that is not good.
+        """Raise RecordError for the first of the values, shape (N,), one for each row, that is not `good`, shape (N,).
 
-        Parameters
-        ----------
-        good : ndarray of bool, shape (N,)
-            Whether each value is valid.
-        column : str
-            Name of the column, for the message.
-        values : ndarray, shape (N,)
-            Values of the column, one for each row.
-        rule : str
-            Requirement for the values, for the message.
+        `rule` is the requirement for the values of this column, for the message.
         """
         if not good.all():
             row = int(np.argmin(good))
@@ -173,10 +151,7 @@ class CsvTable:
 def load_csv(path: Path) -> CsvTable:
     """Read the text and the column names of a table; encoding, separator and header line are detected.
 
-    Raises
-    ------
-    RecordError
-        If the file cannot be read, or is not a table with column names above its numbers.
+    RecordError if the file cannot be read, or is not a table with column names above its numbers.
     """
     text = _text(path)
     try:
@@ -308,13 +283,8 @@ _NUMERIC = {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("",
 class MatTable:
     """Vectors in a MATLAB file; a matrix is split into vectors along its longer side.
 
-    Parameters
-    ----------
-    path : Path
-        Path of the file, for messages.
-    columns : tuple of str
-        Names of the columns: ``name`` for a vector; ``name(:,1)``, ``name(:,2)``, ... or ``name(1,:)``, ... for a
-        matrix.
+    `columns` are ``name`` for a vector; ``name(:,1)``, ``name(:,2)``, ... or ``name(1,:)``, ... for a matrix. `path` is
+    that of the file, for messages.
     """
 
     path: Path
@@ -327,10 +297,7 @@ class MatTable:
     def read(self, wanted: Sequence[str]) -> dict[str, FloatArray]:
         """Return the wanted columns, each of shape (N,), N >= 2.
 
-        Raises
-        ------
-        RecordError
-            If a column is missing, the columns differ in length, have fewer than two values, or are complex.
+        RecordError if a column is missing, the columns differ in length, have fewer than two values, or are complex.
         """
         for column in wanted:
             if column not in self.columns:
@@ -358,10 +325,7 @@ class MatTable:
 def load_mat(path: Path) -> MatTable:
     """Find the numeric vectors and matrices in a MATLAB file.
 
-    Raises
-    ------
-    RecordError
-        If the file cannot be read, is of MATLAB v7.3, or holds no numeric vector.
+    RecordError if the file cannot be read, is of MATLAB v7.3, or holds no numeric vector.
     """
     columns: list[str] = []
     others = []
@@ -400,14 +364,8 @@ def _require_small(file: BinaryIO) -> None:
     """Raise an error if SciPy must not read a MATLAB file.
 
     From version 5 on it is a header of 128 bytes and elements: type, size and data, each as a whole compressed or not
-    (https://www.mathworks.com/help/pdf_doc/matlab/matfile_format.pdf).
-
-    Raises
-    ------
-    LimitError
-        If it unpacks to more than any record, or has too many variables.
-    ValueError
-        If a part of a numeric matrix has a wrong type.
+    (https://www.mathworks.com/help/pdf_doc/matlab/matfile_format.pdf). LimitError if it unpacks to more than any
+    record, or has too many variables; ValueError if a part of a numeric matrix has a wrong type.
     """
     size = file.seek(0, 2)
     left = min(ARRAY_BYTES, most_unpacked(size))

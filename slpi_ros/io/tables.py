@@ -29,64 +29,35 @@ def import_table(
     displacement_unit: str | None = None,
     axes: Sequence[str] = (),
 ) -> Record:
-    """Import measured data from a table, identifying columns and units by name or option.
+    """Import measured data (V, m) from a table, identifying columns and units by name or option.
 
-    A column name may contain a unit, as in ``time_ms``, ``Voltage (mV)``, ``x [nm]`` or ``displacement in nm``; upper
-    and lower case matter only where they change the meaning. Default units are seconds, volts and micrometres.
+    The table is a text file with a line of column names above the numbers, separated by comma, semicolon or tab; with
+    semicolon or tab, decimal commas are allowed. Or it is a MATLAB file (``.mat``, up to version 7), whose numeric
+    vectors are the columns. A column name may contain a unit, as in ``time_ms``, ``Voltage (mV)``, ``x [nm]`` or
+    ``displacement in nm``; upper and lower case matter only where they change the meaning. Default units are seconds,
+    volts and micrometres; `displacement_unit` ("um", "m", "mm", "nm" or "pm") is that of displacement columns whose
+    names contain none.
 
-    Parameters
-    ----------
-    path : path
-        Text file with a line of column names above the numbers, separated by comma, semicolon or tab; with semicolon
-        or tab, decimal commas are allowed. Or a MATLAB file (``.mat``, up to version 7), whose numeric vectors are the
-        columns.
-    time : str, optional
-        Time column; by default ``time_s``, else the first column with a unit whose name begins with "time" or is
-        ``t``, else the first column whose name begins with "time".
-    voltage : sequence of str
-        Voltage columns, one for all axes or one for each displacement column; by default those whose names begin with
-        "voltage" or contain a unit of voltage.
-    displacement : sequence of str
-        Displacement columns, one for each axis; by default those whose names begin with "displacement", else with
-        "position", else ``<axis>_m`` (or another unit) if there is ``<axis>_V``, else x, y and z with a unit.
-    displacement_unit : {"um", "m", "mm", "nm", "pm"}, optional
-        Unit of displacement columns whose names contain none; by default "um".
-    axes : sequence of str
-        Names of the axes; by default taken from the names of the displacement columns, ``x`` if they contain none.
+    The default of `time` is ``time_s``, else the first column with a unit whose name begins with "time" or is ``t``,
+    else the first column whose name begins with "time". `voltage` is one column for all axes or one for each
+    displacement column, by default those whose names begin with "voltage" or contain a unit of voltage. `displacement`
+    is one column for each axis, by default those whose names begin with "displacement", else with "position", else
+    ``<axis>_m`` (or another unit) if there is ``<axis>_V``, else x, y and z with a unit. `axes` are by default taken
+    from the names of the displacement columns, ``x`` if they contain none.
 
-    Returns
-    -------
-    Record
-        Record in volts and metres. Empty cells and ``nan`` become NaN. If the first time is negative, all times are
-        shifted such that the record begins at 0.
-
-    Raises
-    ------
-    RecordError
-        If the file, a column, its unit or a value is invalid.
-    UsageError
-        If an option is invalid, contradicts the name of a column, or gives one column two roles.
+    Empty cells and ``nan`` become NaN. If the first time is negative, all times are shifted such that the record begins
+    at 0. RecordError if the file, a column, its unit or a value is invalid; UsageError if an option is invalid,
+    contradicts the name of a column, or gives one column two roles.
     """
     options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
     return import_with_summary(path, options)[0]
 
 
 def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) -> tuple[Record, tuple[str, ...]]:
-    """Import a table as `import_table` does, with a summary of the columns.
+    """Import a table as `import_table` does, with a summary of the columns; `options` are its other parameters.
 
-    Parameters
-    ----------
-    path : path
-        As for `import_table`.
-    options : ColumnOptions
-        The other parameters of `import_table`.
-
-    Returns
-    -------
-    record : Record
-        Record in volts and metres.
-    lines : tuple of str
-        One line for each axis with columns, units and ranges; preceded by a line on time if its unit was assumed.
+    The summary is one line for each axis with columns, units and ranges, preceded by a line on time if its unit was
+    assumed.
     """
     path = Path(path)
     table = load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
@@ -125,26 +96,11 @@ def _column_summary(column: Column, values: FloatArray, unit: str) -> str:
 
 
 def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Read a table of the command line, in which every value must be finite.
+    """Read times (s) and finite values (V or m) by axis, shape (N,) each, from a table of the command line.
 
-    Parameters
-    ----------
-    path : path
-        Table with the columns ``time_s`` and ``<axis>_<suffix>`` in any order; other columns are ignored.
-    suffix : {"V", "m"}
-        Unit of the wanted columns.
-
-    Returns
-    -------
-    t : ndarray, shape (N,), seconds
-        Non-decreasing times.
-    values : dict of axis name to ndarray, shape (N,), volts or metres
-        In the order of the columns.
-
-    Raises
-    ------
-    RecordError
-        If a value is missing or not finite, or time runs backwards; the message names line, column and value.
+    The table has the columns ``time_s`` and ``<axis>_<suffix>`` in any order, with the unit "V" or "m" as `suffix`;
+    other columns are ignored, and the axes are in the order of the columns. RecordError if a value is missing or not
+    finite, or time runs backwards; the message names line, column and value.
     """
     table = load_csv(Path(path))
     ending = _ending(suffix)
@@ -169,23 +125,9 @@ def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, d
 def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[str, FloatArray], suffix: str) -> None:
     """Write a table that ``read_table`` reads back: time to the nanosecond, values to the last bit.
 
-    The file is written atomically; an existing file is replaced.
-
-    Parameters
-    ----------
-    path : path
-        File to write.
-    t : ndarray, shape (N,), seconds
-        Time.
-    columns : mapping of axis name to ndarray, shape (N,), volts or metres
-        One column for each axis.
-    suffix : {"V", "m"}
-        Unit of the columns.
-
-    Raises
-    ------
-    RecordError
-        If the lengths differ or the file cannot be written.
+    The times `t` (s) and the column of each axis (V or m) have the shape (N,); the unit "V" or "m" is the `suffix`. The
+    file is written atomically; an existing file is replaced. RecordError if the lengths differ or the file cannot be
+    written.
     """
     path = Path(path)
     for axis, values in columns.items():

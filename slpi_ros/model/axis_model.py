@@ -181,6 +181,13 @@ class AxisModel:
             turns = tuple(turns[i] for first in loops for i in (first, first + 1)) + turns[len(turns) // 2 * 2 :]
         return Start(state.voltage, state.displacement, turns or (state.voltage,), from_rest)
 
+    def at_rest(self, u: FloatArray, v: float, start_memory: StartMemory = "start") -> Start:
+        """Return the state after voltages `u`, as of `after`, and a rest at the applied voltage `v` (V).
+
+        The voltage that reaches the hysteresis follows the applied one late; at rest the two are equal.
+        """
+        return self.after(np.append(u, np.clip(v, *self.chain.clipped)), start_memory)
+
     def stream(self, limits: Limits | None = None, start_memory: StartMemory = "end") -> StreamingInverse:
         """Return a streaming inverse within `limits` and the identified voltage range, from `initial(start_memory)`."""
         return self.stream_from(self.memory(start_memory), self._allowed(limits))

@@ -77,8 +77,8 @@ def _update(document: dict[str, Any], source: str) -> None:
                 continue
             if name == "rate_dependence" and "exponent" in given:
                 raise ModelError(
-                    f"{source}: axis {axis[:40]!r}: rate_dependence has a retired form (a power of the rate); diagnose "
-                    "again from its bags with slpi diagnose"
+                    f"{source}: axis {axis[:40]!r}: rate_dependence has a retired form (a power of the rate); identify "
+                    "and diagnose again from its bags"
                 )
             if name in LISTS and "gain" not in given:
                 key, unsaid = LISTS[name]

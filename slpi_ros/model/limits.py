@@ -16,13 +16,7 @@ PERIOD = 1e-3
 class Limits:
     """Limits of voltage, slew rate and acceleration of an axis; UsageError if lower > upper or a rate is not positive.
 
-    Parameters
-    ----------
-    lower, upper : float, volts
-    slew : float, V/s
-        Maximum rate of change; inf (default): no limit.
-    acceleration : float, V/s^2
-        Maximum change of the rate; inf (default): no limit.
+    They are in V, V/s and V/s^2; inf for `slew` or `acceleration`: no limit.
     """
 
     lower: float
@@ -61,14 +55,8 @@ class RateLimiter:
 
     All times `now_ns` are nanoseconds on the steady clock, never ROS time and never stamps.
 
-    Parameters
-    ----------
-    limits : Limits
-        May be replaced at any time, see `change`.
-    period : float, seconds
-        Output period; default 1 ms.
-    voltage : float, volts
-        Last output, or the voltage found at the amplifier; default 0. The rate of the last step is `rate` (V/s).
+    The `limits` may be replaced at any time, see `change`; `period` is the output period (s). `voltage` (V) is the last
+    output, or the voltage found at the amplifier, and `rate` (V/s) the rate of the last step.
     """
 
     __slots__ = ("_changed_ns", "_goal", "_limits", "_pending", "period", "rate", "voltage")

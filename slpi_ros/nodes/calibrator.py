@@ -125,13 +125,7 @@ class _Job:
 
 
 def settings_of(values: Values) -> CalibrationSettings:
-    """Return the settings of a calibration from the parameters of the node.
-
-    Raises
-    ------
-    UsageError
-        If a value is not valid.
-    """
+    """Return the settings of a calibration from the parameters of the node; UsageError if a value is not valid."""
     checked, axes = validated(DECLARATIONS, values), tuple(values["axes"])
     if not checked["output"]:
         raise UsageError("calibrator: no output; name the folder with --ros-args -p output:=FOLDER")
@@ -212,13 +206,7 @@ class Calibrator(Node):
         self.create_timer(REPORT_PERIOD, self._report, clock=self._steady)
 
     def destroy_node(self) -> None:
-        """Return to rest, keep what was recorded, then destroy the node.
-
-        Raises
-        ------
-        Interrupted
-            If the calibration was ended by a signal.
-        """
+        """Return to rest, keep what was recorded, then destroy the node; Interrupted if a signal ended the run."""
         ended = self._outcome is not None or self._failure is not None
         if self._worker is not None:
             self._worker.end()

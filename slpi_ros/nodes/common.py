@@ -54,12 +54,7 @@ def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
 class DeferredService:
     """Trigger service with a deferred response that does not block the executor.
 
-    Parameters
-    ----------
-    node : Node
-    name : str
-    start : callable
-        Starts the requested action; returns the reason if this is not possible, else "".
+    `start` starts the requested action, and returns the reason if this is not possible, else "".
     """
 
     def __init__(self, node: Node, name: str, start: Callable[[], str]) -> None:
@@ -140,16 +135,8 @@ ERROR: bytes = DiagnosticStatus.ERROR
 class Health:
     """Diagnostic status of a node.
 
-    Parameters
-    ----------
-    problems : sequence of (level, str)
-        Problems with their levels, in any order; empty if there are none.
-    summary : str
-        Message if there are no problems.
-    values : mapping of str to object
-        Counters and states, shown as text.
-    hardware_id : str
-        Hardware id of the stage; "" (default) if unknown.
+    `problems` are (level, text), in any order; `summary` is the message if there are none. `values` are counters and
+    states, shown as text; `hardware_id` is "" if unknown.
     """
 
     problems: tuple[tuple[bytes, str], ...]
@@ -225,34 +212,18 @@ _stop = Stop()
 def request_stop(failure: SlpiError | None = None) -> None:
     """Stop the node that ``run`` is spinning; for use in callbacks.
 
-    An exception raised out of a callback would make the events executor print a traceback.
-
-    Parameters
-    ----------
-    failure : SlpiError, optional
-        Error that causes the stop: ``run`` prints its message and returns its exit code.
+    An exception raised out of a callback would make the events executor print a traceback. If `failure` causes the
+    stop, ``run`` prints its message and returns its exit code.
     """
     _stop.requested = True
     _stop.failure = _stop.failure or failure
 
 
 def make_executor(kind: str) -> Executor:
-    """Return a new executor.
+    """Return a new executor of the `kind` "events" or "default"; UsageError for another value.
 
-    Parameters
-    ----------
-    kind : {"events", "default"}
-        The events executor needs much less processor time; if rclpy lacks it, the default executor is returned.
-
-    Returns
-    -------
-    rclpy.executors.Executor
-        Call only its ``spin_once``, with a timeout: its ``spin`` may miss SIGINT and SIGTERM.
-
-    Raises
-    ------
-    UsageError
-        If `kind` has another value.
+    The events executor needs much less processor time; if rclpy lacks it, the default executor is returned. Call only
+    its ``spin_once``, with a timeout: its ``spin`` may miss SIGINT and SIGTERM.
     """
     if kind not in ("events", "default"):
         raise UsageError(f"no executor '{kind}'; choose events or default")
@@ -268,19 +239,9 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
     """Create a node, spin it until a signal or ``request_stop``, and shut it down cleanly.
 
     The ROS context stays valid until the node's ``destroy_node`` has returned, so that the node may still publish in
-    that method.
-
-    Parameters
-    ----------
-    make_node : callable
-        Creates the node; if it raises a SlpiError, the message is printed and the exit code of the error returned.
-    executor : {"events", "default"}
-        Executor that spins the node; a node with an attribute `executor_kind` chooses its executor itself.
-
-    Returns
-    -------
-    int
-        Exit code of the process: 0 after a signal, a shutdown of ROS or a stop without an error.
+    that method. Return the exit code of the process: 0 after a signal, a shutdown of ROS or a stop without an error. If
+    `make_node` raises a SlpiError, the message is printed and the exit code of the error returned. `executor` is as in
+    `make_executor`; a node with an attribute `executor_kind` chooses its executor itself.
     """
     global _stop
     _stop = start.of_process or Stop()

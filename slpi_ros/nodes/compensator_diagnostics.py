@@ -19,28 +19,12 @@ Problem = tuple[bool, bytes, str]
 class Reporter:
     """Collect and publish the diagnostics of the compensator.
 
-    Parameters
-    ----------
-    node : Node
-    controller : Controller
-
-    Attributes
-    ----------
-    finalized : bool
-        Whether the node has been shut down.
-    timing : Timing
-        Latency of messages.
-    lateness : Timing
-        Deadline error of trajectory points.
-    last_rejection, model_error : str
-        Reason for the last rejected message and model; `model_error` is "" after a newer model was accepted.
-    models_refused : int
-    model_id : str
-        Fingerprint of the model in use.
-    lost, worked_off, largest_backlog : int
-        Messages that the middleware has lost; messages of a backlog that were answered in one go, and the most of them.
-    age : float or None, seconds
-        Age of the last answered command by its stamp; None without a stamp.
+    `finalized` tells whether the node has been shut down. `timing` is the latency of messages, `lateness` the deadline
+    error of trajectory points. `last_rejection` and `model_error` are the reasons for the last rejected message and
+    model; `model_error` is "" after a newer model was accepted. `model_id` is the fingerprint of the model in use.
+    `lost` counts the messages that the middleware has lost, `worked_off` those of a backlog that were answered in one
+    go, and `largest_backlog` is the most of them; `age` (s) is that of the last answered command by its stamp, None
+    without a stamp.
     """
 
     def __init__(self, node: Node, controller: Controller) -> None:

@@ -186,24 +186,11 @@ DECLARATIONS = (
 
 @dataclass(frozen=True)
 class CompensatorSettings:
-    """Validated settings of the compensator.
+    """Validated settings of the compensator; tuples hold one value for each axis.
 
-    Parameters
-    ----------
-    values : mapping of str to object
-        All parameters by name, validated; a parameter that may differ between axes is a tuple, one value per axis.
-    limits : tuple of Limits
-        One for each axis.
-    starts : tuple of str or float
-        Start voltage of each axis.
-    reset_spans : tuple of (float, float), volts
-        Lowest and highest voltage of the reset of each axis.
-    period : float, seconds
-        Output period.
-    time : TimestampRules
-    safety : Safety
-    loops : tuple of LoopSettings
-        One for each axis.
+    `values` holds all parameters by name, validated; a parameter that may differ between axes is a tuple. `starts` are
+    the start voltages, `reset_spans` the lowest and highest voltage (V) of the reset, and `period` is the output period
+    (s).
     """
 
     values: Mapping[str, Any]
@@ -219,10 +206,7 @@ class CompensatorSettings:
     def of(cls, given: Values) -> "CompensatorSettings":
         """Return the settings from a mapping of parameter names to values.
 
-        Raises
-        ------
-        UsageError
-            If a value, or a combination of values, is not valid.
+        UsageError if a value, or a combination of values, is not valid.
         """
         axes, values = given["axes"], validated(DECLARATIONS, given)
         if values["desired_type"] == "Float64" and len(axes) > 1:

@@ -76,16 +76,9 @@ DECLARATIONS = (
 
 @dataclass(frozen=True)
 class ExciterSettings:
-    """Validated settings of the exciter.
+    """Validated settings of the exciter: all parameters by name (`values`), and the limits of each axis.
 
-    Parameters
-    ----------
-    values : mapping of str to object
-        All parameters by name.
-    limits : tuple of Limits
-        Limits of each axis.
-    rest : list of float or None, volts
-        Voltage of each axis before and after the excitation; None: as reported by ``stage_state``.
+    `rest` is the voltage (V) of each axis before and after the excitation; None: as reported by ``stage_state``.
     """
 
     values: Values
@@ -96,10 +89,7 @@ class ExciterSettings:
     def of(cls, given: Values) -> "ExciterSettings":
         """Return the settings from a mapping of parameter names to values.
 
-        Raises
-        ------
-        UsageError
-            If a value is not valid, or the values do not allow an excitation.
+        UsageError if a value is not valid, or the values do not allow an excitation.
         """
         values, axes = validated(DECLARATIONS, given), given["axes"]
         low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
@@ -118,10 +108,7 @@ class ExciterSettings:
     def drawn(self, found: Sequence[float]) -> Drive:
         """Return the excitation, from and to rest: `rest`, or the voltages (V) at which the amplifier was found.
 
-        Raises
-        ------
-        UsageError
-            If the settings do not allow an excitation.
+        UsageError if the settings do not allow an excitation.
         """
         rest = self.rest or [limits.clip(v) for limits, v in zip(self.limits, found, strict=True)]
         given = {name: self.values[name] for name in ("axes", "duration", "rate", "seed", "drive")}

@@ -33,19 +33,8 @@ DEPTH = 1000
 def probe(state_topic: str, command_topic: str, namespace: str, seconds: float) -> Graph:
     """Watch a running graph for some seconds, without publishing anything.
 
-    Parameters
-    ----------
-    state_topic, command_topic : str
-        Topics of the stage state and of the voltages, relative to `namespace`.
-    namespace : str
-        Namespace of the stage; "" : the root.
-    seconds : float
-        Time for which the state is received.
-
-    Raises
-    ------
-    UsageError
-        If ROS refuses the names.
+    `state_topic` and `command_topic` are those of the stage state and of the voltages, relative to `namespace`, "" for
+    the root; the state is received for `seconds`. UsageError if ROS refuses the names.
     """
     context = Context()
     try:

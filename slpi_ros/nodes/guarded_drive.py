@@ -32,31 +32,10 @@ class GuardedDrive:
     """Drive a stage within its limits, alone, from where it is, and only while it does what it is told.
 
     Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock.
-
-    Parameters
-    ----------
-    node : Node
-        Its name begins the messages of errors.
-    axes : sequence of str
-        In the order of the voltages.
-    limits : sequence of Limits
-    rate : float, hertz
-        Rate at which `move` is called.
-    timeout : float, seconds
-        Longest time without a valid state during a drive.
-    on_state : callable, optional
-        Called with each serialized state and its time on the clock of the node.
-    publisher : rclpy publisher, optional
-        Publisher of the voltages; default: a new one of ``voltage_command``.
-
-    Attributes
-    ----------
-    publisher : rclpy publisher
-    watch : DriveWatch
-    reported : list of float or None
-        Voltages of the last valid state, volts.
-    hardware_id : str
-        Of the last valid state.
+    Sequences are in the order of the voltages. The name of `node` begins the messages of errors; `rate` (Hz) is that at
+    which `move` is called, and `timeout` (s) the longest time without a valid state during a drive. `on_state` is
+    called with each serialized state and its time on the clock of the node; `publisher` is a new one of
+    ``voltage_command`` by default. `reported` (V) and `hardware_id` are those of the last valid state.
     """
 
     def __init__(
@@ -147,10 +126,7 @@ class GuardedDrive:
     def start(self, voltages: Sequence[float]) -> None:
         """Start from voltages (V) at which the amplifier is.
 
-        Raises
-        ------
-        RecordError
-            If one is outside the limits by more than `TOLERATED_SHARE` of the range.
+        RecordError if one is outside the limits by more than `TOLERATED_SHARE` of the range.
         """
         for axis, limits, v in zip(self._axes, self._limits, voltages, strict=True):
             slack = TOLERATED_SHARE * (limits.upper - limits.lower)

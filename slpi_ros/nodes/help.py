@@ -21,14 +21,7 @@ WIDEST = 110
 def help_asked(name: str, node: type[Node], declarations: Sequence[Declaration]) -> bool:
     """Print the help of a node program if the command line asks for it; return whether it does.
 
-    Parameters
-    ----------
-    name : str
-        Name of the program.
-    node : type
-        Class of the node; its docstring says what it does.
-    declarations : sequence of Declaration
-        Its parameters.
+    The docstring of `node`, the class of the node, says what it does.
     """
     if not {"-h", "--help"} & set(sys.argv[1:]):
         return False

@@ -17,25 +17,12 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Declaration:
-    """Declaration of one node parameter.
+    """Declaration of one node parameter, whose type is that of its default value.
 
-    Parameters
-    ----------
-    name : str
-    default : object
-        Default value; its type is the parameter's type.
-    description : str
-        Text shown by ``ros2 param describe``.
-    read_only : bool
-        Whether the value can only be set at the start of the node; default False.
-    between : (float, float), optional
-        Smallest and largest value of a number; default: any value.
-    number : bool
-        Whether a double may also be given as an integer or as one value for each axis. Not for integer parameters.
-    each_axis : bool
-        Whether each axis may have its own value.
-    choices : tuple of str
-        Allowed values of a string; empty (default): any.
+    `description` is shown by ``ros2 param describe``. A `read_only` value can only be set at the start of the node.
+    `between` are the smallest and largest value of a number, by default any; `choices` are the allowed values of a
+    string, if empty any. With `number`, a double may also be given as an integer or as one value for each axis; this is
+    not for integer parameters. With `each_axis`, each axis may have its own value.
     """
 
     name: str
@@ -50,12 +37,8 @@ class Declaration:
     def read(self, values: Values, axes: Sequence[str]) -> Any:
         """Return the validated value from `values`: a tuple with one value per axis if `each_axis`.
 
-        None stands for NaN, if that is the default: it depends on other parameters.
-
-        Raises
-        ------
-        UsageError
-            If the value is not valid; the message names the parameter and the allowed values.
+        None stands for NaN, if that is the default: it depends on other parameters. UsageError if the value is not
+        valid; the message names the parameter and the allowed values.
         """
         given = values[self.name]
         if self._is_nan(given) and self._is_nan(self.default):
@@ -93,10 +76,7 @@ class Declaration:
 def validated(declarations: Sequence[Declaration], values: Values) -> dict[str, Any]:
     """Return all parameters by name, each validated.
 
-    Raises
-    ------
-    UsageError
-        If a value is not valid, or the parameter ``axes`` is empty or holds a name twice.
+    UsageError if a value is not valid, or the parameter ``axes`` is empty or holds a name twice.
     """
     # An empty list is given as None.
     axes = values.get("axes") or ()
@@ -108,17 +88,8 @@ def validated(declarations: Sequence[Declaration], values: Values) -> dict[str, 
 class Parameters(Generic[Settings]):
     """Node parameters and the settings derived from them, changed atomically.
 
-    Parameters
-    ----------
-    node : Node
-    declarations : sequence of Declaration
-    make : callable
-        Returns the settings from a mapping of names to values; raises SlpiError if they are not valid.
-
-    Raises
-    ------
-    UsageError
-        If the initial values are not valid.
+    `make` returns the settings from a mapping of names to values, and raises SlpiError if they are not valid.
+    UsageError if the initial values are not valid.
     """
 
     def __init__(self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]) -> None:
@@ -156,23 +127,14 @@ class Parameters(Generic[Settings]):
 
 
 def number(values: Values, name: str, low: float, high: float) -> float:
-    """Return the parameter `name` as a float.
-
-    Raises
-    ------
-    UsageError
-        If it is not one finite number from `low` to `high`.
-    """
+    """Return the parameter `name` as a float; UsageError if it is not one finite number from `low` to `high`."""
     return numbers(values, name, ("",), low, high)[0]
 
 
 def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: float) -> list[float]:
     """Return the parameter `name` as floats, one for each axis; a single value applies to all axes.
 
-    Raises
-    ------
-    UsageError
-        If not all are finite numbers from `low` to `high`, or there is not one for each axis.
+    UsageError if not all are finite numbers from `low` to `high`, or there is not one for each axis.
     """
     given = values[name]
     if isinstance(given, Sequence) and not isinstance(given, str):

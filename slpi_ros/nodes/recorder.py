@@ -75,13 +75,7 @@ class Recorder(Node):
         self.get_logger().info(f"recording {', '.join(self._awaited)} into {output}")
 
     def destroy_node(self) -> None:
-        """Complete the bag, then destroy the node.
-
-        Raises
-        ------
-        RecordError
-            If nothing was recorded, or the bag cannot be completed.
-        """
+        """Complete the bag, then destroy the node; RecordError if it is empty or cannot be completed."""
         try:
             self._finish()
         finally:

@@ -22,16 +22,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
-    """Stop request for the running node, with its reason.
-
-    Attributes
-    ----------
-    requested : bool
-    signals : int
-        Number of signals received.
-    failure : SlpiError or None
-        Error that is the reason.
-    """
+    """Stop request for the running node, with the number of received signals and the error that is the reason."""
 
     def __init__(self) -> None:
         self.requested, self.signals = False, 0

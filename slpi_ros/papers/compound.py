@@ -59,15 +59,9 @@ PID = "PID"
 
 @dataclass(frozen=True)
 class Outcome:
-    """Desired, measured and true displacement along a path.
+    """Desired, measured and true displacement (m) along a path, shape (N,) each.
 
-    Parameters
-    ----------
-    desired : ndarray, shape (N,), metres
-    measured : ndarray, shape (N,), metres
-        Sensor readings.
-    displacement : ndarray, shape (N,), metres
-        True displacement, without sensor errors.
+    `measured` are the sensor readings, `displacement` is the true one, without sensor errors.
     """
 
     desired: FloatArray
@@ -106,18 +100,11 @@ class Outcome:
 
 @dataclass(frozen=True)
 class AxisStudy:
-    """Results of the experiments on one axis.
+    """Results of the experiments on one axis, by model.
 
-    Parameters
-    ----------
-    gains : PidGains
-        Controller gains.
-    feedforward : mapping of model to Outcome
-        Feedforward alone, Fig. 11.
-    compound : mapping of (model or "", whether with PID) to Outcome
-        Segments of Table 6, Fig. 13; "" is no feedforward.
-    rested : mapping of model to Outcome
-        The same with PID, with a rest at 0 V between warm-up and zeroing of the sensor.
+    `feedforward` is without feedback, Fig. 11. `compound` are the segments of Table 6, Fig. 13, by model, "" for no
+    feedforward, and by whether with PID. `rested` is the same with PID, with a rest at 0 V between warm-up and zeroing
+    of the sensor. `gains` are those of the controller.
     """
 
     gains: PidGains
@@ -169,12 +156,8 @@ def tune(stage: StageParameters, gain: float) -> PidGains:
     ``K_i = 2 z w / g``, or proportional action alone of ``K_p = 2 z / g``. With one third of the former and one tenth
     of the latter it is below 0.35 for any phase, so for any lag and delay. Derivative action would increase it.
 
-    Parameters
-    ----------
-    stage : StageParameters
-        Only the frequency and damping of the mode are used, which could be measured by a ring-down test.
-    gain : float, metres per volt
-        Static gain ``g``.
+    Of `stage`, only the frequency and damping of the mode are used, which could be measured by a ring-down test; `gain`
+    is ``g`` (m/V).
     """
     omega, double_damping = 2.0 * math.pi * stage.resonance_frequency, 2.0 * stage.resonance_damping
     return PidGains(PROPORTIONAL_SHARE * double_damping / gain, INTEGRAL_SHARE * double_damping * omega / gain)
@@ -192,18 +175,9 @@ def follow(
 
     A voltage is reached one sample after its command. The path is known, so the feedforward is one sample ahead.
 
-    Parameters
-    ----------
-    axis : PreisachStage
-    desired : ndarray, shape (N,), metres
-        Desired displacement, starting at 0.
-    feedforward : ndarray, shape (N,), volts
-    gains : PidGains or None
-        Controller gains; None for no feedback.
-    warm_up : float, volts
-        Amplitude of the warm-up cycles.
-    rest : float, seconds
-        Time at 0 V between warm-up and zeroing of the sensor.
+    `desired` (m), starting at 0, and `feedforward` (V) have the shape (N,). `gains` is None for no feedback, `warm_up`
+    is the amplitude (V) of the warm-up cycles, and `rest` the time (s) at 0 V between warm-up and zeroing of the
+    sensor.
     """
     axis.rest()
     v = np.append(triangles(warm_up, 1.0, WARM_UP, round(RATE))[1], np.zeros(1 + round(rest * RATE)))

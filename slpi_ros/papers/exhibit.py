@@ -30,18 +30,8 @@ class Picture:
 class Exhibit:
     """Comparison of a result of a paper with the reproduced one; a section of the page.
 
-    Parameters
-    ----------
-    title : str
-        Figure or table of the paper.
-    paper : str
-        Result of the paper, in words or numbers.
-    ours : str
-        Reproduced result.
-    remark : str
-        Explanation of differences.
-    tables : tuple of Table
-    pictures : tuple of Picture
+    `title` is the figure or table of the paper, `paper` its result in words or numbers, `ours` the reproduced result,
+    and `remark` explains the differences.
     """
 
     title: str

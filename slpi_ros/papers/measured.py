@@ -19,16 +19,9 @@ from slpi_ros.papers.exhibit import Exhibit, Table
 
 @dataclass(frozen=True)
 class Case:
-    """The parts of a record that are fitted and predicted.
+    """The parts of the record ``<name>.csv`` that are fitted and predicted, the latter by name.
 
-    Parameters
-    ----------
-    name : str
-        The record is the file ``<name>.csv``.
-    fitted : (float, float), seconds
-        Start and end of the fitted part; values up to 1 are shares of the record.
-    predicted : mapping of str to (float, float), seconds
-        Start and end of each predicted part, by name; values up to 1 are shares of the record.
+    Each part is its start and its end (s); values up to 1 are shares of the record.
     """
 
     name: str
@@ -64,10 +57,7 @@ class Scores:
 def score(folder: Path, case: Case, kind: str) -> Scores:
     """Fit a kind of model to one part of a record and predict the others, free-run from the record's start.
 
-    Raises
-    ------
-    SlpiError
-        If the record cannot be read.
+    SlpiError if the record cannot be read.
     """
     record = import_table(folder / f"{case.name}.csv")
     end = float(record.t[-1]) + 1e-9

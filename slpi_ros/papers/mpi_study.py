@@ -70,14 +70,7 @@ ONE_MPI, OWN_MPI, SCALED_MPI = "MPI of 120 V", "MPI of each amplitude", "and of 
 
 @dataclass(frozen=True)
 class Drive:
-    """Drive with equal triangles from rest, and the sensor readings.
-
-    Parameters
-    ----------
-    t : ndarray, shape (N,), seconds
-    v : ndarray, shape (N,), volts
-    y : ndarray, shape (N,), metres
-    """
+    """Drive with equal triangles from rest: times (s), voltages (V) and sensor readings `y` (m), shape (N,) each."""
 
     t: FloatArray
     v: FloatArray
@@ -115,15 +108,9 @@ class Drive:
 
 @dataclass(frozen=True)
 class CycleFit:
-    """A model fitted to the settled cycle of a drive.
+    """A model fitted to the settled cycle of a drive; `simulated` (m), shape (n,), is its displacement on this cycle.
 
-    Parameters
-    ----------
-    model : AxisModel
-    simulated : ndarray, shape (n,), metres
-        Displacement of the model on the fitted cycle.
-    fitted, following : ErrorMetrics
-        Errors on the fitted cycle, and on the next one.
+    `fitted` and `following` are the errors on the fitted cycle, and on the next one.
     """
 
     model: AxisModel
@@ -142,17 +129,10 @@ class ScaledFit:
 
 @dataclass(frozen=True)
 class VariablePath:
-    """The path of Fig. 8.
+    """The path of Fig. 8: times (s) and sensor readings `y` (m), shape (N,) each.
 
-    Parameters
-    ----------
-    t : ndarray, shape (N,), seconds
-    y : ndarray, shape (N,), metres
-        Sensor readings.
-    parts : tuple of slice
-        The samples of each amplitude and frequency, as in `VARIABLE`.
-    models : mapping of name to ndarray, shape (N,), metres
-        Displacements of the models, with an offset such that the mean error in the first part is 0.
+    `parts` are the samples of each amplitude and frequency, as in `VARIABLE`. `models` are the displacements (m) by
+    name of the model, shape (N,), with an offset such that the mean error in the first part is 0.
     """
 
     t: FloatArray
@@ -165,17 +145,10 @@ class VariablePath:
 class Study:
     """All measurements and fits.
 
-    Parameters
-    ----------
-    drives : mapping of (amplitude (V), frequency (Hz)) to Drive
-    peaks : mapping of amplitude (V) to PeakFrequency
-        Eq. 1, fitted to the peaks of the first cycles.
-    ringing : mapping of frequency (Hz) to float, metres
-        Largest displacement due to the flexure mode, at the highest amplitude.
-    fits : mapping of kind's name to mapping of amplitude (V) to CycleFit
-        Fits at the highest frequency.
-    scaled : mapping of amplitude (V) to ScaledFit
-    variable : VariablePath
+    `drives` are by amplitude (V) and frequency (Hz). `peaks` is Eq. 1, fitted to the peaks of the first cycles, by
+    amplitude (V). `ringing` is the largest displacement (m) due to the flexure mode, at the highest amplitude, by
+    frequency (Hz). `fits`, at the highest frequency, are by name of the kind and amplitude (V), `scaled` by amplitude
+    (V).
     """
 
     drives: Mapping[tuple[float, float], Drive]
@@ -200,15 +173,8 @@ def run_study(
 ) -> Study:
     """Measure an axis and fit the models.
 
-    Parameters
-    ----------
-    axis : PreisachStage
-    amplitudes : sequence of float, volts
-        In ascending order; the SMPI model is scaled from the last one.
-    frequencies : sequence of float, hertz
-        In ascending order.
-    samples : int
-        Samples per cycle, an even number.
+    `amplitudes` (V) and `frequencies` (Hz) are in ascending order; the SMPI model is scaled from the last amplitude.
+    `samples` is the even number of samples per cycle.
     """
     drives = {(a, f): _drive(axis, a, f, samples) for f in frequencies for a in amplitudes}
     fastest = {a: drives[a, frequencies[-1]] for a in amplitudes}
@@ -227,20 +193,9 @@ def run_study(
 
 
 def triangles(amplitude: float, frequency: float, cycles: int, samples: int = 2000) -> tuple[FloatArray, FloatArray]:
-    """Return a triangle wave from 0 to `amplitude` and back.
+    """Return times (s) and a triangle wave from 0 to `amplitude` (V or m) and back, shape (cycles * samples,) each.
 
-    Parameters
-    ----------
-    amplitude : float, volts or metres
-    frequency : float, hertz
-    cycles : int
-    samples : int
-        Samples per cycle, an even number.
-
-    Returns
-    -------
-    t : ndarray, shape (cycles * samples,), seconds
-    x : ndarray, shape (cycles * samples,), in the unit of `amplitude`
+    `frequency` is in hertz; `samples` is the even number of samples per cycle.
     """
     k = np.arange(cycles * samples)
     phase = (k % samples) / samples

@@ -21,17 +21,8 @@ COLUMNS = "k,voltage_V,displacement_m,tr,lv,sp"
 def write_experiments(folder: Path, data: Path | None) -> Path:
     """Run all experiments, write ``index.html`` and ``separation.csv`` into `folder`, and return the page's path.
 
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    data : Path or None
-        Folder of measured records.
-
-    Raises
-    ------
-    SlpiError
-        If a file cannot be read or written.
+    The folder is created if it does not exist; `data` is the folder of measured records, or None. SlpiError if a file
+    cannot be read or written.
     """
     make_folder(folder)
     random = study(RANDOM_PATH)

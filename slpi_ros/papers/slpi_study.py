@@ -61,13 +61,9 @@ Drive = Memory | KnownPath
 
 @dataclass(frozen=True)
 class LoopErrors:
-    """Errors of one model along a path, metres.
+    """Errors (m) of one model along a path, shape (N,).
 
-    Parameters
-    ----------
-    error : ndarray, shape (N,)
-    means, maxima : tuple of float
-        Mean and largest absolute error on each loop, the outer one first.
+    `means` and `maxima` are the mean and largest absolute error (m) on each loop, the outer one first.
     """
 
     error: FloatArray
@@ -97,29 +93,15 @@ class LoopErrors:
 
 @dataclass(frozen=True)
 class Study:
-    """One path on the stage, and the errors of the models along it.
+    """One path on the stage with the reversals `turns` (V), and the errors of the models along it, by model name.
 
-    Parameters
-    ----------
-    turns : tuple of float, volts
-        Reversals of the path.
-    separation : Separation
-        Voltage and displacement, separated into loops.
-    classical : PrandtlIshlinskii
-    at_rest, closing : SeparatedLoops
-        Published model with play operators that start at rest in every loop, and primed, so that loops close.
-    modelled : dict of model name to LoopErrors
-        Model - measured.
-    compensated : dict of model name to LoopErrors
-        Achieved - desired displacement; the desired one consists of straight lines between the measured reversals.
-    straight : dict of model name to LoopErrors
-        The same for a desired displacement proportional to the voltage (section 4.1 of the SLPI paper).
-    desired : ndarray, shape (N,), metres
-        Desired displacement of `compensated`.
-    voltages : dict of model name to ndarray, shape (N,), volts
-        Voltages of `compensated`.
-    drives : dict of model name to callable
-        Function that makes the model anew in its initial state.
+    `separation` is voltage and displacement, separated into loops. `at_rest` and `closing` are the published model with
+    play operators that start at rest in every loop, and primed, so that loops close.
+
+    `modelled` is model - measured. `compensated` is achieved - desired displacement, for `desired` (m), shape (N,),
+    which consists of straight lines between the measured reversals, and `voltages` (V), shape (N,). `straight` is the
+    same for a desired displacement proportional to the voltage (section 4.1 of the SLPI paper). `drives` are functions
+    that make the model anew in its initial state.
     """
 
     turns: tuple[float, ...]
@@ -182,16 +164,10 @@ def study(turns: tuple[float, ...]) -> Study:
 
 @dataclass(frozen=True)
 class UnseenPaths:
-    """Errors of the models of one study along other paths.
+    """Errors of the models of one study along other paths with the reversals `turns` (V).
 
-    Parameters
-    ----------
-    turns : tuple of tuple of float, volts
-        Reversals of the paths.
-    mean_errors : dict of model name to tuple of float, metres
-        Mean absolute free-run error, model - stage, for each path.
-    loops, replaced : int
-        Number of inner loops of all paths, and number of those that were never identified.
+    `mean_errors` (m), by name of the model, are the mean absolute free-run errors, model - stage, of each path. `loops`
+    is the number of inner loops of all paths, and `replaced` the number of those that were never identified.
     """
 
     turns: tuple[tuple[float, ...], ...]
@@ -246,18 +222,9 @@ def classical_model(v: FloatArray, y: FloatArray) -> PrandtlIshlinskii:
 
 
 def ramps(turns: Sequence[float], step: float) -> FloatArray:
-    """Return straight ramps between reversals, with a sample every `step` and at every reversal.
+    """Return straight ramps between reversals, shape (N,), with a sample every `step` and at every reversal.
 
-    Parameters
-    ----------
-    turns : sequence of float
-        Reversals; successive values must differ.
-    step : float
-        Distance of the samples, in the unit of `turns`.
-
-    Returns
-    -------
-    ndarray, shape (N,)
+    `step` is in the unit of `turns`, the reversals, whose successive values must differ.
     """
     parts = [np.append(np.arange(a, b, step if b > a else -step)[1:], b) for a, b in pairwise(turns)]
     return np.concatenate([np.array([turns[0]], dtype=np.float64), *parts])

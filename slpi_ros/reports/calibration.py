@@ -18,16 +18,7 @@ TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
 def write_files(folder: Path, outcome: Outcome) -> None:
     """Write ``model.json``, ``report.html`` and the files of the last diagnosis into `folder`, each atomically.
 
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    outcome : Outcome, the result to be written
-
-    Raises
-    ------
-    SlpiError
-        If a file cannot be written.
+    The folder is created if it does not exist. SlpiError if a file cannot be written.
     """
     make_folder(folder)
     save_model(outcome.model, str(folder / MODEL))

@@ -50,17 +50,8 @@ def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
 
     Of NaN sequences at least as long as an interval, one NaN is kept, so that the line is interrupted.
 
-    Parameters
-    ----------
-    *signals : ndarray, shape (N,)
-        Signals with a common horizontal axis; NaN for missing values.
-    most : int
-        Approximate largest number of samples to be kept.
-
-    Returns
-    -------
-    ndarray of int, shape (K,)
-        Indices in increasing order.
+    The signals, shape (N,) each, have a common horizontal axis, and NaN for missing values. The indices, shape (K,)
+    with K up to about `most`, are in increasing order.
     """
     size = signals[0].size
     if size <= most:
@@ -100,16 +91,9 @@ def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArr
 
 @dataclass(frozen=True)
 class Quantity:
-    """Quantity, unit and number format of a panel axis.
+    """Quantity, unit and number format of a panel axis, as displayed.
 
-    Parameters
-    ----------
-    name, unit : str, as displayed
-    scale : float
-        Factor from SI to the displayed unit; 1 by default.
-    digits : str
-        Number format of values, as in d3-format.
-    logarithmic : bool, whether the axis is logarithmic
+    `scale` is the factor from SI to the displayed unit; `digits` is the number format of values, as in d3-format.
     """
 
     name: str
@@ -140,11 +124,7 @@ SAMPLES = Quantity("samples", "", digits=",d")
 class Panel:
     """One pair of axes.
 
-    Parameters
-    ----------
-    x, y : Quantity
-    share : float
-        Share of the width (in a row) or height (in a column), relative to the other panels.
+    `share` is that of the width (in a row) or height (in a column), relative to the other panels.
     """
 
     x: Quantity
@@ -156,14 +136,8 @@ class Panel:
 class Chart:
     """Panels in a row or a column with a common legend; a legend entry shows or hides its curves in all panels.
 
-    Parameters
-    ----------
-    panels : sequence of Panel
-    arrangement : {"row", "column"}
-        Panels in a row share the vertical axis, panels in a column the horizontal one, if they show the same quantity,
-        so that they zoom together.
-    height : int
-        Height of the chart, pixels.
+    Panels in a row share the vertical axis, panels in a column the horizontal one, if they show the same quantity, so
+    that they zoom together. `height` is that of the chart in pixels.
     """
 
     panels: Sequence[Panel]

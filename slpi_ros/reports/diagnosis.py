@@ -40,16 +40,7 @@ FILES = (_, _, PAGE) = "diagnosis.json", "extended_model.json", "report.html"
 def write_files(folder: Path, diagnosis: Diagnosis) -> None:
     """Write ``diagnosis.json``, ``extended_model.json`` and ``report.html`` into `folder`, each atomically.
 
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    diagnosis : Diagnosis, the result to be written
-
-    Raises
-    ------
-    SlpiError
-        If a file cannot be written, or a value is not finite.
+    The folder is created if it does not exist. SlpiError if a file cannot be written, or a value is not finite.
     """
     make_folder(folder, *FILES)
     try:

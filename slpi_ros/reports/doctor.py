@@ -29,14 +29,7 @@ FEWEST = 10
 
 @dataclass(frozen=True)
 class Check:
-    """One statement.
-
-    Parameters
-    ----------
-    level : {"ok", "note", "mend"}
-    text : str
-        What was found; for "mend" also what to do.
-    """
+    """One statement: `level` is "ok", "note" or "mend"; `text` is what was found, for "mend" also what to do."""
 
     level: str
     text: str
@@ -50,28 +43,14 @@ class Check:
 class Graph:
     """What was seen of a running ROS graph.
 
-    Parameters
-    ----------
-    state_topic, command_topic : str
-        Names of the topics after namespace and remapping.
-    seconds : float
-        Time for which the state was received.
-    nodes : sequence of str
-        All other nodes.
-    state_publishers, command_publishers, command_subscribers : mapping of str to str
-        Type of the topic by name of the node.
-    stamps, arrivals : ndarray, shape (N,), seconds
-        Stamps of the states, and the time of the node's clock at which they came.
-    axes : sequence of str
-        Axes of the last state.
-    displacement, voltage : mapping of axis name to float, metres, volts
-        Last state.
-    hardware_id : str
-        Of the last state.
-    limits : mapping of axis name to (float, float), volts
-        Limits of the node that publishes the voltages; empty if it does not tell.
-    model : StageModel, optional
-        Model on the topic ``stage_model``; None: none.
+    `state_topic` and `command_topic` are the names after namespace and remapping. `seconds` is the time for which the
+    state was received. `nodes` are all other nodes. `state_publishers` are the types of the topic by name of the node,
+    `command_publishers` and `command_subscribers` the names of the nodes.
+
+    `stamps` and `arrivals` (s), shape (N,), are the stamps of the states, and the time of the node's clock at which
+    they came. `axes`, `displacement` (m), `voltage` (V) and `hardware_id` are those of the last state. `limits` (V) are
+    those of the node that publishes the voltages, by axis; empty if it does not tell. `model` is that on the topic
+    ``stage_model``; None: none.
     """
 
     state_topic: str
@@ -135,11 +114,7 @@ def check_model(model: StageModel, limits: Range | None = None) -> list[Check]:
 def check_graph(graph: Graph, model: StageModel | None = None) -> list[Check]:
     """Check a running graph: discovery, the state of the stage, who commands, and whether the model fits the stage.
 
-    Parameters
-    ----------
-    graph : Graph
-    model : StageModel, optional
-        Model of the stage; default: that on ``stage_model``, if any.
+    `model` is by default that on ``stage_model``, if any.
     """
     if not graph.nodes:
         text = "ROS: no other node; start the driver of the stage, and use its ROS_DOMAIN_ID and discovery range"

@@ -35,26 +35,13 @@ def write_report(
     start: float | None = None,
     stop: float | None = None,
 ) -> Path:
-    """Write ``report.html`` into `folder` and return its path.
+    """Write ``report.html`` into `folder`, which is created if it does not exist, and return its path.
 
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    record : Record
-        Record on which the model is shown; the first one of several bags.
-    model : StageModel, the identified model
-    held_out : mapping of axis name to CrossValidationReport, optional
-        Held-out errors by axis.
-    found : mapping of axis name to sequence of Finding, optional
-        Findings on the quality of the record; determined from the record by default.
-    start, stop : float, seconds, optional
-        Fitted part of the record, as for `slpi_ros.identify`; the rest is drawn but not evaluated.
-
-    Raises
-    ------
-    SlpiError
-        If the file cannot be written, or the record does not contain the model's axes.
+    `record`, the first one of several bags, is that on which the identified model is shown. `held_out` are the held-out
+    errors and `found` the findings on the quality of the record, by axis; the findings are determined from the record
+    by default. `start` and `stop` (s) are those of the fitted part of the record, as for `slpi_ros.identify`; the rest
+    is drawn but not evaluated. SlpiError if the file cannot be written, or the record does not contain the model's
+    axes.
     """
     page = Page(f"Model of {record.source}")
     page.contents(tuple(model.axes))

@@ -48,12 +48,7 @@ class Share:
 
 @dataclass
 class Page:
-    """A page to which elements are appended from top to bottom.
-
-    Parameters
-    ----------
-    title : str
-    """
+    """A page to which elements are appended from top to bottom."""
 
     title: str
     _parts: list[str] = field(default_factory=list, init=False)
@@ -171,13 +166,7 @@ class Page:
         )
 
     def write(self, path: Path) -> None:
-        """Write the page atomically.
-
-        Raises
-        ------
-        SlpiError
-            If the file cannot be written.
-        """
+        """Write the page atomically; SlpiError if the file cannot be written."""
         title = _text(self.title)
         scripts = ("plotly-cartesian.min.js", "page.js") if self._has_charts else ()
         document = (

@@ -48,16 +48,7 @@ _SMALLEST_SHARE = 0.01
 def write_files(folder: Path, found: Verification) -> None:
     """Write ``verification.json`` and ``report.html`` into `folder`, each atomically.
 
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    found : Verification, the result to be written
-
-    Raises
-    ------
-    SlpiError
-        If a file cannot be written.
+    The folder is created if it does not exist. SlpiError if a file cannot be written.
     """
     make_folder(folder, *FILES)
     with all_or_nothing(folder / FILES[0]) as file:

@@ -75,16 +75,10 @@ _WINDOWS, _LONGEST_WINDOW, _SPECTRUM_POINTS = 8, 1 << 14, 400
 class Motion:
     """Speed, reversals and branches of a voltage signal, by sample.
 
-    Parameters
-    ----------
-    speed : ndarray, shape (N,), volts per second
-        Rate of change, negative for a falling voltage.
-    since_turn : ndarray, shape (N,), seconds
-        Time since the last reversal or stop of the voltage.
-    branch_from : ndarray, shape (N,), volts
-        Voltage at the start of the present hysteresis branch.
-    runs : ndarray of int, shape (M + 1,)
-        Sample indices of the reversals, with the first and the last sample.
+    `speed` (V/s) is the rate of change, negative for a falling voltage, `since_turn` (s) the time since the last
+    reversal or stop of the voltage, and `branch_from` (V) the voltage at the start of the present hysteresis branch,
+    shape (N,) each. `runs`, shape (M + 1,), are the sample indices of the reversals, with the first and the last
+    sample.
     """
 
     speed: FloatArray
@@ -152,19 +146,9 @@ def show_model(
 ) -> Motion:
     """Add the charts of a model on a record: loops, time, and residual over voltage; return the motion.
 
-    Parameters
-    ----------
-    page : Page
-    name : str
-        First part of the charts' names.
-    t : ndarray, shape (N,), seconds
-    v : ndarray, shape (N,), volts
-    y, simulated : ndarray, shape (N,), metres
-        Measured and simulated displacement.
-    noise : float, metres
-        Half-width of the shaded noise band; 0 for none.
-    fitted : ndarray of bool, shape (N,)
-        Mask of the samples to be evaluated.
+    The times (s), voltages (V), measured (`y`) and simulated displacement (m), and the mask of the samples to be
+    evaluated (`fitted`) have the shape (N,). `name` is the first part of the charts' names; `noise` (m) is the
+    half-width of the shaded noise band, 0 for none.
     """
     motion, models = Motion.of(t, v), [Curve("model", simulated, AFTER)]
     chart, said = loops(v, y, models, motion, fitted)
@@ -185,22 +169,9 @@ def loops(
 ) -> tuple[Chart, str]:
     """Draw displacement over voltage, and the deviation from a straight-line fit in a second panel.
 
-    Parameters
-    ----------
-    v : ndarray, shape (N,), volts
-    y : ndarray, shape (N,), metres
-        Measured displacement.
-    models : sequence of Curve
-        Simulated displacements.
-    motion : Motion
-    fitted : ndarray of bool, shape (N,), optional
-        Mask of fitted samples, by default all; the others have different colours.
-
-    Returns
-    -------
-    Chart
-    str
-        Note on the share of branches that are drawn of a long record, or "".
+    The voltages (V), the measured displacement `y` (m) and the mask of fitted samples, by default all, have the shape
+    (N,); the other samples have different colours. `models` are simulated displacements. The text is a note on the
+    share of branches that are drawn of a long record, or "".
     """
     chart = Chart([Panel(VOLTAGE, DISPLACEMENT), Panel(VOLTAGE, OPENED)], height=470)
     kept, said = _some_runs(v, y, motion)
@@ -271,24 +242,10 @@ def over_time(
 ) -> tuple[Chart, str]:
     """Draw displacement over time, and the residuals of models below.
 
-    Parameters
-    ----------
-    t : ndarray, shape (N,), seconds
-    y : ndarray, shape (N,), metres
-        Measured displacement.
-    models : sequence of Curve
-    noise : float, metres
-        Half-width of the shaded noise band; 0 for none.
-    parts : sequence of Curve
-        Contributions to the first model's residual.
-    fitted : ndarray of bool, shape (N,), optional
-        Mask of fitted samples, by default all; the others are shaded.
-
-    Returns
-    -------
-    Chart
-    str
-        Note on the number of samples outside the initial view, or "".
+    The times (s), the measured displacement `y` (m) and the mask of fitted samples, by default all, have the shape
+    (N,); the other samples are shaded. `noise` (m) is the half-width of the shaded noise band, 0 for none; `parts` are
+    contributions to the first model's residual. The text is a note on the number of samples outside the initial view,
+    or "".
     """
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, ERROR, 1.2)], "column", 540)
     for start, stop in _rows(np.zeros(t.size, dtype=bool) if fitted is None else ~fitted):
@@ -403,22 +360,10 @@ def focus(chart: Chart, panels: Sequence[int], errors: Sequence[FloatArray], cho
 
 
 def over_motion(v: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], motion: Motion) -> tuple[Chart, str]:
-    """Draw residuals over voltage and over its speed, with means for rising and falling voltage.
+    """Draw residuals over voltage (V), shape (N,), and over its speed, with means for rising and falling voltage.
 
-    Parameters
-    ----------
-    v : ndarray, shape (N,), volts
-    curves : sequence of Curve
-        Residuals.
-    parts : sequence of Curve
-        Contributions to the residuals; only their means are drawn.
-    motion : Motion
-
-    Returns
-    -------
-    Chart
-    str
-        Note on the number of samples outside the initial view, or "".
+    `curves` are the residuals, `parts` contributions to them, of which only the means are drawn. The text is a note on
+    the number of samples outside the initial view, or "".
     """
     chart = Chart([Panel(VOLTAGE, ERROR), Panel(SPEED, ERROR)], height=430)
     ways = [np.flatnonzero(motion.speed > 0.0), np.flatnonzero(motion.speed < 0.0)]

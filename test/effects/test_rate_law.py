@@ -247,3 +247,27 @@ def test_a_step_within_the_last_digit_of_the_voltage_has_the_direction_of_the_wi
 def test_the_sentence_holds_the_figures():
     sentence = RateDependence(1.0, 0.25, 7e-9).describe()
     assert "0.25 V/s" in sentence and "2.3 V" in sentence and "7 nm/V" in sentence
+
+
+@given(rate_laws(leads=1), numbers(-100, 100), numbers(-100, 100), st.integers(1, 4000))
+def test_during_a_hold_the_hysteresis_never_turns(law, first, goal, samples):
+    v = np.concatenate([[first], np.full(samples, goal)])
+    u = law.apply(v, EffectContext(1e-3 * np.arange(v.size)))
+    assert not (np.diff(np.sign(np.diff(u[1:]))[np.diff(u[1:]) != 0.0]) != 0.0).any()
+
+
+def test_the_start_of_a_record_belongs_to_that_record():
+    law = RateDependence(0.5, 1.0, 1e-9, (-2.0, 3.0))
+    assert law.lasting == replace(law, initial=()) and law.of_record(1) == replace(law, initial=(3.0,))
+    axis = replace(axis_model(PI_CASE), effects=(law,))
+    t, v = 1e-3 * np.arange(200), np.linspace(0.0, 100.0, 200)
+    plain = replace(axis, effects=(law.lasting,))
+    assert np.array_equal(axis.simulate(t, v), plain.simulate(t, v))
+    assert not np.array_equal(axis.simulate(t, v, of_record=True), axis.simulate(t, v))
+
+
+def test_a_record_ends_at_the_applied_voltage():
+    axis = replace(axis_model(PI_CASE), effects=(RateDependence(2.0, 1e-3),))
+    t, v = 1e-3 * np.arange(200), np.linspace(0.0, 80.0, 200)
+    u = axis.effects[0].apply(v, EffectContext(t))
+    assert axis.after(u).voltage < 70.0 and axis.at_rest(u, 80.0).voltage == 80.0

@@ -9,7 +9,7 @@ from identification.records import calibration, record_of, stage
 import slpi_ros
 from slpi_ros.effects.thermal_drift import ThermalDrift
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.identification.initial_history import match
+from slpi_ros.identification.free_run import match
 from slpi_ros.identification.refit import refit
 from slpi_ros.identification.samples import select_samples
 from slpi_ros.simulation.preisach import PreisachStage

@@ -10,7 +10,7 @@ import slpi_ros
 from slpi_ros.diagnosis.prepare import evidence_of
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.bad_readings import far_outliers, outliers_by_model
-from slpi_ros.identification.initial_history import InitialHistoryWarning
+from slpi_ros.identification.free_run import InitialHistoryWarning
 from slpi_ros.identification.record_quality import assess
 from slpi_ros.identification.samples import select_samples
 from slpi_ros.simulation.parameters import StageParameters

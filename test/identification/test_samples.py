@@ -13,7 +13,7 @@ import slpi_ros
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.identification import linear_kinds as linear
-from slpi_ros.identification.initial_history import InitialHistoryWarning
+from slpi_ros.identification.free_run import InitialHistoryWarning
 from slpi_ros.identification.samples import Samples, select_samples
 
 paths = st.lists(st.integers(0, 8), min_size=1, max_size=80).map(lambda values: np.array(values, dtype=np.float64))

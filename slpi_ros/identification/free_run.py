@@ -1,11 +1,11 @@
-"""Initial history of a record: the unknown motion of the stage before the first sample.
+"""Free run of a model on a record, whose initial state is unknown as the stage has moved before the first sample.
 
-`choose_start` chooses the initial history for a fit. `match` compares a model with a record of unknown initial
-history, using only samples whose prediction does not depend on that history.
+`choose_start` chooses the initial state for a fit, `free_run` the one from which a model predicts a record best, and
+`match` compares a model with a record by the samples whose prediction does not depend on the initial state.
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -140,6 +140,78 @@ def warn_of_initial_history(before: FloatArray, after: FloatArray) -> None:
 def _residual(fit: Fit, samples: Samples) -> FloatArray:
     """Return the errors of a fit on `samples`, shape (N,), without those of the initial history."""
     return fit.reweighted().residual()[-samples.v.size :]
+
+
+# An initial state is possible up to this multiple of the lowest error.
+AS_WELL = 1.1
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """Free run of a model on a record from the initial state with the lowest error, its `rms` (m) without the mean.
+
+    `offsets`: smallest and largest offset (m), median of measured - model, over all possible initial states.
+    """
+
+    rms: float
+    offsets: tuple[float, float]
+
+    @property
+    def offset(self) -> float:
+        """Offset with the smallest magnitude, metres."""
+        return min(self.offsets, key=abs)
+
+    @property
+    def moved(self) -> float:
+        """Shift of the zero (m) that remains for every possible initial state; 0 if one of them can explain it."""
+        return 0.0 if self.offsets[0] <= 0.0 <= self.offsets[1] else self.offset
+
+
+def free_run(
+    axis: AxisModel,
+    t: FloatArray,
+    v: FloatArray,
+    y: FloatArray,
+    used: NDArray[np.bool_],
+    known: NDArray[np.bool_],
+    starts: Sequence[Start],
+    *,
+    others: Mapping[str, FloatArray],
+    of_record: bool,
+) -> FreeRun:
+    """Return the best free run of a model from the initial states `starts` over a record, shape (N,), s, V and m.
+
+    The error is that of the samples `used`, the offset that of the samples `known`, to which the initial state only
+    adds a constant. `others` and `of_record` as in `AxisModel.simulate`.
+    """
+    errors = [y - replace(axis, start=start).simulate(t, v, others, of_record=of_record) for start in starts]
+    spread = [float(np.std(error[known])) for error in errors]
+    as_well = [error for error, own in zip(errors, spread, strict=True) if own <= AS_WELL * min(spread)]
+    offsets = [float(np.median(error[known])) for error in as_well]
+    return FreeRun(min(float(np.std(error[used])) for error in errors), (min(offsets), max(offsets)))
+
+
+def rms_of(runs: Sequence[FreeRun]) -> float:
+    """Return the rms (m) of the errors of several free runs, each without its mean."""
+    return float(np.sqrt(np.mean([run.rms**2 for run in runs])))
+
+
+def likely_starts(axis: AxisModel, v: float, *others: tuple[float, ...]) -> list[Start]:
+    """Return the initial states at the voltage `v` (V) for the usual histories and `others`.
+
+    Their displacements are such that after a sweep over the whole range all are alike.
+    """
+    if not axis.causal:
+        return [axis.start]
+    low, high = axis.voltage_range
+    ends = np.array([min(low, v), max(high, v)])
+    usual = histories(Samples(np.append(v, ends), np.zeros(3), np.ones(3, dtype=bool)))
+    swept = axis.memory("start").forward_array(ends)[-1]
+    found = [axis.start] if axis.start.voltage == v else []
+    for history in dict.fromkeys((*others, axis.start.history, *usual)):
+        way = replace(axis, start=Start(v, 0.0, history)).memory("start").forward_array(ends)[-1]
+        found.append(Start(v, float(swept - way), history))
+    return found
 
 
 # In `match`: candidate start voltages of the last move before a record, as shares of the distance to either end.

@@ -6,7 +6,7 @@ SLPI is the Separated Level-loop Prandtl-Ishlinskii model. The names exported he
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from slpi_ros.dependencies import dependencies_needed
+from slpi_ros.errors import dependencies_needed
 
 if TYPE_CHECKING:
     from slpi_ros.diagnosis.diagnose import diagnose

@@ -1,7 +1,33 @@
-"""Exceptions of the package, all derived from `SlpiError`, and the form of text that is shown to people."""
+"""Exceptions of the package, all derived from `SlpiError`, the form of text shown to people, and missing packages."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
 
 # Characters of a line on a terminal, in a log or on a page; a hostile file may hold names of megabytes.
 LONGEST_SHOWN = 2_000
+_FLEET = "pip install 'dask[distributed]' bokeh pandas pyarrow"
+# How to get each package; a test compares the names with setup.py.
+HOW_TO_GET = {
+    "bokeh": _FLEET,
+    "dask": _FLEET,
+    "distributed": _FLEET,
+    "jsonschema": "apt install python3-jsonschema, or pip install jsonschema",
+    "matplotlib": "apt install python3-matplotlib, or pip install matplotlib",
+    "numba": "apt install python3-numba, or pip install numba",
+    "numpy": "apt install python3-numpy, or pip install numpy",
+    "osqp": "pip install osqp",
+    "pandas": _FLEET,
+    "pyarrow": _FLEET,
+    "rosbags": "pip install rosbags",
+    "scipy": "apt install python3-scipy, or pip install scipy",
+    "threadpoolctl": "apt install python3-threadpoolctl, or pip install threadpoolctl",
+}
+_OF_ROS = ("ament_index_python", "builtin_interfaces", "launch", "launch_ros", "rcl_interfaces", "rclpy", "rpyutils")
+_ENDINGS_OF_ROS = ("_msgs", "_srvs")
+_FROM_ROS = "source a ROS 2 workspace, for example /opt/ros/jazzy/setup.bash"
+# Characters of the reason that another package gives.
+_LONGEST_REASON = 200
 
 
 def shown(text: object, most: int = LONGEST_SHOWN) -> str:
@@ -58,3 +84,47 @@ class IdentificationError(SlpiError):
 
 class UnreachableError(SlpiError):
     """A desired displacement lies far outside the identified displacement range."""
+
+
+class DependencyError(SlpiError, ImportError):
+    """A package that is needed is missing or cannot be loaded; the message names it and says how to get it."""
+
+
+@contextmanager
+def dependencies_needed() -> Iterator[None]:
+    """Raise DependencyError if an import in the ``with`` block fails in another package or for the lack of it."""
+    try:
+        yield
+    except DependencyError:
+        raise
+    except ImportError as error:
+        message = explanation(error)
+        if message is None:
+            raise
+        raise DependencyError(message) from error
+
+
+def explanation(error: BaseException) -> str | None:
+    """Return what is missing or broken and how to get it; None if the error is not that of a known dependency."""
+    missing = error.name if isinstance(error, ModuleNotFoundError) else None
+    if missing and (how := _how_to_get(missing)):
+        return f"{missing} is not installed; get it with: {how}" if how != _FROM_ROS else f"no {missing}: {how}"
+    package = (error.name or "").split(".")[0] if isinstance(error, ImportError) else ""
+    how = _how_to_get(package)
+    at: TracebackType | None = error.__traceback__
+    while at is not None:
+        # The innermost known package: one that another dependency cannot load is the one to repair.
+        own = str(at.tb_frame.f_globals.get("__name__", "")).split(".")[0]
+        if found := _how_to_get(own):
+            package, how = own, found
+        at = at.tb_next
+    if how is None:
+        return None
+    reason = " ".join(str(error).split())[:_LONGEST_REASON]
+    return f"{package} is installed but cannot be loaded ({reason}); repair it: {how}"
+
+
+def _how_to_get(package: str) -> str | None:
+    if package in _OF_ROS or package.endswith(_ENDINGS_OF_ROS):
+        return _FROM_ROS
+    return HOW_TO_GET.get(package)

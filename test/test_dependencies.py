@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slpi_ros.dependencies import HOW_TO_GET
+from slpi_ros.errors import HOW_TO_GET
 
 ROOT = Path(__file__).resolve().parents[1]
 # What a module in the place of another one does when it is imported.
@@ -98,7 +98,7 @@ def test_python_raises_an_error_that_names_it(tmp_path, contents):
 
 def test_an_error_of_the_package_itself_is_not_blamed_on_another_one(tmp_path):
     code = (
-        "from slpi_ros.dependencies import dependencies_needed\n"
+        "from slpi_ros.errors import dependencies_needed\n"
         "try:\n    with dependencies_needed():\n        from slpi_ros.errors import nothing\n"
         "except ImportError as error:\n    print(type(error).__name__)"
     )

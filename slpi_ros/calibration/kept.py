@@ -9,8 +9,8 @@ from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.errors import RecordError, SlpiError
 from slpi_ros.excitation.drives import Drive
-from slpi_ros.identification.record_quality import assess, findings, require_usable
 from slpi_ros.io.record import Record
+from slpi_ros.workflows.records import Source, require_records
 
 # The range of a recorded voltage may differ from that of its drive by this share.
 FOLLOWS = 0.2
@@ -46,8 +46,8 @@ def require_kept(
         if before and record.hardware_id and before.hardware_id and record.hardware_id != before.hardware_id:
             raise RecordError(f"of stage '{record.hardware_id}', {before.source} of '{before.hardware_id}'")
         moving = [axis for axis in settings.axes if np.ptp(drive.voltage[axis]) > 0.0]
-        for axis in moving if fitted else ():
-            require_usable(findings(assess(record, axis)), f"axis '{axis}'")
+        if fitted:
+            require_records([record], Source(axes=moving))
         for axis in moving if before else ():
             assert before is not None
             own, other = _slope(record, axis), _slope(before, axis)

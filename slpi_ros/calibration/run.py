@@ -15,16 +15,17 @@ from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, VERIFICATION, CalibrationSettings
-from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.diagnosis.result import AxisDiagnosis, Diagnosis
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.errors import RecordError
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.drives import SWEEP, Drive
-from slpi_ros.identification.fit import identify
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
+from slpi_ros.workflows.identify import IdentifyRequest, identify
+from slpi_ros.workflows.records import Source
 
 FloatArray = NDArray[np.float64]
 
@@ -43,13 +44,8 @@ MOST_ROUNDS = 3
 class Recording:
     """What the stage did during one drive.
 
-    Parameters
-    ----------
-    record : Record
-    desired : mapping of axis name to ndarray, shape (N,), metres
-        Desired displacement at the samples of the record, NaN where there was none; empty without compensator.
-    kept : bool
-        Whether it is a recording of an earlier run; default False.
+    `desired` (m, shape (N,)): desired displacement at the samples of the record, NaN where there was none; empty
+    without compensator. `kept`: whether it is a recording of an earlier run; default False.
     """
 
     record: Record
@@ -61,13 +57,8 @@ class Recording:
 class Request:
     """A drive to be recorded.
 
-    Parameters
-    ----------
-    name : str
-        Name of the record, unique within a calibration.
-    drive : Drive
-    desired : mapping of axis name to ndarray, shape (N,), metres
-        Desired displacement at the samples of the drive; empty without compensator.
+    `name`: name of the record, unique within a calibration. `desired` (m, shape (N,)): desired displacement at the
+    samples of the drive; empty without compensator.
     """
 
     name: str
@@ -79,20 +70,10 @@ class Request:
 class TrackingError:
     """Error of the compensated stage on one path, measured - desired without its median.
 
-    Parameters
-    ----------
-    mean, rms, maximum : float, metres
-        Of the magnitude.
-    offset : float, metres
-        Median that was removed.
-    stroke : float, metres
-        Displacement range of the model.
-    goal : float, metres
-        Largest mean error that meets the target.
-    t : ndarray, shape (N,), seconds
-        Time of the samples along the path, from the first stamp of the record.
-    desired, error : ndarray, shape (N,), metres
-        Desired displacement, and measured - desired without the offset.
+    `mean`, `rms`, `maximum` (m): of the magnitude. `offset` (m): median that was removed. `stroke` (m): displacement
+    range of the model. `goal` (m): largest mean error that meets the target. `t` (s, shape (N,)): time of the samples
+    along the path, from the first stamp of the record. `desired`, `error` (m, shape (N,)): desired displacement, and
+    measured - desired without the offset.
     """
 
     mean: float
@@ -115,18 +96,8 @@ class TrackingError:
 class Step:
     """One step of a calibration.
 
-    Parameters
-    ----------
-    name : str
-        Name of the record, or of the computation.
-    seconds : float
-        Duration of the drive; 0 for a computation.
-    why : str
-        Why this step.
-    finding : str
-        What the step showed.
-    errors : mapping of axis name to TrackingError
-        Errors if the step was a verification, else empty.
+    `name`: name of the record, or of the computation. `seconds`: duration of the drive; 0 for a computation. `why`: why
+    this step. `finding`: what the step showed. `errors`: errors if the step was a verification, else empty.
     """
 
     name: str
@@ -140,18 +111,9 @@ class Step:
 class Outcome:
     """Result of a calibration.
 
-    Parameters
-    ----------
-    settings : CalibrationSettings
-    model : StageModel
-        Model with the lowest verified error.
-    errors : mapping of axis name to TrackingError
-        Its verified errors.
-    diagnosis : Diagnosis
-        Last diagnosis, of all records before the last verification.
-    steps : tuple of Step
-    why : str
-        Why the target is met or not, and why the calibration ended, in one line.
+    `model`: model with the lowest verified error. `errors`: its verified errors. `diagnosis`: last diagnosis, of all
+    records before the last verification. `why`: why the target is met or not, and why the calibration ended, in one
+    line.
     """
 
     settings: CalibrationSettings
@@ -176,16 +138,8 @@ class Outcome:
 class Progress:
     """Progress of a calibration.
 
-    Parameters
-    ----------
-    doing : str
-        Present step.
-    step : int
-        Its number, from 1.
-    seconds_left : float
-        Time left for drives.
-    error : float or None, metres
-        Largest verified mean error so far; None before the first verification.
+    `doing`: present step. `step`: its number, from 1. `seconds_left`: time left for drives. `error` (m): largest
+    verified mean error so far; None before the first verification.
     """
 
     doing: str
@@ -202,22 +156,8 @@ def calibrate(
 ) -> Outcome:
     """Calibrate a stage by itself.
 
-    Parameters
-    ----------
-    settings : CalibrationSettings
-    record : callable
-        Drives the stage and returns what it did; an exception ends the calibration.
-    report : callable, optional
-        Called at the beginning of each step.
-
-    Returns
-    -------
-    Outcome
-
-    Raises
-    ------
-    SlpiError
-        If the stage does not follow the voltages, or the records allow no model.
+    `record`: drives the stage and returns what it did; an exception ends the calibration. `report`: called at the
+    beginning of each step. Raises SlpiError if the stage does not follow the voltages, or the records allow no model.
     """
     return _Calibration(settings, record, report).run()
 
@@ -320,7 +260,7 @@ class _Calibration:
 
     def _identify(self) -> StageModel:
         self._begin("identifying the hysteresis")
-        model = identify(self._records)
+        model = identify(IdentifyRequest(Source(records=self._records))).model
         self._floors = {name: axis.quality.floor_rms for name, axis in model.axes.items()}
         said = "; ".join(
             f"axis {name}: held-out error {axis.quality.held_out_rms * 1e9:.3g} nm rms, "
@@ -369,7 +309,7 @@ def _diagnosed(records: Sequence[Record], model: StageModel) -> Diagnosis:
     found, extended = {}, {}
     for axis in model.axes:
         moving = [_from_first_move(record, axis) for record in records if np.ptp(record.voltage[axis]) > 0.0]
-        one = diagnose(moving, model, axes=[axis])
+        one = diagnose(DiagnoseRequest(Source(records=moving, axes=[axis]), model)).diagnosis
         found[axis], extended[axis] = one.axes[axis], one.extended.axes[axis]
     source = ", ".join(record.source for record in records)
     return Diagnosis(found, replace(one.extended, axes=extended), source)
@@ -429,20 +369,9 @@ def _follows(axis: str, drive: Drive, record: Record) -> str:
 def tracking_error(recording: Recording, axis: str, model: StageModel, goal: float) -> TrackingError:
     """Return the error of an axis along the path of a recording.
 
-    Parameters
-    ----------
-    recording : Recording
-        With desired displacements.
-    axis : str
-    model : StageModel
-        Model that the compensator used; what it knows of the sensor is taken out of the readings.
-    goal : float, metres
-        Largest mean error that meets the target.
-
-    Raises
-    ------
-    RecordError
-        If there are no readings along the path.
+    `recording`: with desired displacements. `model`: model that the compensator used; what it knows of the sensor is
+    taken out of the readings. `goal` (m): largest mean error that meets the target. Raises RecordError if there are no
+    readings along the path.
     """
     record, desired = recording.record, recording.desired[axis]
     error = model.axis(axis).correct(record.t, record.displacement[axis]) - desired
@@ -473,14 +402,8 @@ def aligned(
     Commands take some time to the stage and readings some time back. The delay between commanded and applied voltages
     is removed, so that only what the stage itself does is left.
 
-    Parameters
-    ----------
-    record : Record
-    sent_ns : ndarray of int64, shape (M,), nanoseconds
-        Stamps of the commands, on the clock of the record.
-    commands : mapping of axis name to ndarray, shape (M,), volts
-    desired : mapping of axis name to ndarray, shape (M,), metres
-        NaN where there was none.
+    `sent_ns` (ns, shape (M,)): stamps of the commands, on the clock of the record. `commands` (V, shape (M,)).
+    `desired` (m, shape (M,)): NaN where there was none.
     """
     if not desired:
         return Recording(record, {})

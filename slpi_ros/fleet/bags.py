@@ -20,20 +20,20 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slpi_ros.diagnosis.diagnose import diagnose
-from slpi_ros.diagnosis.verify import Verification, verify
+from slpi_ros.diagnosis.verify import Verification
 from slpi_ros.effects.registry import to_document
 from slpi_ros.errors import SlpiError
 from slpi_ros.fleet.sources import Bag
-from slpi_ros.identification.fit import identify
-from slpi_ros.identification.record_quality import assess, findings, require_usable
-from slpi_ros.identification.refit import refit
-from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.document import load_model, save_model
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports import verification as verification_page
+from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
+from slpi_ros.workflows.identify import IdentifyRequest, identify
+from slpi_ros.workflows.records import Source, assess_record
+from slpi_ros.workflows.refit import RefitRequest, refit
+from slpi_ros.workflows.verify import VerifyRequest, verify
 
 FloatArray = NDArray[np.float64]
 
@@ -102,22 +102,10 @@ class Row:
 class Examined:
     """What is known of a bag without a model.
 
-    Parameters
-    ----------
-    bag : Bag
-    stage : str
-        Name of the stage: of the list, else the bag's hardware id, else "".
-    hardware_id : str
-    date_ns : int or None, nanoseconds
-        First time stamp, Unix time; None if the bag cannot be read.
-    axes : tuple of str
-        Axes that can be used.
-    findings : mapping of axis name to tuple of str
-        Findings on the quality of the record, other than "ok".
-    refused : mapping of axis name to str
-        Reason for each axis that cannot be used; axis "" if that is the whole bag.
-    seconds : float
-        Computing time.
+    `stage`: name of the stage: of the list, else the bag's hardware id, else "". `date_ns` (ns): first time stamp, Unix
+    time; None if the bag cannot be read. `axes`: axes that can be used. `findings`: findings on the quality of the
+    record, other than "ok". `refused`: reason for each axis that cannot be used; axis "" if that is the whole bag.
+    `seconds`: computing time.
     """
 
     bag: Bag
@@ -168,62 +156,50 @@ class Judged:
 def examine(bag: Bag, topic: str) -> Examined:
     """Read a bag and assess the quality of its record.
 
-    Parameters
-    ----------
-    bag : Bag
-    topic : str
-        Topic with voltage and displacement.
+    `topic`: topic with voltage and displacement.
     """
     began = time.process_time()
     try:
         with _quiet():
-            record = read_bag(bag.path, topic)
-            stage = bag.stage or record.hardware_id
-            axes, told, refused = [], {}, {}
-            for axis in record.axes:
-                try:
-                    found = findings(assess(record, axis))
-                    told[axis] = tuple(f"{one.level}: {one.text}" for one in found if one.level != "ok")
-                    require_usable(found, f"{bag.path}: axis '{axis}'")
-                    axes.append(axis)
-                except SlpiError as error:
-                    refused[axis] = str(error)
+            source = Source((bag.path,), topic)
+            (record,) = source.read()
+            assessed = assess_record(record, source)
     except Exception as error:
         return Examined(bag, bag.stage, refused={"": _reason(error)}, seconds=time.process_time() - began)
     return Examined(
-        bag, stage, record.hardware_id, int(record.time_ns[0]), tuple(axes), told, refused, time.process_time() - began
+        bag,
+        bag.stage or record.hardware_id,
+        record.hardware_id,
+        int(record.time_ns[0]),
+        tuple(axis for axis in record.axes if axis not in assessed.refused),
+        {
+            axis: tuple(f"{one.level}: {one.text}" for one in found if one.level != "ok")
+            for axis, found in assessed.findings.items()
+        },
+        {axis: str(error) for axis, error in assessed.refused.items()},
+        time.process_time() - began,
     )
 
 
 def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
     """Identify the reference model of a stage from a bag, and write it to the file `name` in the folder `output`.
 
-    Parameters
-    ----------
-    one : Examined
-        Examination of the bag.
-    topic : str
-    output, name : str
-        Folder of the results, and path of the model within it.
-
-    Returns
-    -------
-    Judged
-        Its `model` is `name`, or "" if no axis can be identified.
+    `one`: examination of the bag. `output`, `name`: folder of the results, and path of the model within it. Returned:
+    its `model` is `name`, or "" if no axis can be identified.
     """
     began = time.process_time()
     rows, axes = [], {}
     try:
         with _quiet():
-            record = read_bag(one.bag.path, topic)
+            (record,) = Source((one.bag.path,), topic).read()
             for axis in one.axes:
                 try:
-                    axes[axis] = identify(record, axes=[axis]).axes[axis]
+                    axes[axis] = identify(IdentifyRequest(_examined(record, (axis,)))).model.axes[axis]
                 except SlpiError as error:
                     rows.append(replace(one.row(axis), error=str(error)))
             if axes:
                 model = StageModel(axes, one.stage, datetime.now(UTC).isoformat(timespec="seconds"))
-                found = verify(_of_stage(record, one.stage), model, axes=tuple(axes))
+                found = _verification(_of_stage(record, one.stage), model, tuple(axes))
                 rows += [_identified(one, axis, found, axes[axis], name) for axis in axes]
                 path = Path(output, name)
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -237,18 +213,13 @@ def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
 def compare(one: Examined, topic: str, output: str, reference: str, name: str) -> Judged:
     """Verify the reference model of the stage on a bag, and refit it where it is beyond the limit.
 
-    Parameters
-    ----------
-    one : Examined
-        Examination of the bag.
-    topic, output : str
-    reference, name : str
-        Paths of the reference model and of the refitted one within the folder of the results.
+    `one`: examination of the bag. `reference`, `name`: paths of the reference model and of the refitted one within the
+    folder of the results.
     """
     began = time.process_time()
     try:
         with _quiet():
-            record = _of_stage(read_bag(one.bag.path, topic), one.stage)
+            record = _read(one, topic)
             model = _model(output, reference)
             shared = [axis for axis in one.axes if axis in model.axes]
             rows = [
@@ -256,7 +227,7 @@ def compare(one: Examined, topic: str, output: str, reference: str, name: str) -
                 for axis in one.axes
                 if axis not in model.axes
             ]
-            verified = verify(record, model, axes=shared) if shared else None
+            verified = _verification(record, model, shared) if shared else None
             for axis in shared:
                 assert verified is not None
                 rows.append(_verified(one, axis, verified, model.axes[axis], reference))
@@ -283,26 +254,18 @@ def explain(
 ) -> Judged:
     """Explain the error of a bag that neither the reference model nor a changed gain, width or zero describes.
 
-    Parameters
-    ----------
-    one : Examined
-    rows : sequence of Row
-        Rows from `identify_bag` or `compare`.
-    topic, output, reference, name : str
-        As for `compare`.
-    others : mapping of str to str
-        Paths of the reference models of all other stages.
-    diagnosed : bool
-        Whether a diagnosis names the causes if no other stage's model describes the record.
+    `rows`: rows from `identify_bag` or `compare`. `topic`, `output`, `reference`, `name`: as for `compare`. `others`:
+    paths of the reference models of all other stages. `diagnosed`: whether a diagnosis names the causes if no other
+    stage's model describes the record.
     """
     began = time.process_time()
     told = []
     try:
         with _quiet():
-            record = read_bag(one.bag.path, topic)
+            record = _read(one, topic)
             for row in rows:
                 told.append(_like_another(row, record, others, output) if row.verdict == FAILED else row)
-            record, model = _of_stage(record, one.stage), _model(output, reference)
+            model = _model(output, reference)
             if any(row.verdict == FAILED for row in told) and not any(row.verdict == FOREIGN for row in told):
                 told = _refitted(told, record, model, output, name)
             if diagnosed:
@@ -339,6 +302,20 @@ def plain_name(stage: str) -> str:
         digest = hashlib.sha256(name.encode()).hexdigest()[:16]
         name = f"{name[: _LONGEST_PLAIN - len(digest) - 1]}-{digest}"
     return name or "unnamed"
+
+
+def _read(one: Examined, topic: str) -> Record:
+    """Return the record of a bag, under the name of its stage."""
+    return _of_stage(Source((one.bag.path,), topic).read()[0], one.stage)
+
+
+def _verification(record: Record, model: StageModel, axes: Sequence[str]) -> Verification:
+    return verify(VerifyRequest(_examined(record, axes), model)).verification
+
+
+def _examined(record: Record, axes: Sequence[str]) -> Source:
+    """Return axes of a record that `examine` has found usable."""
+    return Source(records=(record,), axes=axes, assessed=True)
 
 
 def _of_stage(record: Record, stage: str) -> Record:
@@ -416,12 +393,14 @@ def _beyond(error: float | None, limit: float | None) -> bool:
 def _refitted(rows: Sequence[Row], record: Record, model: StageModel, output: str, name: str) -> list[Row]:
     """Refit the reference to a record; write the model, and note error and reason of a refusal in the rows."""
     try:
-        new, changes = refit(model, record)
+        axes = [row.axis for row in rows if row.axis in model.axes]
+        found = refit(RefitRequest(_examined(record, axes), model))
     except SlpiError as error:
         return [replace(row, error=row.error or str(error)) for row in rows]
     path = Path(output, name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_model(new, path)
+    save_model(found.model, path)
+    changes = found.steps[-1].changes
     return [
         replace(row, refitted_rms_m=changes[row.axis].error_after, model=name) if row.axis in changes else row
         for row in rows
@@ -440,7 +419,7 @@ def _like_another(row: Row, record: Record, others: Mapping[str, str], output: s
             off = y - model.simulate(t, v)
             errors[stage] = float(np.sqrt(np.mean((off - np.median(off)) ** 2)))
     for stage in sorted(errors, key=lambda stage: (errors[stage], stage))[:CANDIDATES]:
-        found = verify(_of_stage(record, stage), _model(output, others[stage]), axes=[axis])
+        found = _verification(_of_stage(record, stage), _model(output, others[stage]), [axis])
         match = found.axes[axis].records[0].match
         limit = found.axes[axis].records[0].limit
         if match.rms_explained <= limit and match.rms_explained <= MUCH_BETTER * (row.explained_rms_m or np.inf):
@@ -451,7 +430,8 @@ def _like_another(row: Row, record: Record, others: Mapping[str, str], output: s
 def _diagnosed(row: Row, record: Record, model: StageModel) -> Row:
     """Return the row with the causes that a diagnosis names."""
     try:
-        found = diagnose(record, model, axes=[row.axis]).axes[row.axis]
+        request = DiagnoseRequest(_examined(record, (row.axis,)), model)
+        found = diagnose(request).diagnosis.axes[row.axis]
     except SlpiError as error:
         return replace(row, error=row.error or f"no diagnosis: {error}")
     causes = tuple(

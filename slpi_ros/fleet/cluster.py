@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slpi_ros.dependencies import dependencies_needed
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import SlpiError, UsageError, dependencies_needed
 from slpi_ros.fleet import bags
 from slpi_ros.fleet.bags import Examined, Judged
 from slpi_ros.fleet.results import Results, State, as_table

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from slpi_ros.dependencies import HOW_TO_GET, explanation
+from slpi_ros.errors import HOW_TO_GET, explanation
 
 listeners: list[Callable[[str], None]] = []
 

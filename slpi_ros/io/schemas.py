@@ -8,8 +8,7 @@ from importlib.resources import files
 from itertools import islice
 from typing import Any
 
-from slpi_ros.dependencies import dependencies_needed
-from slpi_ros.errors import ModelError, UsageError
+from slpi_ros.errors import ModelError, UsageError, dependencies_needed
 from slpi_ros.io.input_limits import LONGEST_NAME, MOST_AXES, MOST_ERRORS
 
 

@@ -29,14 +29,8 @@ STATE, PATH = "stage_state", "verification_path"
 class Wanted:
     """A drive to be recorded.
 
-    Parameters
-    ----------
-    name : str
-        Name of the bag.
-    t : ndarray, shape (N,), seconds
-    voltage : ndarray, shape (N, axes), volts
-    desired : ndarray, shape (N, axes), metres
-        Desired displacements; shape (N, 0) if there are none.
+    `name`: name of the bag. `t` (s, shape (N,)). `voltage` (V, shape (N, axes)). `desired` (m, shape (N, axes)):
+    desired displacements; shape (N, 0) if there are none.
     """
 
     name: str
@@ -49,13 +43,7 @@ class Wanted:
 class CalibrationRequest:
     """What the worker needs.
 
-    Parameters
-    ----------
-    settings : CalibrationSettings
-    output : str
-        Folder of bags and results.
-    node : Connection
-        Connection to the node.
+    `output`: folder of bags and results. `node`: connection to the node.
     """
 
     settings: CalibrationSettings
@@ -77,11 +65,7 @@ class CalibrationOutcome:
 class CalibrationJob:
     """A calibration in a worker process.
 
-    Parameters
-    ----------
-    settings : CalibrationSettings
-    output : Path
-        Folder of bags and results.
+    `output`: folder of bags and results.
     """
 
     def __init__(self, settings: CalibrationSettings, output: Path) -> None:

@@ -89,15 +89,9 @@ DECLARATIONS = (
 class IdentifySettings:
     """Validated settings of the node.
 
-    Parameters
-    ----------
-    request : FitRequest
-        Settings of the identification, also used for bags of the watched folder.
-    watch_directory : str
-        Watched folder; "" if none.
-    diagnosis_directory : str
-        Output folder of ~/diagnose; "" for a temporary folder.
-    diagnostic_period : float, seconds
+    `request`: settings of the identification, also used for bags of the watched folder. `watch_directory`: watched
+    folder; "" if none. `diagnosis_directory`: output folder of ~/diagnose; "" for a temporary folder.
+    `diagnostic_period` (s).
     """
 
     request: FitRequest
@@ -109,10 +103,7 @@ class IdentifySettings:
     def of(cls, values: Values) -> "IdentifySettings":
         """Return the settings from a mapping of parameter names to values.
 
-        Raises
-        ------
-        UsageError
-            If a value is not valid.
+        Raises UsageError if a value is not valid.
         """
         bags = tuple(bag for bag in values["bags"] if bag)
         if not values["topic"]:
@@ -162,15 +153,8 @@ class DiagnosisService:
 
     The diagnosis only writes files; it does not change the published model.
 
-    Parameters
-    ----------
-    node : Node
-    identified : callable
-        Returns the request for the published model and its bags; None if there is no model.
-    folder : callable
-        Returns the output folder; "" for a temporary folder.
-    report : callable
-        Called at the start and at the end of a diagnosis.
+    `identified`: returns the request for the published model and its bags; None if there is no model. `folder`: returns
+    the output folder; "" for a temporary folder. `report`: called at the start and at the end of a diagnosis.
     """
 
     def __init__(
@@ -287,10 +271,7 @@ class Identify(Node):
     stage, is reported and skipped; the last valid model stays published. So it does if the new model is worse than the
     model in use: the last one on ``stage_model``, by whomever, or else the one in the file ``output``.
 
-    Raises
-    ------
-    UsageError
-        If the parameters are not valid.
+    Raises UsageError if the parameters are not valid.
     """
 
     def __init__(self) -> None:

@@ -8,14 +8,13 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from slpi_ros.compensator.persistence import model_id
-from slpi_ros.dependencies import DependencyError, dependencies_needed
-from slpi_ros.errors import ModelError, RecordError, SlpiError, shown
+from slpi_ros.errors import DependencyError, ModelError, RecordError, SlpiError, dependencies_needed, shown
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.input_limits import TOPIC_MODEL_CHARACTERS
 from slpi_ros.io.record import Record
@@ -29,15 +28,9 @@ Outcome = TypeVar("Outcome")
 class WorkerProcess(Generic[Request, Outcome]):
     """Run a function in a worker process and return its outcome without blocking.
 
-    Parameters
-    ----------
-    work : callable
-        Module-level function that returns the outcome of a request.
-    request : object
-    outcome : type
-        Dataclass of plain values; it is created with only `error` set if the process ends without a result.
-    what : str
-        Description of the work for this error message.
+    `work`: module-level function that returns the outcome of a request. `outcome`: dataclass of plain values; it is
+    created with only `error` set if the process ends without a result. `what`: description of the work for this error
+    message.
     """
 
     def __init__(
@@ -95,11 +88,7 @@ def _run(sender: Connection, work: Callable[[Any], Any], request: Any) -> None:
 class StageIdentity:
     """Identity of a stage: hardware id and axes.
 
-    Parameters
-    ----------
-    hardware_id : str
-        "" if unknown.
-    axes : tuple of str
+    `hardware_id`: "" if unknown.
     """
 
     hardware_id: str
@@ -129,25 +118,12 @@ class StageIdentity:
 class FitRequest:
     """Request of an identification.
 
-    Parameters
-    ----------
-    bags : tuple of str
-        Paths of the bags, all used in one fit.
-    topic : str
-    kind : str
-        Kind of hysteresis model.
-    start, stop : float or None, seconds
-        Start and end of the fitted part of the record; None: first stamp, or last stamp.
-    output : str
-        File for the model document; "" if none.
-    stage : StageIdentity, optional
-        Stage that the bags must belong to; default: any.
-    in_use : str
-        Document of the model in use, with which the new one is compared; "" (default): that in `output`, if any.
-    unconditional : bool
-        Whether the new model is published whatever the comparison says. Default False.
-    sensor_delay, sensor_lag : float, seconds
-        Known delay and lag of the sensor; default 0.
+    `bags`: paths of the bags, all used in one fit. `kind`: kind of hysteresis model. `start`, `stop` (s): start and end
+    of the fitted part of the record; None: first stamp, or last stamp. `output`: file for the model document; "" if
+    none. `stage`: stage that the bags must belong to; default: any. `in_use`: document of the model in use, with which
+    the new one is compared; "" (default): that in `output`, if any. `unconditional`: whether the new model is published
+    whatever the comparison says. Default False. `sensor_delay`, `sensor_lag` (s): known delay and lag of the sensor;
+    default 0.
     """
 
     bags: tuple[str, ...]
@@ -184,23 +160,18 @@ def fit(request: FitRequest) -> FitOutcome:
     """Read the bags, identify the model and compare it with the one in use."""
     # Imported here because they load slowly: the compensator uses this module to read models only.
     from slpi_ros.diagnosis.replacement import doubt_about
-    from slpi_ros.identification.fit import identify
-    from slpi_ros.io.bag_reader import read_bag
+    from slpi_ros.model.sensor import Sensor
+    from slpi_ros.workflows.identify import IdentifyRequest, identify
+    from slpi_ros.workflows.records import Source
 
     try:
-        records = [read_bag(bag, request.topic) for bag in request.bags]
+        sensor = Sensor(request.sensor_delay, request.sensor_lag)
+        source = Source(request.bags, request.topic, start=request.start, stop=request.stop)
+        records = source.read()
         if request.stage:
             for record in records:
                 request.stage.require(record)
-        _require_usable(records, request.start, request.stop)
-        model = identify(
-            records,
-            request.kind,
-            start=request.start,
-            stop=request.stop,
-            sensor_delay=request.sensor_delay,
-            sensor_lag=request.sensor_lag,
-        )
+        model = identify(IdentifyRequest(replace(source, records=records), request.kind, sensor=sensor)).model
         document, doubt = format_model(model), ""
         in_use = None if request.unconditional else _in_use(request, records)
         if in_use:
@@ -208,16 +179,6 @@ def fit(request: FitRequest) -> FitOutcome:
     except SlpiError as error:
         return FitOutcome(error=str(error))
     return FitOutcome(document, doubt=doubt and f"{request.source}: {doubt}")
-
-
-def _require_usable(records: Sequence[Record], start: float | None = None, stop: float | None = None) -> None:
-    """Raise IdentificationError for the first record whose quality allows no fit, as the command line does."""
-    from slpi_ros.identification.record_quality import assess, findings, require_usable
-
-    for record in records:
-        for axis in record.axes:
-            found = findings(assess(record, axis, start=start, stop=stop))
-            require_usable(found, f"{record.source}: axis '{axis}'")
 
 
 def _in_use(request: FitRequest, records: Sequence[Record]) -> StageModel | None:
@@ -240,16 +201,8 @@ def _in_use(request: FitRequest, records: Sequence[Record]) -> StageModel | None
 class DiagnosisRequest:
     """Request of a diagnosis.
 
-    Parameters
-    ----------
-    bags : tuple of str
-        Paths of the bags, diagnosed together.
-    topic : str
-        Topic of the recorded voltages and displacements.
-    document : str
-        Model document.
-    folder : str
-        Output folder; "" (default) if not chosen yet.
+    `bags`: paths of the bags, diagnosed together. `topic`: topic of the recorded voltages and displacements.
+    `document`: model document. `folder`: output folder; "" (default) if not chosen yet.
     """
 
     bags: tuple[str, ...]
@@ -274,16 +227,15 @@ class DiagnosisOutcome:
 
 def run_diagnosis(request: DiagnosisRequest) -> DiagnosisOutcome:
     """Read the bags, diagnose the model and write the output files."""
-    from slpi_ros.diagnosis.diagnose import diagnose
-    from slpi_ros.io.bag_reader import read_bag
     from slpi_ros.reports.diagnosis import FILES, write_files
+    from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
+    from slpi_ros.workflows.records import Source
 
     folder = Path(request.folder)
     try:
         make_folder(folder, *FILES)
-        records = [read_bag(bag, request.topic) for bag in request.bags]
-        _require_usable(records)
-        diagnosis = diagnose(records, parse_model(request.document, "stage_model"))
+        model = parse_model(request.document, "stage_model")
+        diagnosis = diagnose(DiagnoseRequest(Source(request.bags, request.topic), model)).diagnosis
         write_files(folder, diagnosis)
     except SlpiError as error:
         return DiagnosisOutcome(error=str(error))
@@ -322,15 +274,8 @@ def check(request: tuple[str, str]) -> CheckOutcome:
 class Reading:
     """Validation of a model document in the background.
 
-    Parameters
-    ----------
-    document, source : str
-        Text of the document, and its name in messages.
-
-    Raises
-    ------
-    ModelError
-        If the document is too large.
+    `document`, `source`: text of the document, and its name in messages. Raises ModelError if the document is too
+    large.
     """
 
     def __init__(self, document: str, source: str) -> None:
@@ -349,10 +294,7 @@ class Reading:
     def read(self) -> Read | None:
         """Return the model and its fingerprint; None if canceled.
 
-        Raises
-        ------
-        ModelError
-            If the document is not valid.
+        Raises ModelError if the document is not valid.
         """
         if self._unwanted.is_set():
             return None

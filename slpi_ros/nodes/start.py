@@ -48,8 +48,7 @@ def _executable(name: str) -> "Callable[[], int]":
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 signal.signal(number, of_process.on_signal)
-        from slpi_ros.dependencies import DependencyError, dependencies_needed
-        from slpi_ros.errors import shown
+        from slpi_ros.errors import DependencyError, dependencies_needed, shown
 
         # Like a line of the node's log, without the line of code that warns.
         warnings.formatwarning = lambda message, *_: f"[WARN] {shown(str(message))}\n"

@@ -1,11 +1,13 @@
 """A whole calibration on simulated stages, without ROS."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibration.stages import SimulatedRecorder, settings, stage_of
 
 from slpi_ros.calibration.run import Recording, aligned, calibrate
-from slpi_ros.errors import RecordError, SlpiError
+from slpi_ros.errors import IdentificationError, RecordError, SlpiError
 from slpi_ros.io.record import Record
 from slpi_ros.reports.calibration import write_files
 from slpi_ros.simulation.character import Character
@@ -44,6 +46,20 @@ def test_a_stage_that_does_not_follow_is_not_driven_further(spoil):
     with pytest.raises(RecordError, match="'x'"):
         calibrate(settings(), recorder)
     assert [request.name for request in recorder.requests] == ["01_check"]
+
+
+def test_a_record_that_allows_no_fit_ends_it():
+    class Coarse(SimulatedRecorder):
+        def __call__(self, request):
+            recording = super().__call__(request)
+            y = recording.record.displacement["x"]
+            digit = 0.12 * np.ptp(y) if request.name != "01_check" else 1e-12
+            return replace(recording, record=replace(recording.record, displacement={"x": np.round(y / digit) * digit}))
+
+    recorder = Coarse(stage_of(Character()))
+    with pytest.raises(IdentificationError, match="too coarse"):
+        calibrate(settings(), recorder)
+    assert len(recorder.requests) == 2
 
 
 @pytest.mark.slow

@@ -436,7 +436,7 @@ def test_a_diagnosis_of_the_model_in_use(humming_bag, tmp_path):
 def test_a_diagnosis_reads_all_bags_of_the_fit(bag, humming_bag, tmp_path, monkeypatch):
     seen = []
 
-    def diagnosed(records, model):
+    def diagnosed(records, model, **_):
         seen.extend(record.source for record in records)
         raise RecordError("enough")
 

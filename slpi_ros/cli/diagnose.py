@@ -1,0 +1,61 @@
+"""``slpi diagnose``: the causes of the errors of a model."""
+
+import shlex
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from slpi_ros.cli import options as common
+from slpi_ros.cli.command import MOST_LINES, Command, Result
+
+
+def _add_options(command: ArgumentParser) -> None:
+    common.add_bags(command, "; several records allow cross-validation of each cause")
+    command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
+    common.add_output(command, "DIR", "folder of diagnosis.json, extended_model.json and report.html")
+    common.add_topics(command)
+    common.add_axes(command, help="default: every axis that bag and model share")
+    common.add_span(command)
+    common.add_sensor(command)
+
+
+def _run(options: Namespace) -> Result:
+    from slpi_ros.io.atomic_file import output_folder
+    from slpi_ros.io.bag_reader import require_different
+    from slpi_ros.io.schemas import format_document
+    from slpi_ros.model.document import load_model
+    from slpi_ros.reports.diagnosis import FILES, PAGE, describe_diagnosis, diagnosis_limits, write_files
+    from slpi_ros.reports.text import verdict
+    from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
+
+    source = common.source_of(options)
+    require_different(options.bags)
+    model = common.with_sensor(load_model(options.model), options)
+    # The model is not checked: an extended model may be extended again.
+    common.allow_folder(options, options.output, *FILES)
+    with output_folder(options.output, *FILES) as folder:
+        diagnosis = diagnose(DiagnoseRequest(source, model)).diagnosis
+        write_files(folder, diagnosis)
+    limits = diagnosis_limits(diagnosis)
+    found_any = any(found.effects for found in diagnosis.axes.values())
+    page, lines = f"{folder / PAGE}: open it in a browser", describe_diagnosis(diagnosis)
+    if found_any or not limits:
+        tested = Path(options.output) / "extended_model.json" if found_any else options.model
+        next_command = f"slpi verify OTHER_BAG --model {shlex.quote(str(tested))}"
+    else:
+        experiments = (found.next_experiment for found in diagnosis.axes.values())
+        next_command = next(filter(None, experiments), f"slpi show {shlex.quote(options.model)}")
+    return Result(
+        [*lines[: MOST_LINES - 2], page] if len(lines) >= MOST_LINES else [*lines, page],
+        format_document(diagnosis.to_document(), "diagnosis"),
+        next_command,
+        verdict(limits),
+        [*lines, page],
+    )
+
+
+COMMAND = Command(
+    "find the causes of a model's errors on bags and extend the model",
+    "slpi diagnose calibration check --model model.json -o diagnosis",
+    _add_options,
+    _run,
+)

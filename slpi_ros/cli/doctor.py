@@ -1,0 +1,104 @@
+"""``slpi doctor``: checks of bags, a model and a running ROS graph."""
+
+import math
+import shlex
+from argparse import ArgumentParser, Namespace
+
+from slpi_ros.cli import options as common
+from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.identification.progress import report_progress
+
+COMMANDS_TOPIC = "voltage_command"
+# Longest time to watch a running graph, seconds.
+LONGEST_WATCH = 3600.0
+
+
+def _add_options(command: ArgumentParser) -> None:
+    command.add_argument("bags", metavar="BAG", nargs="*", help="records to be checked; default: none")
+    command.add_argument("--model", metavar="MODEL.json", help="model to be checked; default: that on stage_model")
+    command.add_argument("--voltage-min", metavar="V", type=float, help="lowest voltage allowed; default: not checked")
+    command.add_argument("--voltage-max", metavar="V", type=float, help="highest voltage allowed; default: not checked")
+    common.add_topic(command)
+    command.add_argument(
+        "--command-topic", metavar="TOPIC", default=COMMANDS_TOPIC,
+        help=f"topic of the voltage commands; default: {COMMANDS_TOPIC}",
+    )  # fmt: skip
+    command.add_argument("--namespace", metavar="NAME", default="", help="namespace of the stage; default: none")
+    command.add_argument(
+        "--seconds", metavar="S", type=common.seconds, default=3.0, help="time to watch a running graph; default: 3 s"
+    )
+    command.add_argument("--no-ros", action="store_true", help="check the files only; default: also a running graph")
+
+
+def _run(options: Namespace) -> Result:
+    from importlib.util import find_spec
+
+    from slpi_ros.io.bag_reader import read_bag
+    from slpi_ros.model.document import load_model
+    from slpi_ros.reports.doctor import (
+        MEND,
+        NOTE,
+        Check,
+        check_graph,
+        check_model,
+        check_record,
+        described,
+        doctor_document,
+    )
+
+    limits = None
+    if (options.voltage_min is None) != (options.voltage_max is None):
+        raise UsageError("--voltage-min and --voltage-max go together; give both or none")
+    if options.voltage_min is not None:
+        if not -math.inf < options.voltage_min < options.voltage_max < math.inf:
+            raise UsageError(f"--voltage-min {options.voltage_min:g}: give a voltage below --voltage-max")
+        limits = options.voltage_min, options.voltage_max
+    if not 0.0 < options.seconds <= LONGEST_WATCH:
+        raise UsageError(f"--seconds {options.seconds:g}: give a time of up to {LONGEST_WATCH:g} s")
+    checks, model, files = [], None, [*options.bags, *filter(None, [options.model])]
+    if options.model:
+        try:
+            model = load_model(options.model)
+            checks += check_model(model, limits)
+        except SlpiError as error:
+            checks.append(Check(MEND, str(error)))
+    for bag in options.bags:
+        report_progress(f"reading {bag}")
+        try:
+            checks += check_record(read_bag(bag, options.topic), model, limits)
+        except SlpiError as error:
+            checks.append(Check(MEND, str(error)))
+    if options.no_ros or find_spec("rclpy") is None:
+        why = "--no-ros" if options.no_ros else "no rclpy; source the setup file of ROS 2 to check a running graph"
+        checks.append(Check(NOTE if files or options.no_ros else MEND, f"ROS: not checked: {why}"))
+    else:
+        from slpi_ros.nodes.graph_probe import probe
+
+        report_progress("watching the ROS graph")
+        graph = probe(options.topic, options.command_topic, options.namespace, options.seconds)
+        if graph.nodes or not files:
+            checks += check_graph(graph, model)
+        else:
+            checks.append(Check(NOTE, "ROS: no node is running; only the files were checked"))
+    verdict, lines, details = described(checks)
+    well = not any(check.level == MEND for check in checks)
+    if not well:
+        next_command = command_line("slpi", "doctor", *options.bags, *(["--model", options.model] if model else []))
+    elif options.bags and model is None:
+        next_command = command_line("slpi", "identify", *options.bags, "-o", "model.json")
+    elif options.bags:
+        next_command = command_line("slpi", "verify", *options.bags, "--model", options.model)
+    elif model is not None:
+        next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.model)}"
+    else:
+        next_command = "slpi calibrate -o DIR --voltage-min V --voltage-max V"
+    return Result(lines, doctor_document(checks), next_command, verdict, details, well)
+
+
+COMMAND = Command(
+    "check bags, a model and a running ROS graph, and say what to mend",
+    "slpi doctor calibration --model model.json",
+    _add_options,
+    _run,
+)

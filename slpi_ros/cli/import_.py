@@ -1,0 +1,69 @@
+"""``slpi import``: a table of measured data becomes a bag."""
+
+import os
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+
+from slpi_ros.cli import options as common
+from slpi_ros.cli.command import Command, Result, command_line
+
+
+def _add_options(command: ArgumentParser) -> None:
+    command.add_argument(
+        "table", metavar="DATA.csv|DATA.mat",
+        help="columns separated by comma, semicolon or tab; names include the unit: x_nm, x (nm), x [nm] or x in nm",
+    )  # fmt: skip
+    common.add_output(command, "BAG", "folder of the new bag")
+    command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
+    command.add_argument(
+        "--voltage", metavar="COLUMN", nargs="+", default=(),
+        help="one for all axes or one per axis; default: the columns in volts",
+    )  # fmt: skip
+    command.add_argument(
+        "--displacement", metavar="COLUMN", nargs="+", default=(),
+        help="one column per axis; default: the columns in units of length",
+    )  # fmt: skip
+    command.add_argument(
+        "--displacement-unit", help="m, mm, um, nm or pm, for columns without a unit in the name; default: um"
+    )
+    command.add_argument(
+        "--axes", metavar="NAME", nargs="+", default=(), help="names of the axes; default: from the column names"
+    )
+    command.add_argument("--hardware-id", metavar="ID", default="", help="identifier of the stage; default: none")
+    command.add_argument(
+        "--storage", choices=("mcap", "sqlite3"), default="mcap", help="file format of the bag; default: mcap"
+    )
+
+
+def _run(options: Namespace) -> Result:
+    from slpi_ros.io.bag_writer import write_bag
+    from slpi_ros.io.columns import ColumnOptions
+    from slpi_ros.io.outputs import allow_bag
+    from slpi_ros.io.tables import import_with_summary
+
+    columns = ColumnOptions(
+        time=options.time,
+        voltage=tuple(options.voltage),
+        displacement=tuple(options.displacement),
+        displacement_unit=options.displacement_unit,
+        axes=tuple(options.axes),
+    )
+    options.remarks += allow_bag(options.output, overwrite=options.overwrite)
+    record, lines = import_with_summary(options.table, columns)
+    record = replace(record, hardware_id=options.hardware_id)
+    # What a link leads to is replaced, not the link.
+    place = os.path.realpath(options.output) if options.overwrite else options.output
+    write_bag(place, record, storage=options.storage, replace=options.overwrite)
+    return Result(
+        [f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s", *lines],
+        {"bag": options.output, "samples": len(record), "axes": list(record.axes), "seconds": float(record.t[-1])},
+        command_line("slpi", "identify", options.output, "-o", "model.json"),
+    )
+
+
+COMMAND = Command(
+    "turn a table of measured data into a bag",
+    "slpi import data.csv -o calibration",
+    _add_options,
+    _run,
+)

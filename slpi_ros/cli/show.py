@@ -1,0 +1,33 @@
+"""``slpi show``: the contents of a model."""
+
+import shlex
+from argparse import ArgumentParser, Namespace
+
+from slpi_ros.cli.command import Command, Result
+
+
+def _add_options(command: ArgumentParser) -> None:
+    command.add_argument("model", metavar="MODEL.json", help="model to be shown")
+
+
+def _run(options: Namespace) -> Result:
+    from slpi_ros.model.document import format_model, load_model
+    from slpi_ros.reports.text import describe_model, model_limits, verdict
+
+    model = load_model(options.model)
+    limits, own = model_limits(model), shlex.quote(options.model)
+    return Result(
+        describe_model(model, details=False),
+        format_model(model),
+        f"slpi diagnose BAG... --model {own} -o diagnosis" if limits else f"slpi verify OTHER_BAG --model {own}",
+        verdict(limits),
+        describe_model(model),
+    )
+
+
+COMMAND = Command(
+    "print the contents of a model",
+    "slpi show model.json",
+    _add_options,
+    _run,
+)

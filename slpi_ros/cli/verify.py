@@ -1,0 +1,80 @@
+"""``slpi verify``: a model on bags that it was not identified from."""
+
+import math
+import shlex
+from argparse import ArgumentParser, Namespace
+from contextlib import nullcontext
+
+from slpi_ros.cli import options as common
+from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.errors import UsageError
+
+
+def _add_options(command: ArgumentParser) -> None:
+    from slpi_ros.io.bag_reader import DESIRED
+
+    common.add_bags(command)
+    command.add_argument("--model", metavar="MODEL.json", required=True, help="model of the same stage")
+    command.add_argument(
+        "--tolerance", metavar="UM", type=float,
+        help="largest rms error that passes, micrometres; default: three times the repeatability floor of the record, "
+        "at least 0.02 %% of the stroke",
+    )  # fmt: skip
+    common.add_output(command, "DIR", "folder of verification.json and report.html; default: none", required=False)
+    command.add_argument(
+        "--desired-topic", metavar="TOPIC",
+        help=f"also evaluate the tracking error against this topic; default: {DESIRED}, if present in the bag",
+    )  # fmt: skip
+    common.add_topics(command)
+    common.add_axes(command, help="default: every axis that bags and model share")
+    common.add_sensor(command)
+
+
+def _run(options: Namespace) -> Result:
+    from slpi_ros.io.atomic_file import output_folder
+    from slpi_ros.io.schemas import format_document
+    from slpi_ros.model.document import load_model
+    from slpi_ros.reports.text import verdict
+    from slpi_ros.reports.verification import (
+        FILES,
+        describe_verification,
+        verification_good,
+        verification_limits,
+        write_files,
+    )
+    from slpi_ros.workflows.verify import VerifyRequest, verify
+
+    source, tolerance = common.source_of(options), None
+    if options.tolerance is not None:
+        if not 0.0 < options.tolerance < math.inf:
+            raise UsageError(f"--tolerance {options.tolerance:g}: give a positive number of micrometres")
+        tolerance = 1e-6 * options.tolerance
+    model = common.with_sensor(load_model(options.model), options)
+    if options.output is not None:
+        common.allow_folder(options, options.output, *FILES, inputs=[options.model])
+    with nullcontext() if options.output is None else output_folder(options.output, *FILES) as folder:
+        found = verify(VerifyRequest(source, model, tolerance, options.desired_topic)).verification
+        if folder:
+            write_files(folder, found)
+    if found.passed:
+        next_command = f"slpi compensate {shlex.quote(options.model)} DESIRED.csv -o VOLTAGE.csv"
+    else:
+        next_command = command_line(
+            "slpi", "diagnose", *options.bags, "--model", options.model, "-o", "diagnosis", *common.same_record(options)
+        )
+    return Result(
+        describe_verification(found, details=False),
+        format_document(found.to_document(), "verification"),
+        next_command,
+        verdict(verification_limits(found), verification_good(found)),
+        describe_verification(found),
+        found.passed,
+    )
+
+
+COMMAND = Command(
+    "test a model on bags not used to identify it: pass or fail",
+    "slpi verify check --model model.json --tolerance 0.05",
+    _add_options,
+    _run,
+)

@@ -1,0 +1,134 @@
+"""Reading of the records of a request, and the decision whether they can be used."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
+from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
+from slpi_ros.io.alignment import SeparateTopics
+from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stage
+from slpi_ros.io.record import Record
+from slpi_ros.model.sensor import IDEAL, Sensor, corrected
+from slpi_ros.model.stage_model import StageModel
+
+# Findings on a record by axis.
+Findings = Mapping[str, Sequence[Finding]]
+
+
+class UnusableRecordError(IdentificationError):
+    """The quality of a record does not allow the request; `findings` holds what was found up to the reason."""
+
+    def __init__(self, message: str = "", found: Findings | None = None) -> None:
+        super().__init__(message)
+        self.findings = dict(found or {})
+
+
+@dataclass(frozen=True)
+class Source:
+    """Records of one stage: the bags that hold them, or the records themselves.
+
+    `bags`: paths of the bags; not read if there are `records`. `topic`: where the bags hold voltage and displacement.
+    `axes`: axes in use; default: all. `start`, `stop` (s): part in use, from the first stamp of each record; default:
+    all. `assessed`: whether `assess_record` has found the axes in use usable already, so that it is not asked again;
+    default False.
+    """
+
+    bags: Sequence[str] = ()
+    topic: str | SeparateTopics = "stage_state"
+    axes: Sequence[str] | None = None
+    start: float | None = None
+    stop: float | None = None
+    records: Sequence[Record] = ()
+    assessed: bool = False
+
+    def read(self, *, coupled: bool = False) -> tuple[Record, ...]:
+        """Return the records.
+
+        `coupled`: whether axes that are not in use are read as well, since they may couple into the others; default
+        False. Raises UsageError if there is no bag, or one is given twice. Raises RecordError if a bag cannot be read,
+        or they are of several stages.
+        """
+        if self.records:
+            return tuple(self.records)
+        records = tuple(self._read(str(bag), coupled) for bag in require_different(self.bags))
+        require_one_stage(records)
+        return records
+
+    def _read(self, bag: str, coupled: bool) -> Record:
+        # Separate topics may not name their axes; their names are then those of the request.
+        if not coupled or (self.axes and isinstance(self.topic, SeparateTopics)):
+            return read_bag(bag, self.topic, axes=self.axes)
+        try:
+            return read_bag(bag, self.topic)
+        except RecordError:
+            if not self.axes:
+                raise
+            return read_bag(bag, self.topic, axes=self.axes)
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Findings on a record by axis, and the reason for each axis that cannot be used."""
+
+    findings: Findings
+    refused: Mapping[str, SlpiError]
+
+
+def assess_record(record: Record, source: Source, sensors: Mapping[str, Sensor] | None = None) -> Assessment:
+    """Assess the axes of a record that are in use, all by default; `sensors` are known by axis."""
+    found: dict[str, Sequence[Finding]] = {}
+    refused: dict[str, SlpiError] = {}
+    for axis in record.axes if source.axes is None else source.axes:
+        try:
+            sensed = _sensed(record, axis, (sensors or {}).get(axis, IDEAL))
+            found[axis] = findings(assess(sensed, axis, start=source.start, stop=source.stop))
+            require_usable(found[axis], f"{record.source}: axis '{axis}'")
+        except SlpiError as error:
+            refused[axis] = UnusableRecordError(str(error), found) if axis in found else error
+    return Assessment(found, refused)
+
+
+def _sensed(record: Record, axis: str, sensor: Sensor) -> Record:
+    """Return the record without delay and lag of the sensor, and without its end, which a late one has not told yet."""
+    if not sensor:
+        return record
+    ends_ns = record.time_ns[-1:] - round(sensor.delay * 1e9)
+    told = slice(int((record.time_ns <= ends_ns).sum()))
+    return corrected(record, {axis: sensor.undo}).part(told)
+
+
+def shared_axes(records: Sequence[Record], model: StageModel, source: Source) -> Sequence[str]:
+    """Return the axes in use; by default those that the model and every record hold."""
+    return source.axes or [axis for axis in model.axes if all(axis in record.axes for record in records)]
+
+
+def require_for_model(records: Sequence[Record], model: StageModel, source: Source) -> tuple[Findings, ...]:
+    """Return the findings on records that a model is compared with; SlpiError if one of them cannot be used."""
+    for record in records:
+        for axis in source.axes or ():
+            record.require_axis(axis)
+            model.axis(axis)
+    return require_records(records, source, {name: axis.sensor for name, axis in model.axes.items()})
+
+
+def require_records(
+    records: Sequence[Record], source: Source, sensors: Mapping[str, Sensor] | None = None
+) -> tuple[Findings, ...]:
+    """Return the findings on each record; SlpiError for the first axis that cannot be used."""
+    found: list[Findings] = []
+    for record in () if source.assessed else records:
+        assessed = assess_record(record, source, sensors)
+        for error in assessed.refused.values():
+            raise error
+        found.append(assessed.findings)
+    return tuple(found)
+
+
+@contextmanager
+def mismatch_in_data() -> Iterator[None]:
+    """Raise ModelError for a UsageError: records and model that do not match are found in the data, not in the call."""
+    try:
+        yield
+    except UsageError as error:
+        raise ModelError(str(error)) from None

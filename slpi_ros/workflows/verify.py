@@ -1,0 +1,54 @@
+"""Verification of a model on records that it has not seen: read, check, judge."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from slpi_ros.diagnosis import verify as verification
+from slpi_ros.diagnosis.verify import Verification
+from slpi_ros.io.bag_reader import read_desired
+from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, require_for_model, shared_axes
+
+
+@dataclass(frozen=True)
+class VerifyRequest:
+    """Request of a verification.
+
+    `source`: whole records are judged, whatever its `start` and `stop`. `tolerance` (m): largest rms error that
+    passes; default: as for `slpi_ros.verify`. `desired_topic`: topic of the bags that holds the desired displacement;
+    default: ``desired_displacement``, where a bag has it.
+    """
+
+    source: Source
+    model: StageModel
+    tolerance: float | None = None
+    desired_topic: str | None = None
+
+
+@dataclass(frozen=True)
+class VerifyOutcome:
+    """Verification, the records that it judges, and the findings on each of them."""
+
+    verification: Verification
+    records: Sequence[Record]
+    findings: Sequence[Findings]
+
+
+def verify(request: VerifyRequest) -> VerifyOutcome:
+    """Verify a model.
+
+    Raises UsageError if a bag is given twice. Raises RecordError, IdentificationError, ModelError if the records cannot
+    be read, allow no judgement, or do not match the model.
+    """
+    source, model = request.source, request.model
+    records = source.read(coupled=True)
+    desired = None
+    if not source.records:
+        read = zip(source.bags, records, strict=True)
+        desired = [read_desired(bag, record, request.desired_topic) for bag, record in read]
+    with mismatch_in_data():
+        source = replace(source, axes=shared_axes(records, model, source), start=None, stop=None)
+        found = require_for_model(records, model, source)
+        told = verification.verify(records, model, request.tolerance, axes=source.axes, desired=desired)
+    return VerifyOutcome(told, records, found)

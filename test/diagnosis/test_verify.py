@@ -60,7 +60,8 @@ def judged(record, model, **options):
 def test_whatever_went_before_an_unchanged_stage_passes(record, history, model):
     one = judged(record(history), model)
     assert one.passed and not one.zero_moved
-    assert one.error.rms < 1.2 * 8e-9
+    assert one.rest.rms < 1.2 * 8e-9 and one.share > 0.95
+    assert abs(one.constant) <= one.offset_uncertainty
 
 
 @pytest.mark.parametrize("offset", [-0.93e-6, 0.2e-6])
@@ -82,12 +83,14 @@ def test_the_error_is_that_of_the_samples_judged(model):
     record = unseen()
     one = judged(record, model)
     assert one.known_from == pytest.approx(float(record.t[one.judged][0]))
-    error = (record.displacement["x"] - one.model)[one.judged]
+    rest = (record.displacement["x"] - one.model)[one.judged]
+    assert one.rest.rms == pytest.approx(rms(rest)) and one.rest.maximum == pytest.approx(np.abs(rest).max())
+    error = rest + one.constant
     assert one.error.rms == pytest.approx(rms(error)) and one.error.maximum == pytest.approx(np.abs(error).max())
     found = slpi_ros.verify([record, small_loops(())], model).axes["x"]
     for parts in (found.by_level, found.by_speed, found.by_region):
         total = sum(part.samples * part.rms**2 for part in parts)
-        assert np.sqrt(total / found.overall.samples) == pytest.approx(found.overall.rms)
+        assert np.sqrt(total / found.rest.samples) == pytest.approx(found.rest.rms)
 
 
 def test_a_coupled_axis_is_judged_with_the_motion_of_the_other(model):
@@ -219,7 +222,7 @@ def test_command_passes_fails_and_writes(slpi, folder, tmp_path):
     document = json.loads((tmp_path / "out" / "verification.json").read_text())
     validate(document, "verification", "test")
     assert document["passed"] and document["axes"]["x"]["records"][0]["zero_moved"]
-    assert parsed(tmp_path / "out" / "report.html").texts["verdict-x"].startswith("pass")
+    assert parsed(tmp_path / "out" / "report.html").texts["verdict-x"].startswith("passed")
     both = (folder / "good", folder / "bad", "--model", folder / "model.json")
     code, said, _ = slpi(*both, "--json")
     assert code == 1 and [one["passed"] for one in json.loads(said)["axes"]["x"]["records"]] == [True, False]

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from slpi_ros.diagnosis.diagnose import diagnose
-from slpi_ros.errors import RecordError, SlpiError, UsageError
+from slpi_ros.diagnosis.tracking import ErrorPart, Tracking, track
+from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
 from slpi_ros.identification.cross_validation import (
     level_classes,
@@ -38,17 +39,10 @@ Mask = NDArray[np.bool_]
 SCHEMA = "slpi_ros/verification/2"
 # Default tolerance as a multiple of the repeatability floor.
 TIMES_THE_FLOOR = 3.0
-# A delay is accepted if it reduces the difference between model and desired displacement by this factor.
-BETTER = 1.1
 # A change of gain contributes to the offset if the error after fitting it is below this share of the error before.
 MOSTLY = 0.5
 # Approximate number of samples from which tables are computed.
 TABLE_SAMPLES = 40_000
-# A voltage is at a limit if it stays at the extreme of the record for at least this many samples.
-FEWEST_AT_LIMIT = 3
-# Longest delay that is searched for, in seconds and as a share of the record, and number of steps of the search.
-LONGEST_DELAY, DELAY_SHARE, DELAY_STEPS = 0.5, 0.05, 200
-
 # Smallest shares of the samples that are judged: for a judgement without those before the initial state is known,
 # without a warning, and at all.
 MOST_KNOWN, FEW, LEAST = 0.6, 0.2, 0.05
@@ -57,82 +51,6 @@ PASSED, FAILED, UNPROVED = "passed", "failed", "unproved"
 # A voltage stands if it stays within this share of its range for this many samples; shares of moving and standing
 # samples from which both are reported.
 STANDS, STANDS_FOR, BOTH = 1e-3, 50, 0.05
-
-CAUSES = {
-    "zero": "the zero of the sensor has moved since the model was identified",
-    "memory": "the compensator started from another memory than the stage had",
-    "limits": "the voltage was at a limit",
-    "delay": "the displacement follows the desired one later",
-    "command": "the voltages are not those of this model: rate limits, feedback, a reset or another model",
-    "effects": "the stage does what the model does not hold; `slpi diagnose` names it",
-    "model": "the model's hysteresis is not that of the stage",
-    "noise": "noise of the sensor",
-}
-
-
-@dataclass(frozen=True)
-class ErrorPart:
-    """Number of samples, and their rms and maximum error (m), for a part of the samples."""
-
-    name: str
-    samples: int
-    rms: float
-    maximum: float
-
-    @classmethod
-    def of(cls, name: str, error: FloatArray) -> "ErrorPart":
-        """Summarise errors, shape (N,), metres, N > 0."""
-        return cls(name, error.size, _rms(error), float(np.abs(error).max()))
-
-    def to_document(self) -> dict[str, Any]:
-        """Return the part as in ``msg_schemas/verification.schema.json``."""
-        return {"name": self.name, "samples": self.samples, "rms_m": self.rms, "maximum_m": self.maximum}
-
-
-@dataclass(frozen=True)
-class Tracking:
-    """Tracking error of a compensated path, and its causes.
-
-    Parameters
-    ----------
-    error : ErrorPart
-        Measured - desired displacement.
-    shares : mapping of cause to float
-        Share of each of `CAUSES` in the mean square error. Their sum is 1; a cause that counteracts others is negative.
-    delay : float, seconds
-        Delay of the displacement behind the desired one.
-    effects : tuple of str
-        Effects that a diagnosis of the record identified.
-    t, desired : ndarray, shape (N,), seconds and metres
-        Time and desired displacement, for charts.
-    parts : mapping of cause to ndarray, shape (N,), metres
-        Contribution of each cause to the error; "model" includes noise and effects.
-    """
-
-    error: ErrorPart
-    shares: Mapping[str, float]
-    delay: float
-    effects: tuple[str, ...]
-    t: FloatArray
-    desired: FloatArray
-    parts: Mapping[str, FloatArray]
-
-    @property
-    def blame(self) -> str:
-        """The cause with the largest share."""
-        return max(self.shares, key=lambda cause: self.shares[cause])
-
-    def to_document(self) -> dict[str, Any]:
-        """Return the figures as in ``msg_schemas/verification.schema.json``."""
-        return {
-            "rms_m": self.error.rms,
-            "maximum_m": self.error.maximum,
-            "samples": self.error.samples,
-            "shares": dict(self.shares),
-            "blame": self.blame,
-            "delay_s": self.delay,
-            "effects": list(self.effects),
-        }
 
 
 @dataclass(frozen=True)
@@ -389,7 +307,13 @@ def verify(
             axis, run = model.axis(name), runs[name]
             one = _judge(run, axis, record.source, tolerance, without_offset=without_offset)
             if path is not None and name in path:
-                one = replace(one, tracking=_tracking(one, run, path[name], record, model, name))
+                followed = path[name][np.isfinite(record.voltage[name])][: run.t.size]
+                tracking = track(
+                    (record.source, name), run.t, one.v, one.measured, followed,
+                    one.model - run.explained, run.assumed, zero=one.offset if one.zero_moved else 0.0,
+                    noise_rms=one.floor_rms, effects=_effects(one, record, model, name),
+                )  # fmt: skip
+                one = replace(one, tracking=tracking)
             found[name].append(one)
     return Verification(
         {name: _summary(found[name], model.axis(name).quality.held_out_rms) for name in names},
@@ -620,78 +544,6 @@ def _thinned(record: RecordVerification, most: int) -> IntArray:
     return at[:: max(1, round(at.size / most))]
 
 
-def _tracking(
-    one: RecordVerification, run: _Run, path: FloatArray, record: Record, model: StageModel, name: str
-) -> Tracking:
-    """Decompose the tracking error, measured - desired, by cause.
-
-    ``m`` is the model from the initial history that explains the record, ``a`` the model from the initial state that
-    the compensator seems to have assumed, and ``d`` the desired displacement (``d'``: delayed as the stage is)::
-
-        y - d = (y - offset - m) + offset + (m - a) + (a - d') + (d' - d)
-                 model, noise      zero     memory    command    delay
-    """
-    driven = np.isfinite(record.voltage[name])
-    d = path[driven][: run.t.size]
-    at = np.isfinite(d) & run.samples.fitted
-    if np.count_nonzero(at) < 2:
-        raise RecordError(f"{record.source}: axis '{name}': no desired displacement while it was measured; record both")
-    t, v, y, d = run.t[at], run.samples.v[at], run.samples.y[at], d[at]
-    offset = one.offset if one.zero_moved else 0.0
-    estimated = run.simulated[at] - run.explained
-    assumed = min((each[at] for each in run.assumed), key=lambda each: _rms(each - d))
-    delay = _delay(t, d, assumed)
-    late = np.interp(t - delay, t, d)
-    command = assumed - late
-    limited = _at_limit(v, command)
-    parts = {
-        "zero": np.full(t.size, offset),
-        "memory": estimated - assumed,
-        "limits": np.where(limited, command, 0.0),
-        "delay": late - d,
-        "command": np.where(limited, 0.0, command),
-        "model": y - offset - estimated,
-    }
-    error = y - d
-    total = float(error @ error)
-    shares = {cause: float(part @ error) / total if total else 0.0 for cause, part in parts.items()}
-    named, explained = _effects(one, record, model, name)
-    noise = min(one.floor_rms**2 * error.size / total if total else 0.0, max(shares["model"], 0.0))
-    effects = explained * max(shares["model"] - noise, 0.0)
-    shares |= {"model": shares["model"] - noise - effects, "effects": effects, "noise": noise}
-    return Tracking(
-        error=ErrorPart.of(record.source, error),
-        shares={cause: shares[cause] for cause in CAUSES},
-        delay=delay,
-        effects=named,
-        t=t,
-        desired=d,
-        parts=parts,
-    )
-
-
-def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
-    """Return the delay (s) of the model behind the desired displacement; 0 if no delay is clearly better."""
-    longest = min(LONGEST_DELAY, DELAY_SHARE * float(t[-1] - t[0]))
-    shifts = np.linspace(0.0, longest, DELAY_STEPS + 1)
-    misses = [_rms(model - np.interp(t - shift, t, desired)) for shift in shifts.tolist()]
-    best = int(np.argmin(misses))
-    return float(shifts[best]) if misses[best] < misses[0] / BETTER else 0.0
-
-
-def _at_limit(v: FloatArray, command: FloatArray) -> Mask:
-    """Return the mask of samples, shape (N,), with the voltage at a limit and a desired displacement beyond it."""
-    margin = 1e-6 * float(np.ptp(v))
-    limited = np.zeros(v.size, dtype=bool)
-    for extreme, missing in ((v.max(), command < 0.0), (v.min(), command > 0.0)):
-        there = np.abs(v - extreme) <= margin
-        edges = np.flatnonzero(np.diff(np.pad(there, 1).astype(np.int8)))
-        for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            if stop - start >= FEWEST_AT_LIMIT:
-                limited[start:stop] |= missing[start:stop]
-    return limited
-
-
 def _effects(one: RecordVerification, record: Record, model: StageModel, name: str) -> tuple[tuple[str, ...], float]:
     """Return the effects that a diagnosis identifies, and their share of the residual; none if the error is small."""
     if one.rest.rms <= _default_limit(model.axis(name), one.floor_rms):
@@ -702,7 +554,3 @@ def _effects(one: RecordVerification, record: Record, model: StageModel, name: s
         # With too little data for a diagnosis, the contribution of the model is still known.
         return (), 0.0
     return tuple(effect.name for effect in found), min(sum(max(one.share_of_residual, 0.0) for one in found), 1.0)
-
-
-def _rms(error: FloatArray) -> float:
-    return float(np.sqrt(np.mean(error**2)))

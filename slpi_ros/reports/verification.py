@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.diagnosis.tracking import CAUSES, ErrorPart, Tracking
 from slpi_ros.diagnosis.verify import (
-    CAUSES,
     FAILED,
     FEW,
     MOST_KNOWN,
@@ -15,9 +15,7 @@ from slpi_ros.diagnosis.verify import (
     TIMES_THE_FLOOR,
     UNPROVED,
     AxisVerification,
-    ErrorPart,
     RecordVerification,
-    Tracking,
     Verification,
 )
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
@@ -108,7 +106,8 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
     for name, axis in found.axes.items():
         told = [f"{axis.verdict}: " + _summary(name, axis).removeprefix(f"Axis {name}: ")]
         for record in axis.records:
-            told += [f"{record.error.name}: {line}" for line in (_error(record), *_notes(record))]
+            error = [_error(record)] if len(axis.records) > 1 else []
+            told += [f"{record.error.name}: {line}" for line in (*error, *_notes(record))]
             if record.tracking:
                 told += [f"{record.error.name}: {line}" for line in _tracking_notes(record.tracking)]
         parts = (axis.overall, axis.rest, *axis.by_level, *axis.by_speed, *axis.by_region) if details else ()

@@ -54,10 +54,10 @@ class ErrorPart:
 class Tracking:
     """Tracking error of a compensated path of N samples, and its causes.
 
-    `shares`: share of each of `CAUSES` in the mean square of measured - desired; their sum is 1, a cause that counteracts
-    others is negative. `delay` (s): that of the displacement behind the desired one. `effects`: what a diagnosis of the
-    record identified. `t`, `desired`, (N,), s and m. `parts`: contribution of each cause, (N,), m, with noise and
-    effects in "model".
+    `shares`: share of each of `CAUSES` in the mean square of measured - desired; their sum is 1, a cause that
+    counteracts others is negative. `delay` (s): that of the displacement behind the desired one. `effects`: what a
+    diagnosis of the record identified. `t`, `desired`, (N,), s and m. `parts`: contribution of each cause, (N,), m,
+    with noise and effects in "model".
     """
 
     error: ErrorPart
@@ -108,8 +108,8 @@ def track(
         y - d = (y - zero - m) + zero + (m - a) + (a - d') + (d' - d)
                  model, noise           memory    command    delay
 
-    `effects` are the names of a diagnosis, and the share of the model's part that they explain. RecordError, which names
-    record and axis `where`, if there is no desired displacement.
+    `effects` are the names of a diagnosis, and the share of the model's part that they explain. RecordError, which
+    names record and axis `where`, if there is no desired displacement.
     """
     at = np.isfinite(desired) & np.isfinite(y)
     if np.count_nonzero(at) < 2:

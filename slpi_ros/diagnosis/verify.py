@@ -57,17 +57,18 @@ STANDS, STANDS_FOR, BOTH = 1e-3, 50, 0.05
 class RecordVerification:
     """Verification of one axis on one record of N samples.
 
-    `error` is the absolute error, measured - model, of the judged samples, named after the record; of it, `constant`
-    (m) is constant, and `rest` is the rest. `offset` (m) is the shift of the zero, without that of a changed gain, and
-    `offset_uncertainty` (m) what the unknown initial state and random errors can make of it.
-    `judged_error` (m, rms) is compared with `limit` (m): the absolute one if `absolute`, else the rest. `share` is that
-    of the judged samples in all samples, and `known_from` (s) the time from which they are judged, None if the initial
-    state is estimated and all are. `moving` and `standing` are absolute errors where both occur. `noise_rms` (m) is the
-    repeatability of the record, estimated from `noise_source`. `zero_moved`: the offset exceeds its uncertainty.
-    `gain` and `width` are relative changes of the loops' height, and of their width in addition. `outside` counts
-    voltages outside the range of the identification. `t`, `v`, `measured`, `model`, (N,), s, V and m: the record, and
-    the displacement of the model with the constant; `judged`: mask of the judged samples. `tracking` is None if the
-    desired displacement is not known. `corrected` says what was taken out of the readings, as known of the sensor.
+    `error` is the absolute error, measured - model, of the judged samples, named after the record; of it,
+    `constant` (m) is constant, and `rest` is the rest. `offset` (m) is the shift of the zero, without that of a
+    changed gain, and `offset_uncertainty` (m) what the unknown initial state and random errors can make of it.
+    `judged_error` (m, rms) is compared with `limit` (m): the absolute one if `absolute`, else the rest. `samples`
+    counts all samples of the part that was to be judged, and `known_from` (s) the time from which they are judged,
+    None if the initial state is estimated and all are. `moving` and `standing` are absolute errors where both
+    occur. `floor_rms` (m) is the repeatability of the record, estimated from `floor_source`. `zero_moved`: the
+    offset exceeds its uncertainty. `gain` and `width` are relative changes of the loops' height, and of their width
+    in addition. `outside` counts voltages outside the range of the identification. `t`, `v`, `measured`, `model`,
+    (N,), s, V and m: the record, and the displacement of the model with the constant; `judged`: mask of the judged
+    samples. `tracking` is None if the desired displacement is not known. `corrected` says what was taken out of the
+    readings, as known of the sensor.
     """
 
     error: ErrorPart
@@ -77,7 +78,7 @@ class RecordVerification:
     offset_uncertainty: float
     limit: float
     absolute: bool
-    share: float
+    samples: int
     known_from: float | None
     begins_known: bool
     history: tuple[float, ...]
@@ -97,6 +98,11 @@ class RecordVerification:
     judged: Mask
     tracking: Tracking | None = None
     corrected: str = ""
+
+    @property
+    def share(self) -> float:
+        """Share of the judged samples in all samples."""
+        return self.error.samples / self.samples
 
     @property
     def judged_error(self) -> float:
@@ -326,14 +332,16 @@ def verify(
 class _Run:
     """Free run of one axis on a record, from the given, the known or the estimated initial state.
 
-    `simulated`, (N,), m, contains the constant error; `constant` (m) is that error, and `explained` (m) the part of it
-    that a change of gain makes, and a significant `offset`. `assumed` holds a simulation from each initial state that a
-    compensator may have assumed. `begins_known`: the initial state is known.
+    `simulated`, (N,), m, contains the constant error; `constant` (m) is that error, and `explained` (m) the part of
+    it that a change of gain makes, and a significant `offset`. `assumed` holds a simulation from each initial state
+    that a compensator may have assumed. `begins_known`: the initial state is known. `samples_in_span`: all samples
+    of the part that is to be judged.
     """
 
     t: FloatArray
     samples: Samples
     judged: Mask
+    samples_in_span: int
     begins_known: bool
     found: Match
     simulated: FloatArray
@@ -366,7 +374,7 @@ def _free_run(
         with warnings.catch_warnings():
             # The effect of loops that were never identified is visible in the errors.
             warnings.simplefilter("ignore", UnidentifiedLoopWarning)
-            runs[name] = _run(axis, t, samples, start_memory)
+            runs[name] = _run(axis, t, samples, start_memory, -np.inf if span[0] is None else span[0])
             start = runs[name].found.start
             own = replace(axis, start=start).uncoupled_displacement(t, samples.v)
         motions[name] = t, own - start.displacement
@@ -390,8 +398,8 @@ def _free_run(
     return coupled
 
 
-def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None) -> _Run:
-    """Simulate an axis on a record from its initial state."""
+def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None, start: float) -> _Run:
+    """Simulate an axis on a record from its initial state; samples before `start` (s) are not judged."""
     found, begins_known = _matched(axis, t, samples, start_memory)
     simulated = replace(axis, start=found.start).simulate(t, samples.v)
     # The outliers that `identify` leaves out are no error of the model.
@@ -409,6 +417,7 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMe
         t=t,
         samples=samples,
         judged=judged,
+        samples_in_span=int(np.count_nonzero(t >= start)),
         begins_known=begins_known,
         found=found,
         simulated=simulated + shift,
@@ -422,8 +431,8 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMe
 def _matched(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None) -> tuple[Match, bool]:
     """Compare the model with a record; return also whether the initial state is known.
 
-    It is if it is given, or if the record begins at an end of the model's voltage range, unless the state there explains
-    the record worse than the samples to which any initial state only adds a constant.
+    It is if it is given, or if the record begins at an end of the model's voltage range, unless the state there
+    explains the record worse than the samples to which any initial state only adds a constant.
     """
     if start_memory:
         return match(axis, samples, t, axis.initial(start_memory)), True
@@ -481,7 +490,7 @@ def _judge(
         offset_uncertainty=found.offset_uncertainty,
         limit=_default_limit(axis, floor.rms) if tolerance is None else tolerance,
         absolute=tolerance is not None and not without_offset,
-        share=float(np.count_nonzero(judged) / samples.fitted.size),
+        samples=run.samples_in_span,
         known_from=None if estimated else float(run.t[judged][0]),
         begins_known=run.begins_known,
         history=found.start.history,

@@ -151,7 +151,7 @@ def _error(record: RecordVerification) -> str:
 
 def _judged_share(record: RecordVerification) -> str:
     """Return how many samples are judged, and why not more."""
-    said = f"{record.error.samples:,} of {record.judged.size:,} samples judged ({record.share:.0%})"
+    said = f"{record.error.samples:,} of {record.samples:,} samples judged ({record.share:.0%})"
     if record.share >= MOST_KNOWN:
         return said
     why = "" if record.known_from is None else f", as the initial state is unknown before {record.known_from:.4g} s"

@@ -58,13 +58,13 @@ class _UniqueNames(Action):
         setattr(namespace, self.dest, names)
 
 
-def add_span(command: ArgumentParser) -> None:
-    """Add ``--start`` and ``--stop``."""
+def add_span(command: ArgumentParser, of: str = "the fit") -> None:
+    """Add ``--start`` and ``--stop`` `of` the part in use."""
     command.add_argument(
-        "--start", metavar="S", type=seconds, help="start of the fit, s from the first stamp; default: 0"
+        "--start", metavar="S", type=seconds, help=f"start of {of}, s from the first stamp; default: 0"
     )
     command.add_argument(
-        "--stop", metavar="S", type=seconds, help="end of the fit, s from the first stamp; default: the last"
+        "--stop", metavar="S", type=seconds, help=f"end of {of}, s from the first stamp; default: the last"
     )
 
 

@@ -12,19 +12,30 @@ from slpi_ros.errors import UsageError
 
 def _add_options(command: ArgumentParser) -> None:
     from slpi_ros.io.bag_reader import DESIRED
+    from slpi_ros.model.axis_model import START_MEMORIES
 
     common.add_bags(command)
     command.add_argument("--model", metavar="MODEL.json", required=True, help="model of the same stage")
     command.add_argument(
         "--tolerance", metavar="UM", type=float,
-        help="largest rms error that passes, micrometres; default: three times the repeatability floor of the record, "
-        "at least 0.02 %% of the stroke",
+        help="largest absolute rms error that passes, micrometres; default: three times the repeatability of the "
+        "record, at least 0.02 %% of the stroke, for the error without its constant part",
+    )  # fmt: skip
+    command.add_argument(
+        "--without-offset", action="store_true",
+        help="the tolerance holds for the error without its constant part; default: for the absolute error",
     )  # fmt: skip
     common.add_output(command, "DIR", "folder of verification.json and report.html; default: none", required=False)
     command.add_argument(
         "--desired-topic", metavar="TOPIC",
         help=f"also evaluate the tracking error against this topic; default: {DESIRED}, if present in the bag",
     )  # fmt: skip
+    command.add_argument(
+        "--start-memory", choices=START_MEMORIES,
+        help="initial state of the stage: as at the end of the identified record, as at its start, or after a reset; "
+        "default: found from the record",
+    )  # fmt: skip
+    common.add_span(command, "what is judged")
     common.add_topics(command)
     common.add_axes(command, help="default: every axis that bags and model share")
     common.add_sensor(command)
@@ -53,7 +64,10 @@ def _run(options: Namespace) -> Result:
     if options.output is not None:
         common.allow_folder(options, options.output, *FILES, inputs=[options.model])
     with nullcontext() if options.output is None else output_folder(options.output, *FILES) as folder:
-        found = verify(VerifyRequest(source, model, tolerance, options.desired_topic)).verification
+        request = VerifyRequest(
+            source, model, tolerance, options.desired_topic, options.without_offset, options.start_memory
+        )
+        found = verify(request).verification
         if folder:
             write_files(folder, found)
     if found.passed:
@@ -73,7 +87,7 @@ def _run(options: Namespace) -> Result:
 
 
 COMMAND = Command(
-    "test a model on bags not used to identify it: pass or fail",
+    "test a model on bags not used to identify it: passed, failed or unproved",
     "slpi verify check --model model.json --tolerance 0.05",
     _add_options,
     _run,

@@ -97,7 +97,7 @@ def _predicts_worse(error: float, before: float, in_use: StageModel, name: str, 
         # What the model in use cannot be compared with is no reason to keep it.
         return ""
     if found:
-        of_records = float(np.sqrt(np.mean([one.error.rms**2 for one in found.records])))
+        of_records = float(np.sqrt(np.mean([one.rest.rms**2 for one in found.records])))
         if error > WORSE * of_records:
             return (
                 f"{said}, on the same record the model in use has {of_records * 1e9:.3g} nm; at most "

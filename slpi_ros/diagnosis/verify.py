@@ -1,7 +1,8 @@
 """Verification of a model on records not used for its identification, and causes of the error of compensated paths.
 
-The motion before a record is unknown: an initial history and a constant offset are estimated for each record, and
-nothing else. The samples to which the initial history only adds a constant are evaluated, or all if these are too few.
+Errors are absolute, measured - model, from the initial state of the record: the given one, that at an end of the
+model's voltage range if the record begins there, else an estimated one. Of an unknown initial state the samples are
+judged to which it only adds a constant, or all if these are too few.
 """
 
 import warnings
@@ -11,9 +12,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from slpi_ros.diagnosis.diagnose import diagnose
-from slpi_ros.errors import RecordError, SlpiError, UsageError
+from slpi_ros.diagnosis.tracking import ErrorPart, Tracking, track
+from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
 from slpi_ros.identification.cross_validation import (
     level_classes,
@@ -22,157 +25,67 @@ from slpi_ros.identification.cross_validation import (
     speed_classes,
     speeds,
 )
-from slpi_ros.identification.free_run import Match, match
+from slpi_ros.identification.free_run import AS_WELL, Match, match, starts_at_end
 from slpi_ros.identification.repeatability_floor import floor_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
-from slpi_ros.model.axis_model import RESOLUTION, START_MEMORIES, AxisModel
+from slpi_ros.model.axis_model import RESOLUTION, START_MEMORIES, AxisModel, StartMemory
 from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-SCHEMA = "slpi_ros/verification/1"
+SCHEMA = "slpi_ros/verification/2"
 # Default tolerance as a multiple of the repeatability floor.
 TIMES_THE_FLOOR = 3.0
-# A delay is accepted if it reduces the difference between model and desired displacement by this factor.
-BETTER = 1.1
 # A change of gain contributes to the offset if the error after fitting it is below this share of the error before.
 MOSTLY = 0.5
 # Approximate number of samples from which tables are computed.
 TABLE_SAMPLES = 40_000
-# A voltage is at a limit if it stays at the extreme of the record for at least this many samples.
-FEWEST_AT_LIMIT = 3
-# Longest delay that is searched for, in seconds and as a share of the record, and number of steps of the search.
-LONGEST_DELAY, DELAY_SHARE, DELAY_STEPS = 0.5, 0.05, 200
-
-CAUSES = {
-    "zero": "the zero of the sensor has moved since the model was identified",
-    "memory": "the compensator started from another memory than the stage had",
-    "limits": "the voltage was at a limit",
-    "delay": "the displacement follows the desired one later",
-    "command": "the voltages are not those of this model: rate limits, feedback, a reset or another model",
-    "effects": "the stage does what the model does not hold; `slpi diagnose` names it",
-    "model": "the model's hysteresis is not that of the stage",
-    "noise": "noise of the sensor",
-}
-
-
-@dataclass(frozen=True)
-class ErrorPart:
-    """Number of samples, and their rms and maximum error (m), for a part of the samples."""
-
-    name: str
-    samples: int
-    rms: float
-    maximum: float
-
-    @classmethod
-    def of(cls, name: str, error: FloatArray) -> "ErrorPart":
-        """Summarise errors, shape (N,), metres, N > 0."""
-        return cls(name, error.size, _rms(error), float(np.abs(error).max()))
-
-    def to_document(self) -> dict[str, Any]:
-        """Return the part as in ``msg_schemas/verification.schema.json``."""
-        return {"name": self.name, "samples": self.samples, "rms_m": self.rms, "maximum_m": self.maximum}
-
-
-@dataclass(frozen=True)
-class Tracking:
-    """Tracking error of a compensated path, and its causes.
-
-    Parameters
-    ----------
-    error : ErrorPart
-        Measured - desired displacement.
-    shares : mapping of cause to float
-        Share of each of `CAUSES` in the mean square error. Their sum is 1; a cause that counteracts others is negative.
-    delay : float, seconds
-        Delay of the displacement behind the desired one.
-    effects : tuple of str
-        Effects that a diagnosis of the record identified.
-    t, desired : ndarray, shape (N,), seconds and metres
-        Time and desired displacement, for charts.
-    parts : mapping of cause to ndarray, shape (N,), metres
-        Contribution of each cause to the error; "model" includes noise and effects.
-    """
-
-    error: ErrorPart
-    shares: Mapping[str, float]
-    delay: float
-    effects: tuple[str, ...]
-    t: FloatArray
-    desired: FloatArray
-    parts: Mapping[str, FloatArray]
-
-    @property
-    def blame(self) -> str:
-        """The cause with the largest share."""
-        return max(self.shares, key=lambda cause: self.shares[cause])
-
-    def to_document(self) -> dict[str, Any]:
-        """Return the figures as in ``msg_schemas/verification.schema.json``."""
-        return {
-            "rms_m": self.error.rms,
-            "maximum_m": self.error.maximum,
-            "samples": self.error.samples,
-            "shares": dict(self.shares),
-            "blame": self.blame,
-            "delay_s": self.delay,
-            "effects": list(self.effects),
-        }
+# Smallest shares of the samples that are judged: for a judgement without those before the initial state is known,
+# without a warning, and at all.
+MOST_KNOWN, FEW, LEAST = 0.6, 0.2, 0.05
+# Verdicts.
+PASSED, FAILED, UNPROVED = "passed", "failed", "unproved"
+# A voltage stands if it stays within this share of its range for this many samples; shares of moving and standing
+# samples from which both are reported.
+STANDS, STANDS_FOR, BOTH = 1e-3, 50, 0.05
 
 
 @dataclass(frozen=True)
 class RecordVerification:
-    """Verification of one axis on one record.
+    """Verification of one axis on one record of N samples.
 
-    Parameters
-    ----------
-    error : ErrorPart
-        Error, measured - model, of the evaluated samples without the offset, named after the record.
-    limit : float, metres
-        Largest rms error that passes.
-    floor_rms : float, metres
-        Repeatability floor of the record.
-    floor_source : str
-        Data from which the floor was estimated.
-    known_from : float or None, seconds
-        Time from which the initial history only adds a constant; evaluation starts there. None if there is no such
-        time: all samples are evaluated, from the estimated history.
-    history : tuple of float, volts
-        Initial history that best explains the record, as in `slpi_ros.model.axis_model.Start`.
-    offset : float, metres
-        Shift of the zero.
-    offset_uncertainty : float, metres
-        Uncertainty of the offset, due to the unknown initial history and to random errors.
-    zero_moved : bool
-        Whether the offset exceeds its uncertainty.
-    gain, width : float
-        Relative change of the height of the loops from those of the model, and additional change of their width.
-    match : Match
-        Comparison of the model with the record, with the uncertainties of these changes.
-    outside : int
-        Number of samples with a voltage outside the range of the identification.
-    t, v, measured, model : ndarray, shape (N,), seconds, volts and metres
-        Time, voltage and displacement of the record, and displacement of the model including the offset.
-    judged : ndarray of bool, shape (N,)
-        Mask of the evaluated samples.
-    tracking : Tracking or None
-        Tracking error; None if the desired displacement is not known.
-    corrected : str
-        What was taken out of the readings, as known of the sensor; "" if nothing.
+    `error` is the absolute error, measured - model, of the judged samples, named after the record; of it,
+    `constant` (m) is constant, and `rest` is the rest. `offset` (m) is the shift of the zero, without that of a
+    changed gain, and `offset_uncertainty` (m) what the unknown initial state and random errors can make of it.
+    `judged_error` (m, rms) is compared with `limit` (m): the absolute one if `absolute`, else the rest. `samples`
+    counts all samples of the part that was to be judged, and `known_from` (s) the time from which they are judged,
+    None if the initial state is estimated and all are. `moving` and `standing` are absolute errors where both
+    occur. `floor_rms` (m) is the repeatability of the record, estimated from `floor_source`. `zero_moved`: the
+    offset exceeds its uncertainty. `gain` and `width` are relative changes of the loops' height, and of their width
+    in addition. `outside` counts voltages outside the range of the identification. `t`, `v`, `measured`, `model`,
+    (N,), s, V and m: the record, and the displacement of the model with the constant; `judged`: mask of the judged
+    samples. `tracking` is None if the desired displacement is not known. `corrected` says what was taken out of the
+    readings, as known of the sensor.
     """
 
     error: ErrorPart
-    limit: float
-    floor_rms: float
-    floor_source: str
-    known_from: float | None
-    history: tuple[float, ...]
+    constant: float
+    rest: ErrorPart
     offset: float
     offset_uncertainty: float
+    limit: float
+    absolute: bool
+    samples: int
+    known_from: float | None
+    begins_known: bool
+    history: tuple[float, ...]
+    moving: ErrorPart | None
+    standing: ErrorPart | None
+    floor_rms: float
+    floor_source: str
     zero_moved: bool
     gain: float
     width: float
@@ -187,27 +100,57 @@ class RecordVerification:
     corrected: str = ""
 
     @property
+    def share(self) -> float:
+        """Share of the judged samples in all samples."""
+        return self.error.samples / self.samples
+
+    @property
+    def judged_error(self) -> float:
+        """Rms error that is compared with the limit, metres."""
+        return self.error.rms if self.absolute else self.rest.rms
+
+    @property
+    def verdict(self) -> str:
+        """The verdict: `PASSED`, `FAILED`, or `UNPROVED` if too few samples are judged.
+
+        Also if the absolute error is to be judged, and the unknown initial state alone may be beyond the limit.
+        """
+        hidden = self.absolute and not self.begins_known and self.offset_uncertainty > self.limit
+        if self.share < LEAST or (hidden and self.rest.rms <= self.limit):
+            return UNPROVED
+        return PASSED if self.judged_error <= self.limit else FAILED
+
+    @property
     def passed(self) -> bool:
-        """Whether the rms error is within the limit."""
-        return self.error.rms <= self.limit
+        """Whether the verdict is `PASSED`."""
+        return self.verdict == PASSED
 
     @property
     def left(self) -> FloatArray:
-        """Measured - model of the evaluated samples, shape (M,), metres."""
+        """Measured - model of the judged samples without the constant, shape (M,), metres."""
         return (self.measured - self.model)[self.judged]
 
     def to_document(self) -> dict[str, Any]:
         """Return the figures as in ``msg_schemas/verification.schema.json``."""
+        both = self.moving is not None and self.standing is not None
         return {
             "source": self.error.name,
+            "verdict": self.verdict,
             "passed": self.passed,
             "samples": self.error.samples,
+            "share": self.share,
             "rms_m": self.error.rms,
             "maximum_m": self.error.maximum,
+            "constant_m": self.constant,
+            "rest_rms_m": self.rest.rms,
+            "rest_maximum_m": self.rest.maximum,
+            "moving_rms_m": self.moving.rms if self.moving and both else None,
+            "standing_rms_m": self.standing.rms if self.standing and both else None,
             "limit_m": self.limit,
+            "limit_of": "rms_m" if self.absolute else "rest_rms_m",
             "floor_rms_m": self.floor_rms,
             "floor_source": self.floor_source,
-            "start": "estimated" if self.known_from is None else "known",
+            "start": "known" if self.begins_known or self.known_from is not None else "estimated",
             "known_from_s": self.known_from,
             "offset_m": self.offset,
             "offset_uncertainty_m": self.offset_uncertainty,
@@ -223,18 +166,13 @@ class RecordVerification:
 class AxisVerification:
     """Verification of one axis on all records.
 
-    Parameters
-    ----------
-    overall : ErrorPart
-        Error of all evaluated samples.
-    resolution : float, metres
-        Held-out error of the model at its identification.
-    records : tuple of RecordVerification
-    by_level, by_speed, by_region : tuple of ErrorPart
-        Errors by nesting depth of the loop, by magnitude of dv/dt, and by voltage.
+    `overall` and `rest` are the absolute error of all judged samples and that without the constant of each record;
+    `resolution` (m) is the held-out error of the model at its identification. `by_level`, `by_speed`, `by_region`: the
+    rest by nesting depth of the loop, magnitude of dv/dt, and voltage.
     """
 
     overall: ErrorPart
+    rest: ErrorPart
     resolution: float
     records: tuple[RecordVerification, ...]
     by_level: tuple[ErrorPart, ...]
@@ -242,21 +180,29 @@ class AxisVerification:
     by_region: tuple[ErrorPart, ...]
 
     @property
+    def verdict(self) -> str:
+        """The worst verdict of the records: `FAILED`, then `UNPROVED`, then `PASSED`."""
+        return worst_verdict([record.verdict for record in self.records])
+
+    @property
     def passed(self) -> bool:
         """Whether every record passes."""
-        return all(record.passed for record in self.records)
+        return self.verdict == PASSED
 
     @property
     def worst(self) -> RecordVerification:
         """Record with the largest ratio of error to limit."""
-        return max(self.records, key=lambda record: record.error.rms / record.limit if record.limit else np.inf)
+        return max(self.records, key=lambda one: one.judged_error / one.limit if one.limit else np.inf)
 
     def to_document(self) -> dict[str, Any]:
         """Return the figures as in ``msg_schemas/verification.schema.json``."""
         return {
+            "verdict": self.verdict,
             "passed": self.passed,
             "rms_m": self.overall.rms,
             "maximum_m": self.overall.maximum,
+            "rest_rms_m": self.rest.rms,
+            "rest_maximum_m": self.rest.maximum,
             "samples": self.overall.samples,
             "resolution_m": self.resolution,
             "records": [record.to_document() for record in self.records],
@@ -266,33 +212,35 @@ class AxisVerification:
         }
 
 
+def worst_verdict(verdicts: Sequence[str]) -> str:
+    """Return `FAILED` if any is, else `UNPROVED` if any is, else `PASSED`."""
+    return next((one for one in (FAILED, UNPROVED) if one in verdicts), PASSED)
+
+
 @dataclass(frozen=True)
 class Verification:
-    """Verification of the model of a stage on records not used for its identification.
-
-    Parameters
-    ----------
-    axes : mapping of axis name to AxisVerification
-    tolerance : float or None, metres
-        As given.
-    hardware_id : str
-        Hardware id of the stage.
-    """
+    """Verification of the model of the stage `hardware_id` by axis, with the `tolerance` (m) as given."""
 
     axes: Mapping[str, AxisVerification]
     tolerance: float | None
     hardware_id: str = ""
 
     @property
+    def verdict(self) -> str:
+        """The worst verdict of the axes."""
+        return worst_verdict([axis.verdict for axis in self.axes.values()])
+
+    @property
     def passed(self) -> bool:
         """Whether every axis passes on every record."""
-        return all(axis.passed for axis in self.axes.values())
+        return self.verdict == PASSED
 
     def to_document(self) -> dict[str, Any]:
         """Return the verification document, ``msg_schemas/verification.schema.json``."""
         return {
             "schema": SCHEMA,
             "hardware_id": self.hardware_id,
+            "verdict": self.verdict,
             "passed": self.passed,
             "tolerance_m": self.tolerance,
             "axes": {name: axis.to_document() for name, axis in self.axes.items()},
@@ -306,6 +254,10 @@ def verify(
     *,
     axes: Sequence[str] | None = None,
     desired: Sequence[Mapping[str, FloatArray] | None] | None = None,
+    without_offset: bool = False,
+    start: float | None = None,
+    stop: float | None = None,
+    start_memory: StartMemory | None = None,
 ) -> Verification:
     """Verify a model by free-run simulation of records not used for its identification.
 
@@ -316,13 +268,21 @@ def verify(
         Model of the same stage. What it knows of the sensor is taken out of the readings first: all errors are those of
         the stage.
     tolerance : float, metres, optional
-        Largest rms error that passes; by default three times the record's repeatability floor, but at least the
-        fraction `RESOLUTION` of the stroke, the best accuracy that a hysteresis model attains.
+        Largest absolute rms error that passes. By default three times the record's repeatability floor, but at least
+        the fraction `RESOLUTION` of the stroke, the best accuracy of a hysteresis model, for the error without its
+        constant part.
     axes : sequence of str, optional
         Axes to be verified; by default all that the model and every record contain.
     desired : sequence of mapping of axis name to ndarray, shape (N,), metres, or None, optional
         Desired displacement of each record at its samples, NaN where there was none. If given, the tracking error of
         the compensator is evaluated as well.
+    without_offset : bool
+        Whether the tolerance holds for the error without its constant part. Default False.
+    start, stop : float, seconds, optional
+        Judge only samples with ``start <= t < stop``; t is counted from the first stamp of each record.
+    start_memory : {"end", "start", "wiped"}, optional
+        Initial state of every record, as of `StageModel.compensate`; by default that at an end of the model's voltage
+        range if a record begins there, else an estimated one.
 
     Returns
     -------
@@ -348,12 +308,18 @@ def verify(
     found: dict[str, list[RecordVerification]] = {name: [] for name in names}
     for record, path in zip(records, paths, strict=True):
         # Errors are those of the stage, not those of its sensor.
-        runs = _free_run(model.correct(record), model.stage_only, names)
+        runs = _free_run(model.correct(record), model.stage_only, names, (start, stop), start_memory)
         for name in names:
             axis, run = model.axis(name), runs[name]
-            one = _judge(run, axis, record.source, tolerance)
+            one = _judge(run, axis, record.source, tolerance, without_offset=without_offset)
             if path is not None and name in path:
-                one = replace(one, tracking=_tracking(one, run, path[name], record, model, name))
+                followed = path[name][np.isfinite(record.voltage[name])][: run.t.size]
+                tracking = track(
+                    (record.source, name), run.t, one.v, one.measured, followed,
+                    one.model - run.explained, run.assumed, zero=one.offset if one.zero_moved else 0.0,
+                    noise_rms=one.floor_rms, effects=_effects(one, record, model, name),
+                )  # fmt: skip
+                one = replace(one, tracking=tracking)
             found[name].append(one)
     return Verification(
         {name: _summary(found[name], model.axis(name).quality.held_out_rms) for name in names},
@@ -364,40 +330,51 @@ def verify(
 
 @dataclass(frozen=True)
 class _Run:
-    """Free-run simulation of one axis on a record, from the initial history that best explains the record.
+    """Free run of one axis on a record, from the given, the known or the estimated initial state.
 
-    `constant` (m) is the part of the offset due to a change of gain, plus `offset` if that is significant. `assumed`
-    holds a simulation from each initial state that a compensator may have assumed.
+    `simulated`, (N,), m, contains the constant error; `constant` (m) is that error, and `explained` (m) the part of
+    it that a change of gain makes, and a significant `offset`. `assumed` holds a simulation from each initial state
+    that a compensator may have assumed. `begins_known`: the initial state is known. `samples_in_span`: all samples
+    of the part that is to be judged.
     """
 
     t: FloatArray
     samples: Samples
     judged: Mask
+    samples_in_span: int
+    begins_known: bool
     found: Match
     simulated: FloatArray
     assumed: tuple[FloatArray, ...]
-    offset: float
     constant: float
+    offset: float
+    explained: float
 
 
-def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[str, _Run]:
-    """Simulate the axes on a record, each from the initial history that best explains it, with cross coupling."""
+def _free_run(
+    record: Record,
+    model: StageModel,
+    names: Sequence[str],
+    span: tuple[float | None, float | None],
+    start_memory: StartMemory | None,
+) -> dict[str, _Run]:
+    """Simulate the axes on a record, each from its initial state, with cross coupling."""
     moving = [name for name in model.axes if name in record.axes and np.isfinite(record.voltage[name]).any()]
     runs, motions = {}, {}
     for name in dict.fromkeys((*names, *moving)):
         axis = model.axis(name)
         try:
-            samples = select_samples(record, name, None, None)
+            samples = select_samples(record, name, *span)
         except SlpiError:
             if name in names:
                 raise
             # An axis at rest does not couple into others.
             continue
-        t = record.t[np.isfinite(record.voltage[name])]
+        t = record.t[np.isfinite(record.voltage[name])][: samples.v.size]
         with warnings.catch_warnings():
             # The effect of loops that were never identified is visible in the errors.
             warnings.simplefilter("ignore", UnidentifiedLoopWarning)
-            runs[name] = _run(axis, t, samples)
+            runs[name] = _run(axis, t, samples, start_memory, -np.inf if span[0] is None else span[0])
             start = runs[name].found.start
             own = replace(axis, start=start).uncoupled_displacement(t, samples.v)
         motions[name] = t, own - start.displacement
@@ -410,20 +387,24 @@ def _free_run(record: Record, model: StageModel, names: Sequence[str]) -> dict[s
             zero = np.zeros_like(run.t)
             moved = axis.seen(run.t, zero, others) - axis.seen(run.t, zero, alone)
             simulated = run.simulated + moved
-            simulated += np.median((run.samples.y - simulated)[run.judged])
-            run = replace(run, simulated=simulated, assumed=tuple(each + moved for each in run.assumed))
+            shift = float(np.median((run.samples.y - simulated)[run.judged]))
+            run = replace(
+                run,
+                simulated=simulated + shift,
+                constant=run.constant + shift,
+                assumed=tuple(each + moved for each in run.assumed),
+            )
         coupled[name] = run
     return coupled
 
 
-def _run(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
-    """Simulate an axis on a record from the initial history that best explains it."""
-    found = match(axis, samples, t)
+def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None, start: float) -> _Run:
+    """Simulate an axis on a record from its initial state; samples before `start` (s) are not judged."""
+    found, begins_known = _matched(axis, t, samples, start_memory)
     simulated = replace(axis, start=found.start).simulate(t, samples.v)
     # The outliers that `identify` leaves out are no error of the model.
     samples = samples.without_outliers(simulated)
-    after = samples.fitted & (np.arange(t.size) >= found.known_from)
-    judged = after if np.count_nonzero(after) >= FEWEST else samples.fitted
+    judged = samples.fitted if begins_known else _judged(samples, found)
     # A change of gain leaves the start displacement of the model unchanged.
     by_gain = 0.0
     if found.gain_changed and found.rms_explained < MOSTLY * found.rms:
@@ -431,16 +412,55 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples) -> _Run:
     offset = found.offset - by_gain
     moved = abs(offset) > found.offset_uncertainty
     starts = [axis.initial(memory) for memory in START_MEMORIES] if axis.causal else [axis.start]
+    shift = float(np.median((samples.y - simulated)[judged]))
     return _Run(
         t=t,
         samples=samples,
         judged=judged,
+        samples_in_span=int(np.count_nonzero(t >= start)),
+        begins_known=begins_known,
         found=found,
-        simulated=simulated + float(np.median((samples.y - simulated)[judged])),
+        simulated=simulated + shift,
         assumed=tuple(replace(axis, start=start).simulate(t, samples.v) for start in starts),
+        constant=found.offset + shift,
         offset=offset,
-        constant=by_gain + (offset if moved else 0.0),
+        explained=by_gain + (offset if moved else 0.0),
     )
+
+
+def _matched(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None) -> tuple[Match, bool]:
+    """Compare the model with a record; return also whether the initial state is known.
+
+    It is if it is given, or if the record begins at an end of the model's voltage range, unless the state there
+    explains the record worse than the samples to which any initial state only adds a constant.
+    """
+    if start_memory:
+        return match(axis, samples, t, axis.initial(start_memory)), True
+    found = match(axis, samples, t)
+    at_end = [match(axis, samples, t, start) for start in starts_at_end(axis, float(samples.v[0]))]
+    if at_end:
+        best = min(at_end, key=_spread)
+        if _spread(best) <= AS_WELL * _spread(found, found.known_from):
+            return best, True
+    return found, False
+
+
+def _judged(samples: Samples, found: Match) -> Mask:
+    """Return the mask, (N,), of the samples that are judged where the initial state is unknown.
+
+    Those to which it only adds a constant, unless they are few and the estimated one explains all others as well.
+    """
+    known = samples.fitted & (np.arange(samples.v.size) >= found.known_from)
+    share = np.count_nonzero(known) / np.count_nonzero(samples.fitted)
+    if share >= MOST_KNOWN or (share >= LEAST and _spread(found) > AS_WELL * _spread(found, found.known_from)):
+        return known
+    return samples.fitted
+
+
+def _spread(found: Match, first: int = 0) -> float:
+    """Return the rms (m) of the residual without its mean from sample `first` on; infinite for too few samples."""
+    residual = found.residual[first:]
+    return float(np.nanstd(residual)) if np.count_nonzero(np.isfinite(residual)) >= FEWEST else np.inf
 
 
 def _default_limit(axis: AxisModel, floor: float) -> float:
@@ -449,22 +469,35 @@ def _default_limit(axis: AxisModel, floor: float) -> float:
     return max(TIMES_THE_FLOOR * floor, RESOLUTION * (high - low))
 
 
-def _judge(run: _Run, axis: AxisModel, source: str, tolerance: float | None) -> RecordVerification:
+def _judge(
+    run: _Run, axis: AxisModel, source: str, tolerance: float | None, *, without_offset: bool
+) -> RecordVerification:
     samples, judged, found = run.samples, run.judged, run.found
     t, v, y = run.t[judged], samples.v[judged], samples.y[judged]
     # What the model explains, such as the motion of another axis, is no noise.
     floor = min(floor_of(t, v, y), floor_of(t, v, y, y - run.simulated[judged]), key=lambda one: one.rms)
     low, high = axis.voltage_range
     margin = 1e-6 * (high - low)
+    rest = (samples.y - run.simulated)[judged]
+    estimated = not run.begins_known and bool(judged[: found.known_from].any())
+    stands = standing(v)
+    both = BOTH <= float(np.mean(stands)) <= 1.0 - BOTH
     return RecordVerification(
-        error=ErrorPart.of(source, (samples.y - run.simulated)[judged]),
-        limit=_default_limit(axis, floor.rms) if tolerance is None else tolerance,
-        floor_rms=floor.rms,
-        floor_source=floor.source,
-        known_from=float(run.t[judged][0]) if samples.fitted[~judged].any() or not found.known_from else None,
-        history=found.start.history,
+        error=ErrorPart.of(source, rest + run.constant),
+        constant=run.constant,
+        rest=ErrorPart.of(source, rest),
         offset=run.offset,
         offset_uncertainty=found.offset_uncertainty,
+        limit=_default_limit(axis, floor.rms) if tolerance is None else tolerance,
+        absolute=tolerance is not None and not without_offset,
+        samples=run.samples_in_span,
+        known_from=None if estimated else float(run.t[judged][0]),
+        begins_known=run.begins_known,
+        history=found.start.history,
+        moving=ErrorPart.of("moving", (rest + run.constant)[~stands]) if both else None,
+        standing=ErrorPart.of("standing", (rest + run.constant)[stands]) if both else None,
+        floor_rms=floor.rms,
+        floor_source=floor.source,
         zero_moved=bool(abs(run.offset) > found.offset_uncertainty),
         gain=found.gain_change,
         width=found.width_change,
@@ -477,6 +510,14 @@ def _judge(run: _Run, axis: AxisModel, source: str, tolerance: float | None) -> 
         judged=judged,
         corrected=axis.describe_correction(),
     )
+
+
+def standing(v: FloatArray) -> Mask:
+    """Return the mask, (N,), of the samples at which a voltage `v`, (N,), stands still."""
+    width = min(STANDS_FOR, v.size)
+    still = maximum_filter1d(v, width) - minimum_filter1d(v, width) <= STANDS * np.ptp(v)
+    # The last sample of a window of even width is the one before its end.
+    return np.asarray(maximum_filter1d(still.astype(np.int8), width, origin=-1 if width % 2 == 0 else 0) > 0)
 
 
 def _summary(records: Sequence[RecordVerification], resolution: float) -> AxisVerification:
@@ -496,7 +537,8 @@ def _summary(records: Sequence[RecordVerification], resolution: float) -> AxisVe
         return tuple(ErrorPart.of(name, error[chosen]) for name, chosen in classes if chosen.any())
 
     return AxisVerification(
-        overall=ErrorPart.of("all", np.concatenate([one.left for one in records])),
+        overall=ErrorPart.of("all", np.concatenate([one.left + one.constant for one in records])),
+        rest=ErrorPart.of("all, without the constant", np.concatenate([one.left for one in records])),
         resolution=resolution,
         records=tuple(records),
         by_level=cut(level_classes(level)),
@@ -511,81 +553,9 @@ def _thinned(record: RecordVerification, most: int) -> IntArray:
     return at[:: max(1, round(at.size / most))]
 
 
-def _tracking(
-    one: RecordVerification, run: _Run, path: FloatArray, record: Record, model: StageModel, name: str
-) -> Tracking:
-    """Decompose the tracking error, measured - desired, by cause.
-
-    ``m`` is the model from the initial history that explains the record, ``a`` the model from the initial state that
-    the compensator seems to have assumed, and ``d`` the desired displacement (``d'``: delayed as the stage is)::
-
-        y - d = (y - offset - m) + offset + (m - a) + (a - d') + (d' - d)
-                 model, noise      zero     memory    command    delay
-    """
-    driven = np.isfinite(record.voltage[name])
-    d = path[driven]
-    at = np.isfinite(d) & run.samples.fitted
-    if np.count_nonzero(at) < 2:
-        raise RecordError(f"{record.source}: axis '{name}': no desired displacement while it was measured; record both")
-    t, v, y, d = run.t[at], run.samples.v[at], run.samples.y[at], d[at]
-    offset = one.offset if one.zero_moved else 0.0
-    estimated = run.simulated[at] - run.constant
-    assumed = min((each[at] for each in run.assumed), key=lambda each: _rms(each - d))
-    delay = _delay(t, d, assumed)
-    late = np.interp(t - delay, t, d)
-    command = assumed - late
-    limited = _at_limit(v, command)
-    parts = {
-        "zero": np.full(t.size, offset),
-        "memory": estimated - assumed,
-        "limits": np.where(limited, command, 0.0),
-        "delay": late - d,
-        "command": np.where(limited, 0.0, command),
-        "model": y - offset - estimated,
-    }
-    error = y - d
-    total = float(error @ error)
-    shares = {cause: float(part @ error) / total if total else 0.0 for cause, part in parts.items()}
-    named, explained = _effects(one, record, model, name)
-    noise = min(one.floor_rms**2 * error.size / total if total else 0.0, max(shares["model"], 0.0))
-    effects = explained * max(shares["model"] - noise, 0.0)
-    shares |= {"model": shares["model"] - noise - effects, "effects": effects, "noise": noise}
-    return Tracking(
-        error=ErrorPart.of(record.source, error),
-        shares={cause: shares[cause] for cause in CAUSES},
-        delay=delay,
-        effects=named,
-        t=t,
-        desired=d,
-        parts=parts,
-    )
-
-
-def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
-    """Return the delay (s) of the model behind the desired displacement; 0 if no delay is clearly better."""
-    longest = min(LONGEST_DELAY, DELAY_SHARE * float(t[-1] - t[0]))
-    shifts = np.linspace(0.0, longest, DELAY_STEPS + 1)
-    misses = [_rms(model - np.interp(t - shift, t, desired)) for shift in shifts.tolist()]
-    best = int(np.argmin(misses))
-    return float(shifts[best]) if misses[best] < misses[0] / BETTER else 0.0
-
-
-def _at_limit(v: FloatArray, command: FloatArray) -> Mask:
-    """Return the mask of samples, shape (N,), with the voltage at a limit and a desired displacement beyond it."""
-    margin = 1e-6 * float(np.ptp(v))
-    limited = np.zeros(v.size, dtype=bool)
-    for extreme, missing in ((v.max(), command < 0.0), (v.min(), command > 0.0)):
-        there = np.abs(v - extreme) <= margin
-        edges = np.flatnonzero(np.diff(np.pad(there, 1).astype(np.int8)))
-        for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            if stop - start >= FEWEST_AT_LIMIT:
-                limited[start:stop] |= missing[start:stop]
-    return limited
-
-
 def _effects(one: RecordVerification, record: Record, model: StageModel, name: str) -> tuple[tuple[str, ...], float]:
     """Return the effects that a diagnosis identifies, and their share of the residual; none if the error is small."""
-    if one.error.rms <= _default_limit(model.axis(name), one.floor_rms):
+    if one.rest.rms <= _default_limit(model.axis(name), one.floor_rms):
         return (), 0.0
     try:
         found = diagnose(record, model, axes=[name]).axes[name].effects
@@ -593,7 +563,3 @@ def _effects(one: RecordVerification, record: Record, model: StageModel, name: s
         # With too little data for a diagnosis, the contribution of the model is still known.
         return (), 0.0
     return tuple(effect.name for effect in found), min(sum(max(one.share_of_residual, 0.0) for one in found), 1.0)
-
-
-def _rms(error: FloatArray) -> float:
-    return float(np.sqrt(np.mean(error**2)))

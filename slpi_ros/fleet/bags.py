@@ -365,8 +365,8 @@ def _measured(one: Examined, axis: str, found: Verification, model: AxisModel) -
         offset_m=judged.offset,
         offset_uncertainty_m=_finite(judged.offset_uncertainty),
         floor_rms_m=judged.floor_rms,
-        held_out_rms_m=judged.error.rms,
-        explained_rms_m=min(match.rms_explained, judged.error.rms),
+        held_out_rms_m=judged.rest.rms,
+        explained_rms_m=min(match.rms_explained, judged.rest.rms),
         limit_rms_m=judged.limit,
     )
 

@@ -214,6 +214,8 @@ def likely_starts(axis: AxisModel, v: float, *others: tuple[float, ...]) -> list
     return found
 
 
+# Share of a range within which a voltage is at its end.
+AT_END = 0.005
 # In `match`: candidate start voltages of the last move before a record, as shares of the distance to either end.
 LAST_MOVES = np.linspace(0.0, 1.0, 9)
 # Fewest samples of a stretch (between two new extremes of the voltage) that is used in the comparison.
@@ -286,30 +288,17 @@ class Match:
         return abs(self.offset) > self.offset_uncertainty
 
 
-def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Match:
-    """Compare a model with a record of unknown initial history.
+def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None, start: Start | None = None) -> Match:
+    """Compare a model, from voltage to displacement of the stage, with a record of unknown initial state.
 
-    While the voltage stays within the range visited so far, the unknown initial history adds only a constant, so the
+    While the voltage stays within the range visited so far, the unknown initial state adds only a constant, so the
     samples of such a stretch can be compared with each other. Once both ends of the model's voltage range have been
-    visited, the offset is known as well.
-
-    Parameters
-    ----------
-    axis : AxisModel
-        Model of the axis, from voltage to displacement of the stage.
-    samples : Samples
-        Record without an initial history.
-    t : ndarray, shape (N,), seconds, optional
-        Times of the samples; required if the model has effects. By default the sample number.
-
-    Returns
-    -------
-    Match
-        Offset, changes of gain and width, and their uncertainties.
+    visited, the offset is known as well. `t`, shape (N,), seconds, is needed only with effects. `start` is the initial
+    state where it is known.
     """
     time = np.arange(float(samples.v.size)) if t is None else t
-    starts = _possible_starts(axis, float(samples.v[0]))
-    predictions = [replace(axis, start=start).simulate(time, samples.v) for start in starts]
+    starts = [start] if start else _possible_starts(axis, float(samples.v[0]))
+    predictions = [replace(axis, start=one).simulate(time, samples.v) for one in starts]
     fitted = samples.fitted
     errors = [prediction[fitted] - samples.y[fitted] for prediction in predictions]
     best = int(np.argmin([_mean_size(error - np.median(error)) for error in errors]))
@@ -342,6 +331,20 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None) -> Mat
         known=known,
         residual=residual + zero,
     )
+
+
+def starts_at_end(axis: AxisModel, v: float) -> list[Start]:
+    """Return the states at an end of the model's voltage range if `v` (V) is one, else none.
+
+    There a stage has lost its memory of the range, unless it has never moved, as before the record of the model.
+    """
+    low, high = axis.voltage_range
+    near = AT_END * (high - low)
+    if not axis.causal or low + near < v < high - near:
+        return []
+    ends = [low, high, v] if v >= high - near else [high, low, v]
+    rest = [axis.start] if not axis.start.history and abs(axis.start.voltage - v) <= near else []
+    return [replace(axis.after(np.array(ends)), from_rest=False), *rest]
 
 
 def _possible_starts(axis: AxisModel, v: float) -> list[Start]:

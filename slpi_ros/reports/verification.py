@@ -1,4 +1,4 @@
-"""The page and the files of a verification: errors on records not used for the fit, pass or fail."""
+"""The page and the files of a verification: errors on records not used for the fit, and the verdict."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.diagnosis.tracking import CAUSES, ErrorPart, Tracking
 from slpi_ros.diagnosis.verify import (
-    CAUSES,
+    FAILED,
+    FEW,
+    MOST_KNOWN,
+    PASSED,
     TIMES_THE_FLOOR,
+    UNPROVED,
     AxisVerification,
-    ErrorPart,
     RecordVerification,
-    Tracking,
     Verification,
 )
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
@@ -33,7 +36,7 @@ from slpi_ros.reports.chart import (
     thin_line,
 )
 from slpi_ros.reports.chart import CAUSES as COLOURS
-from slpi_ros.reports.page import Page, Share
+from slpi_ros.reports.page import Page, Severity, Share
 from slpi_ros.reports.text import nm
 
 FloatArray = NDArray[np.float64]
@@ -41,6 +44,7 @@ FloatArray = NDArray[np.float64]
 FILES = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
 COLOUR = {**dict(zip(CAUSES, (*COLOURS, AFTER), strict=False)), "model": BEFORE, "noise": NOISE}
+SEVERITY: dict[str, Severity] = {PASSED: "good", UNPROVED: "warn", FAILED: "bad"}
 # Smaller shares of the tracking error are not reported.
 _SMALLEST_SHARE = 0.01
 
@@ -57,7 +61,7 @@ def write_files(folder: Path, found: Verification) -> None:
     page.contents(tuple(found.axes))
     for name, axis in found.axes.items():
         page.heading(f"Axis {name}", name)
-        page.verdict(name, _summary(name, axis), "good" if axis.passed else "bad", "pass" if axis.passed else "fail")
+        page.verdict(name, _summary(name, axis), SEVERITY[axis.verdict], axis.verdict)
         page.tiles(_figures(axis))
         page.section("Errors by record")
         page.table(*_records_table(axis))
@@ -70,17 +74,15 @@ def write_files(folder: Path, found: Verification) -> None:
 
 
 def verification_limits(found: Verification) -> dict[str, str]:
-    """Return what limits the accuracy of each axis: a failed model, or the largest part of a tracking error."""
+    """Return what limits the accuracy of each axis: the model, or the largest part of a tracking error."""
     limits = {}
     for name, axis in found.axes.items():
         tracked = [record.tracking for record in axis.records if record.tracking]
         if not axis.passed:
             worst = axis.worst
-            noisy = worst.error.rms <= ABOVE_FLOOR * worst.floor_rms
-            limits[name] = (
-                f"{'the noise of the record' if noisy else 'the model'}, {nm(worst.error.rms)} rms where "
-                f"{nm(worst.limit)} are allowed"
-            )
+            noisy = worst.rest.rms <= ABOVE_FLOOR * worst.floor_rms
+            model = "unproved" if axis.verdict == UNPROVED else "the noise of the record" if noisy else "the model"
+            limits[name] = f"{model}, {nm(worst.judged_error)} rms where {nm(worst.limit)} are allowed"
         elif tracked:
             worst_path = max(tracked, key=lambda tracking: tracking.error.rms)
             if worst_path.error.rms > axis.worst.limit:
@@ -90,25 +92,25 @@ def verification_limits(found: Verification) -> dict[str, str]:
 
 def verification_good(found: Verification) -> str:
     """Return how good a verified model is that nothing limits."""
-    noise = all(
-        record.error.rms <= ABOVE_FLOOR * record.floor_rms for axis in found.axes.values() for record in axis.records
-    )
-    return "at the noise floor" if noise else "within its limit on every record"
+    records = [record for axis in found.axes.values() for record in axis.records]
+    noise = all(record.error.rms <= ABOVE_FLOOR * record.floor_rms for record in records)
+    return "at the repeatability of the record" if noise else "within its limit on every record"
 
 
 def describe_verification(found: Verification, *, details: bool = True) -> list[str]:
-    """Return lines of text: for each axis pass or fail, and the errors (nm) by record, level, speed and region.
+    """Return lines of text: for each axis the verdict, and the errors (nm) by record, level, speed and region.
 
-    Without `details`: pass or fail, and the notes of each record.
+    Without `details`: the verdict, and the notes of each record.
     """
     lines = []
     for name, axis in found.axes.items():
-        told = [("pass: " if axis.passed else "fail: ") + _summary(name, axis).removeprefix(f"Axis {name}: ")]
+        told = [f"{axis.verdict}: " + _summary(name, axis).removeprefix(f"Axis {name}: ")]
         for record in axis.records:
-            told += [f"{record.error.name}: {line}" for line in (_error(record), *_notes(record))]
+            error = [_error(record)] if len(axis.records) > 1 else []
+            told += [f"{record.error.name}: {line}" for line in (*error, *_notes(record))]
             if record.tracking:
                 told += [f"{record.error.name}: {line}" for line in _tracking_notes(record.tracking)]
-        parts = (axis.overall, *axis.by_level, *axis.by_speed, *axis.by_region) if details else ()
+        parts = (axis.overall, axis.rest, *axis.by_level, *axis.by_speed, *axis.by_region) if details else ()
         told += [f"{'error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}"] if parts else []
         for part in parts:
             told.append(f"{part.name:<24}{part.samples:9}{part.rms * 1e9:9.1f}{part.maximum * 1e9:10.1f}")
@@ -117,36 +119,61 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
 
 
 def _summary(name: str, axis: AxisVerification) -> str:
-    """Return a sentence with the error and its limit, and the remedy for an axis that fails."""
-    failed = [record for record in axis.records if not record.passed]
+    """Return a sentence with the error and its limit, and the remedy for an axis that does not pass."""
     several = f" on the worst of {len(axis.records)} records" if len(axis.records) > 1 else ""
     said = f"Axis {name}: {_error(axis.worst)}{several}."
-    if not failed:
+    if axis.passed:
         moved = [record for record in axis.records if record.zero_moved]
         return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")
+    if axis.verdict == UNPROVED:
+        return f"{said} {_why_unproved(next(one for one in axis.records if one.verdict == UNPROVED))}"
     return f"{said} 'slpi diagnose' finds the cause, 'slpi refit' corrects the model."
+
+
+def _why_unproved(record: RecordVerification) -> str:
+    if record.rest.rms <= record.limit:
+        return (
+            f"The initial state is unknown, which alone can be {nm(record.offset_uncertainty)}: begin a record at an "
+            "end of the voltage range, say the initial state with --start-memory, or judge --without-offset."
+        )
+    return "The initial state is unknown for most of the record: begin it at an end of the voltage range."
 
 
 def _error(record: RecordVerification) -> str:
     error = record.error
+    limit = "" if record.absolute else ", for the rest"
     return (
-        f"measured - model is {nm(error.rms)} rms (limit {nm(record.limit)}), maximum {nm(error.maximum)}; "
-        f"repeatability floor {nm(record.floor_rms)} rms"
+        f"measured - model is {nm(error.rms)} rms, {nm(error.maximum)} at most; of it constant "
+        f"{_um(record.constant)} µm, the rest {nm(record.rest.rms)} rms (limit {nm(record.limit)}{limit}; "
+        f"repeatability {nm(record.floor_rms)}); {_judged_share(record)}"
     )
+
+
+def _judged_share(record: RecordVerification) -> str:
+    """Return how many samples are judged, and why not more."""
+    said = f"{record.error.samples:,} of {record.samples:,} samples judged ({record.share:.0%})"
+    if record.share >= MOST_KNOWN:
+        return said
+    why = "" if record.known_from is None else f", as the initial state is unknown before {record.known_from:.4g} s"
+    return f"{'WARNING: only ' if record.share < FEW else ''}{said}{why}"
 
 
 def _notes(record: RecordVerification) -> list[str]:
-    """Return the assumptions about a record's start, and findings other than the error."""
-    start = (
-        "the start is unknown: the initial history and the offset are fitted to the record"
-        if record.known_from is None
-        else f"evaluated from {record.known_from:.4g} s on, where the unknown history before it only adds a constant"
-    )
-    notes = [start]
+    """Return the assumptions about a record's initial state, and findings other than the error."""
+    if record.known_from is None:
+        notes = ["the initial state is unknown: it is estimated from the record"]
+    elif record.begins_known:
+        notes = ["the initial state is known"]
+    else:
+        notes = [f"the initial state is known from {record.known_from:.4g} s on, but for a constant"]
+    if not record.begins_known:
+        notes.append(f"the unknown initial state makes the constant uncertain by {nm(record.offset_uncertainty)}")
+    if record.moving and record.standing:
+        notes.append(f"while the voltage moves {nm(record.moving.rms)} rms, while it stands {nm(record.standing.rms)}")
     if record.corrected:
         notes.append(f"errors are those of the stage; taken out of the readings of its sensor: {record.corrected}")
     if record.zero_moved:
-        notes.append(f"the zero has moved by {_um(record.offset)} µm, which is not counted as an error")
+        notes.append(f"the zero has moved by {_um(record.offset)} µm")
     if not record.passed:
         notes.append(f"relative to the model, gain {record.gain:+.2%}, loop width {record.width:+.2%}")
     if record.outside:
@@ -173,9 +200,11 @@ def _figures(axis: AxisVerification) -> dict[str, str]:
     worst = axis.worst
     figures = {
         "measured - model, rms": nm(axis.overall.rms),
-        "maximum": nm(axis.overall.maximum),
-        "limit of the rms": nm(worst.limit),
-        "repeatability floor, rms": nm(worst.floor_rms),
+        "at most": nm(axis.overall.maximum),
+        "without its constant part, rms": nm(axis.rest.rms),
+        f"limit of the {'rms' if worst.absolute else 'rms without the constant'}": nm(worst.limit),
+        "repeatability, rms": nm(worst.floor_rms),
+        "samples judged": f"{min(record.share for record in axis.records):.0%}",
         "held-out error of the model": nm(axis.resolution),
     }
     tracked = [record.tracking.error.rms for record in axis.records if record.tracking]
@@ -184,22 +213,26 @@ def _figures(axis: AxisVerification) -> dict[str, str]:
 
 def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[str]], None, str]:
     header = (
-        "record", "", "samples", "rms (nm)", "maximum (nm)", "limit (nm)", "floor (nm)", "zero moved (µm)",
+        "record", "", "samples", "judged", "rms (nm)", "maximum (nm)", "constant (µm)", "rest, rms (nm)", "limit (nm)",
+        "repeatability (nm)", "zero moved (µm)",
     )  # fmt: skip
     rows: list[Sequence[str]] = [
         (
             record.error.name,
-            "pass" if record.passed else "fail",
+            record.verdict,
             f"{record.error.samples:,}",
-            *(f"{x * 1e9:.1f}" for x in (record.error.rms, record.error.maximum, record.limit, record.floor_rms)),
+            f"{record.share:.0%}",
+            *(f"{x * 1e9:.1f}" for x in (record.error.rms, record.error.maximum)),
+            _um(record.constant),
+            *(f"{x * 1e9:.1f}" for x in (record.rest.rms, record.limit, record.floor_rms)),
             _um(record.offset) if record.zero_moved else "no",
         )
         for record in axis.records
     ]
+    held_to = "rms" if axis.worst.absolute else "rms of the rest"
     caption = (
-        "Measured - model, free-run, without a constant offset for each record. The rms must be within the tolerance, "
-        f"else within {TIMES_THE_FLOOR:g} times the repeatability floor, but at least the model's held-out error. "
-        f"Floor: {axis.records[0].floor_source}."
+        f"Measured - model, free-run. The limit holds for the {held_to}: the tolerance, else {TIMES_THE_FLOOR:g} times "
+        f"the repeatability, but at least 0.02 % of the stroke. Repeatability: {axis.records[0].floor_source}."
     )
     return header, rows, None, caption
 
@@ -211,11 +244,16 @@ def _parts_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[s
         times = f"{part.rms / floor:.2f}" if floor > 0.0 else ""
         return [part.name, f"{part.samples:,}", f"{part.rms * 1e9:.1f}", times, f"{part.maximum * 1e9:.1f}"]
 
-    rows: list[Sequence[str] | str] = [row(axis.overall)]
+    rows: list[Sequence[str] | str] = [row(axis.overall), row(axis.rest)]
     groups = {"by loop level": axis.by_level, "by speed": axis.by_speed, "by region": axis.by_region}
     for name, parts in groups.items():
         rows += [name, *map(row, parts)]
-    return ("", "samples", "rms (nm)", "times the floor", "maximum (nm)"), rows, 0, f"All records; floor {nm(floor)}."
+    return (
+        ("", "samples", "rms (nm)", "times the repeatability", "maximum (nm)"),
+        rows,
+        0,
+        f"All records; but for the first row without the constant of each record; repeatability {nm(floor)}.",
+    )
 
 
 def _show_record(page: Page, name: str, record: RecordVerification) -> None:

@@ -7,6 +7,7 @@ from slpi_ros.diagnosis import verify as verification
 from slpi_ros.diagnosis.verify import Verification
 from slpi_ros.io.bag_reader import read_desired
 from slpi_ros.io.record import Record
+from slpi_ros.model.axis_model import StartMemory
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, require_for_model, shared_axes
 
@@ -15,15 +16,18 @@ from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, requi
 class VerifyRequest:
     """Request of a verification.
 
-    `source`: whole records are judged, whatever its `start` and `stop`. `tolerance` (m): largest rms error that
-    passes; default: as for `slpi_ros.verify`. `desired_topic`: topic of the bags that holds the desired displacement;
-    default: ``desired_displacement``, where a bag has it.
+    `tolerance` (m): largest rms error that passes, of the absolute error, or, if `without_offset`, of that without its
+    constant part; default: as for `slpi_ros.verify`. `desired_topic`: topic of the bags that holds the desired
+    displacement; default: ``desired_displacement``, where a bag has it. `start_memory`: initial state of the records,
+    if it is known.
     """
 
     source: Source
     model: StageModel
     tolerance: float | None = None
     desired_topic: str | None = None
+    without_offset: bool = False
+    start_memory: StartMemory | None = None
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,10 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
         read = zip(source.bags, records, strict=True)
         desired = [read_desired(bag, record, request.desired_topic) for bag, record in read]
     with mismatch_in_data():
-        source = replace(source, axes=shared_axes(records, model, source), start=None, stop=None)
+        source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)
-        told = verification.verify(records, model, request.tolerance, axes=source.axes, desired=desired)
+        told = verification.verify(
+            records, model, request.tolerance, axes=source.axes, desired=desired, without_offset=request.without_offset,
+            start=source.start, stop=source.stop, start_memory=request.start_memory,
+        )  # fmt: skip
     return VerifyOutcome(told, records, found)

@@ -13,7 +13,8 @@ from reports.pages import parsed
 import slpi_ros
 import slpi_ros.io.bag_writer
 from slpi_ros.cli import main
-from slpi_ros.diagnosis.verify import CAUSES
+from slpi_ros.diagnosis.tracking import CAUSES
+from slpi_ros.diagnosis.verify import UNPROVED
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.schemas import validate
@@ -60,7 +61,8 @@ def judged(record, model, **options):
 def test_whatever_went_before_an_unchanged_stage_passes(record, history, model):
     one = judged(record(history), model)
     assert one.passed and not one.zero_moved
-    assert one.error.rms < 1.2 * 8e-9
+    assert one.rest.rms < 1.2 * 8e-9 and one.share > 0.95
+    assert abs(one.constant) <= one.offset_uncertainty
 
 
 @pytest.mark.parametrize("offset", [-0.93e-6, 0.2e-6])
@@ -68,6 +70,48 @@ def test_a_moved_zero_is_no_error_of_the_loops(offset, model):
     one = judged(unseen((100, 20, 80), offset=offset), model)
     assert one.passed and one.zero_moved
     assert one.offset == pytest.approx(offset, abs=0.1 * abs(offset))
+
+
+def test_a_tolerance_holds_for_the_absolute_error(model):
+    record = unseen(offset=1.5e-7)
+    one = judged(record, model, tolerance=5e-8, start_memory="start")
+    assert one.absolute and not one.passed and one.constant == pytest.approx(1.5e-7, rel=0.1)
+    assert one.error.rms == pytest.approx(np.hypot(one.constant, one.rest.rms), rel=0.02)
+    assert judged(record, model, tolerance=5e-8, start_memory="start", without_offset=True).passed
+    assert judged(record, model, tolerance=2e-7, start_memory="start").passed
+
+
+def test_what_an_unknown_initial_state_may_hide_is_unproved(model):
+    one = judged(small_loops(()), model, tolerance=2e-8)
+    assert one.verdict == UNPROVED and one.offset_uncertainty > 2e-8 > one.rest.rms
+    found = slpi_ros.verify([unseen(), small_loops(())], model, tolerance=2e-8, start_memory=None)
+    assert found.verdict == UNPROVED and not found.passed
+
+
+def test_a_record_that_begins_at_an_end_of_the_range_is_judged_from_its_first_sample(model):
+    t = np.arange(2400) / RATE
+    v = 35.0 - 35.0 * np.cos(2.0 * np.pi * t) * np.exp(-t / 30.0) - 35.0 * (1.0 - np.exp(-t / 30.0))
+    v[0] = 0.0
+    one = judged(record_of(t, v, stage(SEED).run(t, v)[1]), model)
+    assert one.begins_known and one.known_from == 0.0 and one.share > 0.95 and one.passed
+
+
+@pytest.mark.parametrize("span", [(2.0, None), (None, 9.0), (3.0, 8.0)])
+def test_a_part_of_a_record(span, model):
+    record, (start, stop) = unseen(), span
+    one = judged(record, model, start=start, stop=stop)
+    t = one.t[one.judged]
+    assert t.min() >= (start or 0.0) and t.max() < (stop or np.inf) and one.passed
+
+
+def test_moving_and_standing_are_told_apart(model):
+    t, moving = np.arange(4800) / RATE, np.arange(4800) < 2400
+    v = np.where(moving, 50.0 - 50.0 * np.cos(2.0 * np.pi * np.minimum(t, 12.0)), 0.0)
+    y = stage(SEED).run(t, v)[1] + np.where(moving, 3e-8 * np.sin(50.0 * t), 0.0)
+    one = judged(record_of(t, v, y), model)
+    assert one.standing.rms < one.moving.rms
+    assert one.standing.samples + one.moving.samples == one.error.samples
+    assert one.standing.samples == pytest.approx(2400, abs=60)
 
 
 @pytest.mark.parametrize("gain", [0.99, 1.02])
@@ -82,12 +126,14 @@ def test_the_error_is_that_of_the_samples_judged(model):
     record = unseen()
     one = judged(record, model)
     assert one.known_from == pytest.approx(float(record.t[one.judged][0]))
-    error = (record.displacement["x"] - one.model)[one.judged]
+    rest = (record.displacement["x"] - one.model)[one.judged]
+    assert one.rest.rms == pytest.approx(rms(rest)) and one.rest.maximum == pytest.approx(np.abs(rest).max())
+    error = rest + one.constant
     assert one.error.rms == pytest.approx(rms(error)) and one.error.maximum == pytest.approx(np.abs(error).max())
     found = slpi_ros.verify([record, small_loops(())], model).axes["x"]
     for parts in (found.by_level, found.by_speed, found.by_region):
         total = sum(part.samples * part.rms**2 for part in parts)
-        assert np.sqrt(total / found.overall.samples) == pytest.approx(found.overall.rms)
+        assert np.sqrt(total / found.rest.samples) == pytest.approx(found.rest.rms)
 
 
 def test_a_coupled_axis_is_judged_with_the_motion_of_the_other(model):
@@ -219,7 +265,7 @@ def test_command_passes_fails_and_writes(slpi, folder, tmp_path):
     document = json.loads((tmp_path / "out" / "verification.json").read_text())
     validate(document, "verification", "test")
     assert document["passed"] and document["axes"]["x"]["records"][0]["zero_moved"]
-    assert parsed(tmp_path / "out" / "report.html").texts["verdict-x"].startswith("pass")
+    assert parsed(tmp_path / "out" / "report.html").texts["verdict-x"].startswith("passed")
     both = (folder / "good", folder / "bad", "--model", folder / "model.json")
     code, said, _ = slpi(*both, "--json")
     assert code == 1 and [one["passed"] for one in json.loads(said)["axes"]["x"]["records"]] == [True, False]

@@ -36,7 +36,7 @@ _Path = str | os.PathLike[str]
 GROUPS_PER_THREAD = 4
 # Most seconds of work, bytes of bags and tasks in one group, unless it is a single task: client and scheduler need
 # milliseconds for each group, whatever is in it.
-GROUP_SECONDS, GROUP_BYTES, MOST_TASKS = 1.0, 64_000_000, 64
+GROUP_SECONDS, GROUP_BYTES, MOST_TASKS = 5.0, 64_000_000, 64
 # A bag is given up after this many times that Dask has given it up, each after several workers have ended.
 ATTEMPTS = 3
 # Seconds: until a lost scheduler is back, until the first worker is there, between two looks at the sources, and

@@ -31,7 +31,7 @@ def test_the_page_has_each_step_once():
 
 
 @pytest.mark.slow
-@pytest.mark.minutes
+@pytest.mark.long
 def test_readme_leads_to_the_set_points_and_so_does_a_restart_on_the_next_day(user):
     model, errors, warnings = as_written(user, seed=2)
     assert model.hardware_id == "simulated-2"

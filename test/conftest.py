@@ -15,6 +15,8 @@ import pytest
 CHECKOUT = Path(__file__).resolve().parents[1]
 # Folders whose tests start nodes.
 STREAM = ("nodes", "documentation")
+# Those that compute more than they wait, and need no core at any moment.
+COMPUTES = ("test_identify.py", "test_site.py")
 
 
 def _reserve_ros_domain() -> int:
@@ -78,8 +80,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class ByFile(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            file = nodeid.partition("::")[0]
-            return "nodes" if Path(file).parent.name in STREAM else file
+            file = Path(nodeid.partition("::")[0])
+            return "nodes" if file.parent.name in STREAM and file.name not in COMPUTES else str(file)
 
     # As sorted above.
     config.option.loadscopereorder = False

@@ -40,7 +40,7 @@ def test_clean_readings_are_not_mixed_and_nothing_is_found():
     assert found.verdict == "nothing_found" and "mixed" not in found.summary
 
 
-@pytest.mark.parametrize("kind", ["coarse", "clipped"])
+@pytest.mark.parametrize("kind", ["coarse", pytest.param("clipped", marks=pytest.mark.long)])
 def test_a_sensor_is_no_cause(kind):
     record, _ = calibration(seed=2)
     y = record.displacement["x"]

@@ -24,7 +24,8 @@ IN_WORKSPACE := . $(INSTALL)/setup.sh &&
 VENV_STAMP  := .venv$(SUFFIX)/.stamp
 BUILD_STAMP := $(INSTALL)/.stamp
 
-PYTEST := $(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 3 --dist worksteal
+# One worker waits for nodes most of the time, the others compute (test/conftest.py).
+PYTEST := $(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 3
 
 # What .venv has to be made for: a copied checkout, another Python or a newly sourced ROS needs another one.
 WANTED := $(CURDIR) ROS_DISTRO=$(ROS_DISTRO) $(if $(PYTHON),PYTHON=$(PYTHON))
@@ -39,11 +40,12 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs package bench-lies bench-calibrator bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-agreement FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs package bench-lies bench-calibrator bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-agreement FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
-	@echo 'make test       build, lint, types, docstrings, tests'
+	@echo 'make test       build, lint, types, docstrings, tests: ten minutes on two cores'
+	@echo 'make test-long  build, then the tests that take long, and properties with more examples'
 	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: all tests but the long lives of nodes'
 	@echo 'make test-newest   the same tests with the newest versions of today; make test-minimum with the oldest allowed'
 	@echo 'make docs       build, then the documentation site: docs/_build/html/index.html'
@@ -92,15 +94,20 @@ test: build
 	$(VENV) -m ruff check .
 	$(VENV) -m ruff format --check .
 	$(VENV) -m mypy
-	$(PYTEST)
+	$(PYTEST) -m 'not long'
 
-# Everything but the few tests of nodes that take a minute or more each: tutorials, README, a calibration, a measured path.
+# Also every property, with more examples than in `make test`.
+test-long: export SLPI_EXAMPLES = 100
+test-long: build
+	$(PYTEST) -m 'long or hypothesis'
+
+# Everything but the long tests of nodes.
 test-jazzy test-newest test-minimum:
 	@$(MAKE) --no-print-directory ENVIRONMENT=$(@:test-%=%) test-environment
 
 test-environment: build
 	$(VENV) tools/list_versions.py
-	$(PYTEST) -m 'not ros or not minutes'
+	$(PYTEST) -m 'not ros or not long'
 
 docs: build
 	$(VENV) -m sphinx -E -W --keep-going -q docs docs/_build/html

@@ -12,7 +12,7 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.calibration.drive_watch import DriveWatch
+from slpi_ros.calibration.drive_watch import LASTS, LATE, DriveWatch
 from slpi_ros.calibration.drives import checking, exciting
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, excite
@@ -24,7 +24,8 @@ LIES = ("replayed", "frozen", "stale stamps", "sign flipped", "moved by 1 mm", "
 DRIVERS = ("exciter", "calibrator")
 LOW, HIGH = 0.0, 100.0
 TIMEOUT, PERIOD = 0.5, 1.0 / 200.0
-# A lie shows in the first sample that is off by this share of stroke or voltage range, or by this time (s).
+# A lie shows in the first sample that is off by this share of stroke or voltage range, or by this time (s). A voltage
+# is off that has not been output within the time that reports may be late, for as long as a fault has to last.
 SHOWS, SHOWS_SECONDS = 0.05, 0.3
 # Longest time driven after that, seconds: the mark.
 MARK = 1.0
@@ -160,28 +161,35 @@ def _watched(
     watch.begin(run.v[0].tolist(), round(begun * SECOND_NS))
     first = min(int(np.searchsorted(run.t, lies_from)), count - 1)
     spacing = max(round(sensor.period / PERIOD), 1)
-    shown, next_state = nan, 0
+    shown, contradicted, next_state = nan, nan, 0
     size = abs(sensor.gain) * stroke
+    recent = round(LATE * TIMEOUT / PERIOD)
     for index in range(count):
         now = float(run.t[index])
         watch.command(run.v[index].tolist(), round(now * SECOND_NS))
         while next_state < count and run.t[next_state] + sensor.late <= now:
-            stamp, true_v, true_y = float(run.t[next_state]), run.v[next_state], y[next_state]
+            stamp, true_y = float(run.t[next_state]), y[next_state]
+            true_v = run.v[max(next_state - recent, 0) : next_state + 1]
             told = _told(lie if next_state >= first else "", next_state, first, run, y, stamp)
             if told is None:
                 shown = now if shown != shown else shown
             else:
                 said_stamp, said_v, said_y = told
-                off = max(
-                    float(np.max(np.abs(said_y - true_y))) / size,
-                    float(np.max(np.abs(said_v - true_v))) / (HIGH - LOW),
-                )
+                off = float(np.max(np.abs(said_y - true_y))) / size
+                late = np.clip(said_v, true_v.min(axis=0), true_v.max(axis=0))
+                if float(np.max(np.abs(said_v - late))) / (HIGH - LOW) <= SHOWS:
+                    contradicted = nan
+                elif contradicted != contradicted:
+                    contradicted = now
                 if shown != shown and (off > SHOWS or abs(said_stamp - stamp) > SHOWS_SECONDS):
                     shown = now
+                if shown != shown and now - contradicted >= LASTS:
+                    shown = contradicted
                 _tell(watch, now, said_stamp, said_v.tolist(), said_y.tolist())
             next_state += spacing
         fault = watch.check(round(now * SECOND_NS))
         if fault:
+            shown = contradicted if shown != shown else shown
             since = int(np.searchsorted(run.t, shown)) if shown == shown else index
             way = np.abs(np.diff(run.v[since : index + 1], axis=0)).sum(axis=1) / (HIGH - LOW)
             return Life(fault, now, shown, PERIOD * np.count_nonzero(way > MOVES * PERIOD), float(way.sum()))

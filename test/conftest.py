@@ -13,6 +13,10 @@ import hypothesis
 import pytest
 
 CHECKOUT = Path(__file__).resolve().parents[1]
+# Folders whose tests start nodes.
+STREAM = ("nodes", "documentation")
+# Those that compute more than they wait, and need no core at any moment.
+COMPUTES = ("test_identify.py", "test_site.py")
 
 
 def _reserve_ros_domain() -> int:
@@ -42,14 +46,15 @@ os.environ["ROS_DOMAIN_ID"] = str(_reserve_ros_domain())
 # A shell starts background jobs with SIGINT ignored, and the nodes that tests start and interrupt inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# No verdict depends on the clock. CI draws the same examples every time: more of them would find nothing new there.
+# No verdict depends on the clock. CI draws the same examples every time; `make test-long` draws more of them.
 CI = bool(os.environ.get("CI"))
-hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize=CI, max_examples=50 if CI else 100)
+EXAMPLES = int(os.environ.get("SLPI_EXAMPLES", "50"))
+hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize=CI, max_examples=EXAMPLES)
 hypothesis.settings.load_profile("slpi_ros")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark what needs ROS and what needs the measured records; let the longest tests begin first."""
+    """Mark what needs ROS and what needs the measured records; put files with long tests first."""
     # Real processes on a busy machine may be stopped for seconds: under CI such a test has a second try, which the
     # last line counts ("rerun"). Pure numerics have none.
     repeats = CI and config.pluginmanager.hasplugin("rerunfailures")
@@ -60,17 +65,34 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 item.add_marker(pytest.mark.flaky(reruns=1, reruns_delay=2))
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")
-    # A worker gets an equal part of the tests, in their order: each begins with its share of the longest.
-    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    longest = [item for item in items if item.get_closest_marker("minutes")]
-    others = [item for item in items if not item.get_closest_marker("minutes")]
-    ordered: list[pytest.Item] = []
-    for worker in range(workers):
-        own = longest[worker::workers]
-        room = len(items) * (worker + 1) // workers - len(ordered) - len(own)
-        ordered += own + others[:room]
-        del others[:room]
-    items[:] = ordered
+    # The stream of nodes and the files with slow tests begin first; what is short fills the gaps at the end.
+    first = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: (item.path.parent.name not in STREAM, item.path not in first))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give all tests with nodes, one after the other, to one worker, and whole files to the others.
+
+    Nodes wait most of their time, and two tests with nodes at once disturb each other; a file's tests share fixtures.
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = Path(nodeid.partition("::")[0])
+            return "nodes" if file.parent.name in STREAM and file.name not in COMPUTES else str(file)
+
+    # As sorted above.
+    config.option.loadscopereorder = False
+    return ByFile(config, log)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Let nodes have the cores when they want them: pure numerics on other workers stand back."""
+    if "PYTEST_XDIST_WORKER" in os.environ and not item.get_closest_marker("ros"):
+        os.setpriority(os.PRIO_PROCESS, 0, max(os.getpriority(os.PRIO_PROCESS, 0), 10))
 
 
 def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:

@@ -388,6 +388,7 @@ def test_the_shell_is_told_completions(line, wanted, tmp_path):
     assert wanted in (tmp_path / "told").read_text()
 
 
+@pytest.mark.long
 def test_what_is_known_of_the_sensor_is_kept_used_and_said(folder, tmp_path):
     record = slpi_ros.read_bag(folder / "bag")
     # Four samples late.

@@ -31,8 +31,11 @@ if TYPE_CHECKING:
 
 _Path = str | os.PathLike[str]
 
-# Tasks at the scheduler for each thread of the cluster: enough to keep every thread busy, and bounded memory.
-TASKS_PER_THREAD = 4
+# Groups of tasks at the scheduler for each thread of the cluster: enough to keep every thread busy, and bounded memory.
+GROUPS_PER_THREAD = 4
+# Most seconds of work, bytes of bags and tasks in one group, unless it is a single task: client and scheduler need
+# milliseconds for each group, whatever is in it.
+GROUP_SECONDS, GROUP_BYTES, MOST_TASKS = 5.0, 64_000_000, 64
 # A bag is given up after this many times that Dask has given it up, each after several workers have ended.
 ATTEMPTS = 3
 # Seconds: until a lost scheduler is back, until the first worker is there, between two looks at the sources, and
@@ -44,13 +47,17 @@ WRITE_PAUSE = 20.0
 
 @dataclass(frozen=True)
 class Task:
-    """A function with its arguments, and what is done with its result; `bag` is the bag that it processes."""
+    """A function with its arguments, and what is done with its result; `bag` is the bag that it processes.
+
+    One that is `alone` shares a group with no other.
+    """
 
     bag: Examined
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
     finish: Callable[[Any], Iterable["Task"]]
     attempts: int = 0
+    alone: bool = False
 
 
 def run(
@@ -260,8 +267,10 @@ class _Fleet:
         others = {stage: model for stage, model in sorted(self._state.references.items()) if stage != one.stage}
         reference = self._state.references.get(one.stage) if one.stage else None
         reference = reference or self._state.judged[path].model
-        arguments = (one, rows, self._topic, str(self._results.folder), reference, bags.model_name(one), others)
-        return Task(one, bags.explain, (*arguments, self._diagnosed), lambda judged: self._keep(one, judged))
+        known = (one, rows, self._topic, str(self._results.folder), reference, bags.model_name(one), others)
+        # It may take minutes.
+        arguments = (*known, self._diagnosed)
+        return Task(one, bags.explain, arguments, lambda judged: self._keep(one, judged), alone=True)
 
     def _keep(self, one: Examined, judged: Judged) -> Iterable[Task]:
         self._results.add_judged(one.bag.path, judged)
@@ -275,6 +284,8 @@ class _Cluster:
         self.client, self._reconnect = client, reconnect
         self._waiting: deque[Task] = deque()
         self._count, self._asked = 1, -np.inf
+        # Seconds that a task of each function takes.
+        self._pace: dict[Callable[..., Any], float] = {}
 
     def require_shared(self, folder: Path, found: Sequence[Bag]) -> None:
         """Raise SlpiError unless every worker has this package and sees the folder and the first bag."""
@@ -306,19 +317,20 @@ class _Cluster:
         from distributed import as_completed
 
         source = iter(tasks)
-        running: dict[Any, Task] = {}
+        running: dict[Any, list[Task]] = {}
         completed = as_completed(loop=self.client.loop)
         try:
             while True:
                 lost = False
-                for task in self._next(source, TASKS_PER_THREAD * self._threads() - len(running)):
+                while len(running) < GROUPS_PER_THREAD * self._threads() and (group := self._next(source)):
                     try:
-                        future = self.client.submit(task.function, *task.arguments, pure=False)
+                        arguments = [task.arguments for task in group]
+                        future = self.client.submit(_together, group[0].function, arguments, pure=False)
                     except Exception:
-                        self._waiting.appendleft(task)
+                        self._waiting.extendleft(reversed(group))
                         lost = True
                         break
-                    running[future] = task
+                    running[future] = group
                     completed.add(future)
                 if not running and not lost:
                     return
@@ -327,7 +339,7 @@ class _Cluster:
                     yield from self._settle(running.pop(done), done)
                     continue
                 # The scheduler is lost, and with it every future.
-                self._waiting.extendleft(running.values())
+                self._waiting.extendleft(task for group in running.values() for task in group)
                 running = {}
                 self._connect_again()
                 completed = as_completed(loop=self.client.loop)
@@ -336,31 +348,44 @@ class _Cluster:
                 self.client.cancel(list(running))
             self._waiting.clear()
 
-    def _next(self, source: Iterator[Task], room: int) -> Iterator[Task]:
-        for _ in range(room):
-            task = self._waiting.popleft() if self._waiting else next(source, None)
-            if task is None:
-                return
-            yield task
+    def _next(self, source: Iterator[Task]) -> list[Task]:
+        """Return the next tasks, of one function, that are sent together."""
+        group: list[Task] = []
+        size, room = 1, GROUP_BYTES
+        while len(group) < size and (task := self._waiting.popleft() if self._waiting else next(source, None)):
+            room -= task.bag.bag.size
+            if group and (task.alone or task.function is not group[0].function or room < 0):
+                self._waiting.appendleft(task)
+                break
+            group.append(task)
+            if not task.alone and task.function in self._pace:
+                size = min(MOST_TASKS, int(GROUP_SECONDS / max(self._pace[task.function], 1e-6)))
+        return group
 
-    def _settle(self, task: Task, future: Any) -> Iterator[tuple[Task, Any]]:
+    def _settle(self, group: Sequence[Task], future: Any) -> Iterator[tuple[Task, Any]]:
         from distributed import KilledWorker
 
         if future.status == "finished":
             try:
-                result = future.result()
+                results, seconds = future.result()
             except Exception:
-                # The worker that held the result has ended.
-                self._waiting.appendleft(task)
+                # The worker that held the results has ended.
+                self._waiting.extendleft(reversed(group))
                 return
-            yield task, result
+            function, pace = group[0].function, seconds / len(group)
+            self._pace[function] = 0.5 * (self._pace.get(function, pace) + pace)
+            yield from zip(group, results, strict=True)
             return
-        error = future.exception()
+        if len(group) > 1:
+            # Each by itself shows which one it was.
+            self._waiting.extendleft(replace(task, alone=True) for task in reversed(group))
+            return
+        (task,), error = group, future.exception()
         if not isinstance(error, KilledWorker):
             what = f"{task.bag.bag.path}: the cluster failed: {type(error).__name__}: {error}"
             raise SlpiError(f"{what}; finished rows are kept: run again")
         if task.attempts + 1 < ATTEMPTS:
-            self._waiting.append(replace(task, attempts=task.attempts + 1))
+            self._waiting.append(replace(task, attempts=task.attempts + 1, alone=True))
             return
         reason = f"{task.bag.bag.path}: every worker that processed it has ended; give workers more memory"
         if task.function is bags.examine:
@@ -457,6 +482,13 @@ def _keep_given(results: Results, stage: str, model: StageModel) -> None:
         results.add_reference(stage, name)
     elif known != name or path.read_text(encoding="utf-8") != format_model(model):
         raise UsageError(f"{results.folder}: stage '{stage}' has another reference there, {known}; name another folder")
+
+
+def _together(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> tuple[list[Any], float]:
+    """Return what a function gives for each of some arguments, and how long (s) all of them took."""
+    began = time.perf_counter()
+    results = [function(*each) for each in arguments]
+    return results, time.perf_counter() - began
 
 
 def _sees(places: Sequence[str]) -> list[str]:

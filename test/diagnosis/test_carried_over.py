@@ -11,7 +11,7 @@ from slpi_ros.effects.lag import Lag
 from slpi_ros.io.tables import import_table
 from slpi_ros.model.axis_model import Start
 
-pytestmark = [pytest.mark.slow, pytest.mark.minutes]
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
 @pytest.fixture(scope="module")

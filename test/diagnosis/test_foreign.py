@@ -31,6 +31,7 @@ def error(model, record):
     return float(np.std(record.displacement["x"] - model.simulate(record.t, record.voltage)["x"]))
 
 
+@pytest.mark.long
 def test_thermally_activated_relays_are_the_rate_law_on_a_record_of_another_speed():
     stage = ThermalRelays()
     model, diagnosis = diagnosed(stage)

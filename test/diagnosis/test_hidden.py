@@ -14,7 +14,8 @@ pytestmark = pytest.mark.slow
 
 SAMPLES = 12_000
 # All eleven take minutes: `make bench-diagnosis`.
-FAST = ("lag", "creep", "resonance", "cross_coupling", "sensor_periodic", "hum", "thermal_drift", "gain_drift")
+FAST = ["lag", "hum"]
+SLOW = ["creep", "resonance", "cross_coupling", "sensor_periodic", "thermal_drift", "gain_drift"]
 # Large enough that nobody should miss it; what is found of smaller ones is for the bench to say.
 LARGE = 10.0
 # A draw of a coercivity that grows with the logarithm of the rate.
@@ -27,7 +28,7 @@ def diagnosed(hidden, folder):
     return slpi_ros.diagnose(record, slpi_ros.identify(record))
 
 
-@pytest.mark.parametrize("name", FAST)
+@pytest.mark.parametrize("name", FAST + [pytest.param(name, marks=pytest.mark.long) for name in SLOW])
 def test_a_hidden_effect_is_named_first(name, tmp_path):
     hidden = hide(1, [name], size=LARGE, samples=SAMPLES)
     (truth,) = hidden.truth

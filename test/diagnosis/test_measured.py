@@ -53,6 +53,7 @@ def test_the_step_of_another_record_agrees_with_the_lag(picma, measured_data):
     assert tau == pytest.approx(seconds, rel=0.4)
 
 
+@pytest.mark.long
 def test_one_frequency_is_ambiguous(measured_data):
     record = import_table(measured_data / "piezo_150v_1hz.csv")
     (axis,) = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes.values()

@@ -50,6 +50,7 @@ def test_no_record_is_worse_with_the_extended_model(hidden):
     assert all(one.after_rms <= 1.05 * one.before_rms for one in found.records)
 
 
+@pytest.mark.long
 def test_a_gain_that_a_free_run_does_not_show_extends_nothing(measured_data):
     record = import_table(measured_data / "hasel_step.csv")
     model = slpi_ros.identify(record)

@@ -85,7 +85,13 @@ def test_a_quieter_record_of_the_same_name_may_show_a_change():
     assert axis.given.gain == pytest.approx(0.01, rel=0.2)
 
 
-@pytest.mark.parametrize("zeros", [(0.0, 170e-9), (0.0, 0.0)], ids=["moved", "alike"])
+@pytest.mark.parametrize(
+    "zeros",
+    [
+        pytest.param((0.0, 170e-9), id="moved"),
+        pytest.param((0.0, 0.0), id="alike", marks=pytest.mark.long),
+    ],
+)
 def test_an_error_of_the_sensor_is_shared_where_the_zeros_are(zeros):
     pair = []
     for seed, zero in zip((15, 16), zeros, strict=True):

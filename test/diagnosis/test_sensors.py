@@ -40,7 +40,7 @@ def test_clean_readings_are_not_mixed_and_nothing_is_found():
     assert found.verdict == "nothing_found" and "mixed" not in found.summary
 
 
-@pytest.mark.parametrize("kind", ["coarse", "clipped"])
+@pytest.mark.parametrize("kind", ["coarse", pytest.param("clipped", marks=pytest.mark.long)])
 def test_a_sensor_is_no_cause(kind):
     record, _ = calibration(seed=2)
     y = record.displacement["x"]
@@ -51,7 +51,7 @@ def test_a_sensor_is_no_cause(kind):
     assert not found.effects and not found.given.changed
 
 
-@pytest.mark.parametrize("seed", [0, 4])
+@pytest.mark.parametrize("seed", [0, pytest.param(4, marks=pytest.mark.long)])
 def test_readings_that_all_come_late_are_no_change(seed):
     """Of equal triangles the model cannot follow the readings, and their own model is not out of date."""
     t = np.arange(SAMPLES) / RATE
@@ -66,7 +66,7 @@ def test_readings_that_all_come_late_are_no_change(seed):
     assert diagnosis.extended.axes["x"] == model.axes["x"]
 
 
-@pytest.mark.minutes
+@pytest.mark.long
 def test_the_measured_record_with_late_readings(measured_data):
     record = import_table(measured_data / "afm_cycles.csv")
     found = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"]

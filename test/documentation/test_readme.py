@@ -55,7 +55,7 @@ def test_links_lead_to_files_and_headings():
 
 
 @pytest.mark.slow
-@pytest.mark.minutes
+@pytest.mark.long
 def test_a_stage_calibrates_itself_and_is_verified_diagnosed_and_refitted(tmp_path, installed):
     installed("calibrator")
     reader = Reader(tmp_path)

@@ -71,7 +71,7 @@ def watcher():
 
 
 @pytest.mark.slow
-@pytest.mark.minutes
+@pytest.mark.long
 @pytest.mark.parametrize("page", ["simulator", "own_stage", "xy_feedback"])
 def test_tutorial_with_a_stage(page, reader, watcher):
     for name in ("driver.py", "my_device.py"):
@@ -117,7 +117,7 @@ def test_the_notebook_is_the_page_with_what_it_prints():
 
 
 @pytest.mark.slow
-@pytest.mark.minutes
+@pytest.mark.long
 def test_tutorial_without_ros(reader):
     """The commands of the page run in its order, and what the page says about their figures holds."""
     said = []

@@ -47,6 +47,7 @@ def assert_same(output, undisturbed):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_nothing_is_lost_whatever_is_killed(fleet, undisturbed, tmp_path):
     output, chance = tmp_path / "out", random.Random(os.environ.get("SLPI_FLEET_SEED", "1"))
     victims = [name for name, count in zip(("worker", "scheduler", "client"), KILLS, strict=True) for _ in range(count)]

@@ -184,11 +184,65 @@ def test_a_bag_that_ends_its_workers_is_a_row(axes):
     task = cluster.Task(one, bags.compare if axes else bags.examine, (), lambda _: ())
     work = cluster._Cluster(None, None)
     for attempt in range(cluster.ATTEMPTS - 1):
-        assert list(work._settle(replace(task, attempts=attempt), Future())) == []
+        assert list(work._settle([replace(task, attempts=attempt)], Future())) == []
         assert work._waiting.pop().attempts == attempt + 1
-    ((_, result),) = work._settle(replace(task, attempts=cluster.ATTEMPTS - 1), Future())
+    ((_, result),) = work._settle([replace(task, attempts=cluster.ATTEMPTS - 1)], Future())
     (row,) = result.rows if axes else result.rows()
     assert row.verdict == bags.REFUSED and row.axis == "".join(axes) and "/huge.mcap" in row.error
+
+
+class Done:
+    """The future of a group of tasks, finished after some seconds."""
+
+    status = "finished"
+
+    def __init__(self, count, seconds):
+        self._result = list(range(count)), seconds
+
+    def result(self):
+        return self._result
+
+
+def tasks_of(count, size=1000, **given):
+    sizes = [size] * count if isinstance(size, int) else size
+    examined = [bags.Examined(Bag(f"/{k}.mcap", "a", size), "a") for k, size in enumerate(sizes)]
+    return [cluster.Task(one, bags.examine, (), lambda _: (), **given) for one in examined]
+
+
+def groups(work, tasks):
+    source = iter(tasks)
+    return [len(group) for group in iter(lambda: work._next(source), [])]
+
+
+def test_quick_tasks_are_sent_together_and_their_results_stay_with_them():
+    work, tasks = cluster._Cluster(None, None), tasks_of(5)
+    # As long as nobody knows how long one takes, each is sent by itself.
+    assert groups(work, tasks) == [1] * 5
+    assert list(work._settle(tasks, Done(5, 5 * cluster.GROUP_SECONDS / 4))) == list(zip(tasks, range(5), strict=True))
+    assert groups(work, tasks_of(9)) == [4, 4, 1]
+    # A large bag is not, nor is a slow function, nor one that is to be alone.
+    large = cluster.GROUP_BYTES
+    assert groups(work, tasks_of(5, [10, large, 10, 10, 2 * large])) == [1, 1, 2, 1]
+    assert groups(work, [*tasks_of(2), *tasks_of(1, alone=True), *tasks_of(2)]) == [2, 1, 2]
+    other = [replace(task, function=bags.compare) for task in tasks_of(2)]
+    assert groups(work, [*tasks_of(2), *other]) == [2, 1, 1]
+    for _ in range(10):
+        list(work._settle(tasks[:1], Done(1, 100.0)))
+    assert groups(work, tasks_of(3)) == [1, 1, 1]
+
+
+@pytest.mark.parametrize("error", [KilledWorker("task", None, 3), MemoryError()])
+def test_of_a_group_that_fails_each_task_is_tried_by_itself(error):
+    class Future:
+        status = "error"
+
+        def exception(self):
+            return error
+
+    work, tasks = cluster._Cluster(None, None), tasks_of(3)
+    assert list(work._settle(tasks, Future())) == []
+    assert list(work._waiting) == [replace(task, alone=True) for task in tasks]
+    assert groups(work, []) == [1, 1, 1]
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,9 @@ def test_picma_growing_from_decaying(measured_data, tmp_path, kind, bound):
     assert rms(error[(record.t >= 25) & (record.t < 37)]) <= bound
 
 
-@pytest.mark.parametrize("name", ["afm_triangle_sine", "picma_1hz_major", "piezo_150v_1hz"])
+@pytest.mark.parametrize(
+    "name", ["picma_1hz_major", "piezo_150v_1hz", pytest.param("afm_triangle_sine", marks=pytest.mark.long)]
+)
 def test_the_other_records_can_be_identified(measured_data, tmp_path, name):
     record = through_a_bag(measured_data / f"{name}.csv", tmp_path)
     for axis, model in slpi_ros.identify(record).axes.items():

@@ -17,6 +17,8 @@ from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage
 
 NOISE = 5e-9
+# Multiples of the noise and numbers of outliers; the others are long.
+CORNERS = ((2, 600), (100, 50), (10_000, 5), (10_000, 600))
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +76,14 @@ def test_displacements_far_away_decide_nothing(clean, of_clean, count, by):
     assert assess(record, "x").displacement.spikes == count
 
 
-@pytest.mark.parametrize("count", [5, 50, 600])
-@pytest.mark.parametrize("times", [2, 100, 10_000])
+@pytest.mark.parametrize(
+    ("times", "count"),
+    [
+        pytest.param(times, count, marks=() if (times, count) in CORNERS else pytest.mark.long)
+        for times in (2, 100, 10_000)
+        for count in (5, 50, 600)
+    ],
+)
 def test_many_outliers_of_any_size_leave_the_model_as_it_is(clean, of_clean, count, times):
     rng = np.random.default_rng(3)
     at = rng.choice(len(clean), count, replace=False)

@@ -34,10 +34,18 @@ def require_safe(stage) -> None:
 
 def begun(graph, node, stage):
     """Wait until the calibration drive is well on its way."""
-    graph.tested = node
+    checked(graph, node, stage)
     graph.spin_until(lambda: "02_calibration" in node.stderr and max(stage.commands) > 40.0, "the calibration drive")
     count = len(stage.commands)
     graph.spin_until(lambda: len(stage.commands) > count + 20, "more of the drive")
+
+
+def checked(graph, node, stage):
+    """Wait until the first drive, the check, has begun."""
+    graph.tested = node
+    graph.spin_until(lambda: "01_check" in node.stderr and stage.commands, "the check")
+    count = len(stage.commands)
+    graph.spin_until(lambda: len(stage.commands) > count + 20, "more of the check")
 
 
 def ended(graph, node) -> int:
@@ -47,7 +55,7 @@ def ended(graph, node) -> int:
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", [FAULTS[0], *(pytest.param(fault, marks=pytest.mark.long) for fault in FAULTS[1:])])
 def test_a_fault_of_the_stage_ends_in_a_ramp_to_rest(tmp_path, fault):
     with on_graph() as graph, started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}) as node:
         stage = FaultyStage(graph.node)
@@ -63,7 +71,9 @@ def test_a_fault_of_the_stage_ends_in_a_ramp_to_rest(tmp_path, fault):
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("how", ["stop", "signal", "other publisher", "no disk"])
+@pytest.mark.parametrize(
+    "how", ["signal", *(pytest.param(how, marks=pytest.mark.long) for how in ("stop", "other publisher", "no disk"))]
+)
 def test_whoever_ends_it_the_stage_comes_to_rest(tmp_path, how):
     with on_graph() as graph, started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}) as node:
         stage = FaultyStage(graph.node)
@@ -137,7 +147,7 @@ def test_a_kept_bag_that_is_no_use_is_named(tmp_path):
 def test_it_pauses_and_goes_on(tmp_path):
     with on_graph() as graph, started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}) as node:
         stage = FaultyStage(graph.node)
-        begun(graph, node, stage)
+        checked(graph, node, stage)
         assert graph.call(Trigger, "/calibrator/pause", Trigger.Request()).success
         count = len(stage.commands)
         graph.spin_until(lambda: len(stage.commands) > count + 50, "held voltages")
@@ -145,7 +155,7 @@ def test_it_pauses_and_goes_on(tmp_path):
         assert graph.call(Trigger, "/calibrator/start", Trigger.Request()).success
         graph.spin_until(lambda: np.ptp(stage.commands[-30:]) > 1.0, "motion")
         graph.watch_diagnostics()
-        graph.wait_for_status("/calibrator: calibrator", lambda status: "02_calibration" in status.message, "progress")
+        graph.wait_for_status("/calibrator: calibrator", lambda status: "recording 0" in status.message, "progress")
 
 
 @pytest.mark.ros
@@ -155,14 +165,14 @@ def test_a_pause_before_the_start_does_not_keep_it_from_starting(tmp_path):
         stage = FaultyStage(graph.node)
         assert graph.call(Trigger, "/calibrator/pause", Trigger.Request()).success
         assert graph.call(Trigger, "/calibrator/start", Trigger.Request()).success
-        begun(graph, node, stage)
+        checked(graph, node, stage)
 
 
 @pytest.mark.ros
 def test_its_worker_ends_with_it_however_it_ends(tmp_path):
     with on_graph() as graph, started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}) as node:
         stage = FaultyStage(graph.node)
-        begun(graph, node, stage)
+        checked(graph, node, stage)
         children = Path(f"/proc/{node.process.pid}/task/{node.process.pid}/children").read_text().split()
         assert children
         os.kill(node.process.pid, signal.SIGKILL)
@@ -197,7 +207,7 @@ def test_topics_may_be_remapped_in_a_namespace(tmp_path):
         started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out")}, *arguments) as node,
     ):
         stage = FaultyStage(graph.node)
-        begun(graph, node, stage)
+        checked(graph, node, stage)
         assert graph.call(Trigger, "/left/calibrator/stop", Trigger.Request()).success
         assert ended(graph, node) == 1
     require_safe(stage)
@@ -237,7 +247,7 @@ def test_a_folder_in_use_is_not_touched(tmp_path):
 
 @pytest.mark.ros
 @pytest.mark.slow
-@pytest.mark.minutes
+@pytest.mark.long
 def test_a_stage_with_a_hidden_cause_calibrates_itself(tmp_path):
     rate = 100.0
     simulated = {"creep": 0.02, "rate": rate, "speed": 4.0}

@@ -48,9 +48,10 @@ def test_silence_leads_to_the_safe_voltage_and_the_next_command_takes_over_from_
         while (before := client.ask(["x"], [5e-6])[0]) < 40.0:
             pass
         client.wait_for_rest(10.0)
-        # What the slew limit held back of the last command has followed before.
+        # What the slew limit held back of the last command has followed before. On a busy machine more than one
+        # command is answered by the goal: the ramp begins at the last of the highest voltages.
         way = voltages(client)
-        way = way[int(np.argmax(way)) :]
+        way = way[way.size - 1 - int(np.argmax(way[::-1])) :]
         assert (np.diff(way) < 0).all() and np.abs(np.diff(way)).max() <= 2.0 * RAMP_RATE * PERIOD + 1e-9
         # Timers are late on a busy machine: not every period has its own step.
         assert len(way) > 0.2 * (before - 10.0) / RAMP_RATE / PERIOD

@@ -47,6 +47,8 @@ pytestmark = pytest.mark.slow
 NAME = "/identify: identify"
 # Quick to fit, and needs no better.
 QUICK = {"kind": "pi", "diagnostic_period": 0.2}
+# Reports in which a bag would have been found.
+LOOKS = 6
 
 
 def write_calibration(
@@ -88,6 +90,11 @@ class Client:
 
     def status(self, wanted, what: str):
         return self.graph.wait_for_status(NAME, wanted, what)
+
+    def look_on(self) -> None:
+        """Wait for more reports than the node looks at its folder between."""
+        before = len(self.graph.statuses(NAME))
+        self.graph.spin_until(lambda: len(self.graph.statuses(NAME)) > before + LOOKS, "more reports")
 
     def identified(self, count: int = 1) -> str:
         """Return the document that is published as the `count`-th."""
@@ -224,8 +231,7 @@ def test_bags_completed_in_the_watched_folder_are_identified(tmp_path):
         new.mkdir()
         (recorded,) = (tmp_path / "elsewhere").glob("*.mcap")
         (new / recorded.name).write_bytes(recorded.read_bytes())
-        later = time.monotonic() + 1.5
-        client.graph.spin_until(lambda: time.monotonic() > later, "a moment")
+        client.look_on()
         assert len(client.models) == 1
         # A broken one is reported and skipped.
         broken = old.parent / "broken"
@@ -256,8 +262,7 @@ def test_a_bag_whose_recording_was_killed_is_told_once_and_stays_watched(tmp_pat
         assert told.level == b"\1" and str(killed) in told.message and str(junk) in told.message
         assert "ros2 bag reindex" in told.message and "delete" in told.message and "\n" not in told.message
         assert values_of(told)["abandoned_bags"] == "2"
-        later = time.monotonic() + 1.5
-        client.graph.spin_until(lambda: time.monotonic() > later, "a few looks")
+        client.look_on()
         assert client.node.stderr.count("abandoned") == 2
         junk.unlink()
         (killed / "metadata.yaml").write_bytes((whole / "metadata.yaml").read_bytes())
@@ -290,8 +295,10 @@ def test_bags_that_no_message_can_name_and_pipes_are_skipped(tmp_path):
 
 @pytest.mark.parametrize(
     ("other", "why"),
-    [({"hardware_id": "stage 8"}, "stage 'stage 8'"), ({"axes": ("y",)}, "no axis 'x'")],
-    ids=["another stage", "another axis"],
+    [
+        pytest.param({"hardware_id": "stage 8"}, "stage 'stage 8'", id="another stage"),
+        pytest.param({"axes": ("y",)}, "no axis 'x'", id="another axis", marks=pytest.mark.long),
+    ],
 )
 def test_a_bag_of_another_stage_replaces_no_model(tmp_path, other, why):
     watched, output = tmp_path / "watched", tmp_path / "model.json"
@@ -352,7 +359,7 @@ def test_a_small_record_does_not_replace_a_model_of_the_whole_range(tmp_path):
         assert "Traceback" not in client.node.stderr
 
 
-@pytest.mark.parametrize("where", ["topic", "file"])
+@pytest.mark.parametrize("where", ["topic", pytest.param("file", marks=pytest.mark.long)])
 def test_the_model_in_use_may_be_of_somebody_else(bag, tmp_path, where):
     """The last one on the topic, or that in the file after a restart."""
     small, output = write_calibration(tmp_path / "small", seed=2, samples=60, top=5.0), tmp_path / "model.json"
@@ -487,7 +494,7 @@ def children(pid: int) -> list[int]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds processes in /proc")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
 def test_an_endless_identification_blocks_nothing_and_leaves_nothing(bag, number):
     with identifying() as client:
         client.status(lambda status: True, "a report")

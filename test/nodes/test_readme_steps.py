@@ -31,12 +31,14 @@ def test_the_page_has_each_step_once():
 
 
 @pytest.mark.slow
-@pytest.mark.minutes
-def test_readme_leads_to_the_set_points_and_so_does_a_restart_on_the_next_day(user):
+@pytest.mark.parametrize("days", [1, pytest.param(2, marks=pytest.mark.long)])
+def test_readme_leads_to_the_set_points_and_so_does_a_restart_on_the_next_day(user, days):
     model, errors, warnings = as_written(user, seed=2)
     assert model.hardware_id == "simulated-2"
     assert np.abs(errors).max() <= ALLOWED
     assert sum(line.count("~/reset_memory") for line in warnings) == 1
+    if days == 1:
+        return
     errors, warnings = next_day(user, 2, model)
     assert np.abs(errors).max() <= ALLOWED
     # But for the reset that was asked for.

@@ -20,9 +20,9 @@ LAYERS = (
     {"calibration"},
     {"diagnosis"},
     {"identification", "compensator"},
-    {"model"},
+    {"model", "excitation"},
     {"effects"},
-    {"hysteresis", "io", "simulation", "excitation"},
+    {"hysteresis", "io", "simulation"},
     {"dependencies"},
     {"errors"},
 )

@@ -23,7 +23,6 @@ from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, 
 from slpi_ros.diagnosis.prepare import Evidence
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
 from slpi_ros.effects.chain import Chain
-from slpi_ros.effects.creep import Creep, settling
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import Hysteresis
@@ -467,7 +466,12 @@ class Explanation:
             self.joint = like.joint
         else:
             self.joint = Joint(evidence, self.u, like.joint if like else None)
-        starting = settling(self._relaxations, evidence.around, evidence.used, older=evidence.older_moves)
+        starting = np.column_stack(
+            [
+                np.empty((evidence.t.size, 0)),
+                *(one.starting(evidence.around, evidence.used, older=evidence.older_moves) for one in self.effects),
+            ]
+        )
         self._before = np.column_stack([starting, evidence.beside])
         self._starting = range(starting.shape[1])
         beside = self.joint.columns(self._before)
@@ -490,10 +494,6 @@ class Explanation:
         self._x, gains = beside.fit(self.target)
         self.h = self.joint.predict(self._x)
         self.settling, self.began = self._before @ gains, gains[: len(self._starting)]
-
-    @property
-    def _relaxations(self) -> list[float]:
-        return [tau for effect in self.effects if isinstance(effect, Creep) for tau in effect.time_constants]
 
     @property
     def t(self) -> FloatArray:

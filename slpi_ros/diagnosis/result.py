@@ -21,26 +21,13 @@ from slpi_ros.diagnosis.selection import (
 )
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
-from slpi_ros.excitation.effects import for_effect
+from slpi_ros.excitation.effects import for_effect, separating
 from slpi_ros.identification.repeatability_floor import Floor
 from slpi_ros.model.axis_model import ABOVE_FLOOR, RESOLUTION
 from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
-# Drive that separates each pair of effects; the first pair contained in the ambiguous effects is used.
-SEPARATES = (
-    ({"lag", "delay"}, "lag"),
-    ({"lag", "rate_dependence"}, "rate_dependence"),
-    ({"delay", "rate_dependence"}, "rate_dependence"),
-    ({"gain_drift", "thermal_drift"}, "gain_drift"),
-    ({"creep", "thermal_drift"}, "thermal_drift"),
-    ({"creep", "lag"}, "creep"),
-    ({"creep", "delay"}, "creep"),
-    ({"creep", "rate_dependence"}, "creep"),
-    ({"resonance", "lag"}, "resonance"),
-    ({"resonance", "delay"}, "resonance"),
-)
 OTHER_FREQUENCIES = "This record has one drive frequency; other frequencies tell these apart. "
 UP_TO_DATE = "`slpi refit` with this record brings the model up to date; no other one is needed for that."
 ANOTHER_HYSTERESIS = {
@@ -487,8 +474,8 @@ def _more_loops(evidence: Evidence) -> str:
 
 def _separating(names: Sequence[str], evidence: Evidence) -> str:
     """Return sentences that recommend an experiment to distinguish the effects `names` (likeliest first)."""
-    chosen = next((drive for pair, drive in SEPARATES if pair <= set(names)), names[0])
-    axes = " --axis OTHER THIS" if chosen == "cross_coupling" else ""
+    chosen = separating(names)
+    axes = " --axis OTHER THIS" if for_effect(chosen).least_axes > 1 else ""
     other = OTHER_FREQUENCIES if one_speed(evidence) else ""
     return f"{other}Record `{_command(evidence)} --for {chosen}{axes}`. {for_effect(chosen).why}"
 

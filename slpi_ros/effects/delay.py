@@ -11,14 +11,22 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
+    FitView,
     FloatArray,
     ResidualView,
     Side,
     Signal,
+    TimeShift,
     by_record,
-    require,
+    longer_than_hold,
     usual_step,
 )
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
+from slpi_ros.effects.parameters import parameter
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    at_speeds(path, limits, 0.35, 0.65, straight=True)
 
 
 @dataclass(frozen=True)
@@ -36,12 +44,28 @@ class Delay(EffectBase):
     name: ClassVar[str] = "delay"
     acts_on: ClassVar[Signal] = "voltage"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "voltage and displacement are shifted in time"
+    compensated: ClassVar[str] = "on trajectories"
+    needs_feedback: ClassVar[bool] = True
+    time_shift: ClassVar[TimeShift] = "only"
+    dynamic: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "The same triangle at six speeds: a delay shifts its sharp corners by one time at every speed and leaves "
+        "them sharp, where a lag rounds them and rate dependence changes the loop between them.",
+        _draw,
+    )
 
-    seconds: float
+    seconds: float = field(
+        metadata=parameter(
+            "s",
+            "delay from voltage to displacement",
+            low=-100,
+            high=100,
+            fitted="linear",
+            step=lambda value, scales: 0.05 * scales.interval,
+        )
+    )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        require(self, ("seconds", abs(self.seconds) <= 100, "from -100 to 100 s"))
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
@@ -63,6 +87,10 @@ class Delay(EffectBase):
     @classmethod
     def _times(cls, seconds: float, gains: FloatArray) -> "Delay":
         return cls(seconds * float(gains[0]))
+
+    def plausible(self, view: FitView) -> bool:
+        """Return whether it is not due to the hold of commands between samples."""
+        return longer_than_hold(self, view)
 
     @property
     def shift(self) -> float:

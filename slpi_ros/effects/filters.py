@@ -1,12 +1,14 @@
 """Linear filters: first-order hold of a lag, second-order mode, and resampling to a uniform grid."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import cos, exp, expm1, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from slpi_ros.effects.parameters import fixed_step, parameter
 
 FloatArray = NDArray[np.float64]
 
@@ -16,6 +18,8 @@ _SMALL = 1e-3
 EVEN = 0.01
 # Largest number of grid points per sample.
 FINEST = 4
+# Smallest share of the motion of a fitted mode: smaller ones, near the drive, imitate errors of the hysteresis.
+LEAST_GAIN = 0.01
 
 
 class Hold(NamedTuple):
@@ -56,9 +60,23 @@ class Mode:
         Share of the static displacement that the mode carries; default: all of it.
     """
 
-    frequency: float
-    damping: float
-    gain: float = 1.0
+    frequency: float = field(metadata=parameter("Hz", "frequency", low=1e-3, high=1e7, fitted="relative", least=1e-3))
+    # With more damping there is no resonance.
+    damping: float = field(
+        metadata=parameter("", "damping ratio", low=1e-6, high=1, below=True, fitted="relative", least=1e-3, most=0.4)
+    )
+    gain: float = field(
+        default=1.0,
+        metadata=parameter(
+            *("", "share of the static displacement that it carries; at most 1 in sum"),
+            low=0,
+            high=1,
+            fitted="linear",
+            least=LEAST_GAIN,
+            most=1.0,
+            step=fixed_step(1e-5),
+        ),
+    )
 
     @cached_property
     def omega(self) -> float:

@@ -11,20 +11,33 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
+    FitView,
     FloatArray,
     ResidualView,
     Side,
     Signal,
     StreamingBase,
+    TimeShift,
     by_record,
-    require,
+    longer_than_hold,
     usual_step,
 )
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
 from slpi_ros.effects.filters import Hold, filtered, hold
+from slpi_ros.effects.parameters import parameter
 
 # The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
 # of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
 DAMPING = 1 / 8
+# A lag of one to this number of samples may be a delay; a shorter one may be the hold of commands, which is neither.
+FEW_SAMPLES = 3.0
+# Number of time constants after which the piezo has the voltage of the command.
+SETTLED = 5.0
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    at_speeds(path, limits, 0.45, 0.55, straight=False)
 
 
 @dataclass(frozen=True)
@@ -39,12 +52,30 @@ class Lag(EffectBase):
     name: ClassVar[str] = "lag"
     acts_on: ClassVar[Signal] = "voltage"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "first-order lag of the amplifier or the sensor"
+    compensated: ClassVar[str] = "yes"
+    time_shift: ClassVar[TimeShift] = "only"
+    dynamic: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "The same small loop as a sine, slow to fast: hysteresis stays as it is, the phase of a delay grows with "
+        "frequency at full amplitude, and a lag also loses amplitude.",
+        _draw,
+        separates=("delay",),
+    )
 
-    time_constant: float
+    time_constant: float = field(
+        metadata=parameter(
+            "s",
+            "time constant",
+            low=0,
+            above=True,
+            high=1e4,
+            fitted="relative",
+            least=1e-6,
+            step=lambda value, scales: 0.05 * scales.interval,
+        )
+    )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        require(self, ("time_constant", 0 < self.time_constant <= 1e4, "more than 0 s, at most 10000 s"))
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
@@ -75,6 +106,24 @@ class Lag(EffectBase):
     @classmethod
     def _times(cls, tau: float, gains: FloatArray) -> "Lag | None":
         return cls(tau * float(gains[0])) if gains[0] > 0 else None
+
+    def plausible(self, view: FitView) -> bool:
+        """Return whether it is not due to the hold of commands between samples."""
+        return longer_than_hold(self, view)
+
+    def simpler(self, step: float) -> Delay | None:
+        """Return the delay that looks the same with a sampling interval of `step` (s), for a lag of a few samples."""
+        return Delay(self.time_constant) if step <= self.time_constant < FEW_SAMPLES * step else None
+
+    @property
+    def slow_shift(self) -> float:
+        """The time constant, seconds."""
+        return self.time_constant
+
+    @property
+    def settling_time(self) -> float:
+        """Time (s) after which the piezo has the voltage of the command."""
+        return SETTLED * self.time_constant
 
     def describe(self) -> str:
         """Describe the time constant."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from math import copysign, exp
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -18,8 +18,12 @@ from slpi_ros.effects.base import (
     Side,
     Signal,
     StreamingBase,
-    require,
+    TimeShift,
 )
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
+from slpi_ros.effects.parameters import fixed_step, parameter
+from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.rate_law import solved
 
 if TYPE_CHECKING:
@@ -36,6 +40,19 @@ HOLD_SAMPLES, AT_REST = 50, 1e-3
 AGE = 0.1
 # Smallest age of a step, in units of the threshold over the onset rate, and the age from which nothing is left of it.
 SOONEST, FORGOTTEN = 1e-12, 10.0
+# A state at the start below this size (V) is none.
+NO_START = 1e-6
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    spans, doublings, count = (0.6, 0.3, 0.15), 3, 2
+    # Loops of one span take 2 (1 + 2 + 4) times the shortest leg.
+    quickest = remaining(limits) / (len(spans) * count * 2 * (2**doublings - 1))
+    quickest = max(quickest, limits.quickest(spans[0]), safe_duration(spans[0]))
+    for span in spans:
+        move(path, 0.5 - span / 2)
+        for doubling in range(doublings):
+            loops(path, 0.5 - span / 2, 0.5 + span / 2, quickest * 2**doubling, count)
 
 
 @dataclass(frozen=True)
@@ -65,22 +82,85 @@ class RateDependence(EffectBase):
     name: ClassVar[str] = "rate_dependence"
     acts_on: ClassVar[Signal] = "hysteresis"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = (
+        "loops widen with the logarithm of the drive rate, and creep at rest, by one law (Eyring): "
+        "`v = u + c asinh(u'/s0)`, with a reversible part that does not wait"
+    )
+    compensated: ClassVar[str] = "exactly"
+    time_shift: ClassVar[TimeShift] = "partly"
+    dynamic: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "Loops of three sizes at three speeds each, some of different size at the same volts per second: a linear "
+        "filter treats these alike, loops that widen with the drive rate do not.",
+        _draw,
+        separates=("lag", "delay"),
+    )
 
-    threshold: float
-    onset_rate: float
-    reversible_gain: float = 0.0
-    initial: tuple[float, ...] = ()
+    threshold: float = field(
+        metadata=parameter(
+            *("V", "half-width that the loops gain for each factor of e in the rate"),
+            low=0,
+            high=1e5,
+            fitted="logarithmic",
+            least=1e-6,
+            step=fixed_step(1e-4),
+        )
+    )
+    onset_rate: float = field(
+        metadata=parameter(
+            *("V/s", "rate above which they widen"),
+            low=1e-12,
+            high=1e12,
+            fitted="logarithmic",
+            least=1e-9,
+            step=fixed_step(1e-4),
+        )
+    )
+    reversible_gain: float = field(
+        default=0.0,
+        metadata=parameter(
+            *("m/V", "gain of the reversible part"),
+            low=0,
+            high=1e3,
+            optional=True,
+            fitted="linear",
+            least=0.0,
+            step=lambda value, scales: 1e-9 / scales.voltage,
+        ),
+    )
+    initial: tuple[float, ...] = field(
+        default=(),
+        metadata=parameter(
+            *("V", "applied minus felt voltage at the start of each record"),
+            low=-1e5,
+            high=1e5,
+            count=(0, 1000),
+            optional=True,
+            fitted="relative",
+            start=True,
+        ),
+    )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        """Validate the parameters, including invertibility."""
-        require(
-            self,
-            ("threshold", 0 <= self.threshold <= 1e5, "from 0 to 1e5 V"),
-            ("onset_rate", 1e-12 <= self.onset_rate <= 1e12, "from 1e-12 to 1e12 V/s"),
-            ("reversible_gain", 0 <= self.reversible_gain <= 1e3, "from 0 to 1000 m/V"),
-            ("initial", all(abs(lead) <= 1e5 for lead in self.initial), "within 1e5 V"),
-        )
+    @classmethod
+    def companion(cls) -> Delay:
+        """Return a delay, against which the law trades."""
+        return Delay(0.0)
+
+    @classmethod
+    def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
+        """Return new parameters, with 0 for small states at the start."""
+        return changed | {"initial": tuple(0.0 if abs(lead) < NO_START else lead for lead in changed["initial"])}
+
+    @classmethod
+    def from_version_1(cls, given: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
+        """Refuse the retired form."""
+        if "exponent" in given:
+            raise ModelError(
+                "rate_dependence has a retired form (a power of the rate); diagnose again from its bags with slpi "
+                "diagnose"
+            )
+        return given, spread
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the voltage that the hysteresis feels, shape (N,), volts."""

@@ -5,11 +5,11 @@ from itertools import cycle
 
 import numpy as np
 
+from slpi_ros.effects.excitation import MEAN_SPEED
 from slpi_ros.excitation.legs import DriveSpec, FloatArray, Path
 
-# Mean speed in voltage ranges per second, and the sequence of relative speeds: for a 100 V stage a mean of 70 V/s and
-# at most about 250 V/s. Different speeds separate time-dependent effects from hysteresis.
-MEAN_SPEED = 0.8
+# Sequence of speeds relative to the mean speed: for a 100 V stage a mean of 70 V/s and at most about 250 V/s. Different
+# speeds separate time-dependent effects from hysteresis.
 SPEEDS = (0.6, 1.0, 1.8)
 FAST, SLOW = 1.8, 0.6
 # Shorter moves take the time of a move over this share of the range, for several samples each.

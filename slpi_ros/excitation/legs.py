@@ -6,14 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.effects.excitation import FEWEST_STEPS, STEEPEST
 from slpi_ros.errors import UsageError
 
 FloatArray = NDArray[np.float64]
 
-# Ratio of largest to mean slope of a raised cosine.
-STEEPEST = math.pi / 2
-# Smallest number of steps of a raised cosine.
-FEWEST_STEPS = 3
 # Largest number of samples of a drive.
 MOST_STEPS = 10_000_000
 # Largest magnitude of a voltage limit, volts.

@@ -1,0 +1,185 @@
+"""Facts of the parameters of effects, stored with their fields, and what follows from them: validation and vectors."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cache
+from math import inf, isfinite, isinf
+from textwrap import shorten
+from typing import Any, Literal, NamedTuple
+
+from slpi_ros.errors import ModelError
+
+# How a parameter is fitted. Linear: the displacement is linear in it, or nearly so, and a Gauss-Newton step is not
+# limited; relative and angle: a step is limited in relation to the value, or absolutely; logarithmic: its logarithm is
+# fitted, as it ranges over decades.
+Fitted = Literal["linear", "relative", "angle", "logarithmic"]
+
+
+class Scales(NamedTuple):
+    """Scales of a record: median sampling interval (s), duration (s), and voltage range (V)."""
+
+    interval: float
+    duration: float
+    voltage: float
+
+
+def relative_step(value: float, scales: Scales) -> float:
+    """Return the usual step of numerical derivatives by a parameter."""
+    return 1e-4 * abs(value) + 1e-12
+
+
+def fixed_step(size: float) -> Callable[[float, Scales], float]:
+    """Return the rule for a step of the same size for all values."""
+    return lambda value, scales: size
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Facts of one parameter, or of every number in a list or mapping.
+
+    Parameters
+    ----------
+    unit, meaning : str
+    low, high : float
+        Bounds of valid values.
+    above, below : bool
+        Whether `low` and `high` themselves are excluded.
+    none : bool
+        Whether the parameter may be infinite, which is null in documents: there is none.
+    count : (int, int)
+        Smallest and largest length of a list or mapping.
+    optional : bool
+        Whether documents may omit it.
+    fitted : Fitted or None
+        How it is fitted; None if it is chosen.
+    least, most : float
+        Bounds in fits.
+    within_record : bool
+        Whether a multiple of the duration of the record bounds it in fits.
+    start : bool
+        Whether it is the state at the start of each record; an entry that is 0 stays 0.
+    step : callable
+        Step of numerical derivatives for a value and the `Scales` of a record.
+    """
+
+    unit: str
+    meaning: str
+    low: float = -inf
+    high: float = inf
+    above: bool = False
+    below: bool = False
+    none: bool = False
+    count: tuple[int, int] = (1, 10000)
+    optional: bool = False
+    fitted: Fitted | None = None
+    least: float = -inf
+    most: float = inf
+    within_record: bool = False
+    start: bool = False
+    step: Callable[[float, Scales], float] = field(default=relative_step)
+
+    def holds(self, value: float) -> bool:
+        """Return whether a value is valid."""
+        if not isfinite(value):
+            return self.none and isinf(value)
+        return (value > self.low if self.above else value >= self.low) and (
+            value < self.high if self.below else value <= self.high
+        )
+
+    @property
+    def need(self) -> str:
+        """What a value must be, in words."""
+        low = f"{'more than' if self.above else 'at least'} {self.low:g}"
+        high = f"{'less than' if self.below else 'at most'} {self.high:g}"
+        return f"a finite number, {low} and {high} {self.unit}".rstrip() + (", or infinite for none" * self.none)
+
+
+def parameter(unit: str, meaning: str, **facts: Any) -> Mapping[str, Parameter]:
+    """Return the metadata of a dataclass field that is a parameter, with the fields of `Parameter`."""
+    return {"parameter": Parameter(unit, meaning, **facts)}
+
+
+def elements(meaning: str, most: int) -> Mapping[str, Parameter]:
+    """Return the metadata of a field that is a list of 1 to `most` dataclasses, whose fields have their own facts."""
+    return parameter("", meaning, count=(1, most))
+
+
+def _facts_of(kind: Any) -> dict[str, Parameter]:
+    """Return the facts of the parameters of a kind of effect, or of the elements of a list in one, by field."""
+    return {item.name: item.metadata["parameter"] for item in fields(kind) if "parameter" in item.metadata}
+
+
+facts_of: Callable[[Any], dict[str, Parameter]] = cache(_facts_of)
+
+
+class Leaf(NamedTuple):
+    """A number in a parameter: its place, such as ``modes.0.gain``, its facts, and its value."""
+
+    place: str
+    facts: Parameter
+    value: float
+
+    @property
+    def free(self) -> bool:
+        """Whether it is fitted: a limit that is not there, or an equilibrium at the start, stays as it is."""
+        chosen = self.facts.fitted is None or not isfinite(self.value)
+        return not chosen and (bool(self.value) or not self.facts.start)
+
+
+def leaves(place: str, facts: Parameter, value: Any) -> Iterator[Leaf]:
+    """Yield the numbers in a parameter."""
+    if is_dataclass(value):
+        for name, own in facts_of(type(value)).items():
+            yield from leaves(f"{place}.{name}", own, getattr(value, name))
+    elif isinstance(value, Mapping | tuple):
+        for key, one in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from leaves(f"{place}.{key}", facts, one)
+    else:
+        yield Leaf(place, facts, value)
+
+
+def with_leaves(value: Any, numbers: Iterator[float]) -> Any:
+    """Return a parameter with other numbers, in the order of `leaves`."""
+    if is_dataclass(value) and not isinstance(value, type):
+        names = facts_of(type(value))
+        return replace(value, **{name: with_leaves(getattr(value, name), numbers) for name in names})
+    if isinstance(value, Mapping):
+        return {key: with_leaves(one, numbers) for key, one in value.items()}
+    return tuple(with_leaves(one, numbers) for one in value) if isinstance(value, tuple) else next(numbers)
+
+
+def as_list(name: str, element: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
+    """Return parameters and uncertainty of a document of version 1, of one element, as those of a list `name`."""
+    if isinstance(spread, dict):
+        spread = {f"{name}.0.{part}": deviation for part, deviation in spread.items()}
+    return {name: [element]}, spread
+
+
+# Name of a parameter, whether the rule holds, and the requirement as text.
+Rule = tuple[str, bool, str]
+
+
+def require_facts(effect: Any) -> None:
+    """Raise ModelError if a parameter violates its facts or an uncertainty belongs to no parameter."""
+    known = facts_of(type(effect))
+    for name, facts in known.items():
+        value, (fewest, most) = getattr(effect, name), facts.count
+        if isinstance(value, tuple | Mapping):
+            require(effect, (name, fewest <= len(value) <= most, f"{fewest} to {most} of them"))
+        for leaf in leaves(name, facts, value):
+            if not leaf.facts.holds(leaf.value):
+                raise ModelError(f"effect '{effect.name}': {leaf.place} is {leaf.value}; it must be {leaf.facts.need}")
+    for name, deviation in effect.uncertainty.items():
+        if name.split(".")[0] not in known or not (isfinite(deviation) and deviation >= 0):
+            raise ModelError(
+                f"effect '{effect.name}': uncertainty of {name[:40]!r} is {deviation}; give 0 or more for one of "
+                f"{', '.join(known)}"
+            )
+
+
+def require(effect: Any, *rules: Rule) -> None:
+    """Raise ModelError if a parameter violates a rule."""
+    for name, holds, need in rules:
+        if not holds:
+            value = shorten(str(getattr(effect, name)), 80)
+            raise ModelError(f"effect '{effect.name}': {name} is {value}; it must be {need}")

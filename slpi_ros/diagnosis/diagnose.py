@@ -12,7 +12,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, NO_WORSE, Seen, Selection, counts, is_own, select
+from slpi_ros.diagnosis.selection import BIAS, NO_WORSE, Selection, counts, is_own, seen, select
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
@@ -119,7 +119,7 @@ def _diagnose_axis(
     # Effects that belong to one record (drift, hum, the knots of a gain drift) do not apply to another.
     shared = [effect for effect in model.effects if same or not is_own(effect)]
     base = Explanation(evidence, shared)
-    known = [effect for effect in shared if effect.in_phase(Seen(base))]
+    known = [effect for effect in shared if effect.in_phase(seen(base))]
     if len(known) < len(shared):
         base = Explanation(evidence, known)
     # Other kinds are not refitted; a comparison with the loop family shows whether they are suitable.

@@ -20,7 +20,7 @@ from slpi_ros.effects.base import (
     Signal,
     usual_step,
 )
-from slpi_ros.effects.parameters import Leaf, Scales
+from slpi_ros.effects.parameters import Fit, Leaf, Scales
 
 FloatArray = NDArray[np.float64]
 
@@ -90,54 +90,50 @@ class EachRecord(EffectBase):
         yield from ()
 
 
+def _fitted(effect: Effect) -> list[tuple[str, Fit, float]]:
+    """Return place, kind of fit and value of each free parameter, such as ``modes.0.gain``."""
+    return [(leaf.place, leaf.facts.fit, leaf.value) for leaf in effect.free_leaves() if leaf.facts.fit]
+
+
 def names(effect: Effect) -> list[str]:
     """Return the names of the free parameters; elements of a field have names such as ``gains.0``."""
-    return [leaf.place for leaf in effect.free_leaves()]
+    return [place for place, _, _ in _fitted(effect)]
 
 
 def of_starts(effect: Effect) -> list[bool]:
     """Return for each free parameter whether it is the state at the start of a record."""
-    return [leaf.facts.start for leaf in effect.free_leaves()]
+    return [fit.start for _, fit, _ in _fitted(effect)]
 
 
 def free(effect: Effect) -> FloatArray:
     """Return the values of the free parameters, shape (k,), SI, or their logarithms for logarithmic ones."""
-    values = [
-        log(max(leaf.value, leaf.facts.least)) if leaf.facts.fitted == "logarithmic" else leaf.value
-        for leaf in effect.free_leaves()
-    ]
+    values = [log(max(value, fit.least)) if fit.kind == "logarithmic" else value for _, fit, value in _fitted(effect)]
     return np.array(values, dtype=np.float64)
 
 
 def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect:
     """Return the effect with new free parameters, clipped to their bounds; `longest`: largest time constant (s)."""
-    return effect.with_free(
-        _clipped(leaf, value, longest) for leaf, value in zip(effect.free_leaves(), values.tolist(), strict=True)
-    )
-
-
-def _clipped(leaf: Leaf, value: float, longest: float) -> float:
-    facts = leaf.facts
-    value = exp(min(value, 300.0)) if facts.fitted == "logarithmic" else value
-    return min(max(value, facts.least), longest if facts.within_record else facts.most)
+    new = []
+    for (_, fit, _), value in zip(_fitted(effect), values.tolist(), strict=True):
+        number = exp(min(value, 300.0)) if fit.kind == "logarithmic" else value
+        new.append(min(max(number, fit.least), longest if fit.within_record else fit.most))
+    return effect.with_free(new)
 
 
 def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
     """Return the step of each free parameter for numerical derivatives, shape (k,), SI."""
     scales, found = Scales(usual_step(t), float(np.ptp(t)), float(np.ptp(v))), []
-    for _, facts, value in effect.free_leaves():
-        step = facts.step(value, scales)
+    for _, fit, value in _fitted(effect):
+        step = fit.step(value, scales) if callable(fit.step) else fit.step
         # Downwards where there is an upper bound: at the bound, a step upwards would change nothing.
-        found.append(-step if facts.most < np.inf and value - step >= facts.least else step)
+        found.append(-step if fit.most < np.inf and value - step >= fit.least else step)
     return np.array(found)
 
 
 def bounded(effect: Effect, change: FloatArray) -> FloatArray:
     """Return a change of the free parameters, limited to the range in which the linearised fit is valid."""
     limits = {"linear": np.inf, "angle": LARGEST_STEP, "logarithmic": LARGEST_LOG_STEP}
-    limit = np.array(
-        [limits.get(facts.fitted or "", LARGEST_STEP * abs(value)) for _, facts, value in effect.free_leaves()]
-    )
+    limit = np.array([limits.get(fit.kind, LARGEST_STEP * abs(value)) for _, fit, value in _fitted(effect)])
     return np.clip(change, -limit, limit)
 
 
@@ -147,7 +143,7 @@ def certain(effect: Effect, spread: Sequence[float]) -> Effect:
         left = list(spread)
         return EachRecord(tuple(certain(part, [left.pop(0) for _ in part.free_leaves()]) for part in effect.parts))
     found = {
-        leaf.place: deviation * (leaf.value if leaf.facts.fitted == "logarithmic" else 1.0)
-        for leaf, deviation in zip(effect.free_leaves(), spread, strict=True)
+        place: deviation * (value if fit.kind == "logarithmic" else 1.0)
+        for (place, fit, value), deviation in zip(_fitted(effect), spread, strict=True)
     }
     return replace(effect, uncertainty=found)  # type: ignore[type-var]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency, one_speed
-from slpi_ros.effects.base import Candidate, Effect, usual_step
+from slpi_ros.effects.base import Candidate, Effect, FitView, usual_step
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
@@ -116,77 +116,19 @@ class Contender:
         return counts(now.held_out, self.score, own=is_own(self.effect), least=least)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A joint fit as the plausibility of an effect may see it, see `slpi_ros.effects.base.FitView`."""
+def seen(now: Explanation) -> FitView:
+    """Return a joint fit as the plausibility of an effect may see it."""
+    evidence = now.evidence
 
-    now: Explanation
-
-    @property
-    def t(self) -> FloatArray:
-        """Time from the start of each record, shape (N,), seconds."""
-        return self.now.t
-
-    @property
-    def v(self) -> FloatArray:
-        """Applied voltage, shape (N,), volts."""
-        return self.now.evidence.v
-
-    @property
-    def u(self) -> FloatArray:
-        """Voltage that drives the hysteresis, shape (N,), volts."""
-        return self.now.u
-
-    @property
-    def h(self) -> FloatArray:
-        """Displacement of the hysteresis, shape (N,), metres."""
-        return self.now.h
-
-    @property
-    def y(self) -> FloatArray:
-        """Measured displacement, shape (N,), metres."""
-        return self.now.y
-
-    @property
-    def used(self) -> NDArray[np.bool_]:
-        """Mask of the samples used in the fit, shape (N,)."""
-        return self.now.used
-
-    @property
-    def effects(self) -> Sequence[Effect]:
-        """All effects of the fit."""
-        return self.now.effects
-
-    @property
-    def step(self) -> float:
-        """Median sampling interval, seconds."""
-        return usual_step(self.now.t)
-
-    @property
-    def motion(self) -> float:
-        """Range of the measured displacement, metres."""
-        return float(np.ptp(self.now.y[self.now.used]))
-
-    @property
-    def rounding(self) -> float:
-        """Rms rounding error of the sensor, metres."""
-        return self.now.evidence.rounding
-
-    @property
-    def excited_frequency(self) -> float:
-        """Highest frequency that any record excites, hertz."""
-        return excited_frequency(self.now.evidence)
-
-    @property
-    def drives(self) -> Sequence[tuple[float, float]]:
-        """Of each record the single drive frequency (Hz), 0 if there are several, and the duration (s)."""
-        evidence = self.now.evidence
+    def drives() -> list[tuple[float, float]]:
         return [(drive_frequency(evidence.of_record(k)), float(part.t[-1])) for k, part in enumerate(evidence.parts)]
 
-    @property
-    def zeros(self) -> FloatArray:
-        """Displacement at the centre of the largest loop of each record, shape (records,), metres."""
-        return self.now.zeros
+    return FitView(
+        *(now.t, evidence.v, now.u, now.h, now.y, now.used, evidence.rounding, now.effects),
+        excited_frequency=lambda: excited_frequency(evidence),
+        drives=drives,
+        zeros=lambda: now.zeros,
+    )
 
 
 def is_own(effect: Effect | type[Any]) -> bool:
@@ -208,16 +150,16 @@ def contenders(now: Explanation, names: Iterable[str] | None = None) -> list[Con
     screened = [best for name in names or EFFECTS if name not in taken for best in _screened(name, now)]
     error = now.held_out.rms
     # Implausible effects do not determine the threshold.
-    most = max((error - score.rms for score, effect in screened if effect.plausible(Seen(now))), default=0.0)
+    most = max((error - score.rms for score, effect in screened if effect.plausible(seen(now))), default=0.0)
     least = max(WORTH_TRYING * most, LEAST_SCREENED * error)
     tried = [
         Contender(effect.name, _with_companion(now, effect).adding(effect)).refined(1)
         for score, effect in screened
         if error - score.rms > least
     ]
-    sound = [one for one in tried if one.effect.plausible(Seen(one.explanation))]
+    sound = [one for one in tried if one.effect.plausible(seen(one.explanation))]
     most = max((error**2 - one.score.rms**2 for one in sound), default=0.0)
-    sound = [one for one in _refined(tried, now, most) if one.effect.plausible(Seen(one.explanation))]
+    sound = [one for one in _refined(tried, now, most) if one.effect.plausible(seen(one.explanation))]
     # Of an effect that was refined from several forms, the best.
     sound = [min((one for one in sound if one.name == name), key=_error) for name in {one.name: None for one in sound}]
     several = len(now.evidence.parts) > 1
@@ -263,7 +205,7 @@ def _screened(name: str, now: Explanation) -> list[tuple[Score, Effect]]:
     """
     tried: dict[int, list[tuple[Score, Effect]]] = {}
     for form in _forms(name, now):
-        if (scored := _scored(form, now)) and scored[1].in_phase(Seen(now)):
+        if (scored := _scored(form, now)) and scored[1].in_phase(seen(now)):
             tried.setdefault(getattr(form, "group", 0), []).append(scored)
     return [_simplest_of_best(group) for group in tried.values()]
 
@@ -512,7 +454,7 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
                 one for one in contenders(without, [name]) if one.counts_beside(without) and not one.effect.at_bound
             ]
             now = anew[0].explanation if anew else without
-        elif effect.plausible_to_the_end and not effect.plausible(Seen(now)):
+        elif effect.plausible_to_the_end and not effect.plausible(seen(now)):
             now = now.without(name)
     return now
 

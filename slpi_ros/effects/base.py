@@ -369,60 +369,50 @@ class ResidualView(Protocol):
         """Return the displacement of the hysteresis, shape (N,), metres, for the voltage `u`, shape (N,), volts."""
 
 
-class FitView(Protocol):
-    """A fit and its records as the plausibility of an effect may see them; signals of all records, shape (N,)."""
+@dataclass(frozen=True)
+class FitView:
+    """A fit and its records as the plausibility of an effect may see them; signals of all records, shape (N,).
 
-    @property
-    def t(self) -> FloatArray:
-        """Time from the start of each record, seconds."""
+    Parameters
+    ----------
+    t, v, u, h, y : ndarray
+        Time from the start of each record (s), applied and felt voltage (V), displacement of the hysteresis and
+        measured displacement (m).
+    used : ndarray of bool
+        Samples used in the fit.
+    rounding : float, metres
+        Rms rounding error of the sensor.
+    effects : sequence of Effect
+        All effects of the fit.
+    excited_frequency : callable
+        Returns the highest frequency (Hz) that any record excites.
+    drives : callable
+        Returns of each record the single drive frequency (Hz), 0 if there are several, and the duration (s).
+    zeros : callable
+        Returns the displacement (m) at the centre of the largest loop of each record, shape (records,).
+    """
 
-    @property
-    def v(self) -> FloatArray:
-        """Applied voltage, volts."""
-
-    @property
-    def u(self) -> FloatArray:
-        """Voltage that drives the hysteresis, volts."""
-
-    @property
-    def h(self) -> FloatArray:
-        """Displacement of the hysteresis, metres."""
-
-    @property
-    def y(self) -> FloatArray:
-        """Measured displacement, metres."""
-
-    @property
-    def used(self) -> NDArray[np.bool_]:
-        """Mask of the samples used in the fit."""
-
-    @property
-    def effects(self) -> "Sequence[Effect]":
-        """All effects of the fit."""
+    t: FloatArray
+    v: FloatArray
+    u: FloatArray
+    h: FloatArray
+    y: FloatArray
+    used: NDArray[np.bool_]
+    rounding: float
+    effects: Sequence[Effect]
+    excited_frequency: Callable[[], float]
+    drives: Callable[[], Sequence[tuple[float, float]]]
+    zeros: Callable[[], FloatArray]
 
     @property
     def step(self) -> float:
         """Median sampling interval, seconds."""
+        return usual_step(self.t)
 
     @property
     def motion(self) -> float:
         """Range of the measured displacement, metres."""
-
-    @property
-    def rounding(self) -> float:
-        """Rms rounding error of the sensor, metres."""
-
-    @property
-    def excited_frequency(self) -> float:
-        """Highest frequency that any record excites, hertz."""
-
-    @property
-    def drives(self) -> Sequence[tuple[float, float]]:
-        """Of each record the single drive frequency (Hz), 0 if there are several, and the duration (s)."""
-
-    @property
-    def zeros(self) -> FloatArray:
-        """Displacement at the centre of the largest loop of each record, shape (records,), metres."""
+        return float(np.ptp(self.y[self.used]))
 
 
 def longer_than_hold(effect: Effect, view: FitView) -> bool:

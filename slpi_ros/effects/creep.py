@@ -23,7 +23,7 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.filters import Hold, hold
-from slpi_ros.effects.parameters import Leaf, fixed_step, parameter, require
+from slpi_ros.effects.parameters import Fit, Leaf, parameter, require
 
 # Shortest time constant (s) of creep; shorter ones are modelled as lag.
 FASTEST = 0.1
@@ -84,33 +84,19 @@ class Creep(EffectBase):
         lacking=(0.2, "no record holds the voltage for long after a quick move, where creep would show"),
     )
 
-    time_constants: tuple[float, ...] = field(
-        metadata=parameter(
-            *("s", "time constants"),
-            low=0,
-            above=True,
-            high=1e7,
-            count=(1, 100),
-            fitted="relative",
-            least=FASTEST,
-            within_record=True,
-        )
+    time_constants: tuple[float, ...] = parameter(
+        "s",
+        "time constants",
+        0,
+        1e7,
+        above=True,
+        count=(1, 100),
+        fit=Fit("relative", least=FASTEST, within_record=True),
     )
-    gains: tuple[float, ...] = field(
-        metadata=parameter(
-            *("", "shares of the motion that follow with each time constant"),
-            low=-0.9,
-            high=11,
-            count=(1, 100),
-            fitted="linear",
-            least=0.0,
-            step=fixed_step(1e-5),
-        )
+    gains: tuple[float, ...] = parameter(
+        "", "shares of the motion that follow with each", -0.9, 11, count=(1, 100), fit=Fit("linear", 1e-5, 0.0)
     )
-    initial: float = field(
-        default=0.0,
-        metadata=parameter("m", "step of the displacement just before the record", low=-1e3, high=1e3, optional=True),
-    )
+    initial: float = parameter("m", "step of the displacement just before the record", -1e3, 1e3, default=0.0)
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

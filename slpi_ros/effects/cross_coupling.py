@@ -9,7 +9,7 @@ import numpy as np
 
 from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FloatArray, ResidualView, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining
-from slpi_ros.effects.parameters import fixed_step, parameter, require
+from slpi_ros.effects.parameters import Fit, parameter, require
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
@@ -46,16 +46,13 @@ class CrossCoupling(EffectBase):
         least_axes=2,
     )
 
-    gains: Mapping[str, float] = field(
-        metadata=parameter(
-            *("", "metres for one metre of another axis, by its name"),
-            low=-1,
-            high=1,
-            count=(1, 100),
-            fitted="linear",
-            most=0.4,
-            step=fixed_step(1e-5),
-        )
+    gains: Mapping[str, float] = parameter(
+        "",
+        "metres for one metre of another axis, by its name",
+        -1,
+        1,
+        count=(1, 100),
+        fit=Fit("linear", 1e-5, most=0.4),
     )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 

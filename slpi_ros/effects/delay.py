@@ -22,7 +22,7 @@ from slpi_ros.effects.base import (
     usual_step,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
-from slpi_ros.effects.parameters import parameter
+from slpi_ros.effects.parameters import Fit, in_samples, parameter
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
@@ -55,16 +55,7 @@ class Delay(EffectBase):
         _draw,
     )
 
-    seconds: float = field(
-        metadata=parameter(
-            "s",
-            "delay from voltage to displacement",
-            low=-100,
-            high=100,
-            fitted="linear",
-            step=lambda value, scales: 0.05 * scales.interval,
-        )
-    )
+    seconds: float = parameter("s", "delay from voltage to displacement", -100, 100, fit=Fit("linear", in_samples))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @by_record

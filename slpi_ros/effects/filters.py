@@ -1,6 +1,6 @@
 """Linear filters: first-order hold of a lag, second-order mode, and resampling to a uniform grid."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from math import cos, exp, expm1, pi, sin, sqrt
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slpi_ros.effects.parameters import fixed_step, parameter
+from slpi_ros.effects.parameters import Fit, parameter
 
 FloatArray = NDArray[np.float64]
 
@@ -60,23 +60,13 @@ class Mode:
         Share of the static displacement that the mode carries; default: all of it.
     """
 
-    frequency: float = field(metadata=parameter("Hz", "frequency", low=1e-3, high=1e7, fitted="relative", least=1e-3))
+    frequency: float = parameter("Hz", "frequency", 1e-3, 1e7, fit=Fit("relative", least=1e-3))
     # With more damping there is no resonance.
-    damping: float = field(
-        metadata=parameter("", "damping ratio", low=1e-6, high=1, below=True, fitted="relative", least=1e-3, most=0.4)
-    )
-    gain: float = field(
-        default=1.0,
-        metadata=parameter(
-            *("", "share of the static displacement that it carries; at most 1 in sum"),
-            low=0,
-            high=1,
-            fitted="linear",
-            least=LEAST_GAIN,
-            most=1.0,
-            step=fixed_step(1e-5),
-        ),
-    )
+    damping: float = parameter("", "damping ratio", 1e-6, 1, below=True, fit=Fit("relative", least=1e-3, most=0.4))
+    gain: float = parameter(
+        "", "share of the static displacement; at most 1 in sum", 0, 1, default=1.0, required=True,
+        fit=Fit("linear", 1e-5, LEAST_GAIN, 1.0),
+    )  # fmt: skip
 
     @cached_property
     def omega(self) -> float:

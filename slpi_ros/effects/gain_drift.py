@@ -20,7 +20,7 @@ from slpi_ros.effects.base import (
     StreamingBase,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
-from slpi_ros.effects.parameters import fixed_step, parameter, require
+from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Numbers of uniform knots of the candidates. The first interval has more knots, spaced logarithmically (number per
 # decade), as piezo ageing is logarithmic in time; the first lies after one loop and at least this many readings.
@@ -72,27 +72,12 @@ class GainDrift(EffectBase):
         order=1,
     )
 
-    times: tuple[float, ...] = field(
-        metadata=parameter("s", "times from the record's start; 0 alone: constant", low=0, high=1e9)
+    times: tuple[float, ...] = parameter("s", "times from the record's start; 0 alone: constant", 0, 1e9)
+    gains: tuple[float, ...] = parameter(
+        "", "relative changes of the sensitivity", -0.9, 10, above=True, fit=Fit("linear", 1e-5)
     )
-    gains: tuple[float, ...] = field(
-        metadata=parameter(
-            *("", "relative changes of the sensitivity"),
-            low=-0.9,
-            above=True,
-            high=10,
-            fitted="linear",
-            step=fixed_step(1e-5),
-        )
-    )
-    origin: float = field(
-        metadata=parameter(
-            *("m", "displacement that does not change with the sensitivity"),
-            low=-1e3,
-            high=1e3,
-            fitted="linear",
-            step=fixed_step(1e-9),
-        )
+    origin: float = parameter(
+        "m", "displacement that does not change with the sensitivity", -1e3, 1e3, fit=Fit("linear", 1e-9)
     )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 

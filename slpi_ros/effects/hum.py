@@ -23,7 +23,7 @@ from slpi_ros.effects.base import (
     wave,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, move, remaining
-from slpi_ros.effects.parameters import as_list, elements, fixed_step, parameter
+from slpi_ros.effects.parameters import Fit, as_list, parameter
 
 # Number of spectral peaks that are tried, and lowest frequency (Hz); slower disturbances are drift or creep.
 PEAKS, SLOWEST = 4, 2.0
@@ -43,23 +43,11 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class Line:
     """One line of hum: frequency (Hz), amplitude (m), and phase (rad) at the record's start."""
 
-    frequency: float = field(
-        metadata=parameter(
-            *("Hz", "frequency"),
-            low=0,
-            above=True,
-            high=1e7,
-            fitted="relative",
-            least=1e-3,
-            step=lambda value, scales: 1e-3 / scales.duration,
-        )
+    frequency: float = parameter(
+        "Hz", "frequency", 0, 1e7, above=True, fit=Fit("relative", lambda _, of: 1e-3 / of.duration, 1e-3)
     )
-    amplitude: float = field(metadata=parameter("m", "amplitude", low=0, high=1e3, fitted="relative", least=0.0))
-    phase: float = field(
-        metadata=parameter(
-            "rad", "phase at the record's start", low=-1e6, high=1e6, fitted="angle", step=fixed_step(1e-4)
-        )
-    )
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0))
+    phase: float = parameter("rad", "phase at the record's start", -1e6, 1e6, fit=Fit("angle", 1e-4))
 
 
 @dataclass(frozen=True)
@@ -87,7 +75,7 @@ class Hum(EffectBase):
         _draw,
     )
 
-    lines: tuple[Line, ...] = field(metadata=elements("spectral lines", MOST_LINES))
+    lines: tuple[Line, ...] = parameter("", "spectral lines", count=(1, MOST_LINES))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -102,7 +90,7 @@ class Hum(EffectBase):
             and round(line.frequency / drive) <= MOST_HARMONICS
             and abs(line.frequency - round(line.frequency / drive) * drive) < 2.0 / duration
             for line in self.lines
-            for drive, duration in view.drives
+            for drive, duration in view.drives()
         )
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:

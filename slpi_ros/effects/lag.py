@@ -25,7 +25,7 @@ from slpi_ros.effects.base import (
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
 from slpi_ros.effects.filters import Hold, filtered, hold
-from slpi_ros.effects.parameters import parameter
+from slpi_ros.effects.parameters import Fit, in_samples, parameter
 
 # The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
 # of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
@@ -63,18 +63,7 @@ class Lag(EffectBase):
         separates=("delay",),
     )
 
-    time_constant: float = field(
-        metadata=parameter(
-            "s",
-            "time constant",
-            low=0,
-            above=True,
-            high=1e4,
-            fitted="relative",
-            least=1e-6,
-            step=lambda value, scales: 0.05 * scales.interval,
-        )
-    )
+    time_constant: float = parameter("s", "time constant", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @by_record

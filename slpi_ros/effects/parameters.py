@@ -1,7 +1,7 @@
 """Facts of the parameters of effects, stored with their fields, and what follows from them: validation and vectors."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from math import inf, isfinite, isinf
 from textwrap import shorten
@@ -12,7 +12,7 @@ from slpi_ros.errors import ModelError
 # How a parameter is fitted. Linear: the displacement is linear in it, or nearly so, and a Gauss-Newton step is not
 # limited; relative and angle: a step is limited in relation to the value, or absolutely; logarithmic: its logarithm is
 # fitted, as it ranges over decades.
-Fitted = Literal["linear", "relative", "angle", "logarithmic"]
+Kind = Literal["linear", "relative", "angle", "logarithmic"]
 
 
 class Scales(NamedTuple):
@@ -23,14 +23,34 @@ class Scales(NamedTuple):
     voltage: float
 
 
-def relative_step(value: float, scales: Scales) -> float:
-    """Return the usual step of numerical derivatives by a parameter."""
-    return 1e-4 * abs(value) + 1e-12
+def in_samples(value: float, scales: Scales) -> float:
+    """Return the step of numerical derivatives by a short time."""
+    return 0.05 * scales.interval
 
 
-def fixed_step(size: float) -> Callable[[float, Scales], float]:
-    """Return the rule for a step of the same size for all values."""
-    return lambda value, scales: size
+@dataclass(frozen=True)
+class Fit:
+    """How a parameter is fitted.
+
+    Parameters
+    ----------
+    kind : Kind
+    step : float or callable
+        Step of numerical derivatives, or how it follows from the value and the scales of the record.
+    least, most : float
+        Bounds in fits.
+    within_record : bool
+        Whether a multiple of the duration of the record is the upper bound instead.
+    start : bool
+        Whether it is the state at the start of each record; an entry that is 0 stays 0.
+    """
+
+    kind: Kind
+    step: float | Callable[[float, Scales], float] = lambda value, scales: 1e-4 * abs(value) + 1e-12
+    least: float = -inf
+    most: float = inf
+    within_record: bool = False
+    start: bool = False
 
 
 @dataclass(frozen=True)
@@ -48,60 +68,56 @@ class Parameter:
         Whether the parameter may be infinite, which is null in documents: there is none.
     count : (int, int)
         Smallest and largest length of a list or mapping.
-    optional : bool
-        Whether documents may omit it.
-    fitted : Fitted or None
+    required : bool
+        Whether documents must contain it.
+    fit : Fit or None
         How it is fitted; None if it is chosen.
-    least, most : float
-        Bounds in fits.
-    within_record : bool
-        Whether a multiple of the duration of the record bounds it in fits.
-    start : bool
-        Whether it is the state at the start of each record; an entry that is 0 stays 0.
-    step : callable
-        Step of numerical derivatives for a value and the `Scales` of a record.
     """
 
     unit: str
     meaning: str
-    low: float = -inf
-    high: float = inf
-    above: bool = False
-    below: bool = False
-    none: bool = False
-    count: tuple[int, int] = (1, 10000)
-    optional: bool = False
-    fitted: Fitted | None = None
-    least: float = -inf
-    most: float = inf
-    within_record: bool = False
-    start: bool = False
-    step: Callable[[float, Scales], float] = field(default=relative_step)
+    low: float
+    high: float
+    above: bool
+    below: bool
+    none: bool
+    count: tuple[int, int]
+    required: bool
+    fit: Fit | None
 
     def holds(self, value: float) -> bool:
         """Return whether a value is valid."""
         if not isfinite(value):
             return self.none and isinf(value)
-        return (value > self.low if self.above else value >= self.low) and (
-            value < self.high if self.below else value <= self.high
-        )
+        excluded = (self.above and value == self.low) or (self.below and value == self.high)
+        return self.low <= value <= self.high and not excluded
 
     @property
     def need(self) -> str:
         """What a value must be, in words."""
         low = f"{'more than' if self.above else 'at least'} {self.low:g}"
         high = f"{'less than' if self.below else 'at most'} {self.high:g}"
-        return f"a finite number, {low} and {high} {self.unit}".rstrip() + (", or infinite for none" * self.none)
+        return f"a finite number, {low} and {high} {self.unit}".rstrip() + ", or infinite for none" * self.none
 
 
-def parameter(unit: str, meaning: str, **facts: Any) -> Mapping[str, Parameter]:
-    """Return the metadata of a dataclass field that is a parameter, with the fields of `Parameter`."""
-    return {"parameter": Parameter(unit, meaning, **facts)}
-
-
-def elements(meaning: str, most: int) -> Mapping[str, Parameter]:
-    """Return the metadata of a field that is a list of 1 to `most` dataclasses, whose fields have their own facts."""
-    return parameter("", meaning, count=(1, most))
+def parameter(
+    unit: str,
+    meaning: str,
+    low: float = -inf,
+    high: float = inf,
+    *,
+    above: bool = False,
+    below: bool = False,
+    none: bool = False,
+    count: tuple[int, int] = (1, 10000),
+    default: Any = MISSING,
+    required: bool = False,
+    fit: Fit | None = None,
+) -> Any:
+    """Return a dataclass field that is a parameter, see `Parameter`; documents may omit it if it has a default."""
+    must = required or default is MISSING
+    facts = Parameter(unit, meaning, low, high, above, below, none, count, must, fit)
+    return field(default=default, metadata={"parameter": facts})
 
 
 def _facts_of(kind: Any) -> dict[str, Parameter]:
@@ -122,8 +138,8 @@ class Leaf(NamedTuple):
     @property
     def free(self) -> bool:
         """Whether it is fitted: a limit that is not there, or an equilibrium at the start, stays as it is."""
-        chosen = self.facts.fitted is None or not isfinite(self.value)
-        return not chosen and (bool(self.value) or not self.facts.start)
+        fit = self.facts.fit
+        return fit is not None and isfinite(self.value) and (bool(self.value) or not fit.start)
 
 
 def leaves(place: str, facts: Parameter, value: Any) -> Iterator[Leaf]:

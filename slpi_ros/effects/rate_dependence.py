@@ -22,7 +22,7 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
-from slpi_ros.effects.parameters import fixed_step, parameter
+from slpi_ros.effects.parameters import Fit, parameter
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.rate_law import solved
 
@@ -96,50 +96,26 @@ class RateDependence(EffectBase):
         separates=("lag", "delay"),
     )
 
-    threshold: float = field(
-        metadata=parameter(
-            *("V", "half-width that the loops gain for each factor of e in the rate"),
-            low=0,
-            high=1e5,
-            fitted="logarithmic",
-            least=1e-6,
-            step=fixed_step(1e-4),
-        )
+    threshold: float = parameter(
+        "V",
+        "half-width that the loops gain for each factor of e in the rate",
+        0,
+        1e5,
+        fit=Fit("logarithmic", 1e-4, 1e-6),
     )
-    onset_rate: float = field(
-        metadata=parameter(
-            *("V/s", "rate above which they widen"),
-            low=1e-12,
-            high=1e12,
-            fitted="logarithmic",
-            least=1e-9,
-            step=fixed_step(1e-4),
-        )
-    )
-    reversible_gain: float = field(
+    onset_rate: float = parameter("V/s", "rate above which they widen", 1e-12, 1e12, fit=Fit("logarithmic", 1e-4, 1e-9))
+    reversible_gain: float = parameter(
+        "m/V",
+        "gain of the reversible part",
+        0,
+        1e3,
         default=0.0,
-        metadata=parameter(
-            *("m/V", "gain of the reversible part"),
-            low=0,
-            high=1e3,
-            optional=True,
-            fitted="linear",
-            least=0.0,
-            step=lambda value, scales: 1e-9 / scales.voltage,
-        ),
+        fit=Fit("linear", lambda _, of: 1e-9 / of.voltage, 0.0),
     )
-    initial: tuple[float, ...] = field(
-        default=(),
-        metadata=parameter(
-            *("V", "applied minus felt voltage at the start of each record"),
-            low=-1e5,
-            high=1e5,
-            count=(0, 1000),
-            optional=True,
-            fitted="relative",
-            start=True,
-        ),
-    )
+    initial: tuple[float, ...] = parameter(
+        "V", "applied minus felt voltage at the start of each record", -1e5, 1e5, default=(), count=(0, 1000),
+        fit=Fit("relative", start=True),
+    )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod

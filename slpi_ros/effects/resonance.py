@@ -27,7 +27,7 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.excitation import FEWEST_STEPS, DriveLimits, DrivePath, Excitation, loops, move, remaining
 from slpi_ros.effects.filters import LEAST_GAIN, Mode, StreamingMode, filtered
-from slpi_ros.effects.parameters import as_list, elements, require
+from slpi_ros.effects.parameters import as_list, parameter, require
 
 # Smallest spacing of taps, in units of 1 / w: smaller ones make larger taps without benefit. From the step `WIDEST` on
 # a mode is not resolved, and only its lag is compensated.
@@ -247,7 +247,7 @@ class Resonance(EffectBase):
         lacking=(0.2, "no record holds small quick steps, where a resonance, a delay or a lag would show"),
     )
 
-    modes: tuple[Mode, ...] = field(metadata=elements("flexure modes", MOST_MODES))
+    modes: tuple[Mode, ...] = parameter("", "flexure modes", count=(1, MOST_MODES))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -267,7 +267,7 @@ class Resonance(EffectBase):
 
     def plausible(self, view: FitView) -> bool:
         """Return whether no mode far above the excited frequencies, damped, just shifts in time or is hysteresis."""
-        highest = RINGS * view.excited_frequency
+        highest = RINGS * view.excited_frequency()
         return all(mode.frequency <= highest or mode.damping <= SHARP for mode in self.modes)
 
     @property

@@ -3,26 +3,22 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from math import inf, isinf
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.effects.base import EffectBase, EffectContext, FitView, FloatArray, ResidualView, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
-from slpi_ros.effects.parameters import parameter, require
+from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Number of voltage bins; a bin is clipped if its gain is below this share of the median gain.
 BINS, STILL = 200, 0.35
-LIMIT = parameter(
-    "V",
-    "limit; null for none",
-    low=-1e4,
-    high=1e4,
-    none=True,
-    fitted="relative",
-    step=lambda value, scales: 1e-3 * scales.voltage,
-)
+
+
+def _limit(default: float) -> Any:
+    fit = Fit("relative", lambda _, of: 1e-3 * of.voltage)
+    return parameter("V", "limit; null for none", -1e4, 1e4, default=default, required=True, none=True, fit=fit)
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
@@ -54,8 +50,8 @@ class Saturation(EffectBase):
         _draw,
     )
 
-    lower: float = field(default=-inf, metadata=LIMIT)
-    upper: float = field(default=inf, metadata=LIMIT)
+    lower: float = _limit(-inf)
+    upper: float = _limit(inf)
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -24,7 +24,7 @@ from slpi_ros.effects.base import (
     wave,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining
-from slpi_ros.effects.parameters import fixed_step, parameter, require
+from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Shortest and longest period (m), number of spectral peaks, and number of displacement bins of the candidates.
 SHORTEST, LONGEST, LINES, BINS = 50e-9, 2e-6, 4, 2**14
@@ -71,20 +71,11 @@ class SensorPeriodic(EffectBase):
         _draw,
     )
 
-    period: float = field(
-        metadata=parameter(
-            *("m", "period in displacement"),
-            low=1e-12,
-            high=1e3,
-            fitted="relative",
-            least=1e-9,
-            step=lambda value, scales: 1e-5 * abs(value),
-        )
+    period: float = parameter(
+        "m", "period in displacement", 1e-12, 1e3, fit=Fit("relative", lambda value, _: 1e-5 * abs(value), 1e-9)
     )
-    amplitude: float = field(metadata=parameter("m", "amplitude", low=0, high=1e3, fitted="relative", least=0.0))
-    phase: float = field(
-        metadata=parameter("rad", "phase at displacement 0", low=-1e3, high=1e3, fitted="angle", step=fixed_step(1e-4))
-    )
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0))
+    phase: float = parameter("rad", "phase at displacement 0", -1e3, 1e3, fit=Fit("angle", 1e-4))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -101,7 +92,7 @@ class SensorPeriodic(EffectBase):
 
         If the zeros of the records differ, so may those of other records, and the phase there is unknown.
         """
-        return view.zeros.size == 1 or float(np.ptp(view.zeros)) <= IN_PHASE * self.period
+        return float(np.ptp(view.zeros())) <= IN_PHASE * self.period
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the sensor reading, shape (N,), metres."""

@@ -19,7 +19,7 @@ from slpi_ros.effects.base import (
     Signal,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
-from slpi_ros.effects.parameters import fixed_step, parameter, require
+from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Numbers of knots of the candidates.
 KNOTS = (2, 3, 5, 8, 13)
@@ -65,10 +65,8 @@ class ThermalDrift(EffectBase):
         order=1,
     )
 
-    times: tuple[float, ...] = field(metadata=parameter("s", "times from the record's start", low=-1e9, high=1e9))
-    values: tuple[float, ...] = field(
-        metadata=parameter("m", "displacements", low=-1e3, high=1e3, fitted="linear", step=fixed_step(1e-9))
-    )
+    times: tuple[float, ...] = parameter("s", "times from the record's start", -1e9, 1e9)
+    values: tuple[float, ...] = parameter("m", "displacements", -1e3, 1e3, fit=Fit("linear", 1e-9))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ BINS, STILL = 200, 0.35
 
 def _limit(default: float) -> Any:
     fit = Fit("relative", lambda _, of: 1e-3 * of.voltage)
-    return parameter("V", "limit; null for none", -1e4, 1e4, default=default, required=True, none=True, fit=fit)
+    return parameter("V", "limit", -1e4, 1e4, default=default, required=True, none=True, fit=fit)
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:

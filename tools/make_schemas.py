@@ -12,7 +12,7 @@ from slpi_ros.effects.parameters import facts_of
 from slpi_ros.effects.registry import EFFECTS
 
 SCHEMAS = Path(__file__).resolve().parents[1] / "msg_schemas"
-UNITS = {"s": "seconds", "V": "volts", "V/s": "V/s", "m/V": "m/V", "m": "metres", "Hz": "hertz", "rad": "radians"}
+UNITS = {"s": "Seconds", "V": "Volts", "V/s": "V/s", "m/V": "m/V", "m": "Metres", "Hz": "Hertz", "rad": "Radians"}
 WIDTH = 120
 
 
@@ -49,8 +49,8 @@ def _fields(kind):
 
 
 def _field(facts, kind):
-    unit = f", {UNITS[facts.unit]}" if facts.unit else ""
-    about = {"description": f"{facts.meaning[0].upper()}{facts.meaning[1:]}{unit}{'; null: none' * facts.none}."}
+    unit = f" {UNITS[facts.unit]}." if facts.unit else ""
+    about = {"description": f"{facts.meaning[0].upper()}{facts.meaning[1:]}{'; null: none' * facts.none}.{unit}"}
     few, most = facts.count
     holds = get_origin(kind)
     if holds is tuple:

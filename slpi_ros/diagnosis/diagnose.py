@@ -436,7 +436,7 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
         voltage_range=(float(voltage.min()), float(voltage.max())),
         displacement_range=(float(y.min()), float(y.max())),
         effects=tuple(
-            effect.started(now.began, len(evidence.parts))
+            effect.started(now.began[effect.name], len(evidence.parts))
             for effect in now.with_uncertainty()
             if not isinstance(effect, EachRecord)
         ),

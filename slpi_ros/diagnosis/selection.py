@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency, one_speed
-from slpi_ros.effects.base import Candidate, Effect, FitView, usual_step
+from slpi_ros.effects.base import FEW_SAMPLES, Candidate, Effect, FitView, usual_step
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
@@ -49,8 +49,6 @@ ALTERNATIVE = 0.7
 ALTERNATIVE_AT_ONE_SPEED = 0.4
 # Smallest relative reduction of the held-out error by an effect with a companion: two at once find more by chance.
 LEAST_GAIN_IN_COMPANY = 0.1
-# A time shift by less than this number of samples may be any effect that only shifts.
-FEW_SAMPLES = 3.0
 # An effect for which a simpler one may stand stays only if its held-out error is lower by this share: a lag also rounds
 # off turns that the hysteresis model makes too sharp.
 CLEARLY = 0.1

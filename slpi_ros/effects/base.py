@@ -27,6 +27,8 @@ Sharing = Literal["shared", "separate", "either"]
 TimeShift = Literal["none", "partly", "only"]
 # Time shifts below this share of the sampling period may be due to the hold of commands between samples.
 HELD = 0.6
+# A shift of one to this number of sampling periods may be any effect that only shifts.
+FEW_SAMPLES = 3.0
 # Number of spectral bins on either side of a peak that are attributed to the peak.
 LINE_WIDTH = 12
 
@@ -144,6 +146,10 @@ class StreamingBase:
 class EffectBase(Protocol):
     """Facts of an effect, and what effects do unless they say otherwise."""
 
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+
     side: ClassVar[Side]
     # Whether only feedback undoes it, because it follows time and not the voltage, or comes before the voltage.
     needs_feedback: ClassVar[bool] = False
@@ -175,8 +181,12 @@ class EffectBase(Protocol):
         return given, spread
 
     def plausible(self, view: "FitView") -> bool:
-        """Return whether the parameters are plausible, so that the effect does not imitate another cause."""
-        return True
+        """Return whether the parameters are plausible, so that the effect does not imitate another cause.
+
+        Where others shift in time, too, a short shift may be the hold of commands between samples.
+        """
+        others = any(other.time_shift != "none" and other.name != self.name for other in view.effects)
+        return self.time_shift != "only" or not others or abs(self.slow_shift) > HELD * view.step
 
     def in_phase(self, view: "FitView") -> bool:
         """Return whether one set of parameters can hold for all records of a fit, and for others."""
@@ -259,10 +269,7 @@ class EffectBase(Protocol):
 
 
 class Effect(EffectBase, Protocol):
-    """One effect: a frozen dataclass whose fields are its parameters in SI units and their `uncertainty`.
-
-    The metadata of a field that is a parameter come from `slpi_ros.effects.parameters.parameter`.
-    """
+    """One effect: a frozen dataclass whose fields are its parameters (`parameter`), in SI units, and `uncertainty`."""
 
     name: ClassVar[str]
     # For the documentation: what it is, and whether it is compensated.
@@ -371,35 +378,21 @@ class ResidualView(Protocol):
 
 @dataclass(frozen=True)
 class FitView:
-    """A fit and its records as the plausibility of an effect may see them; signals of all records, shape (N,).
+    """A fit and its records as the plausibility of an effect may see them; signals of all records, shape (N,)."""
 
-    Parameters
-    ----------
-    t, v, u, h, y : ndarray
-        Time from the start of each record (s), applied and felt voltage (V), displacement of the hysteresis and
-        measured displacement (m).
-    used : ndarray of bool
-        Samples used in the fit.
-    rounding : float, metres
-        Rms rounding error of the sensor.
-    effects : sequence of Effect
-        All effects of the fit.
-    excited_frequency : callable
-        Returns the highest frequency (Hz) that any record excites.
-    drives : callable
-        Returns of each record the single drive frequency (Hz), 0 if there are several, and the duration (s).
-    zeros : callable
-        Returns the displacement (m) at the centre of the largest loop of each record, shape (records,).
-    """
-
+    # Time from the start of each record (s), applied and felt voltage (V), displacement of the hysteresis and measured
+    # displacement (m).
     t: FloatArray
     v: FloatArray
     u: FloatArray
     h: FloatArray
     y: FloatArray
     used: NDArray[np.bool_]
+    # Rms rounding error of the sensor (m).
     rounding: float
     effects: Sequence[Effect]
+    # Return the highest frequency (Hz) that any record excites; of each record the single drive frequency (Hz), 0 if
+    # there are several, and the duration (s); the displacement (m) at the centre of the largest loop of each record.
     excited_frequency: Callable[[], float]
     drives: Callable[[], Sequence[tuple[float, float]]]
     zeros: Callable[[], FloatArray]
@@ -413,12 +406,6 @@ class FitView:
     def motion(self) -> float:
         """Range of the measured displacement, metres."""
         return float(np.ptp(self.y[self.used]))
-
-
-def longer_than_hold(effect: Effect, view: FitView) -> bool:
-    """Return whether a time shift is longer than the hold of commands between samples, if other effects shift, too."""
-    others = any(other.time_shift != "none" and other.name != effect.name for other in view.effects)
-    return not others or abs(effect.slow_shift) > HELD * view.step
 
 
 def usual_step(t: FloatArray) -> float:

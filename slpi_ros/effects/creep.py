@@ -55,17 +55,6 @@ class Creep(EffectBase):
     """Parallel first-order relaxations, ``y = h + sum_k g_k z_k`` with ``tau_k dz_k/dt = (h - h_0) - z_k``.
 
     ``h_0`` is the displacement at the start, where all relaxations are in equilibrium.
-
-    Parameters
-    ----------
-    time_constants : tuple of float, length K >= 1, seconds, ``tau_k``
-    gains : tuple of float, length K
-        Share ``g_k`` of the motion ``h - h_0`` that follows with each time constant.
-    initial : float, metres
-        Displacement step just before the record, default 0. Only `apply` includes the creep after this step; streaming
-        starts at equilibrium.
-    uncertainty : mapping of parameter name to standard deviation, optional
-        Standard deviations; those of single elements have keys such as ``gains.0``.
     """
 
     name: ClassVar[str] = "creep"
@@ -85,17 +74,13 @@ class Creep(EffectBase):
     )
 
     time_constants: tuple[float, ...] = parameter(
-        "s",
-        "time constants",
-        0,
-        1e7,
-        above=True,
-        count=(1, 100),
+        "s", "time constants tau_k", 0, 1e7, above=True, count=(1, 100),
         fit=Fit("relative", least=FASTEST, within_record=True),
-    )
+    )  # fmt: skip
     gains: tuple[float, ...] = parameter(
-        "", "shares of the motion that follow with each", -0.9, 11, count=(1, 100), fit=Fit("linear", 1e-5, 0.0)
+        "", "shares g_k of the motion that follow with each", -0.9, 11, count=(1, 100), fit=Fit("linear", 1e-5, 0.0)
     )
+    # Only `apply` includes the creep after it; streaming starts at equilibrium.
     initial: float = parameter("m", "step of the displacement just before the record", -1e3, 1e3, default=0.0)
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 

@@ -27,11 +27,6 @@ class CrossCoupling(EffectBase):
     """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j relative to its start.
 
     It needs the setpoints of all axes and is compensated by the stage model.
-
-    Parameters
-    ----------
-    gains : mapping of axis name to float
-        Gain by axis name, metres per metre. An axis with unknown motion is taken as stationary.
     """
 
     name: ClassVar[str] = "cross_coupling"
@@ -47,13 +42,9 @@ class CrossCoupling(EffectBase):
     )
 
     gains: Mapping[str, float] = parameter(
-        "",
-        "metres for one metre of another axis, by its name",
-        -1,
-        1,
-        count=(1, 100),
+        "", "metres for one metre of another axis, by its name", -1, 1, count=(1, 100),
         fit=Fit("linear", 1e-5, most=0.4),
-    )
+    )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -11,14 +11,12 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    FitView,
     FloatArray,
     ResidualView,
     Side,
     Signal,
     TimeShift,
     by_record,
-    longer_than_hold,
     usual_step,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
@@ -34,11 +32,6 @@ class Delay(EffectBase):
     """Transport delay, or offset between the stamps of voltage and displacement.
 
     It is not compensated sample by sample, which needs future setpoints.
-
-    Parameters
-    ----------
-    seconds : float, seconds
-        Delay from voltage to displacement; negative if the displacement is stamped too early or the voltage too late.
     """
 
     name: ClassVar[str] = "delay"
@@ -55,7 +48,9 @@ class Delay(EffectBase):
         _draw,
     )
 
-    seconds: float = parameter("s", "delay from voltage to displacement", -100, 100, fit=Fit("linear", in_samples))
+    seconds: float = parameter(
+        "s", "delay of the displacement; negative: stamped too early", -100, 100, fit=Fit("linear", in_samples)
+    )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @by_record
@@ -78,10 +73,6 @@ class Delay(EffectBase):
     @classmethod
     def _times(cls, seconds: float, gains: FloatArray) -> "Delay":
         return cls(seconds * float(gains[0]))
-
-    def plausible(self, view: FitView) -> bool:
-        """Return whether it is not due to the hold of commands between samples."""
-        return longer_than_hold(self, view)
 
     @property
     def shift(self) -> float:

@@ -46,28 +46,17 @@ class DrivePath(Protocol):
 
 @dataclass(frozen=True)
 class Excitation:
-    """An excitation drive for one effect.
+    """An excitation drive for one effect."""
 
-    Parameters
-    ----------
-    why : str
-        One sentence on the motion, and on why it separates the effect from others.
-    draw : callable
-        Function that appends the legs of the drive to a path, after an initial full loop.
-    separates : tuple of str
-        Effects from which it separates its own where records cannot tell them apart.
-    order : int
-        Of several drives that separate ambiguous effects, the one with the lowest order is recorded first.
-    lacking : (float, str) or None
-        If the calibration drive lacks its conditions: share of the error that it may reveal at least, and what lacks.
-    least_axes : int
-        Smallest number of axes.
-    """
-
+    # One sentence on the motion, and on why it separates the effect from others.
     why: str
+    # Appends the legs of the drive to a path, after an initial full loop.
     draw: Callable[[DrivePath, DriveLimits], None]
+    # Effects from which it separates its own where records cannot tell them apart. Of several such drives, the one with
+    # the lowest order is recorded first.
     separates: tuple[str, ...] = ()
     order: int = 0
+    # If the calibration drive lacks its conditions: share of the error that it may reveal at least, and what lacks.
     lacking: tuple[float, str] | None = None
     least_axes: int = 1
 

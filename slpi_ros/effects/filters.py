@@ -48,17 +48,7 @@ def filtered(numerator: ArrayLike, denominator: ArrayLike, signal: FloatArray) -
 
 @dataclass(frozen=True)
 class Mode:
-    """Second-order mode ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``.
-
-    Parameters
-    ----------
-    frequency : float, hertz
-        Undamped natural frequency.
-    damping : float
-        Damping ratio ``z``, from above 0 to below 1.
-    gain : float
-        Share of the static displacement that the mode carries; default: all of it.
-    """
+    """Second-order mode ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``."""
 
     frequency: float = parameter("Hz", "frequency", 1e-3, 1e7, fit=Fit("relative", least=1e-3))
     # With more damping there is no resonance.

@@ -43,15 +43,6 @@ class GainDrift(EffectBase):
     ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
     record; after it the sensitivity stays at its last value, see `lasting`. The factor scales hysteresis, creep and
     resonance, and acts before the cross coupling, so that other axes receive the scaled motion.
-
-    Parameters
-    ----------
-    times : tuple of float, length K >= 1, seconds
-        Knots from the record's start, more than 0, strictly increasing; 0 alone: a constant sensitivity.
-    gains : tuple of float, length K
-        Relative change of sensitivity ``g`` at the knots.
-    origin : float, metres
-        Displacement that does not change with the sensitivity.
     """
 
     name: ClassVar[str] = "gain_drift"
@@ -72,9 +63,9 @@ class GainDrift(EffectBase):
         order=1,
     )
 
-    times: tuple[float, ...] = parameter("s", "times from the record's start; 0 alone: constant", 0, 1e9)
+    times: tuple[float, ...] = parameter("s", "times of the knots from the record's start; 0 alone: constant", 0, 1e9)
     gains: tuple[float, ...] = parameter(
-        "", "relative changes of the sensitivity", -0.9, 10, above=True, fit=Fit("linear", 1e-5)
+        "", "relative changes g of the sensitivity at the knots", -0.9, 10, above=True, fit=Fit("linear", 1e-5)
     )
     origin: float = parameter(
         "m", "displacement that does not change with the sensitivity", -1e3, 1e3, fit=Fit("linear", 1e-9)

@@ -55,11 +55,6 @@ class Hum(EffectBase):
     """Sinusoids in time, ``y = x + sum_k amplitude_k sin(2 pi frequency_k t + phase_k)``.
 
     They are not compensated, as the phases are known only for the clock of the record.
-
-    Parameters
-    ----------
-    lines : tuple of Line
-        Frequencies in hertz, amplitudes in metres, and phases in radians at the record's start.
     """
 
     name: ClassVar[str] = "hum"

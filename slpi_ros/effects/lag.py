@@ -8,10 +8,10 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.effects.base import (
+    FEW_SAMPLES,
     Candidate,
     EffectBase,
     EffectContext,
-    FitView,
     FloatArray,
     ResidualView,
     Side,
@@ -19,7 +19,6 @@ from slpi_ros.effects.base import (
     StreamingBase,
     TimeShift,
     by_record,
-    longer_than_hold,
     usual_step,
 )
 from slpi_ros.effects.delay import Delay
@@ -30,8 +29,6 @@ from slpi_ros.effects.parameters import Fit, in_samples, parameter
 # The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
 # of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
 DAMPING = 1 / 8
-# A lag of one to this number of samples may be a delay; a shorter one may be the hold of commands, which is neither.
-FEW_SAMPLES = 3.0
 # Number of time constants after which the piezo has the voltage of the command.
 SETTLED = 5.0
 
@@ -42,12 +39,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class Lag(EffectBase):
-    """First-order lag, ``tau du/dt = v - u``.
-
-    Parameters
-    ----------
-    time_constant : float, seconds, ``tau``
-    """
+    """First-order lag, ``tau du/dt = v - u``."""
 
     name: ClassVar[str] = "lag"
     acts_on: ClassVar[Signal] = "voltage"
@@ -63,7 +55,9 @@ class Lag(EffectBase):
         separates=("delay",),
     )
 
-    time_constant: float = parameter("s", "time constant", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6))
+    time_constant: float = parameter(
+        "s", "time constant tau", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6)
+    )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @by_record
@@ -95,10 +89,6 @@ class Lag(EffectBase):
     @classmethod
     def _times(cls, tau: float, gains: FloatArray) -> "Lag | None":
         return cls(tau * float(gains[0])) if gains[0] > 0 else None
-
-    def plausible(self, view: FitView) -> bool:
-        """Return whether it is not due to the hold of commands between samples."""
-        return longer_than_hold(self, view)
 
     def simpler(self, step: float) -> Delay | None:
         """Return the delay that looks the same with a sampling interval of `step` (s), for a lag of a few samples."""

@@ -30,60 +30,36 @@ def in_samples(value: float, scales: Scales) -> float:
 
 @dataclass(frozen=True)
 class Fit:
-    """How a parameter is fitted.
-
-    Parameters
-    ----------
-    kind : Kind
-    step : float or callable
-        Step of numerical derivatives, or how it follows from the value and the scales of the record.
-    least, most : float
-        Bounds in fits.
-    within_record : bool
-        Whether a multiple of the duration of the record is the upper bound instead.
-    start : bool
-        Whether it is the state at the start of each record; an entry that is 0 stays 0.
-    """
+    """How a parameter is fitted: with steps of numerical derivatives, and bounds."""
 
     kind: Kind
     step: float | Callable[[float, Scales], float] = lambda value, scales: 1e-4 * abs(value) + 1e-12
     least: float = -inf
     most: float = inf
+    # Whether a multiple of the duration of the record is the upper bound instead.
     within_record: bool = False
+    # Whether it is the state at the start of each record; an entry that is 0 stays 0.
     start: bool = False
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """Facts of one parameter, or of every number in a list or mapping.
-
-    Parameters
-    ----------
-    unit, meaning : str
-    low, high : float
-        Bounds of valid values.
-    above, below : bool
-        Whether `low` and `high` themselves are excluded.
-    none : bool
-        Whether the parameter may be infinite, which is null in documents: there is none.
-    count : (int, int)
-        Smallest and largest length of a list or mapping.
-    required : bool
-        Whether documents must contain it.
-    fit : Fit or None
-        How it is fitted; None if it is chosen.
-    """
+    """Facts of one parameter, or of every number in a list or mapping, with the bounds `low` and `high`."""
 
     unit: str
     meaning: str
     low: float
     high: float
-    above: bool
-    below: bool
-    none: bool
-    count: tuple[int, int]
+    # Whether documents must contain it.
     required: bool
-    fit: Fit | None
+    # Whether the bounds themselves are excluded; whether it may be infinite, null in documents: there is none.
+    above: bool = False
+    below: bool = False
+    none: bool = False
+    # Smallest and largest length of a list or mapping.
+    count: tuple[int, int] = (1, 10000)
+    # None if it is not fitted but chosen.
+    fit: Fit | None = None
 
     def holds(self, value: float) -> bool:
         """Return whether a value is valid."""
@@ -106,18 +82,13 @@ def parameter(
     low: float = -inf,
     high: float = inf,
     *,
-    above: bool = False,
-    below: bool = False,
-    none: bool = False,
-    count: tuple[int, int] = (1, 10000),
     default: Any = MISSING,
     required: bool = False,
-    fit: Fit | None = None,
+    **facts: Any,
 ) -> Any:
-    """Return a dataclass field that is a parameter, see `Parameter`; documents may omit it if it has a default."""
+    """Return a dataclass field with the facts of `Parameter`; documents must contain it if it has no default."""
     must = required or default is MISSING
-    facts = Parameter(unit, meaning, low, high, above, below, none, count, must, fit)
-    return field(default=default, metadata={"parameter": facts})
+    return field(default=default, metadata={"parameter": Parameter(unit, meaning, low, high, must, **facts)})
 
 
 def _facts_of(kind: Any) -> dict[str, Parameter]:
@@ -171,10 +142,6 @@ def as_list(name: str, element: dict[str, Any], spread: Any) -> tuple[dict[str, 
     return {name: [element]}, spread
 
 
-# Name of a parameter, whether the rule holds, and the requirement as text.
-Rule = tuple[str, bool, str]
-
-
 def require_facts(effect: Any) -> None:
     """Raise ModelError if a parameter violates its facts or an uncertainty belongs to no parameter."""
     known = facts_of(type(effect))
@@ -193,8 +160,8 @@ def require_facts(effect: Any) -> None:
             )
 
 
-def require(effect: Any, *rules: Rule) -> None:
-    """Raise ModelError if a parameter violates a rule."""
+def require(effect: Any, *rules: tuple[str, bool, str]) -> None:
+    """Raise ModelError if a rule is violated: name of a parameter, whether the rule holds, and the requirement."""
     for name, holds, need in rules:
         if not holds:
             value = shorten(str(getattr(effect, name)), 80)

@@ -62,17 +62,6 @@ class RateDependence(EffectBase):
     The hysteresis ``H`` feels the voltage ``u``, which follows the applied voltage ``v``; the reversible part ``g`` of
     the displacement does not wait for it. Both directions are solved exactly at each sample, by backward differences.
 
-    Parameters
-    ----------
-    threshold : float, volts, ``c``
-        Half-width that the loops gain for each factor of e in the rate.
-    onset_rate : float, V/s, ``s0``
-        Rate above which they widen.
-    reversible_gain : float, m/V, ``g``
-    initial : tuple of float, volts
-        ``v - u`` at the start of each record, other than 0 after a step just before it. Only `apply` uses it; without
-        an entry a record starts at equilibrium, as streaming does. Default: none.
-    uncertainty : mapping of parameter name to standard deviation, optional
 
     References
     ----------
@@ -97,23 +86,19 @@ class RateDependence(EffectBase):
     )
 
     threshold: float = parameter(
-        "V",
-        "half-width that the loops gain for each factor of e in the rate",
-        0,
-        1e5,
-        fit=Fit("logarithmic", 1e-4, 1e-6),
+        "V", "half-width c that loops gain for each factor of e in the rate", 0, 1e5, fit=Fit("logarithmic", 1e-4, 1e-6)
     )
-    onset_rate: float = parameter("V/s", "rate above which they widen", 1e-12, 1e12, fit=Fit("logarithmic", 1e-4, 1e-9))
+    onset_rate: float = parameter(
+        "V/s", "rate s0 above which they widen", 1e-12, 1e12, fit=Fit("logarithmic", 1e-4, 1e-9)
+    )
     reversible_gain: float = parameter(
-        "m/V",
-        "gain of the reversible part",
-        0,
-        1e3,
-        default=0.0,
+        "m/V", "gain g of the reversible part", 0, 1e3, default=0.0,
         fit=Fit("linear", lambda _, of: 1e-9 / of.voltage, 0.0),
-    )
+    )  # fmt: skip
+    # Other than 0 after a step just before a record. Only `apply` uses it; without an entry a record starts at
+    # equilibrium, as streaming does.
     initial: tuple[float, ...] = parameter(
-        "V", "applied minus felt voltage at the start of each record", -1e5, 1e5, default=(), count=(0, 1000),
+        "V", "difference v - u at the start of each record", -1e5, 1e5, default=(), count=(0, 1000),
         fit=Fit("relative", start=True),
     )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)

@@ -223,12 +223,6 @@ class Resonance(EffectBase):
     the quadratic factors ``N_k`` of ``N`` in order of frequency. Where the zeros of ``N_k`` are near the mode this is
     `Exact`. Else, as ``1 / N_k`` hardly matters and the exact inverse of the sampled mode is unstable or large, the
     factor is `Unringing`: it cancels the oscillation, follows ramps without error, and is bounded.
-
-    Parameters
-    ----------
-    modes : tuple of Mode
-        Frequencies in hertz, damping ratios from above 0 to below 1, and gains: the shares of the static displacement
-        that the modes carry, 0 or more, at most 1 in sum.
     """
 
     name: ClassVar[str] = "resonance"

@@ -31,13 +31,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class Saturation(EffectBase):
-    """Limits of the voltage at the piezo, which the limits of the command keep, see `passes`.
-
-    Parameters
-    ----------
-    lower, upper : float, volts
-        Limits; infinite (the default) for no limit.
-    """
+    """Limits of the voltage at the piezo, which the limits of the command keep, see `passes`."""
 
     name: ClassVar[str] = "saturation"
     acts_on: ClassVar[Signal] = "voltage"

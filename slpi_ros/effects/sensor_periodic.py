@@ -45,16 +45,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class SensorPeriodic(EffectBase):
-    """Periodic sensor error, ``y = x + amplitude sin(2 pi x / period + phase)``.
-
-    Parameters
-    ----------
-    period : float, metres
-        Period in displacement; half or a quarter of the wavelength for an interferometer.
-    amplitude : float, metres
-        Less than ``period / 2 pi``, so that the reading increases with the displacement.
-    phase : float, radians, at displacement 0
-    """
+    """Periodic sensor error, ``y = x + amplitude sin(2 pi x / period + phase)``."""
 
     name: ClassVar[str] = "sensor_periodic"
     acts_on: ClassVar[Signal] = "displacement"
@@ -72,8 +63,9 @@ class SensorPeriodic(EffectBase):
     )
 
     period: float = parameter(
-        "m", "period in displacement", 1e-12, 1e3, fit=Fit("relative", lambda value, _: 1e-5 * abs(value), 1e-9)
-    )
+        "m", "period in displacement, such as half a wavelength", 1e-12, 1e3,
+        fit=Fit("relative", lambda value, _: 1e-5 * abs(value), 1e-9),
+    )  # fmt: skip
     amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0))
     phase: float = parameter("rad", "phase at displacement 0", -1e3, 1e3, fit=Fit("angle", 1e-4))
     uncertainty: Mapping[str, float] = field(default_factory=dict)

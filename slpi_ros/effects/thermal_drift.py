@@ -41,14 +41,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class ThermalDrift(EffectBase):
-    """A displacement that depends on time only, linear between knots and constant outside.
-
-    Parameters
-    ----------
-    times : tuple of float, length K >= 1, seconds
-        Knots from the record's start, strictly increasing.
-    values : tuple of float, length K, metres, displacement at the knots
-    """
+    """A displacement that depends on time only, linear between knots and constant outside."""
 
     name: ClassVar[str] = "thermal_drift"
     acts_on: ClassVar[Signal] = "displacement"
@@ -65,8 +58,8 @@ class ThermalDrift(EffectBase):
         order=1,
     )
 
-    times: tuple[float, ...] = parameter("s", "times from the record's start", -1e9, 1e9)
-    values: tuple[float, ...] = parameter("m", "displacements", -1e3, 1e3, fit=Fit("linear", 1e-9))
+    times: tuple[float, ...] = parameter("s", "times of the knots from the record's start", -1e9, 1e9)
+    values: tuple[float, ...] = parameter("m", "displacements at the knots", -1e3, 1e3, fit=Fit("linear", 1e-9))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -18,19 +18,7 @@ AT_FLOOR = 1.5
 
 @dataclass(frozen=True)
 class Choice:
-    """The next drive.
-
-    Parameters
-    ----------
-    drive : str
-        One of `slpi_ros.excitation.drives.DRIVES`.
-    axes : tuple of str
-        Axes that move.
-    seconds : float
-        Duration.
-    why : str
-        What is open and how this record helps.
-    """
+    """The next drive, one of `DRIVES`: axes that move, duration (s), what is open and how this record helps."""
 
     drive: str
     axes: tuple[str, ...]
@@ -47,17 +35,8 @@ def next_drive(
     """Return the drive with the largest promise per second, or None if none is worth its time.
 
     The promise of a drive is the share of the mean square error of an axis that it may explain. One axis moves in each,
-    so that the others need not be diagnosed on it; only coupling takes them all.
-
-    Parameters
-    ----------
-    settings : CalibrationSettings
-    found : mapping of axis name to AxisDiagnosis, or None
-        Diagnosis of all records so far; None if there is none yet.
-    recorded : sequence of (str, sequence of str)
-        Name and axes of each drive recorded so far.
-    left : float, seconds
-        Time left for drives.
+    so that the others need not be diagnosed on it; only coupling takes them all. `found` is the diagnosis of all
+    records so far, `recorded` are name and axes of each drive, and `left` is the time for drives (s).
     """
     best, chosen = 0.0, None
     for axis in settings.axes:

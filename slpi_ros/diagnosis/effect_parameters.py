@@ -31,13 +31,7 @@ LARGEST_STEP, LARGEST_LOG_STEP = 0.7, 2.0
 
 @dataclass(frozen=True)
 class EachRecord(EffectBase):
-    """An effect with separate parameters in each record, such as drift or hum.
-
-    Parameters
-    ----------
-    parts : tuple of Effect
-        The effect in each record.
-    """
+    """An effect with separate parameters in each record, such as drift or hum: its `parts`."""
 
     parts: tuple[Effect, ...]
     side: ClassVar[Side] = "record"

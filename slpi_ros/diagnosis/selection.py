@@ -66,14 +66,7 @@ FINEST = 1e-6
 
 @dataclass(frozen=True)
 class Contender:
-    """Candidate effect, fitted jointly with the effects selected so far.
-
-    Parameters
-    ----------
-    name : str
-    explanation : Explanation
-        Joint fit that includes the candidate.
-    """
+    """Candidate effect, and the joint fit of it and the effects selected so far."""
 
     name: str
     explanation: Explanation
@@ -181,17 +174,7 @@ def _error(one: Contender) -> float:
 
 
 def _refined(tried: Sequence[Contender], before: Explanation, most: float) -> list[Contender]:
-    """Refine the candidates that explain enough after the first step, and return all candidates.
-
-    Parameters
-    ----------
-    tried : sequence of Contender
-        Candidates after one Gauss-Newton step.
-    before : Explanation
-        Joint fit without candidates.
-    most : float, m^2
-        Reduction of the mean square held-out error by the best candidate.
-    """
+    """Refine the candidates that explain enough of `most`, what the best one explains (m^2), and return all."""
     square, least = before.held_out.rms**2, WORTH_REFINING * most
     return [one.refined() if square - one.score.rms**2 >= least else one for one in tried]
 
@@ -328,64 +311,37 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
 
 @dataclass(frozen=True)
 class Named:
-    """Selected effect.
-
-    Parameters
-    ----------
-    name : str
-    before, after : Score
-        Held-out errors without the effect and with it.
-    alternatives : tuple of str
-        Effects that the records do not distinguish from it.
-    runner_up : (str, float) or None
-        Next best effect, and the held-out rms error (m) with that one instead.
-    own : bool
-        Whether it has separate parameters in each record.
-    confirmed : bool
-        Whether the errors on held-out records confirm it.
-    """
+    """Selected effect, with the held-out errors without it and with it."""
 
     name: str
     before: Score
     after: Score
+    # Effects that the records do not distinguish from it; next best effect, and the held-out rms error (m) with that.
     alternatives: tuple[str, ...]
     runner_up: tuple[str, float] | None
+    # Whether the errors on held-out records confirm it; whether it has separate parameters in each record.
     confirmed: bool
     own: bool
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Result of the selection.
-
-    Parameters
-    ----------
-    base, now : Explanation
-        Joint fit before and after the selection.
-    named : tuple of Named
-        Selected effects, the largest gain first; each gain is relative to the preceding effects.
-    structures : tuple of str
-        Defects of the hysteresis model: `BIAS`, or keys of `STRUCTURES`.
-    dropped : tuple of str
-        Effects that were found on some records but do not carry over to others.
-    """
+    """Result of the selection: joint fit before and after it, and what it found."""
 
     base: Explanation
     now: Explanation
+    # The largest gain first; each gain is relative to the preceding effects.
     named: tuple[Named, ...]
+    # Defects of the hysteresis model: `BIAS`, or keys of `STRUCTURES`.
     structures: tuple[str, ...]
+    # Effects that were found on some records but do not carry over to others.
     dropped: tuple[str, ...]
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
     """Add effects as long as one has a significant gain, and remove those that later ones make unnecessary.
 
-    Parameters
-    ----------
-    base : Explanation
-        Joint fit to start from.
-    family : Explanation, optional
-        The same with the loop family as hysteresis, if it is better than the kind of `base`; it is then used instead.
+    `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better.
     """
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())

@@ -35,23 +35,14 @@ LINE_WIDTH = 12
 
 @dataclass(frozen=True)
 class EffectContext:
-    """Signals other than the input that an effect may depend on.
-
-    Parameters
-    ----------
-    t : ndarray, shape (N,), seconds
-        Time from the first stamp, non-decreasing.
-    others : mapping of axis name to ndarray, shape (N,), metres
-        Displacement of the other axes relative to their start, before coupling.
-    records : tuple of EffectContext
-        Contexts of the records that the signals are concatenated from; empty for a single record.
-    grid : Uniform, optional
-        Grid that covers `t`, if already computed.
-    """
+    """Time (s) from the first stamp, non-decreasing, and signals other than the input that an effect may depend on."""
 
     t: FloatArray
+    # Displacement (m) of the other axes relative to their start, before coupling.
     others: Mapping[str, FloatArray] = field(default_factory=dict)
+    # Contexts of the records that the signals are concatenated from; empty for a single record.
     records: "tuple[EffectContext, ...]" = ()
+    # Grid that covers `t`, if already computed.
     grid: Uniform | None = None
 
     @classmethod
@@ -314,26 +305,17 @@ class AroundHysteresis(Effect, Protocol):
 
 @dataclass(frozen=True)
 class Candidate:
-    """One form of an effect for the identification, linear in its gains.
+    """One form of an effect for the identification, linear in its gains."""
 
-    Parameters
-    ----------
-    columns : ndarray, shape (N, k), metres
-        Contribution to the displacement for a unit value of each of the k gains.
-    effect : callable
-        Returns the effect for gains of shape (k,), or None if the gains are not admissible.
-    positive : int
-        Number of trailing columns whose gains must be non-negative; if not 0, `effect` receives only these gains.
-    starting : int
-        Number of leading columns that describe the initial state of the records; each belongs to one record.
-    group : int
-        Forms of different groups are refined each by itself, as they lead to different parameters.
-    """
-
+    # Contribution to the displacement (m) for a unit value of each of the k gains, shape (N, k).
     columns: FloatArray
+    # Returns the effect for gains of shape (k,), or None if the gains are not admissible.
     effect: Callable[[FloatArray], Effect | None]
+    # Number of trailing columns whose gains must be non-negative; if not 0, `effect` receives only these gains.
     positive: int = 0
+    # Number of leading columns that describe the initial state of the records; each belongs to one record.
     starting: int = 0
+    # Forms of different groups are refined each by itself, as they lead to different parameters.
     group: int = 0
 
 

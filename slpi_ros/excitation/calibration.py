@@ -28,18 +28,8 @@ def calibration(spec: DriveSpec, rng: np.random.Generator) -> Path:
 
     A sweep over the whole range comes first, to set a known hysteresis state. Reversal curves follow in random order,
     rising from minima and falling from maxima over the whole range, so that drift is not correlated with voltage; then
-    nested loops. A longer duration gives more of each.
-
-    Parameters
-    ----------
-    spec : DriveSpec
-    rng : numpy.random.Generator
-        Random generator for the position of each reversal within its part of the range, and for the order.
-
-    Returns
-    -------
-    Path
-        Path that starts and ends at the low end.
+    nested loops. A longer duration gives more of each. `rng` draws the position of each reversal within its part of the
+    range, and the order; the path starts and ends at the low end.
     """
     seed = int(rng.integers(2**63))
 

@@ -19,42 +19,20 @@ MOST_VOLTAGE = 10_000.0
 
 @dataclass(frozen=True)
 class Leg:
-    """One move, or a hold if the target is the current position.
-
-    Parameters
-    ----------
-    to : float
-        Target as a share of the voltage range, 0..1.
-    seconds : float
-        Desired duration, which the slew limit may extend.
-    straight : bool
-        True: constant speed with sharp corners. False: a raised cosine, with zero speed at both ends.
-    """
+    """One move, or a hold if the target, a share of the voltage range, is the current position."""
 
     to: float
+    # Desired duration, which the slew limit may extend.
     seconds: float
+    # Constant speed with sharp corners; else a raised cosine, with zero speed at both ends.
     straight: bool = False
 
 
 @dataclass(frozen=True)
 class DriveSpec:
-    """Voltage limits, duration, sampling rate and slew limit of one axis.
+    """Voltage limits (V), time of the last sample (s), sampling rate (Hz) and slew limit (V/s; 0: none) of one axis.
 
-    Parameters
-    ----------
-    low, high : float, volts
-        Voltage limits.
-    duration : float, seconds
-        Time of the last sample; the first is at 0.
-    rate : float, hertz
-        Samples per second.
-    slew_limit : float, V/s
-        Largest rate of change between samples; 0 for no limit.
-
-    Raises
-    ------
-    UsageError
-        If a value is invalid.
+    UsageError if a value is invalid.
     """
 
     low: float
@@ -100,22 +78,7 @@ class DriveSpec:
 
 
 class Path:
-    """A sequence of legs.
-
-    Parameters
-    ----------
-    start : float
-        Initial position as a share of the voltage range.
-
-    Attributes
-    ----------
-    start : float
-        As given.
-    at : float
-        Position at the end of the last leg.
-    legs : list of Leg
-        Legs in order.
-    """
+    """A sequence of legs; `start` and `at`: position (share of the range) before the first and after the last one."""
 
     def __init__(self, start: float = 0.0) -> None:
         self.start = self.at = start
@@ -145,23 +108,10 @@ class Path:
         return np.array(fewest, dtype=np.int64)
 
     def voltages(self, spec: DriveSpec) -> FloatArray:
-        """Return the voltages along all legs, with the duration of the drive.
+        """Return the voltages (V) along all legs, shape (spec.steps + 1,); every reversal coincides with a sample.
 
         The time beyond the shortest durations is distributed in proportion to desired minus shortest duration.
-
-        Parameters
-        ----------
-        spec : DriveSpec
-
-        Returns
-        -------
-        ndarray, shape (spec.steps + 1,), volts
-            Voltages; every reversal coincides with a sample.
-
-        Raises
-        ------
-        UsageError
-            If the duration is too short for the legs at this slew limit and rate.
+        UsageError if the duration is too short for the legs at this slew limit and rate.
         """
         fewest = self.fewest_steps(spec)
         spare = spec.steps - int(fewest.sum())

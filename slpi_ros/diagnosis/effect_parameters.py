@@ -15,7 +15,6 @@ from slpi_ros.effects.base import (
     EffectContext,
     FitView,
     ResidualView,
-    Sharing,
     Side,
     Signal,
     usual_step,
@@ -35,7 +34,6 @@ class EachRecord(EffectBase):
 
     parts: tuple[Effect, ...]
     side: ClassVar[Side] = "record"
-    sharing: ClassVar[Sharing] = "separate"
     acts_on: ClassVar[Signal] = "displacement"
 
     def __post_init__(self) -> None:

@@ -188,18 +188,10 @@ class AxisDiagnosis:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Diagnosis of the model of a stage.
-
-    Parameters
-    ----------
-    axes : mapping of axis name to AxisDiagnosis
-    extended : StageModel
-        Model with the identified effects; hysteresis and effects are fitted jointly.
-    source : str
-        Names of the records.
-    """
+    """Diagnosis of the model of a stage, by axis, with the names of the records."""
 
     axes: Mapping[str, AxisDiagnosis]
+    # Model with the identified effects; hysteresis and effects are fitted jointly.
     extended: StageModel
     source: str = ""
 

@@ -124,7 +124,7 @@ def seen(now: Explanation) -> FitView:
 
 def is_own(effect: Effect | type[Any]) -> bool:
     """Return whether an effect, or each of its kind, has separate parameters in each record, such as drift or hum."""
-    return effect.sharing == "separate"
+    return effect.side == "record" or effect.sharing == "separate"
 
 
 def held_out_error(score: Score, *, own: bool) -> float:

@@ -21,7 +21,8 @@ Signal = Literal["voltage", "hysteresis", "displacement"]
 # What an effect belongs to. Stage: the compensator inverts it. Sensor: it is taken out of measurements and never
 # inverted into the stage, which would follow the error of its sensor. Record: it is taken out of the fit of its record.
 Side = Literal["stage", "sensor", "record"]
-# Whether the parameters are shared by all records of a fit, separate in each, or either.
+# Whether the parameters are shared by all records of a fit, separate in each (always if it belongs to the record), or
+# either.
 Sharing = Literal["shared", "separate", "either"]
 # Whether an effect shifts the displacement in time: not at all, among other things, or only that.
 TimeShift = Literal["none", "partly", "only"]

@@ -15,7 +15,6 @@ from slpi_ros.effects.base import (
     FitView,
     FloatArray,
     ResidualView,
-    Sharing,
     Side,
     Signal,
     amplitude_and_phase,
@@ -63,7 +62,6 @@ class Hum(EffectBase):
     what: ClassVar[str] = "disturbance that is periodic in time, one or several lines"
     compensated: ClassVar[str] = "no"
     needs_feedback: ClassVar[bool] = True
-    sharing: ClassVar[Sharing] = "separate"
     excitation: ClassVar[Excitation] = Excitation(
         "Rest at three levels: nothing is commanded, so what oscillates there at one frequency comes from outside; "
         "an error of the sensor does not, at rest (sample at more than twice the mains frequency).",

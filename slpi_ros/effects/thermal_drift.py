@@ -14,7 +14,6 @@ from slpi_ros.effects.base import (
     FitView,
     FloatArray,
     ResidualView,
-    Sharing,
     Side,
     Signal,
 )
@@ -49,7 +48,6 @@ class ThermalDrift(EffectBase):
     what: ClassVar[str] = "slow change that does not follow the voltage"
     compensated: ClassVar[str] = "no"
     needs_feedback: ClassVar[bool] = True
-    sharing: ClassVar[Sharing] = "separate"
     excitation: ClassVar[Excitation] = Excitation(
         "The same full loop over and over, with the same holds: voltage, memory and creep repeat, so what differs "
         "from one repeat to the next follows time alone.",

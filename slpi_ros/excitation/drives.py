@@ -28,23 +28,14 @@ _WHY = {
 
 @dataclass(frozen=True)
 class Drive:
-    """Voltage signals of all axes of a stage.
-
-    Parameters
-    ----------
-    t : ndarray, shape (N,), seconds
-        From 0, evenly spaced.
-    voltage : dict of axis name to ndarray, shape (N,), volts
-        Voltages, which start and end at the rest voltage of the axis.
-    specs : dict of axis name to DriveSpec
-        Limits and rate of each axis, with the duration of the whole drive.
-    why : str
-        Purpose of the drive in one sentence.
-    """
+    """Voltage signals of all axes of a stage, shape (N,): times from 0, evenly spaced (s), and voltages by axis (V)."""
 
     t: FloatArray
+    # They start and end at the rest voltage of the axis.
     voltage: dict[str, FloatArray]
+    # With the duration of the whole drive.
     specs: dict[str, DriveSpec]
+    # Purpose of the drive in one sentence.
     why: str
 
     @property
@@ -200,20 +191,9 @@ def _why(drive: str) -> str:
 
 
 class Playback:
-    """Playback of a drive sample by sample, within the limits of the drive.
+    """Playback of a drive sample by sample, within its limits; with `repeat` it restarts at the end until stopped.
 
-    Parameters
-    ----------
-    drive : Drive
-    repeat : bool
-        Whether to restart at the end until stopped; False by default.
-
-    Attributes
-    ----------
-    drive : Drive
-        As given.
-    stopping : bool
-        Whether the axes are returning to their rest voltages after `stop`.
+    After `stop` it is `stopping` while the axes return to their rest voltages.
     """
 
     def __init__(self, drive: Drive, *, repeat: bool = False) -> None:

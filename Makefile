@@ -40,7 +40,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs package bench-lies bench-calibrator bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-agreement FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-agreement FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -49,6 +49,7 @@ help:
 	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: all tests but the long lives of nodes'
 	@echo 'make test-newest   the same tests with the newest versions of today; make test-minimum with the oldest allowed'
 	@echo 'make docs       build, then the documentation site: docs/_build/html/index.html'
+	@echo 'make schemas    what the schemas say of effects, anew from the effects'
 	@echo 'make package    source distribution and wheel, installed and tried in a fresh environment without ROS'
 	@echo 'make demo       build, then a simulated stage is calibrated and follows a path; SEED= repeats one'
 	@echo 'make bench      build, then the benchmarks; ratios that have grown by more than 20 % are marked'
@@ -108,6 +109,9 @@ test-jazzy test-newest test-minimum:
 test-environment: build
 	$(VENV) tools/list_versions.py
 	$(PYTEST) -m 'not ros or not long'
+
+schemas: build
+	$(VENV) tools/make_schemas.py
 
 docs: build
 	$(VENV) -m sphinx -E -W --keep-going -q docs docs/_build/html

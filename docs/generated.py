@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 
 from slpi_ros import cli, nodes
+from slpi_ros.effects.registry import EFFECTS
 
 ROOT = Path(__file__).resolve().parents[1]
 SCHEMAS = ROOT / "msg_schemas"
@@ -75,6 +76,12 @@ def topics():
         ]
         sections.append(f"## {each['name']}\n\n{each['meaning']}\n\n{table(['', ''], rows)}")
     return "\n\n".join(sections)
+
+
+def effects():
+    """Return all effects beside hysteresis, from their facts."""
+    rows = [[code(name), kind.side, kind.what, kind.compensated] for name, kind in EFFECTS.items()]
+    return table(["effect", "side", "what it is", "compensated"], rows)
 
 
 def documents():
@@ -197,4 +204,4 @@ def example(path):
     return f"```{language}\n{(ROOT / path).read_text().strip()}\n```"
 
 
-GENERATORS = {function.__name__: function for function in (parameters, topics, documents, commands, example)}
+GENERATORS = {function.__name__: function for function in (parameters, topics, effects, documents, commands, example)}

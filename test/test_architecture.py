@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
+from slpi_ros.effects.registry import EFFECTS
+
 PACKAGE = "slpi_ros"
 ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
@@ -187,6 +189,33 @@ def test_nothing_runs_what_it_reads() -> None:
         if outside_imported_by(path) & UNSAFE_MODULES or called & UNSAFE_CALLS or "allow_pickle" in arguments:
             offenders.add(name_of(path))
     assert not offenders
+
+
+# Parts that may name single effects: the effects themselves and the physics of simulations, which are none of theirs.
+NAMING_EFFECTS = {"effects", "simulation"}
+# Other names of effects, with the reason.
+NAMED_ELSEWHERE = {
+    "model/sensor.py": ({"delay", "lag"}, "the known timing of a sensor is the physics of these two"),
+    "nodes/stage_simulator.py": (set(EFFECTS), "parameters of the simulated stage"),
+    "identification/record_quality.py": ({"creep", "delay", "lag"}, "what a drive lacks, in words"),
+    "diagnosis/tracking.py": ({"delay"}, "a cause of a tracking error"),
+}
+
+
+def effects_named_by(path: Path) -> set[str]:
+    """Return the effects that a file imports or names in a text of its own."""
+    texts = {node.value for node in nodes_of(path) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    start = f"{PACKAGE}.effects."
+    imported = {name.removeprefix(start).split(".")[0] for name in imports_of(path) if name.startswith(start)}
+    return (texts | imported) & EFFECTS.keys()
+
+
+def test_effects_own_their_facts() -> None:
+    """A new effect is its own file and an entry in the registry: nothing else names an effect."""
+    others = [path for path in FILES if part_of(path) not in NAMING_EFFECTS]
+    named = {str(path.relative_to(ROOT)): found for path in others if (found := effects_named_by(path))}
+    assert named.keys() == NAMED_ELSEWHERE.keys()
+    assert all(named[path] <= effects for path, (effects, _) in NAMED_ELSEWHERE.items())
 
 
 def test_public_api_loads_neither_ros_nor_rosbags() -> None:

@@ -4,17 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from slpi_ros.calibration.settings import CALIBRATION, EFFECT, CalibrationSettings
-from slpi_ros.diagnosis.result import AMBIGUOUS, SEPARATES, UNEXPLAINED, AxisDiagnosis
+from slpi_ros.diagnosis.result import AMBIGUOUS, UNEXPLAINED, AxisDiagnosis
+from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
-from slpi_ros.excitation.effects import EFFECTS
+from slpi_ros.excitation.effects import separating
 
-COUPLING = "cross_coupling"
-# Conditions that the calibration drive lacks, with the drive that has them and what it may reveal at least, as a share
-# of the error: long rest after quick moves, and small steps with time to ring down.
-UNCOVERED = {
-    "creep": (0.2, "no record holds the voltage for long after a quick move, where creep would show"),
-    "resonance": (0.2, "no record holds small quick steps, where a resonance, a delay or a lag would show"),
-}
 # A cause that is named is worth this part of its share until the drive for it has been recorded; nothing below
 # LEAST is worth a record. No drive is recorded more often than MOST.
 CONFIRMED, LEAST, MOST = 0.3, 0.05, 2
@@ -24,10 +18,7 @@ AT_FLOOR = 1.5
 
 @dataclass(frozen=True)
 class Choice:
-    """The next drive, one of `slpi_ros.excitation.drives.DRIVES`, and the axes that move.
-
-    `why` says what is open and how this record helps.
-    """
+    """The next drive, one of `DRIVES`: axes that move, duration (s), what is open and how this record helps."""
 
     drive: str
     axes: tuple[str, ...]
@@ -45,8 +36,7 @@ def next_drive(
 
     The promise of a drive is the share of the mean square error of an axis that it may explain. One axis moves in each,
     so that the others need not be diagnosed on it; only coupling takes them all. `found` is the diagnosis of all
-    records so far, None if there is none yet; `recorded` holds name and axes of each drive recorded so far, and `left`
-    (s) is the time left for drives.
+    records so far, `recorded` are name and axes of each drive, and `left` is the time for drives (s).
     """
     best, chosen = 0.0, None
     for axis in settings.axes:
@@ -54,7 +44,8 @@ def next_drive(
             known = sum(name == drive and axis in axes for name, axes in recorded)
             if known >= (MOST if found else 1):
                 continue
-            axes = settings.axes if drive == COUPLING else (axis,)
+            several = drive in EFFECTS and EFFECTS[drive].excitation.least_axes > 1
+            axes = settings.axes if several else (axis,)
             seconds = (CALIBRATION if drive == CALIBRATION_DRIVE else EFFECT) * len(axes)
             if seconds <= left and promise > LEAST and promise / seconds > best:
                 best = promise / seconds
@@ -65,13 +56,13 @@ def next_drive(
 def _promises(found: AxisDiagnosis | None) -> list[tuple[str, float, str]]:
     """Return drives, the share of the error that each may explain, and why."""
     if found is None:
-        return [(drive, share, why) for drive, (share, why) in UNCOVERED.items()]
+        lacking = {name: effect.excitation.lacking for name, effect in EFFECTS.items()}
+        return [(name, *share_and_why) for name, share_and_why in lacking.items() if share_and_why]
     offers = []
     if found.verdict == AMBIGUOUS:
         for named in found.effects:
             if named.alternatives:
-                names = {named.name, *named.alternatives}
-                drive = next((chosen for pair, chosen in SEPARATES if pair <= names), named.name)
+                drive = separating((named.name, *named.alternatives))
                 others = ", ".join(named.alternatives)
                 offers.append((drive, named.share_of_residual, f"{named.name} may as well be {others}"))
     if found.verdict == UNEXPLAINED and found.after_rms > AT_FLOOR * found.floor_rms:
@@ -79,7 +70,7 @@ def _promises(found: AxisDiagnosis | None) -> list[tuple[str, float, str]]:
         offers.append((CALIBRATION_DRIVE, share, "an error that no known cause explains; more loops of every size"))
     if found.after_rms > AT_FLOOR * found.floor_rms:
         for named in found.effects:
-            if not named.alternatives and named.name in EFFECTS:
+            if not named.alternatives:
                 share = CONFIRMED * named.share_of_residual
                 offers.append((named.name, share, f"{named.name} is named; a drive of its own tells its parameters"))
     return offers

@@ -32,8 +32,6 @@ FloatArray = NDArray[np.float64]
 CHECK_DRIVE, VERIFICATION_DRIVE = "check", "verification"
 # A displacement follows if it moves by this multiple of its noise.
 MOVES = 10.0
-# Effects that follow time and not the voltage, or that come before it: no compensation without feedback undoes them.
-NOT_UNDONE = ("delay", "thermal_drift", "gain_drift", "hum")
 # Rest before the first move of an axis that is diagnosed with it, seconds.
 REST_BEFORE = 0.5
 # Rounds of diagnosis and verification, at most.
@@ -442,6 +440,6 @@ def _why(errors: Mapping[str, TrackingError], diagnosis: Diagnosis, ended: str) 
     if worst.met:
         return f"target met; {said}"
     found: AxisDiagnosis = diagnosis.axes[name]
-    lasting = [each.name for each in found.effects if each.name in NOT_UNDONE]
+    lasting = [each.name for each in found.effects if each.effect.needs_feedback]
     cause = f"; {', '.join(lasting)} cannot be undone without feedback" if lasting else ""
     return f"target not met; {said}{cause}" + (f"; {ended}" if ended else "")

@@ -14,8 +14,8 @@ from slpi_ros.io.messages import SECOND_NS
 REPORTS, MOST_REPORTS, REPORT_AGE_NS, SLOW_NS = 3, 5, SECOND_NS // 5, SECOND_NS
 # After this time a publisher that has never reported a finite voltage counts as none.
 MUTE_NS = 3 * SECOND_NS
-# Reports are compared with the voltages of this time, and of the delay and of this many lags of the stage.
-BAND_NS, LAGS = SECOND_NS // 5, 5.0
+# Reports are compared with the voltages of this time, and of the settling time of the stage's effects.
+BAND_NS = SECOND_NS // 5
 # They may be off by this share of the voltage range, or by this many times their noise.
 TOLERATED_SHARE, TOLERATED_NOISES = 0.02, 4.0
 # This many reports over this time outside: the voltage is another one.

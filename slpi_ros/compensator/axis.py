@@ -6,7 +6,7 @@ from itertools import pairwise
 from math import inf
 from statistics import median
 
-from slpi_ros.compensator.amplifier import BAND_NS, LAGS, Amplifier
+from slpi_ros.compensator.amplifier import BAND_NS, Amplifier
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
 from slpi_ros.compensator.model_swap import continue_from, require_near, take_over, turning_voltages, voltage_history
 from slpi_ros.compensator.persistence import RESETTING, MemoryConfidence
@@ -14,8 +14,6 @@ from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
 from slpi_ros.compensator.statistics import TrackingError
 from slpi_ros.compensator.validation import Stamps, implausible
-from slpi_ros.effects.delay import Delay
-from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import START_MEMORIES, AxisModel, StartMemory
@@ -166,11 +164,7 @@ class Axis:
         stream.pace = planned
         self._set_limits(allowed)
         self.confidence = self.confidence.over(model.hysteresis_range)
-        times = {effect.name: effect for effect in model.effects}
-        lag, delay = times.get(Lag.name), times.get(Delay.name)
-        seconds = (LAGS * lag.time_constant if isinstance(lag, Lag) else 0.0) + (
-            abs(delay.seconds) if isinstance(delay, Delay) else 0.0
-        )
+        seconds = sum(effect.settling_time for effect in model.effects)
         self.amplifier.window_ns = BAND_NS + int(seconds * SECOND_NS)
         low, high = model.displacement_range
         self._sensor_watch.span, self._sensor_watch.noise = high - low, model.quality.floor_rms

@@ -29,10 +29,10 @@ from slpi_ros.compensator.statistics import Counts
 from slpi_ros.compensator.trajectory import CHECKED_FIRST, CHECKED_LATER, PaceCheck, Trajectory, TrajectoryExecutor
 from slpi_ros.compensator.validation import RejectedError, TimestampRules, require_names
 from slpi_ros.compensator.watchdog import CommandWatchdog
-from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import StartMemory
+from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import PERIOD, Limits, decaying_turns
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.model.streaming import StageStream

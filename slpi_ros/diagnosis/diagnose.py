@@ -12,10 +12,8 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, DYNAMIC, NO_WORSE, Selection, counts, in_phase, is_own, select
-from slpi_ros.effects.base import Effect
-from slpi_ros.effects.creep import Creep
-from slpi_ros.effects.gain_drift import GainDrift
+from slpi_ros.diagnosis.selection import BIAS, NO_WORSE, Selection, counts, is_own, seen, select
+from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.free_run import FreeRun, free_run, likely_starts, rms_of
@@ -32,13 +30,9 @@ FloatArray = NDArray[np.float64]
 # Kinds that are refitted together with the effects. Any other kind is reported as unsuitable if its error exceeds that
 # of the loop family by this factor.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
-# Effects with the same predictions wherever they cannot be distinguished: the model may contain either of them.
-SAME_ELSEWHERE = ({"delay", "lag"},)
 # Effects are part of the model if they leave at most this multiple of the repeatability floor, or this share of the
 # error (a third of its mean square), and if the free run of the extended model shows this share of the held-out gain.
 LEFT_BY_NOISE, LEFT_OF_ERROR, GAIN_SHOWN = 1.5, 0.6, 0.5
-# Creep from a move before the records is part of the model if all records agree on the move within this share.
-BEGAN_ALIKE = 0.3
 # A zero has moved if its shift exceeds this multiple of the error; number of parts for the uncertainty of a gain;
 # fewest samples of a comparison.
 ZERO, STRETCHES, FEWEST = 4.0, 8, 50
@@ -124,7 +118,7 @@ def _diagnose_axis(
     # Effects that belong to one record (drift, hum, the knots of a gain drift) do not apply to another.
     shared = [effect for effect in model.effects if same or not is_own(effect)]
     base = Explanation(evidence, shared)
-    known = [effect for effect in shared if in_phase(effect, base)]
+    known = [effect for effect in shared if effect.in_phase(seen(base))]
     if len(known) < len(shared):
         base = Explanation(evidence, known)
     # Other kinds are not refitted; a comparison with the loop family shows whether they are suitable.
@@ -210,17 +204,18 @@ def _not_as_judged(extended: AxisModel, runs: "Sequence[FreeRun]", selection: Se
 def _ambiguous(selection: Selection) -> list[str]:
     """Return the effects that cannot be distinguished from others whose predictions on other records differ.
 
-    Held-out records can resolve this, except for the effects `DYNAMIC` at a single drive frequency.
+    Held-out records can resolve this, except for dynamic effects at a single drive frequency. Effects that only shift
+    in time predict the same wherever they cannot be distinguished.
     """
     alone = one_speed(selection.now.evidence)
     return [
         named.name
         for named in selection.named
-        if (alone and named.name in DYNAMIC)
+        if (alone and EFFECTS[named.name].dynamic)
         or (
             named.alternatives
             and not named.confirmed
-            and not any({named.name, *named.alternatives} <= same for same in SAME_ELSEWHERE)
+            and not all(EFFECTS[name].time_shift == "only" for name in (named.name, *named.alternatives))
         )
     ]
 
@@ -270,8 +265,9 @@ def _given(model: AxisModel, runs: Sequence[FreeRun], selection: Selection) -> G
     own = np.array([part.source in sources for part in evidence.parts])
     rms = rms_of(runs)
     if own.any() and not own.all():
-        # A gain drift within each record would also explain a gain that has changed between records.
-        steady = selection.now.without(GainDrift.name)
+        # Some effects within each record would also explain a gain that has changed between records.
+        now = selection.now
+        steady = now.only([effect.name for effect in now.effects if not EFFECTS[effect.name].changes_gain])
         compared = [_since(own, one) for one in (selection.base, steady)]
     else:
         compared = [_compared(model.hysteresis_only, one) for one in (selection.base, selection.now)]
@@ -389,7 +385,9 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
         voltage_range=(float(voltage.min()), float(voltage.max())),
         displacement_range=(float(y.min()), float(y.max())),
         effects=tuple(
-            _creeping_on(effect, now) for effect in now.with_uncertainty() if not isinstance(effect, EachRecord)
+            effect.started(now.began[effect.name], len(evidence.parts))
+            for effect in now.with_uncertainty()
+            if not isinstance(effect, EachRecord)
         ),
         quality=replace(
             model.quality,
@@ -402,14 +400,3 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
         ),
     )
     return replace(extended, end=extended.at_rest(now.u, float(evidence.v[-1])))
-
-
-def _creeping_on(effect: Effect, now: Explanation) -> Effect:
-    """Return the effect; a creep includes the move before the records (`initial`) if several records agree on it."""
-    records = len(now.evidence.parts)
-    if not isinstance(effect, Creep) or records == 1 or now.began.size != records or not effect.gains[0]:
-        return effect
-    moves = -now.began / effect.gains[0]
-    initial = float(np.mean(moves))
-    alike = bool(np.all(np.abs(moves - initial) <= BEGAN_ALIKE * abs(initial)))
-    return replace(effect, initial=initial) if alike else effect

@@ -23,7 +23,6 @@ from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, 
 from slpi_ros.diagnosis.prepare import Evidence
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
 from slpi_ros.effects.chain import Chain
-from slpi_ros.effects.creep import Creep, settling
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import Hysteresis
@@ -452,7 +451,7 @@ class Explanation:
         Contribution of the effects on the displacement, and of the reversible path parallel to the hysteresis.
     settling : ndarray, shape (N,), metres
         Relaxation in each record from moves before it, and the additional columns `beside` of the evidence.
-    began : ndarray, shape (k,), metres
+    began : mapping of effect name to ndarray, shape (k,), metres
         Amplitudes of that relaxation, record by record.
     """
 
@@ -469,9 +468,10 @@ class Explanation:
             self.joint = like.joint
         else:
             self.joint = Joint(evidence, self.u, like.joint if like else None)
-        starting = settling(self._relaxations, evidence.around, evidence.used, older=evidence.older_moves)
-        self._before = np.column_stack([starting, evidence.beside])
-        self._starting = range(starting.shape[1])
+        starting = [one.starting(evidence.around, evidence.used, older=evidence.older_moves) for one in self.effects]
+        self._ends = np.cumsum([0, *(columns.shape[1] for columns in starting)]).tolist()
+        self._before = np.column_stack([*starting, evidence.beside])
+        self._starting = range(self._ends[-1])
         beside = self.joint.columns(self._before)
         behind = any(effect.acts_on == "displacement" for effect in self.effects)
         self.added = self._aside
@@ -491,11 +491,11 @@ class Explanation:
     def _fit(self, beside: Columns) -> None:
         self._x, gains = beside.fit(self.target)
         self.h = self.joint.predict(self._x)
-        self.settling, self.began = self._before @ gains, gains[: len(self._starting)]
-
-    @property
-    def _relaxations(self) -> list[float]:
-        return [tau for effect in self.effects if isinstance(effect, Creep) for tau in effect.time_constants]
+        self.settling = self._before @ gains
+        self.began = {
+            effect.name: gains[first:end]
+            for effect, (first, end) in zip(self.effects, pairwise(self._ends), strict=True)
+        }
 
     @property
     def t(self) -> FloatArray:

@@ -21,26 +21,13 @@ from slpi_ros.diagnosis.selection import (
 )
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
-from slpi_ros.excitation.effects import for_effect
+from slpi_ros.excitation.effects import for_effect, separating
 from slpi_ros.identification.repeatability_floor import Floor
 from slpi_ros.model.axis_model import ABOVE_FLOOR, RESOLUTION
 from slpi_ros.model.stage_model import StageModel
 
 FloatArray = NDArray[np.float64]
 
-# Drive that separates each pair of effects; the first pair contained in the ambiguous effects is used.
-SEPARATES = (
-    ({"lag", "delay"}, "lag"),
-    ({"lag", "rate_dependence"}, "rate_dependence"),
-    ({"delay", "rate_dependence"}, "rate_dependence"),
-    ({"gain_drift", "thermal_drift"}, "gain_drift"),
-    ({"creep", "thermal_drift"}, "thermal_drift"),
-    ({"creep", "lag"}, "creep"),
-    ({"creep", "delay"}, "creep"),
-    ({"creep", "rate_dependence"}, "creep"),
-    ({"resonance", "lag"}, "resonance"),
-    ({"resonance", "delay"}, "resonance"),
-)
 OTHER_FREQUENCIES = "This record has one drive frequency; other frequencies tell these apart. "
 UP_TO_DATE = "`slpi refit` with this record brings the model up to date; no other one is needed for that."
 ANOTHER_HYSTERESIS = {
@@ -65,29 +52,18 @@ NAMED, AMBIGUOUS, UNEXPLAINED, NOTHING_FOUND = "named", "ambiguous", "unexplaine
 
 @dataclass(frozen=True)
 class NamedEffect:
-    """Effect that explains part of the error.
-
-    Parameters
-    ----------
-    effect : Effect
-        Effect with its parameters and their standard deviations.
-    gain_percent : float
-        Reduction of the held-out rms error when the effect is added to the preceding ones, per cent.
-    share_of_residual : float
-        Share of the mean square held-out error without effects that the effect explains, 0..1.
-    p_value : float
-        Probability that chance reduces the error as much.
-    alternatives : tuple of str
-        Effects that explain the error equally well, so that the records do not distinguish them.
-    evidence : str
-        Evidence for the effect, one sentence with numbers.
-    """
+    """Effect that explains part of the error, with its parameters and their standard deviations."""
 
     effect: Effect
+    # Reduction of the held-out rms error when the effect is added to the preceding ones.
     gain_percent: float
+    # Share of the mean square held-out error without effects that the effect explains, 0..1.
     share_of_residual: float
+    # Probability that chance reduces the error as much.
     p_value: float
+    # Effects that explain the error equally well, so that the records do not distinguish them.
     alternatives: tuple[str, ...]
+    # One sentence with numbers.
     evidence: str
 
     @property
@@ -98,17 +74,10 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class Traces:
-    """Signals of one axis for charts.
+    """Signals of one axis for charts, shape (N,): time from the first stamp (s), voltage (V), and displacements (m).
 
-    Parameters
-    ----------
-    t : ndarray, shape (N,), seconds
-        From the first stamp.
-    voltage : ndarray, shape (N,), volts
-    measured, before, after : ndarray, shape (N,), metres
-        Measured displacement, and that of the hysteresis without effects (`before`) and with effects (`after`).
-    contributions : mapping of effect name to ndarray, shape (N,), metres
-        Contribution of each effect to the displacement.
+    These are the measured one, that of the hysteresis without effects (`before`) and with them (`after`), and the
+    contribution of each effect by its name.
     """
 
     t: FloatArray
@@ -121,24 +90,15 @@ class Traces:
 
 @dataclass(frozen=True)
 class RecordOutcome:
-    """Errors of one record before and after the diagnosis.
-
-    Parameters
-    ----------
-    source : str
-    offset : float, metres
-        Shift of the zero relative to the given model.
-    before_rms, after_rms : float, metres
-        Free-run rms error of the given model and of the extended one, each without its mean.
-    left_out_rms : float or None, metres
-        Held-out rms error, with the hysteresis fitted to the other records; None if there are no others, or if these
-        cover too little of this record.
-    """
+    """Errors (m) of one record before and after the diagnosis."""
 
     source: str
+    # Shift of the zero relative to the given model.
     offset: float
+    # Free-run rms error of the given model and of the extended one, each without its mean.
     before_rms: float
     after_rms: float
+    # With the hysteresis fitted to the other records; None if there are no others, or if these cover too little of it.
     left_out_rms: float | None
 
     def to_document(self) -> dict[str, Any]:
@@ -228,18 +188,10 @@ class AxisDiagnosis:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Diagnosis of the model of a stage.
-
-    Parameters
-    ----------
-    axes : mapping of axis name to AxisDiagnosis
-    extended : StageModel
-        Model with the identified effects; hysteresis and effects are fitted jointly.
-    source : str
-        Names of the records.
-    """
+    """Diagnosis of the model of a stage, by axis, with the names of the records."""
 
     axes: Mapping[str, AxisDiagnosis]
+    # Model with the identified effects; hysteresis and effects are fitted jointly.
     extended: StageModel
     source: str = ""
 
@@ -487,8 +439,8 @@ def _more_loops(evidence: Evidence) -> str:
 
 def _separating(names: Sequence[str], evidence: Evidence) -> str:
     """Return sentences that recommend an experiment to distinguish the effects `names` (likeliest first)."""
-    chosen = next((drive for pair, drive in SEPARATES if pair <= set(names)), names[0])
-    axes = " --axis OTHER THIS" if chosen == "cross_coupling" else ""
+    chosen = separating(names)
+    axes = " --axis OTHER THIS" if for_effect(chosen).least_axes > 1 else ""
     other = OTHER_FREQUENCIES if one_speed(evidence) else ""
     return f"{other}Record `{_command(evidence)} --for {chosen}{axes}`. {for_effect(chosen).why}"
 

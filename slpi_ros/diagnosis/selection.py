@@ -10,18 +10,9 @@ from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
-from slpi_ros.diagnosis.prepare import Evidence, drive_frequency, excited_frequency, one_speed
-from slpi_ros.effects.base import Candidate, Effect, usual_step
-from slpi_ros.effects.creep import Creep, within_bounds
-from slpi_ros.effects.delay import Delay
-from slpi_ros.effects.gain_drift import GainDrift
-from slpi_ros.effects.hum import Hum
-from slpi_ros.effects.lag import Lag
+from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency, one_speed
+from slpi_ros.effects.base import FEW_SAMPLES, Candidate, Effect, FitView, usual_step
 from slpi_ros.effects.registry import EFFECTS
-from slpi_ros.effects.resonance import Resonance
-from slpi_ros.effects.saturation import STILL, Saturation, outward_steps
-from slpi_ros.effects.sensor_periodic import SensorPeriodic
-from slpi_ros.effects.thermal_drift import ThermalDrift
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.identification.progress import report_progress
@@ -56,57 +47,26 @@ WORTH_REFINING = 0.3
 ALTERNATIVE = 0.7
 # The same for a single drive frequency, where a better fit proves little.
 ALTERNATIVE_AT_ONE_SPEED = 0.4
-# Effects that a single drive frequency cannot distinguish.
-DYNAMIC = {"delay", "lag", "rate_dependence", "creep"}
-# Effects that trade against a delay: they are fitted together with one.
-BESIDE_DELAY = {"rate_dependence"}
-# Smallest relative reduction of the held-out error by them: two effects at once find more by chance.
-LEAST_GAIN_BESIDE_DELAY = 0.1
-# Effects that are common to all records or separate in each: a sensor may start each record with another phase.
-MAY_BE_OWN = {"sensor_periodic"}
-# Largest difference of the zeros of records, as a share of the period, for a common periodic sensor error.
-IN_PHASE = 0.1
-# Effects that only shift the displacement in time; a shift by less than this number of samples may be either.
-SHIFTS, FEW_SAMPLES = {"delay", "lag"}, 3.0
-# Such a lag stands only if its held-out error is lower than that of a delay by this share: it also rounds off turns
-# that the hysteresis model makes too sharp.
+# Smallest relative reduction of the held-out error by an effect with a companion: two at once find more by chance.
+LEAST_GAIN_IN_COMPANY = 0.1
+# An effect for which a simpler one may stand stays only if its held-out error is lower by this share: a lag also rounds
+# off turns that the hysteresis model makes too sharp.
 CLEARLY = 0.25
-# Effects that shift the displacement in time, among other things.
-SHIFTING = {"delay", "lag", "rate_dependence", "resonance"}
 # Gauss-Newton steps of a candidate, and of the selected effects in the end.
 STEPS, CONVERGED = 5, 15
 # Steps that lower the objective below this share of it began far from the best parameters.
 FAR_OFF = 0.9
 # Largest accepted ratio of the error with an effect to that without it, on any held-out record.
 NO_WORSE = 1.05
-# Time shifts below this share of the sampling period may be due to the hold of commands between samples.
-HELD = 0.6
-# Thermal drift: shortest duration (s), and highest rate (share of the motion per second).
-DRIFT_TAKES, DRIFT_RATE = 10.0, 1e-2
-# Gain drift: largest distance of the origin from the displacement range, as a share of that range, and largest gain.
-ORIGIN, LARGEST_DRIFT = 0.3, 0.3
-# Highest harmonic of the drive frequency that may be residual hysteresis.
-MOST_HARMONICS = 15
-# Highest frequency of any resonance, as a multiple of the highest excited frequency; above it only sharp ones can be
-# identified, with at most this damping ratio: turns excite them.
-RINGS, SHARP = 2.0, 0.1
-# Multiples of the rms rounding error: shortest period of a sensor error (rounding repeats with every digit, sqrt(12)
-# times its rms), and largest residual that counts as rounding.
-ROUNDING_PERIOD, ROUNDING_LEFT = 1.3 * 12**0.5, 1.3
+# Largest residual that counts as rounding, as a multiple of the rms rounding error.
+ROUNDING_LEFT = 1.3
 # An error below this share of the displacement range is beyond the resolution of any sensor.
 FINEST = 1e-6
 
 
 @dataclass(frozen=True)
 class Contender:
-    """Candidate effect, fitted jointly with the effects selected so far.
-
-    Parameters
-    ----------
-    name : str
-    explanation : Explanation
-        Joint fit that includes the candidate.
-    """
+    """Candidate effect, and the joint fit of it and the effects selected so far."""
 
     name: str
     explanation: Explanation
@@ -137,20 +97,34 @@ class Contender:
         Far from the best parameters the held-out error, of a fit that is linear in them, says nothing.
         """
         better = Contender(self.name, self.explanation.refined(steps))
-        if self.name in BESIDE_DELAY and better.explanation.objective < FAR_OFF * self.explanation.objective:
+        if EFFECTS[self.name].companion() and better.explanation.objective < FAR_OFF * self.explanation.objective:
             return better
         return min(self, better, key=lambda one: one.rms)
 
     def counts_beside(self, now: Explanation) -> bool:
         """Return whether the candidate significantly improves the joint fit `now`, which does not include it."""
-        least = LEAST_GAIN_BESIDE_DELAY if self.name in BESIDE_DELAY else LEAST_GAIN
+        least = LEAST_GAIN_IN_COMPANY if EFFECTS[self.name].companion() else LEAST_GAIN
         return counts(now.held_out, self.score, own=is_own(self.effect), least=least)
+
+
+def seen(now: Explanation) -> FitView:
+    """Return a joint fit as the plausibility of an effect may see it."""
+    evidence = now.evidence
+
+    def drives() -> list[tuple[float, float]]:
+        return [(drive_frequency(evidence.of_record(k)), float(part.t[-1])) for k, part in enumerate(evidence.parts)]
+
+    return FitView(
+        *(now.t, evidence.v, now.u, now.h, now.y, now.used, evidence.rounding, now.effects),
+        excited_frequency=lambda: excited_frequency(evidence),
+        drives=drives,
+        zeros=lambda: now.zeros,
+    )
 
 
 def is_own(effect: Effect | type[Any]) -> bool:
     """Return whether an effect, or each of its kind, has separate parameters in each record, such as drift or hum."""
-    # The knots of a gain drift belong to their record.
-    return effect.side == "record" or effect.name == GainDrift.name
+    return effect.side == "record" or effect.sharing == "separate"
 
 
 def held_out_error(score: Score, *, own: bool) -> float:
@@ -158,25 +132,25 @@ def held_out_error(score: Score, *, own: bool) -> float:
     return score.rms if own else score.rms_of_records
 
 
-def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[Contender]:
-    """Return candidates for the named effects that explain part of the residual, the best one first.
+def contenders(now: Explanation, names: Iterable[str] | None = None) -> list[Contender]:
+    """Return candidates for the named effects (default: all) that explain part of the residual, the best one first.
 
     Of several records, significant effects precede all others, and among them those that are common to all records.
     """
     taken = {effect.name for effect in now.effects}
-    screened = [best for name in names if name not in taken for best in _screened(name, now)]
+    screened = [best for name in names or EFFECTS if name not in taken for best in _screened(name, now)]
     error = now.held_out.rms
     # Implausible effects do not determine the threshold.
-    most = max((error - score.rms for score, effect in screened if plausible(effect, now)), default=0.0)
+    most = max((error - score.rms for score, effect in screened if effect.plausible(seen(now))), default=0.0)
     least = max(WORTH_TRYING * most, LEAST_SCREENED * error)
     tried = [
-        Contender(effect.name, _beside_delay(now, effect).adding(effect)).refined(1)
+        Contender(effect.name, _with_companion(now, effect).adding(effect)).refined(1)
         for score, effect in screened
         if error - score.rms > least
     ]
-    sound = [one for one in tried if plausible(one.effect, one.explanation)]
+    sound = [one for one in tried if one.effect.plausible(seen(one.explanation))]
     most = max((error**2 - one.score.rms**2 for one in sound), default=0.0)
-    sound = [one for one in _refined(tried, now, most) if plausible(one.effect, one.explanation)]
+    sound = [one for one in _refined(tried, now, most) if one.effect.plausible(seen(one.explanation))]
     # Of an effect that was refined from several forms, the best.
     sound = [min((one for one in sound if one.name == name), key=_error) for name in {one.name: None for one in sound}]
     several = len(now.evidence.parts) > 1
@@ -187,10 +161,12 @@ def contenders(now: Explanation, names: Iterable[str] = tuple(EFFECTS)) -> list[
     return sorted(sound, key=rank)
 
 
-def _beside_delay(now: Explanation, effect: Effect) -> Explanation:
-    """Return the fit, for an effect that trades against a delay with one, unless there is a time shift already."""
-    shifted = SHIFTS & {other.name for other in now.effects}
-    return now.adding(Delay(0.0)) if effect.name in BESIDE_DELAY and not shifted else now
+def _with_companion(now: Explanation, effect: Effect) -> Explanation:
+    """Return the fit with the companion of an effect, if it has one, unless an effect like that is there already."""
+    companion = EFFECTS[effect.name].companion()
+    if companion is None or any(other.time_shift == companion.time_shift for other in now.effects):
+        return now
+    return now.adding(companion)
 
 
 def _error(one: Contender) -> float:
@@ -198,78 +174,9 @@ def _error(one: Contender) -> float:
 
 
 def _refined(tried: Sequence[Contender], before: Explanation, most: float) -> list[Contender]:
-    """Refine the candidates that explain enough after the first step, and return all candidates.
-
-    Parameters
-    ----------
-    tried : sequence of Contender
-        Candidates after one Gauss-Newton step.
-    before : Explanation
-        Joint fit without candidates.
-    most : float, m^2
-        Reduction of the mean square held-out error by the best candidate.
-    """
+    """Refine the candidates that explain enough of `most`, what the best one explains (m^2), and return all."""
     square, least = before.held_out.rms**2, WORTH_REFINING * most
     return [one.refined() if square - one.score.rms**2 >= least else one for one in tried]
-
-
-def plausible(effect: Effect, now: Explanation) -> bool:
-    """Return whether the parameters of an effect are plausible, so that it does not imitate another cause."""
-    if isinstance(effect, EachRecord):
-        return all(plausible(part, now) for part in effect.parts)
-    evidence, motion = now.evidence, float(np.ptp(now.y[now.used]))
-    match effect:
-        case Delay() | Lag():
-            # Smaller shifts may be due to the hold of commands between samples.
-            shift = effect.seconds if isinstance(effect, Delay) else effect.time_constant
-            others = {other.name for other in now.effects} & SHIFTING - {effect.name}
-            return not others or abs(shift) > HELD * usual_step(evidence.t)
-        case ThermalDrift():
-            pairs = zip(np.diff(effect.values).tolist(), np.diff(effect.times).tolist(), strict=True)
-            return effect.times[-1] >= DRIFT_TAKES and all(abs(dy) <= DRIFT_RATE * motion * dt for dy, dt in pairs)
-        case GainDrift():
-            # With an origin far away, a gain drift is a thermal drift; no piezo changes by more than `LARGEST_DRIFT`.
-            y = now.y[now.used]
-            near = float(y.min()) - ORIGIN * motion <= effect.origin <= float(y.max()) + ORIGIN * motion
-            small = max(map(abs, effect.gains)) <= LARGEST_DRIFT
-            return near and small and effect.times[-1] >= DRIFT_TAKES
-        case Saturation():
-            return _stands_still(effect, now)
-        case Hum():
-            return not any(_is_harmonic(line.frequency, evidence) for line in effect.lines)
-        case Resonance():
-            # Far above the excited frequencies a damped mode only shifts in time, and can imitate hysteresis.
-            highest = RINGS * excited_frequency(evidence)
-            return all(mode.frequency <= highest or mode.damping <= SHARP for mode in effect.modes)
-        case SensorPeriodic():
-            return bool(effect.period > ROUNDING_PERIOD * evidence.rounding)
-    return True
-
-
-def _stands_still(effect: Saturation, now: Explanation) -> bool:
-    """Return whether the stage stands still while the voltage changes beyond the saturation limits."""
-    middle, dv, dy = outward_steps(now.evidence.v, now.y, now.used)
-    inside = (middle > effect.lower) & (middle < effect.upper)
-    usual = float(dv[inside] @ dy[inside] / max(float(dv[inside] @ dv[inside]), 1e-300))
-    for beyond in (middle >= effect.upper, middle <= effect.lower):
-        if beyond.any() and float(dv[beyond] @ dy[beyond]) > STILL * usual * float(dv[beyond] @ dv[beyond]):
-            return False
-    return True
-
-
-def _is_harmonic(frequency: float, evidence: Evidence) -> bool:
-    """Return whether a frequency (Hz) is a low harmonic of the single drive frequency of any record, within resolution.
-
-    Residual hysteresis decreases with the order. High harmonics are ignored, as any frequency is close to one of them.
-    """
-    for k, part in enumerate(evidence.parts):
-        drive = drive_frequency(evidence.of_record(k))
-        if not drive:
-            continue
-        order = round(frequency / drive)
-        if order <= MOST_HARMONICS and abs(frequency - order * drive) < 2.0 / float(part.t[-1]):
-            return True
-    return False
 
 
 def _screened(name: str, now: Explanation) -> list[tuple[Score, Effect]]:
@@ -279,7 +186,7 @@ def _screened(name: str, now: Explanation) -> list[tuple[Score, Effect]]:
     """
     tried: dict[int, list[tuple[Score, Effect]]] = {}
     for form in _forms(name, now):
-        if (scored := _scored(form, now)) and in_phase(scored[1], now):
+        if (scored := _scored(form, now)) and scored[1].in_phase(seen(now)):
             tried.setdefault(getattr(form, "group", 0), []).append(scored)
     return [_simplest_of_best(group) for group in tried.values()]
 
@@ -295,22 +202,12 @@ def _simplest_of_best(tried: Sequence[tuple[Score, Effect]]) -> tuple[Score, Eff
     return min(equal, key=lambda one: (free(one[1]).size, error(one)))
 
 
-def in_phase(effect: Effect, now: Explanation) -> bool:
-    """Return whether a periodic sensor error has the same phase in all records; True for any other effect.
-
-    If the zeros of the records differ, so may those of other records, and the phase there is unknown.
-    """
-    if not isinstance(effect, SensorPeriodic) or len(now.evidence.parts) == 1:
-        return True
-    return float(np.ptp(now.zeros)) <= IN_PHASE * effect.period
-
-
 def _forms(name: str, now: Explanation) -> Iterator[Candidate | Effect]:
     """Yield the forms of an effect: with common parameters, with separate ones in each record, or both."""
     records, own = len(now.evidence.parts), is_own(EFFECTS[name])
     if not own or records == 1:
         yield from EFFECTS[name].fit(now)
-    if records == 1 or not (own or name in MAY_BE_OWN):
+    if records == 1 or not (own or EFFECTS[name].sharing == "either"):
         return
     for forms in zip(*(EFFECTS[name].fit(now.of_record(k)) for k in range(records)), strict=False):
         yield Candidate(now.evidence.each([form.columns for form in forms]), partial(_each, forms))  # type: ignore[arg-type]
@@ -399,83 +296,52 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
     several records, the errors on held-out records also decide.
     """
     explained, by_other = before.rms**2 - best.score.rms**2, before.rms**2 - other.score.rms**2
-    if best.name in SHIFTS and other.name == Resonance.name:
-        # A resonance is a shift with ringing: if it does not fit better, there is no ringing.
+    one, two = EFFECTS[best.name], EFFECTS[other.name]
+    if one.time_shift == "only" and two.contains_shift:
         return False
     if best.score.records.size and other.score.rms_of_records > NO_WORSE * best.score.rms_of_records:
         return False
-    if one_speed and {best.name, other.name} <= DYNAMIC:
+    if one_speed and one.dynamic and two.dynamic:
         return by_other >= ALTERNATIVE_AT_ONE_SPEED * explained
-    if {best.name, other.name} == SHIFTS and _shift(best.effect) < FEW_SAMPLES * usual_step(best.explanation.t):
+    shifts = one is not two and one.time_shift == two.time_shift == "only"
+    if shifts and abs(best.effect.slow_shift) < FEW_SAMPLES * usual_step(best.explanation.t):
         return by_other >= ALTERNATIVE * explained
     return by_other >= ALTERNATIVE * explained and chance_of_gain(other.score, best.score) > ALIKE
 
 
-def _shift(effect: Effect) -> float:
-    """Return the time shift (s) of a delay or lag; infinite for other effects."""
-    return abs(effect.seconds) if isinstance(effect, Delay) else getattr(effect, "time_constant", np.inf)
-
-
 @dataclass(frozen=True)
 class Named:
-    """Selected effect.
-
-    Parameters
-    ----------
-    name : str
-    before, after : Score
-        Held-out errors without the effect and with it.
-    alternatives : tuple of str
-        Effects that the records do not distinguish from it.
-    runner_up : (str, float) or None
-        Next best effect, and the held-out rms error (m) with that one instead.
-    own : bool
-        Whether it has separate parameters in each record.
-    confirmed : bool
-        Whether the errors on held-out records confirm it.
-    """
+    """Selected effect, with the held-out errors without it and with it."""
 
     name: str
     before: Score
     after: Score
+    # Effects that the records do not distinguish from it; next best effect, and the held-out rms error (m) with that.
     alternatives: tuple[str, ...]
     runner_up: tuple[str, float] | None
+    # Whether the errors on held-out records confirm it; whether it has separate parameters in each record.
     confirmed: bool
     own: bool
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Result of the selection.
-
-    Parameters
-    ----------
-    base, now : Explanation
-        Joint fit before and after the selection.
-    named : tuple of Named
-        Selected effects, the largest gain first; each gain is relative to the preceding effects.
-    structures : tuple of str
-        Defects of the hysteresis model: `BIAS`, or keys of `STRUCTURES`.
-    dropped : tuple of str
-        Effects that were found on some records but do not carry over to others.
-    """
+    """Result of the selection: joint fit before and after it, and what it found."""
 
     base: Explanation
     now: Explanation
+    # The largest gain first; each gain is relative to the preceding effects.
     named: tuple[Named, ...]
+    # Defects of the hysteresis model: `BIAS`, or keys of `STRUCTURES`.
     structures: tuple[str, ...]
+    # Effects that were found on some records but do not carry over to others.
     dropped: tuple[str, ...]
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
     """Add effects as long as one has a significant gain, and remove those that later ones make unnecessary.
 
-    Parameters
-    ----------
-    base : Explanation
-        Joint fit to start from.
-    family : Explanation, optional
-        The same with the loop family as hysteresis, if it is better than the kind of `base`; it is then used instead.
+    `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better.
     """
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
@@ -502,16 +368,16 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
                 break
             continue
         best = _simplest(found, now)
-        if best.name in BESIDE_DELAY:
+        if EFFECTS[best.name].companion():
             best = best.refined(CONVERGED)
         others = [other.effect for other in found if other is not best]
         for effect in best.explanation.effects:
             if effect.name == best.name or effect.name not in {known.name for known in now.effects}:
                 rivals[effect.name] = others
         now = _without_needless(best.explanation.smoothed(), set(rivals) - {best.name})
-        if {Creep.name, ThermalDrift.name} <= {effect.name for effect in now.effects} and not now.evidence.older_moves:
-            # Creep from long before a record looks like a thermal drift.
-            now = _without_needless(now.with_older_moves(), {ThermalDrift.name})
+        resembled = {effect.resembles_when_old for effect in now.effects} & {effect.name for effect in now.effects}
+        if resembled and not now.evidence.older_moves:
+            now = _without_needless(now.with_older_moves(), resembled)
     # Exchanged effects and removed structures may have made other effects unnecessary.
     with_structures, now = now, now.bare()
     now = _without_needless(now, set(rivals), restart=now is not with_structures)
@@ -522,28 +388,28 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
 
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
-    """Return the fit with a delay for a lag of a few samples, unless clearly worse, and without implausible effects."""
-    effects = {effect.name: effect for effect in now.effects}
-    lag, several, step = effects.get(Lag.name), len(now.evidence.parts) > 1, usual_step(now.t)
-    # Below a sampling period it may be the hold of commands between samples, which is neither.
-    if isinstance(lag, Lag) and step <= _shift(lag) < FEW_SAMPLES * step and Delay.name not in effects:
-        effects[Lag.name] = Delay(lag.time_constant)
+    """Return the fit with simpler effects, unless clearly worse, and without effects at bounds or implausible ones."""
+    several, step = len(now.evidence.parts) > 1, usual_step(now.t)
+    for effect in now.effects:
+        simple, effects = effect.simpler(step), {other.name: other for other in now.effects}
+        if simple is None or simple.name in effects:
+            continue
+        effects[effect.name] = simple
         other = Explanation(now.evidence, list(effects.values()), now).refined(CONVERGED)
         if gain(other.held_out, now.held_out) < CLEARLY:
-            rivals[Delay.name] = [lag, *(rival for rival in rivals.pop(Lag.name, []) if rival.name != Delay.name)]
+            rest = [rival for rival in rivals.pop(effect.name, []) if rival.name != simple.name]
+            rivals[simple.name] = [effect, *rest]
             now = other
     for effect in now.effects:
-        if isinstance(effect, Creep) and several and not within_bounds(effect):
-            # At the upper bound of its gains it stands for something else.
-            without = now.without(Creep.name)
+        name = effect.name
+        if several and effect.at_bound:
+            without = now.without(name)
             anew = [
-                one
-                for one in contenders(without, [Creep.name])
-                if one.counts_beside(without) and within_bounds(one.effect)  # type: ignore[arg-type]
+                one for one in contenders(without, [name]) if one.counts_beside(without) and not one.effect.at_bound
             ]
             now = anew[0].explanation if anew else without
-        elif isinstance(effect, GainDrift) and not plausible(effect, now):
-            now = now.without(GainDrift.name)
+        elif effect.plausible_to_the_end and not effect.plausible(seen(now)):
+            now = now.without(name)
     return now
 
 
@@ -649,10 +515,10 @@ def _in_its_place(
     tried = _tried(name, now, rest, rivals)
     alone = one_speed(now.evidence)
     alternatives = [other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone)]
-    inseparable = [other.name for other in tried if {name, other.name} <= DYNAMIC]
-    if alone and name in DYNAMIC and not alternatives:
+    if alone and EFFECTS[name].dynamic and not alternatives:
         # At a single frequency a better fit only means a more suitable loop shape.
-        alternatives = inseparable[:1] or [one for one in ("rate_dependence", "creep") if one != name][:1]
+        others = [*(other.name for other in tried), *(key for key in EFFECTS if EFFECTS[key].time_shift != "only")]
+        alternatives = [other for other in others if other != name and EFFECTS[other].dynamic][:1]
     confirmed = _carries_over_clearly(rest.held_out, now.held_out)
     return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None, confirmed
 

@@ -1,17 +1,17 @@
-"""The `Effect` protocol, its context and fit candidates, and validation of effect parameters."""
+"""The `Effect` protocol with the facts of an effect, its context, and the candidates and views of a fit."""
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import wraps
-from math import inf, isfinite
-from textwrap import shorten
-from typing import Any, ClassVar, Literal, Protocol, TypeVar
+from math import inf
+from typing import Any, ClassVar, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.effects.excitation import Excitation
 from slpi_ros.effects.filters import Uniform
-from slpi_ros.errors import ModelError
+from slpi_ros.effects.parameters import Leaf, facts_of, leaves, require_facts, with_leaves
 from slpi_ros.hysteresis.turning_points import Memory
 
 FloatArray = NDArray[np.float64]
@@ -21,29 +21,29 @@ Signal = Literal["voltage", "hysteresis", "displacement"]
 # What an effect belongs to. Stage: the compensator inverts it. Sensor: it is taken out of measurements and never
 # inverted into the stage, which would follow the error of its sensor. Record: it is taken out of the fit of its record.
 Side = Literal["stage", "sensor", "record"]
+# Whether the parameters are shared by all records of a fit, separate in each (always if it belongs to the record), or
+# either.
+Sharing = Literal["shared", "separate", "either"]
+# Whether an effect shifts the displacement in time: not at all, among other things, or only that.
+TimeShift = Literal["none", "partly", "only"]
+# Time shifts below this share of the sampling period may be due to the hold of commands between samples.
+HELD = 0.6
+# A shift of one to this number of sampling periods may be any effect that only shifts.
+FEW_SAMPLES = 3.0
 # Number of spectral bins on either side of a peak that are attributed to the peak.
 LINE_WIDTH = 12
 
 
 @dataclass(frozen=True)
 class EffectContext:
-    """Signals other than the input that an effect may depend on.
-
-    Parameters
-    ----------
-    t : ndarray, shape (N,), seconds
-        Time from the first stamp, non-decreasing.
-    others : mapping of axis name to ndarray, shape (N,), metres
-        Displacement of the other axes relative to their start, before coupling.
-    records : tuple of EffectContext
-        Contexts of the records that the signals are concatenated from; empty for a single record.
-    grid : Uniform, optional
-        Grid that covers `t`, if already computed.
-    """
+    """Time (s) from the first stamp, non-decreasing, and signals other than the input that an effect may depend on."""
 
     t: FloatArray
+    # Displacement (m) of the other axes relative to their start, before coupling.
     others: Mapping[str, FloatArray] = field(default_factory=dict)
+    # Contexts of the records that the signals are concatenated from; empty for a single record.
     records: "tuple[EffectContext, ...]" = ()
+    # Grid that covers `t`, if already computed.
     grid: Uniform | None = None
 
     @classmethod
@@ -136,9 +136,94 @@ class StreamingBase:
 
 
 class EffectBase(Protocol):
-    """What effects are unless they say otherwise."""
+    """Facts of an effect, and what effects do unless they say otherwise."""
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
 
     side: ClassVar[Side]
+    # Whether only feedback undoes it, because it follows time and not the voltage, or comes before the voltage.
+    needs_feedback: ClassVar[bool] = False
+    sharing: ClassVar[Sharing] = "shared"
+    time_shift: ClassVar[TimeShift] = "none"
+    # Whether a time shift is its special case: if it does not fit better than one, it is not there.
+    contains_shift: ClassVar[bool] = False
+    # Whether a single drive frequency cannot tell it from the other effects of which this is true.
+    dynamic: ClassVar[bool] = False
+    # Whether a change of the sensitivity between records may be its doing.
+    changes_gain: ClassVar[bool] = False
+    # Whether it is dropped from the selection if its final parameters are not plausible.
+    plausible_to_the_end: ClassVar[bool] = False
+    # Effect that it resembles if it continues from long before a record.
+    resembles_when_old: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        """Validate the parameters; ModelError if one is invalid."""
+        require_facts(self)
+
+    @classmethod
+    def companion(cls) -> "Effect | None":
+        """Return the effect against which it trades, and with which it is fitted therefore, as it is at first."""
+        return None
+
+    @classmethod
+    def from_version_1(cls, given: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
+        """Return parameters and uncertainty of a document of version 1 as in the present one; ModelError if retired."""
+        return given, spread
+
+    def plausible(self, view: "FitView") -> bool:
+        """Return whether the parameters are plausible, so that the effect does not imitate another cause.
+
+        Where others shift in time, too, a short shift may be the hold of commands between samples.
+        """
+        others = any(other.time_shift != "none" and other.name != self.name for other in view.effects)
+        return self.time_shift != "only" or not others or abs(self.slow_shift) > HELD * view.step
+
+    def in_phase(self, view: "FitView") -> bool:
+        """Return whether one set of parameters can hold for all records of a fit, and for others."""
+        return True
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether a parameter is at its upper bound, where the effect stands for something else."""
+        return False
+
+    def simpler(self, step: float) -> "Effect | None":
+        """Return the simpler effect that looks the same in records with a sampling interval of `step` (s), if any."""
+        return None
+
+    def starting(self, around: EffectContext, used: NDArray[np.bool_], *, older: bool = False) -> FloatArray:
+        """Return what is left of its state before each record, shape (N, k), m, one column per unknown amplitude.
+
+        With `older` also of its state long before.
+        """
+        return np.empty((around.t.size, 0))
+
+    def started(self, amplitudes: FloatArray, records: int) -> Self:
+        """Return the effect with its state before the records, from the amplitudes (m) of the columns of `starting`."""
+        return self
+
+    def free_leaves(self) -> list[Leaf]:
+        """Return the fitted numbers."""
+        every = (
+            leaf for name, facts in facts_of(type(self)).items() for leaf in leaves(name, facts, getattr(self, name))
+        )
+        return [leaf for leaf in every if leaf.free]
+
+    def with_free(self, numbers: Iterable[float]) -> Self:
+        """Return the effect with other fitted numbers, in the order of `free_leaves`, limited by `limited`."""
+        left, changed = iter(numbers), {}
+        for name, facts in facts_of(type(self)).items():
+            value = getattr(self, name)
+            new = [next(left) if leaf.free else leaf.value for leaf in leaves(name, facts, value)]
+            changed[name] = with_leaves(value, iter(new))
+        return replace(self, **self.limited(changed))  # type: ignore[type-var]
+
+    @classmethod
+    def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
+        """Return new parameters, by name, within bounds that concern several of them."""
+        return changed
 
     def streaming(self) -> Any:
         """Return the `StreamingEffect` or `StreamingAround`; None if it is not compensated sample by sample."""
@@ -164,15 +249,30 @@ class EffectBase(Protocol):
         return 0.0
 
     @property
+    def slow_shift(self) -> float:
+        """Time (s) by which it shifts a slow motion."""
+        return self.shift
+
+    @property
+    def settling_time(self) -> float:
+        """Time (s) after which the piezo has the voltage of the command."""
+        return abs(self.shift)
+
+    @property
     def coupling(self) -> Mapping[str, float]:
         """Gains by which motions of other axes are added, by their names."""
         return {}
 
 
 class Effect(EffectBase, Protocol):
-    """One effect: a frozen dataclass whose fields are its parameters in SI units and their `uncertainty`."""
+    """One effect: a frozen dataclass whose fields are its parameters (`parameter`), in SI units, and `uncertainty`."""
 
     name: ClassVar[str]
+    # For the documentation: what it is, and whether it is compensated.
+    what: ClassVar[str]
+    compensated: ClassVar[str]
+    # The drive that separates it from other effects.
+    excitation: ClassVar[Excitation]
 
     @property
     def acts_on(self) -> Signal:
@@ -210,26 +310,17 @@ class AroundHysteresis(Effect, Protocol):
 
 @dataclass(frozen=True)
 class Candidate:
-    """One form of an effect for the identification, linear in its gains.
+    """One form of an effect for the identification, linear in its gains."""
 
-    Parameters
-    ----------
-    columns : ndarray, shape (N, k), metres
-        Contribution to the displacement for a unit value of each of the k gains.
-    effect : callable
-        Returns the effect for gains of shape (k,), or None if the gains are not admissible.
-    positive : int
-        Number of trailing columns whose gains must be non-negative; if not 0, `effect` receives only these gains.
-    starting : int
-        Number of leading columns that describe the initial state of the records; each belongs to one record.
-    group : int
-        Forms of different groups are refined each by itself, as they lead to different parameters.
-    """
-
+    # Contribution to the displacement (m) for a unit value of each of the k gains, shape (N, k).
     columns: FloatArray
+    # Returns the effect for gains of shape (k,), or None if the gains are not admissible.
     effect: Callable[[FloatArray], Effect | None]
+    # Number of trailing columns whose gains must be non-negative; if not 0, `effect` receives only these gains.
     positive: int = 0
+    # Number of leading columns that describe the initial state of the records; each belongs to one record.
     starting: int = 0
+    # Forms of different groups are refined each by itself, as they lead to different parameters.
     group: int = 0
 
 
@@ -270,6 +361,38 @@ class ResidualView(Protocol):
 
     def respond(self, u: FloatArray) -> FloatArray:
         """Return the displacement of the hysteresis, shape (N,), metres, for the voltage `u`, shape (N,), volts."""
+
+
+@dataclass(frozen=True)
+class FitView:
+    """A fit and its records as the plausibility of an effect may see them; signals of all records, shape (N,)."""
+
+    # Time from the start of each record (s), applied and felt voltage (V), displacement of the hysteresis and measured
+    # displacement (m).
+    t: FloatArray
+    v: FloatArray
+    u: FloatArray
+    h: FloatArray
+    y: FloatArray
+    used: NDArray[np.bool_]
+    # Rms rounding error of the sensor (m).
+    rounding: float
+    effects: Sequence[Effect]
+    # Return the highest frequency (Hz) that any record excites; of each record the single drive frequency (Hz), 0 if
+    # there are several, and the duration (s); the displacement (m) at the centre of the largest loop of each record.
+    excited_frequency: Callable[[], float]
+    drives: Callable[[], Sequence[tuple[float, float]]]
+    zeros: Callable[[], FloatArray]
+
+    @property
+    def step(self) -> float:
+        """Median sampling interval, seconds."""
+        return usual_step(self.t)
+
+    @property
+    def motion(self) -> float:
+        """Range of the measured displacement, metres."""
+        return float(np.ptp(self.y[self.used]))
 
 
 def usual_step(t: FloatArray) -> float:
@@ -320,60 +443,3 @@ def rhythms(left: ResidualView, count: int, lowest: float) -> list[float]:
         power += np.abs(np.fft.rfft(np.interp(grid, t, own) * np.hanning(grid.size), size)) ** 2
     power[frequency < lowest] = 0.0
     return strongest_lines(power, frequency, count)
-
-
-# Place of a parameter, such as ``modes.0.gain``, whether the rule holds, and the requirement as text.
-Rule = tuple[str, bool, str]
-
-
-def require(effect: Any, *rules: Rule) -> None:
-    """Raise ModelError if a parameter is not finite or violates a rule."""
-    for name, value in parameters_of(effect).items():
-        for place, _, number in leaves(name, value):
-            if not isfinite(number):
-                raise ModelError(f"effect '{effect.name}': {place} is {number}; give finite numbers")
-    require_rules(effect, *rules)
-
-
-def require_rules(effect: Any, *rules: Rule) -> None:
-    """Raise ModelError if a parameter violates a rule or an uncertainty belongs to no parameter."""
-    for place, holds, need in rules:
-        if not holds:
-            value = effect
-            for key in place.split("."):
-                value = value[int(key)] if isinstance(value, tuple) else getattr(value, key)
-            raise ModelError(f"effect '{effect.name}': {place} is {shorten(str(value), 80)}; it must be {need}")
-    names = parameters_of(effect)
-    for name, deviation in effect.uncertainty.items():
-        if name.split(".")[0] not in names or not (isfinite(deviation) and deviation >= 0):
-            raise ModelError(
-                f"effect '{effect.name}': uncertainty of {name[:40]!r} is {deviation}; give 0 or more for one of "
-                f"{', '.join(names)}"
-            )
-
-
-def parameters_of(effect: Any) -> dict[str, Any]:
-    """Return the parameters of an effect by name, without `uncertainty`."""
-    return {item.name: getattr(effect, item.name) for item in fields(effect) if item.name != "uncertainty"}
-
-
-def leaves(place: str, value: Any, owner: str = "") -> Iterator[tuple[str, str, float]]:
-    """Yield the numbers in a parameter, each with its place, such as ``modes.0.gain``, and the field that holds it."""
-    owner = owner or place
-    if is_dataclass(value):
-        for item in fields(value):
-            yield from leaves(f"{place}.{item.name}", getattr(value, item.name), item.name)
-    elif isinstance(value, Mapping | tuple):
-        for key, one in value.items() if isinstance(value, Mapping) else enumerate(value):
-            yield from leaves(f"{place}.{key}", one, owner)
-    else:
-        yield place, owner, value
-
-
-def with_leaves(value: Any, numbers: Iterator[float]) -> Any:
-    """Return a parameter with other numbers, in the order of `leaves`."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{item.name: with_leaves(getattr(value, item.name), numbers) for item in fields(value)})
-    if isinstance(value, Mapping):
-        return {key: with_leaves(one, numbers) for key, one in value.items()}
-    return tuple(with_leaves(one, numbers) for one in value) if isinstance(value, tuple) else next(numbers)

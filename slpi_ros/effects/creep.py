@@ -1,9 +1,9 @@
 """Creep: slow relaxation of the displacement after a move."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,11 @@ from slpi_ros.effects.base import (
     StreamingBase,
     by_record,
     longest,
-    require,
     usual_step,
 )
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.filters import Hold, hold
+from slpi_ros.effects.parameters import Fit, Leaf, parameter, require
 
 # Shortest time constant (s) of creep; shorter ones are modelled as lag.
 FASTEST = 0.1
@@ -38,6 +39,15 @@ SINGLE, SEVERAL, LEAST_SHARE = 7, ((2, 0.1), (2, 0.5), (3, 0.3), (4, 0.7)), 0.02
 LAW_PER_DECADE, LAW_SAMPLES, LAW_TO, LAW_FEWEST = 2, 3.0, (0.3, 3.0), 4
 # Relaxations with a time constant below this share of the record may have an identifiable state at its start.
 SOON_SETTLED = 0.025
+# Creep from a move before the records is known if all records agree on the move within this share.
+BEGAN_ALIKE = 0.3
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    levels, shares = (0.8, 0.2, 0.6, 0.9, 0.4), (1, 2, 4, 8, 8)
+    for level, share in zip(levels, shares, strict=True):
+        path.to(level, safe_duration(level - path.at))
+        path.hold(remaining(limits) * share / sum(shares))
 
 
 @dataclass(frozen=True)
@@ -45,38 +55,43 @@ class Creep(EffectBase):
     """Parallel first-order relaxations, ``y = h + sum_k g_k z_k`` with ``tau_k dz_k/dt = (h - h_0) - z_k``.
 
     ``h_0`` is the displacement at the start, where all relaxations are in equilibrium.
-
-    Parameters
-    ----------
-    time_constants : tuple of float, length K >= 1, seconds, ``tau_k``
-    gains : tuple of float, length K
-        Share ``g_k`` of the motion ``h - h_0`` that follows with each time constant.
-    initial : float, metres
-        Displacement step just before the record, default 0. Only `apply` includes the creep after this step; streaming
-        starts at equilibrium.
-    uncertainty : mapping of parameter name to standard deviation, optional
-        Standard deviations; those of single elements have keys such as ``gains.0``.
     """
 
     name: ClassVar[str] = "creep"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "slow relaxation after each movement, from 0.1 s on"
+    compensated: ClassVar[str] = "yes"
+    dynamic: ClassVar[bool] = True
+    resembles_when_old: ClassVar[str] = "thermal_drift"
+    excitation: ClassVar[Excitation] = Excitation(
+        "Quick moves up and down, each followed by a hold, the later ones longer: at constant voltage hysteresis, "
+        "lag and delay are still, and only creep goes on, in proportion to the move and in its direction.",
+        _draw,
+        separates=("lag", "delay", "rate_dependence"),
+        order=2,
+        lacking=(0.2, "no record holds the voltage for long after a quick move, where creep would show"),
+    )
 
-    time_constants: tuple[float, ...]
-    gains: tuple[float, ...]
-    initial: float = 0.0
+    time_constants: tuple[float, ...] = parameter(
+        "s", "time constants tau_k", 0, 1e7, above=True, count=(1, 100),
+        fit=Fit("relative", least=FASTEST, within_record=True),
+    )  # fmt: skip
+    gains: tuple[float, ...] = parameter(
+        "", "shares g_k of the motion that follow with each", -0.9, 11, count=(1, 100), fit=Fit("linear", 1e-5, 0.0)
+    )
+    # Only `apply` includes the creep after it; streaming starts at equilibrium.
+    initial: float = parameter("m", "step of the displacement just before the record", -1e3, 1e3, default=0.0)
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Validate the parameters, including invertibility."""
+        super().__post_init__()
         require(
             self,
-            ("time_constants", 1 <= len(self.time_constants) <= 100, "1 to 100 numbers"),
-            ("time_constants", all(0 < tau <= 1e7 for tau in self.time_constants), "more than 0 s, at most 1e7 s"),
             ("gains", len(self.gains) == len(self.time_constants), "one for each time constant"),
             ("gains", sum(min(g, 0.0) for g in self.gains) > -0.9, "more than -0.9 in sum where they are negative"),
             ("gains", sum(self.gains) <= 10, "at most 10 in sum"),
-            ("initial", abs(self.initial) <= 1e3, "within 1000 m"),
         )
 
     @by_record
@@ -113,14 +128,14 @@ class Creep(EffectBase):
             single = [np.array([tau]) for tau in np.geomspace(shortest, 0.5 * most, SINGLE)]
             several = [np.geomspace(shortest, share * most, count) for count, share in SEVERAL]
             for taus in (*single, *several):
-                starting = settling(taus.tolist(), left.around, left.used)
+                starting = _settling(taus.tolist(), left.around, left.used)
                 columns = np.column_stack([starting, *cls._creeping(taus, left)])
                 yield Candidate(columns, partial(cls._each, taus), taus.size, starting.shape[1])
         for slow in LAW_TO:
             first, last = max(FASTEST, LAW_SAMPLES * step), slow * most
             if last > 10 * first:
                 taus = np.geomspace(first, last, max(LAW_FEWEST, 1 + round(LAW_PER_DECADE * np.log10(last / first))))
-                starting = settling(taus.tolist(), left.around, left.used)
+                starting = _settling(taus.tolist(), left.around, left.used)
                 columns = np.column_stack([starting, np.sum(cls._creeping(taus, left), axis=0)])
                 yield Candidate(columns, partial(cls._law, taus), 1, starting.shape[1])
 
@@ -131,14 +146,56 @@ class Creep(EffectBase):
     @classmethod
     def _law(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":
         each = (float(gains[0]),) * taus.size
-        return cls(tuple(taus.tolist()), each) if gains[0] > 0.0 and plausible(taus.tolist(), each) == each else None
+        return cls(tuple(taus.tolist()), each) if gains[0] > 0.0 and _reduced(taus.tolist(), each) == each else None
 
     @classmethod
     def _each(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":
         seen = gains > LEAST_SHARE * gains.max()
         if not gains.max() > 0.0:
             return None
-        return cls(tuple(taus[seen].tolist()), plausible(taus[seen].tolist(), gains[seen].tolist()))
+        return cls(tuple(taus[seen].tolist()), _reduced(taus[seen].tolist(), gains[seen].tolist()))
+
+    @property
+    def _is_law(self) -> bool:
+        """Whether it is the logarithmic law: several relaxations with equal gains."""
+        return len(self.gains) >= LAW_FEWEST and len(set(self.gains)) == 1
+
+    def free_leaves(self) -> list[Leaf]:
+        """Return the fitted numbers: of the logarithmic law only its gain."""
+        every = super().free_leaves()
+        return [every[len(self.time_constants)]._replace(place="gains")] if self._is_law else every
+
+    def with_free(self, numbers: Iterable[float]) -> "Creep":
+        """Return the creep with other fitted numbers; the gains of the logarithmic law stay equal."""
+        if not self._is_law:
+            return super().with_free(numbers)
+        (gain,) = numbers
+        gains = (gain,) * len(self.gains)
+        return replace(self, gains=(min(_reduced(self.time_constants, gains)),) * len(gains))
+
+    @classmethod
+    def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
+        """Return new parameters with the gains within their upper bounds."""
+        return changed | {"gains": _reduced(changed["time_constants"], changed["gains"])}
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether a gain, or the sum of those that settle within a second, is at its upper bound."""
+        soon = sum(gain for tau, gain in zip(self.time_constants, self.gains, strict=True) if tau < SOON)
+        return not (max(self.gains) < (1.0 - NEAR) * LARGEST and soon < (1.0 - NEAR) * LARGEST_SOON)
+
+    def starting(self, around: EffectContext, used: NDArray[np.bool_], *, older: bool = False) -> FloatArray:
+        """Return the decay of creep from a move before each record, shape (N, k), one column per unknown move."""
+        return _settling(self.time_constants, around, used, older=older)
+
+    def started(self, amplitudes: FloatArray, records: int) -> "Creep":
+        """Return the creep with the move before the records (`initial`) if several records agree on it."""
+        if records == 1 or amplitudes.size != records or not self.gains[0]:
+            return self
+        moves = -amplitudes / self.gains[0]
+        initial = float(np.mean(moves))
+        alike = bool(np.all(np.abs(moves - initial) <= BEGAN_ALIKE * abs(initial)))
+        return replace(self, initial=initial) if alike else self
 
     def describe(self) -> str:
         """Describe the magnitude and the time constants."""
@@ -217,7 +274,7 @@ class StreamingCreep(StreamingBase):
         self._before = sum(gain * one.before for gain, one in zip(gains, self._holds, strict=True))
 
 
-def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[float, ...]:
+def _reduced(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[float, ...]:
     """Return the gains, reduced to the upper bounds for creep."""
     gains = [min(gain, LARGEST) for gain in gains]
     soon = sum(gain for tau, gain in zip(time_constants, gains, strict=True) if tau < SOON)
@@ -225,13 +282,7 @@ def plausible(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[
     return tuple(gain * share if tau < SOON else gain for tau, gain in zip(time_constants, gains, strict=True))
 
 
-def within_bounds(creep: Creep) -> bool:
-    """Return whether no gain, nor the sum of those that settle within a second, is at its upper bound."""
-    soon = sum(gain for tau, gain in zip(creep.time_constants, creep.gains, strict=True) if tau < SOON)
-    return max(creep.gains) < (1.0 - NEAR) * LARGEST and soon < (1.0 - NEAR) * LARGEST_SOON
-
-
-def settling(
+def _settling(
     time_constants: Sequence[float], around: EffectContext, used: NDArray[np.bool_], *, older: bool = False
 ) -> FloatArray:
     """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation.

@@ -3,11 +3,23 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FloatArray, ResidualView, Side, Signal, require
+from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FloatArray, ResidualView, Side, Signal
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining
+from slpi_ros.effects.parameters import Fit, parameter, require
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    spans = ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0), (0.25, 0.75))
+    seconds = remaining(limits) / (len(spans) * 2 * (1 + 2))
+    for low, high in spans:
+        move(path, low)
+        for each in (2 * seconds, seconds):
+            loops(path, low, high, each, 1)
+            path.hold(seconds / 4)
 
 
 @dataclass(frozen=True)
@@ -15,26 +27,31 @@ class CrossCoupling(EffectBase):
     """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j relative to its start.
 
     It needs the setpoints of all axes and is compensated by the stage model.
-
-    Parameters
-    ----------
-    gains : mapping of axis name to float
-        Gain by axis name, metres per metre. An axis with unknown motion is taken as stationary.
     """
 
     name: ClassVar[str] = "cross_coupling"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "part of the movement of another axis"
+    compensated: ClassVar[str] = "if both axes are in one node"
+    excitation: ClassVar[Excitation] = Excitation(
+        "One axis moves while all others rest: what a resting axis shows then is coupling, and neither its own "
+        "hysteresis nor its own dynamics.",
+        _draw,
+        least_axes=2,
+    )
 
-    gains: Mapping[str, float]
+    gains: Mapping[str, float] = parameter(
+        "", "metres for one metre of another axis, by its name", -1, 1, count=(1, 100),
+        fit=Fit("linear", 1e-5, most=0.4),
+    )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require(
-            self,
-            ("gains", 1 <= len(self.gains) <= 100, "for at least one axis"),
-            ("gains", sum(map(abs, self.gains.values())) < 0.9, "less than 0.9 in sum, to tell the axes apart"),
-        )
+        """Validate the gains."""
+        super().__post_init__()
+        least = sum(map(abs, self.gains.values())) < 0.9
+        require(self, ("gains", least, "less than 0.9 in sum, to tell the axes apart"))
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement including the coupled motion, shape (N,), metres."""
@@ -68,44 +85,3 @@ class CrossCoupling(EffectBase):
         """Describe the coupling gains by axis."""
         parts = [f"{gain * 100:.3g} % of axis {axis}" for axis, gain in self.gains.items()]
         return f"the axis follows {' and '.join(parts)}"
-
-
-Motion = TypeVar("Motion", float, FloatArray)
-
-
-class Coupling:
-    """Linear coupling of all axes: the observed motions are ``(I + G) m``, with ``m`` the motions without coupling.
-
-    ``gains[x][y]`` is the displacement of x per metre of y; axes that are not in the mapping have no coupling, and
-    without any gain it is not `on`.
-    """
-
-    def __init__(self, gains: Mapping[str, Mapping[str, float]]) -> None:
-        self._gains = {
-            name: {other: gain for other, gain in row.items() if other in gains and other != name and gain}
-            for name, row in gains.items()
-        }
-        self.on = any(self._gains.values())
-        self._solutions: dict[tuple[str, ...], list[list[float]]] = {}
-
-    def part(self, name: str, motions: Mapping[str, Motion]) -> Motion | float:
-        """Return the displacement (m) of axis `name` caused by the own motions of the others, 0 for missing axes."""
-        return sum((gain * motions[other] for other, gain in self._gains[name].items() if other in motions), 0.0)
-
-    def decouple(self, seen: Mapping[str, Motion], resting: Mapping[str, Motion]) -> dict[str, Motion]:
-        """Return the own motions (m), those without coupling, that produce the observed ones, `seen` (m).
-
-        Each from the start, a number or of shape (N,). `resting` are own motions (m) of axes held in position.
-        """
-        left = {name: motion - self.part(name, resting) for name, motion in seen.items()}
-        rows = self._solution(tuple(seen))
-        return {
-            name: sum(share * motion for share, motion in zip(row, left.values(), strict=True))  # type: ignore[misc]
-            for name, row in zip(seen, rows, strict=True)
-        }
-
-    def _solution(self, names: tuple[str, ...]) -> list[list[float]]:
-        if names not in self._solutions:
-            matrix = [[float(one == other) + self._gains[one].get(other, 0.0) for other in names] for one in names]
-            self._solutions[names] = np.linalg.inv(np.array(matrix)).tolist()
-        return self._solutions[names]

@@ -15,10 +15,16 @@ from slpi_ros.effects.base import (
     ResidualView,
     Side,
     Signal,
+    TimeShift,
     by_record,
-    require,
     usual_step,
 )
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
+from slpi_ros.effects.parameters import Fit, in_samples, parameter
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    at_speeds(path, limits, 0.35, 0.65, straight=True)
 
 
 @dataclass(frozen=True)
@@ -26,22 +32,26 @@ class Delay(EffectBase):
     """Transport delay, or offset between the stamps of voltage and displacement.
 
     It is not compensated sample by sample, which needs future setpoints.
-
-    Parameters
-    ----------
-    seconds : float, seconds
-        Delay from voltage to displacement; negative if the displacement is stamped too early or the voltage too late.
     """
 
     name: ClassVar[str] = "delay"
     acts_on: ClassVar[Signal] = "voltage"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "voltage and displacement are shifted in time"
+    compensated: ClassVar[str] = "on trajectories"
+    needs_feedback: ClassVar[bool] = True
+    time_shift: ClassVar[TimeShift] = "only"
+    dynamic: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "The same triangle at six speeds: a delay shifts its sharp corners by one time at every speed and leaves "
+        "them sharp, where a lag rounds them and rate dependence changes the loop between them.",
+        _draw,
+    )
 
-    seconds: float
+    seconds: float = parameter(
+        "s", "delay of the displacement; negative: stamped too early", -100, 100, fit=Fit("linear", in_samples)
+    )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        require(self, ("seconds", abs(self.seconds) <= 100, "from -100 to 100 s"))
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slpi_ros.effects.parameters import Fit, parameter
+
 FloatArray = NDArray[np.float64]
 
 # Below this ratio of step to time constant a series is used, because differences lose precision.
@@ -16,6 +18,8 @@ _SMALL = 1e-3
 EVEN = 0.01
 # Largest number of grid points per sample.
 FINEST = 4
+# Smallest share of the motion of a fitted mode: smaller ones, near the drive, imitate errors of the hysteresis.
+LEAST_GAIN = 0.01
 
 
 class Hold(NamedTuple):
@@ -44,21 +48,15 @@ def filtered(numerator: ArrayLike, denominator: ArrayLike, signal: FloatArray) -
 
 @dataclass(frozen=True)
 class Mode:
-    """Second-order mode ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``.
+    """Second-order mode ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``."""
 
-    Parameters
-    ----------
-    frequency : float, hertz
-        Undamped natural frequency.
-    damping : float
-        Damping ratio ``z``, from above 0 to below 1.
-    gain : float
-        Share of the static displacement that the mode carries; default: all of it.
-    """
-
-    frequency: float
-    damping: float
-    gain: float = 1.0
+    frequency: float = parameter("Hz", "frequency", 1e-3, 1e7, fit=Fit("relative", least=1e-3))
+    # With more damping there is no resonance.
+    damping: float = parameter("", "damping ratio", 1e-6, 1, below=True, fit=Fit("relative", least=1e-3, most=0.4))
+    gain: float = parameter(
+        "", "share of the static displacement; at most 1 in sum", 0, 1, default=1.0, required=True,
+        fit=Fit("linear", 1e-5, LEAST_GAIN, 1.0),
+    )  # fmt: skip
 
     @cached_property
     def omega(self) -> float:

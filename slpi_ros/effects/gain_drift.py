@@ -11,17 +11,29 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
+    FitView,
     FloatArray,
     ResidualView,
+    Sharing,
     Side,
     Signal,
     StreamingBase,
-    require,
 )
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
+from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Numbers of uniform knots of the candidates. The first interval has more knots, spaced logarithmically (number per
 # decade), as piezo ageing is logarithmic in time; the first lies after one loop and at least this many readings.
 UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
+# Largest distance of the origin from the displacement range, as a share of that range: with an origin far away, a gain
+# drift is a thermal drift; largest gain: no piezo changes by more; and shortest duration (s).
+ORIGIN, LARGEST, TAKES = 0.3, 0.3, 10.0
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    shortest = 2 * max(limits.quickest(1.0), safe_duration(1.0))
+    repeats = min(max(int(remaining(limits) / shortest), 3), 60)
+    loops(path, 0.0, 1.0, remaining(limits) / (2 * repeats), repeats)
 
 
 @dataclass(frozen=True)
@@ -31,36 +43,50 @@ class GainDrift(EffectBase):
     ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
     record; after it the sensitivity stays at its last value, see `lasting`. The factor scales hysteresis, creep and
     resonance, and acts before the cross coupling, so that other axes receive the scaled motion.
-
-    Parameters
-    ----------
-    times : tuple of float, length K >= 1, seconds
-        Knots from the record's start, more than 0, strictly increasing; 0 alone: a constant sensitivity.
-    gains : tuple of float, length K
-        Relative change of sensitivity ``g`` at the knots.
-    origin : float, metres
-        Displacement that does not change with the sensitivity.
     """
 
     name: ClassVar[str] = "gain_drift"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "the sensitivity changes slowly"
+    compensated: ClassVar[str] = "as it was at the end of the record; its course belongs to the record"
+    needs_feedback: ClassVar[bool] = True
+    sharing: ClassVar[Sharing] = "separate"
+    changes_gain: ClassVar[bool] = True
+    plausible_to_the_end: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "Full loops one after the other, all alike and without a rest: voltage, memory and creep repeat, so a "
+        "stroke that grows or shrinks is the sensitivity, where a drift moves both ends of each loop by the same "
+        "(give it several minutes, or start after a rest).",
+        _draw,
+        separates=("thermal_drift",),
+        order=1,
+    )
 
-    times: tuple[float, ...]
-    gains: tuple[float, ...]
-    origin: float
+    times: tuple[float, ...] = parameter("s", "times of the knots from the record's start; 0 alone: constant", 0, 1e9)
+    gains: tuple[float, ...] = parameter(
+        "", "relative changes g of the sensitivity at the knots", -0.9, 10, above=True, fit=Fit("linear", 1e-5)
+    )
+    origin: float = parameter(
+        "m", "displacement that does not change with the sensitivity", -1e3, 1e3, fit=Fit("linear", 1e-9)
+    )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Validate the knots."""
+        super().__post_init__()
         rising = self.times == (0.0,) or all(a < b for a, b in zip((0.0, *self.times), self.times, strict=False))
         require(
             self,
-            ("times", 1 <= len(self.times) <= 10000 and rising, "1 to 10000 numbers, more than 0, strictly increasing"),
-            ("times", all(time <= 1e9 for time in self.times), "at most 1e9 s"),
+            ("times", rising, "more than 0, strictly increasing"),
             ("gains", len(self.gains) == len(self.times), "one for each time"),
-            ("gains", all(-0.9 < gain <= 10 for gain in self.gains), "more than -0.9, at most 10"),
-            ("origin", abs(self.origin) <= 1e3, "within 1000 m"),
         )
+
+    def plausible(self, view: FitView) -> bool:
+        """Return whether it is small and slow, with an origin near the measured displacements."""
+        y = view.y[view.used]
+        near = float(y.min()) - ORIGIN * view.motion <= self.origin <= float(y.max()) + ORIGIN * view.motion
+        return near and max(map(abs, self.gains)) <= LARGEST and self.times[-1] >= TAKES
 
     def factor(self, t: FloatArray) -> FloatArray:
         """Return ``1 + g``, shape (N,), at times `t`, shape (N,), seconds from the record's start."""

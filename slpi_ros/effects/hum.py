@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from math import pi
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -12,29 +12,41 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
+    FitView,
     FloatArray,
     ResidualView,
-    Rule,
     Side,
     Signal,
     amplitude_and_phase,
-    require,
     rhythms,
     wave,
 )
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, move, remaining
+from slpi_ros.effects.parameters import Fit, as_list, parameter
 
 # Number of spectral peaks that are tried, and lowest frequency (Hz); slower disturbances are drift or creep.
 PEAKS, SLOWEST = 4, 2.0
 MOST_LINES = 100
+# Highest harmonic of the drive frequency that may be residual hysteresis, which decreases with the order; any frequency
+# is close to a higher one.
+MOST_HARMONICS = 15
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    for level in (0.1, 0.5, 0.9):
+        move(path, level)
+        path.hold(remaining(limits) / 3)
 
 
 @dataclass(frozen=True)
 class Line:
     """One line of hum: frequency (Hz), amplitude (m), and phase (rad) at the record's start."""
 
-    frequency: float
-    amplitude: float
-    phase: float
+    frequency: float = parameter(
+        "Hz", "frequency", 0, 1e7, above=True, fit=Fit("relative", lambda _, of: 1e-3 / of.duration, 1e-3)
+    )
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0))
+    phase: float = parameter("rad", "phase at the record's start", -1e6, 1e6, fit=Fit("angle", 1e-4))
 
 
 @dataclass(frozen=True)
@@ -42,29 +54,37 @@ class Hum(EffectBase):
     """Sinusoids in time, ``y = x + sum_k amplitude_k sin(2 pi frequency_k t + phase_k)``.
 
     They are not compensated, as the phases are known only for the clock of the record.
-
-    Parameters
-    ----------
-    lines : tuple of Line
-        Frequencies in hertz, amplitudes in metres, and phases in radians at the record's start.
     """
 
     name: ClassVar[str] = "hum"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "record"
+    what: ClassVar[str] = "disturbance that is periodic in time, one or several lines"
+    compensated: ClassVar[str] = "no"
+    needs_feedback: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "Rest at three levels: nothing is commanded, so what oscillates there at one frequency comes from outside; "
+        "an error of the sensor does not, at rest (sample at more than twice the mains frequency).",
+        _draw,
+    )
 
-    lines: tuple[Line, ...]
+    lines: tuple[Line, ...] = parameter("", "spectral lines", count=(1, MOST_LINES))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        rules: list[Rule] = [("lines", 1 <= len(self.lines) <= MOST_LINES, f"a list of 1 to {MOST_LINES}")]
-        for k, line in enumerate(self.lines):
-            rules += [
-                (f"lines.{k}.frequency", 0 < line.frequency <= 1e7, "more than 0 Hz, at most 1e7 Hz"),
-                (f"lines.{k}.amplitude", 0 <= line.amplitude <= 1e3, "0 m or more, at most 1000 m"),
-                (f"lines.{k}.phase", abs(line.phase) <= 1e6, "within 1e6 rad"),
-            ]
-        require(self, *rules)
+    @classmethod
+    def from_version_1(cls, given: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
+        """Return the only line as a list."""
+        return as_list("lines", given, spread)
+
+    def plausible(self, view: FitView) -> bool:
+        """Return whether no line is a low harmonic of the single drive frequency of any record, within resolution."""
+        return not any(
+            drive
+            and round(line.frequency / drive) <= MOST_HARMONICS
+            and abs(line.frequency - round(line.frequency / drive) * drive) < 2.0 / duration
+            for line in self.lines
+            for drive, duration in view.drives()
+        )
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with hum, shape (N,), metres."""

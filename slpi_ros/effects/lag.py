@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.effects.base import (
+    FEW_SAMPLES,
     Candidate,
     EffectBase,
     EffectContext,
@@ -16,35 +17,48 @@ from slpi_ros.effects.base import (
     Side,
     Signal,
     StreamingBase,
+    TimeShift,
     by_record,
-    require,
     usual_step,
 )
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
 from slpi_ros.effects.filters import Hold, filtered, hold
+from slpi_ros.effects.parameters import Fit, in_samples, parameter
 
 # The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
 # of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
 DAMPING = 1 / 8
+# Number of time constants after which the piezo has the voltage of the command.
+SETTLED = 5.0
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    at_speeds(path, limits, 0.45, 0.55, straight=False)
 
 
 @dataclass(frozen=True)
 class Lag(EffectBase):
-    """First-order lag, ``tau du/dt = v - u``.
-
-    Parameters
-    ----------
-    time_constant : float, seconds, ``tau``
-    """
+    """First-order lag, ``tau du/dt = v - u``."""
 
     name: ClassVar[str] = "lag"
     acts_on: ClassVar[Signal] = "voltage"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "first-order lag of the amplifier or the sensor"
+    compensated: ClassVar[str] = "yes"
+    time_shift: ClassVar[TimeShift] = "only"
+    dynamic: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "The same small loop as a sine, slow to fast: hysteresis stays as it is, the phase of a delay grows with "
+        "frequency at full amplitude, and a lag also loses amplitude.",
+        _draw,
+        separates=("delay",),
+    )
 
-    time_constant: float
+    time_constant: float = parameter(
+        "s", "time constant tau", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6)
+    )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        require(self, ("time_constant", 0 < self.time_constant <= 1e4, "more than 0 s, at most 10000 s"))
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
@@ -75,6 +89,20 @@ class Lag(EffectBase):
     @classmethod
     def _times(cls, tau: float, gains: FloatArray) -> "Lag | None":
         return cls(tau * float(gains[0])) if gains[0] > 0 else None
+
+    def simpler(self, step: float) -> Delay | None:
+        """Return the delay that looks the same with a sampling interval of `step` (s), for a lag of a few samples."""
+        return Delay(self.time_constant) if step <= self.time_constant < FEW_SAMPLES * step else None
+
+    @property
+    def slow_shift(self) -> float:
+        """The time constant, seconds."""
+        return self.time_constant
+
+    @property
+    def settling_time(self) -> float:
+        """Time (s) after which the piezo has the voltage of the command."""
+        return SETTLED * self.time_constant
 
     def describe(self) -> str:
         """Describe the time constant."""

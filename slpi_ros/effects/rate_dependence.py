@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from math import copysign, exp
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -18,8 +18,12 @@ from slpi_ros.effects.base import (
     Side,
     Signal,
     StreamingBase,
-    require,
+    TimeShift,
 )
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
+from slpi_ros.effects.parameters import Fit, parameter
+from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.rate_law import solved
 
 if TYPE_CHECKING:
@@ -36,6 +40,19 @@ HOLD_SAMPLES, AT_REST = 50, 1e-3
 AGE = 0.1
 # Smallest age of a step, in units of the threshold over the onset rate, and the age from which nothing is left of it.
 SOONEST, FORGOTTEN = 1e-12, 10.0
+# A state at the start below this size (V) is none.
+NO_START = 1e-6
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    spans, doublings, count = (0.6, 0.3, 0.15), 3, 2
+    # Loops of one span take 2 (1 + 2 + 4) times the shortest leg.
+    quickest = remaining(limits) / (len(spans) * count * 2 * (2**doublings - 1))
+    quickest = max(quickest, limits.quickest(spans[0]), safe_duration(spans[0]))
+    for span in spans:
+        move(path, 0.5 - span / 2)
+        for doubling in range(doublings):
+            loops(path, 0.5 - span / 2, 0.5 + span / 2, quickest * 2**doubling, count)
 
 
 @dataclass(frozen=True)
@@ -45,18 +62,6 @@ class RateDependence(EffectBase):
     The hysteresis ``H`` feels the voltage ``u``, which follows the applied voltage ``v``; the reversible part ``g`` of
     the displacement does not wait for it. Both directions are solved exactly at each sample, by backward differences.
 
-    Parameters
-    ----------
-    threshold : float, volts, ``c``
-        Half-width that the loops gain for each factor of e in the rate.
-    onset_rate : float, V/s, ``s0``
-        Rate above which they widen.
-    reversible_gain : float, m/V, ``g``
-    initial : tuple of float, volts
-        ``v - u`` at the start of each record of the fit, other than 0 after a step just before it. It belongs to these
-        records; any other one starts at equilibrium, as streaming does. Default: none.
-    uncertainty : mapping of parameter name to standard deviation, optional
-
     References
     ----------
     H. Eyring, Viscosity, plasticity, and diffusion as examples of absolute reaction rates, J. Chem. Phys. 4, 283, 1936.
@@ -65,22 +70,56 @@ class RateDependence(EffectBase):
     name: ClassVar[str] = "rate_dependence"
     acts_on: ClassVar[Signal] = "hysteresis"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = (
+        "loops widen with the logarithm of the drive rate, and creep at rest, by one law (Eyring): "
+        "`v = u + c asinh(u'/s0)`, with a reversible part that does not wait"
+    )
+    compensated: ClassVar[str] = "exactly"
+    time_shift: ClassVar[TimeShift] = "partly"
+    dynamic: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "Loops of three sizes at three speeds each, some of different size at the same volts per second: a linear "
+        "filter treats these alike, loops that widen with the drive rate do not.",
+        _draw,
+        separates=("lag", "delay"),
+    )
 
-    threshold: float
-    onset_rate: float
-    reversible_gain: float = 0.0
-    initial: tuple[float, ...] = ()
+    threshold: float = parameter(
+        "V", "half-width c that loops gain for each factor of e in the rate", 0, 1e5, fit=Fit("logarithmic", 1e-4, 1e-6)
+    )
+    onset_rate: float = parameter(
+        "V/s", "rate s0 above which they widen", 1e-12, 1e12, fit=Fit("logarithmic", 1e-4, 1e-9)
+    )
+    reversible_gain: float = parameter(
+        "m/V", "gain g of the reversible part", 0, 1e3, default=0.0,
+        fit=Fit("linear", lambda _, of: 1e-9 / of.voltage, 0.0),
+    )  # fmt: skip
+    # Of the records of the fit, other than 0 after a step just before them; any other one starts at equilibrium, as
+    # streaming does.
+    initial: tuple[float, ...] = parameter(
+        "V", "difference v - u at the start of each record", -1e5, 1e5, default=(), count=(0, 1000),
+        fit=Fit("relative", start=True),
+    )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        """Validate the parameters, including invertibility."""
-        require(
-            self,
-            ("threshold", 0 <= self.threshold <= 1e5, "from 0 to 1e5 V"),
-            ("onset_rate", 1e-12 <= self.onset_rate <= 1e12, "from 1e-12 to 1e12 V/s"),
-            ("reversible_gain", 0 <= self.reversible_gain <= 1e3, "from 0 to 1000 m/V"),
-            ("initial", all(abs(lead) <= 1e5 for lead in self.initial), "within 1e5 V"),
-        )
+    @classmethod
+    def companion(cls) -> Delay:
+        """Return a delay, against which the law trades."""
+        return Delay(0.0)
+
+    @classmethod
+    def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
+        """Return new parameters, with 0 for small states at the start."""
+        return changed | {"initial": tuple(0.0 if abs(lead) < NO_START else lead for lead in changed["initial"])}
+
+    @classmethod
+    def from_version_1(cls, given: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
+        """Refuse the retired form."""
+        if "exponent" in given:
+            raise ModelError(
+                "rate_dependence has a retired form (a power of the rate); identify and diagnose again from its bags"
+            )
+        return given, spread
 
     @property
     def lasting(self) -> "RateDependence":

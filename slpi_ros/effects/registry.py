@@ -2,37 +2,38 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
+from importlib import import_module
 from math import isinf
 from typing import Any, get_args, get_origin
 
-from slpi_ros.effects.base import Effect, parameters_of
-from slpi_ros.effects.creep import Creep
-from slpi_ros.effects.cross_coupling import CrossCoupling
-from slpi_ros.effects.delay import Delay
-from slpi_ros.effects.gain_drift import GainDrift
-from slpi_ros.effects.hum import Hum
-from slpi_ros.effects.lag import Lag
-from slpi_ros.effects.rate_dependence import RateDependence
-from slpi_ros.effects.resonance import Resonance
-from slpi_ros.effects.saturation import Saturation
-from slpi_ros.effects.sensor_periodic import SensorPeriodic
-from slpi_ros.effects.thermal_drift import ThermalDrift
+from slpi_ros.effects.base import Effect
+from slpi_ros.effects.parameters import facts_of
 from slpi_ros.errors import ModelError
 
-# Listed in the order in which the effects act.
+# Modules of the effects, in the order in which the effects act.
+MODULES = (
+    "delay",
+    "lag",
+    "saturation",
+    "rate_dependence",
+    "creep",
+    "resonance",
+    "gain_drift",
+    "cross_coupling",
+    "thermal_drift",
+    "sensor_periodic",
+    "hum",
+)
+# Effects by name. The class of the module ``rate_dependence`` is ``RateDependence``, and so on.
 EFFECTS: dict[str, type[Any]] = {
-    kind.name: kind
-    for kind in (
-        *(Delay, Lag, Saturation),
-        *(RateDependence, Creep, Resonance, GainDrift, CrossCoupling, ThermalDrift, SensorPeriodic, Hum),
-    )
+    name: getattr(import_module(f"slpi_ros.effects.{name}"), name.title().replace("_", "")) for name in MODULES
 }
-_PLACE = {name: place for place, name in enumerate(EFFECTS)}
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     """Return effects in the order in which they act; ModelError if an effect occurs twice."""
-    ordered = tuple(sorted(effects, key=lambda effect: _PLACE[effect.name]))
+    place = list(EFFECTS).index
+    ordered = tuple(sorted(effects, key=lambda effect: place(effect.name)))
     for one, other in zip(ordered, ordered[1:], strict=False):
         if one.name == other.name:
             raise ModelError(f"effect '{one.name}' comes twice; an axis has each effect once")
@@ -43,7 +44,7 @@ def to_document(effect: Effect) -> dict[str, Any]:
     """Return an effect as a JSON document in SI units."""
     return {
         "name": effect.name,
-        "parameters": {name: _plain(value) for name, value in parameters_of(effect).items()},
+        "parameters": {name: _plain(getattr(effect, name)) for name in facts_of(type(effect))},
         "uncertainty": dict(effect.uncertainty),
     }
 

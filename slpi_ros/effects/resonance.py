@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import zip_longest
-from math import pi
+from math import pi, sqrt
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,17 +14,20 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
+    FitView,
     FloatArray,
     ResidualView,
     Side,
     Signal,
     StreamingBase,
+    TimeShift,
     by_record,
-    require,
     rhythms,
     usual_step,
 )
-from slpi_ros.effects.filters import Mode, StreamingMode, filtered
+from slpi_ros.effects.excitation import FEWEST_STEPS, DriveLimits, DrivePath, Excitation, loops, move, remaining
+from slpi_ros.effects.filters import LEAST_GAIN, Mode, StreamingMode, filtered
+from slpi_ros.effects.parameters import as_list, parameter, require
 
 # Smallest spacing of taps, in units of 1 / w: smaller ones make larger taps without benefit. From the step `WIDEST` on
 # a mode is not resolved, and only its lag is compensated.
@@ -190,8 +193,26 @@ class StreamingResonance(StreamingBase):
 # Modes of the candidates: lowest frequency (Hz), highest as share of the sampling rate, number of spectral peaks.
 LOWEST, HIGHEST, LINES = 10.0, 0.45, 4
 DAMPINGS = (0.02, 0.08)
-# Smallest share of the motion of a fitted mode: smaller ones, near the drive, imitate errors of the hysteresis.
-LEAST_GAIN = 0.01
+# Highest frequency of any resonance, as a multiple of the highest excited frequency; above it only sharp ones can be
+# identified, with at most this damping ratio: turns excite them.
+RINGS, SHARP = 2.0, 0.1
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    step, levels, repeats = 0.1, (0.2, 0.5, 0.8), 3
+    ring = 0.5 * remaining(limits) / (len(levels) * (1 + 2 * repeats))
+    for level in levels:
+        move(path, level)
+        path.hold(ring)
+        for _ in range(repeats):
+            for to in (level + step, level):
+                path.to(to, 0.0, straight=True)
+                path.hold(ring)
+    # In the sweep each half-wave is one sample shorter than the previous one; two loops of each take 0.3 of the time.
+    move(path, 0.5)
+    longest = int(sqrt(0.3 * remaining(limits) * limits.rate / 2))
+    for steps in range(longest, FEWEST_STEPS - 1, -1):
+        loops(path, 0.5 - step / 4, 0.5 + step / 4, steps / limits.rate, 2)
 
 
 @dataclass(frozen=True)
@@ -202,30 +223,46 @@ class Resonance(EffectBase):
     the quadratic factors ``N_k`` of ``N`` in order of frequency. Where the zeros of ``N_k`` are near the mode this is
     `Exact`. Else, as ``1 / N_k`` hardly matters and the exact inverse of the sampled mode is unstable or large, the
     factor is `Unringing`: it cancels the oscillation, follows ramps without error, and is bounded.
-
-    Parameters
-    ----------
-    modes : tuple of Mode
-        Frequencies in hertz, damping ratios from above 0 to below 1, and gains: the shares of the static displacement
-        that the modes carry, 0 or more, at most 1 in sum.
     """
 
     name: ClassVar[str] = "resonance"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "lightly damped modes that ring after turns, each with its share of the motion"
+    compensated: ClassVar[str] = "exactly, if a part of the motion follows at once; else what would ring is taken out"
+    time_shift: ClassVar[TimeShift] = "partly"
+    contains_shift: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "Small steps as fast as allowed with time to ring down, at three levels, then a sweep up to a sixth of the "
+        "sampling rate: only a resonance rings on, at one frequency (sample at six times that or more).",
+        _draw,
+        separates=("lag", "delay"),
+        order=2,
+        lacking=(0.2, "no record holds small quick steps, where a resonance, a delay or a lag would show"),
+    )
 
-    modes: tuple[Mode, ...]
+    modes: tuple[Mode, ...] = parameter("", "flexure modes", count=(1, MOST_MODES))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        rules = [("modes", 1 <= len(self.modes) <= MOST_MODES, f"a list of 1 to {MOST_MODES}")]
-        for k, mode in enumerate(self.modes):
-            rules += [
-                (f"modes.{k}.frequency", 1e-3 <= mode.frequency <= 1e7, "from 0.001 to 1e7 Hz"),
-                (f"modes.{k}.damping", 1e-6 <= mode.damping < 1, "from 1e-6 to below 1"),
-                (f"modes.{k}.gain", mode.gain >= 0, "0 or more"),
-            ]
-        require(self, *rules, ("modes", self.rest >= 0, "of gains that are at most 1 in sum"))
+        """Validate the modes."""
+        super().__post_init__()
+        require(self, ("modes", self.rest >= 0, "of gains that are at most 1 in sum"))
+
+    @classmethod
+    def from_version_1(cls, given: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
+        """Return the only mode as a list, with the gain that it had without saying so."""
+        return (given, spread) if "gain" in given else as_list("modes", given | {"gain": 1.0}, spread)
+
+    @classmethod
+    def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
+        """Return new parameters with gains that are at most 1 in sum."""
+        return {"modes": _within(changed["modes"])}
+
+    def plausible(self, view: FitView) -> bool:
+        """Return whether no mode far above the excited frequencies, damped, just shifts in time or is hysteresis."""
+        highest = RINGS * view.excited_frequency()
+        return all(mode.frequency <= highest or mode.damping <= SHARP for mode in self.modes)
 
     @property
     def rest(self) -> float:
@@ -290,7 +327,7 @@ class Resonance(EffectBase):
         return StreamingResonance(self)
 
 
-def within(modes: Sequence[Mode]) -> tuple[Mode, ...]:
+def _within(modes: Sequence[Mode]) -> tuple[Mode, ...]:
     """Return the modes, with their gains reduced to a sum of at most 1."""
     total = max(sum(mode.gain for mode in modes), 1.0)
     return tuple(replace(mode, gain=mode.gain / total) for mode in modes)

@@ -2,40 +2,58 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from math import inf, isinf, isnan
-from typing import ClassVar
+from math import inf, isinf
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import EffectBase, EffectContext, FloatArray, ResidualView, Side, Signal, require_rules
+from slpi_ros.effects.base import EffectBase, EffectContext, FitView, FloatArray, ResidualView, Side, Signal
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
+from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Number of voltage bins; a bin is clipped if its gain is below this share of the median gain.
 BINS, STILL = 200, 0.35
 
 
+def _limit(default: float) -> Any:
+    fit = Fit("relative", lambda _, of: 1e-3 * of.voltage)
+    return parameter("V", "limit", -1e4, 1e4, default=default, required=True, none=True, fit=fit)
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    for near in (0.2, 0.1, 0.05, 0.0):
+        for seconds in (remaining(limits) / 12, remaining(limits) / 48):
+            for end in (1.0 - near, near):
+                path.to(end, max(seconds, safe_duration(1.0)))
+                path.hold(0.01 * limits.duration)
+
+
 @dataclass(frozen=True)
 class Saturation(EffectBase):
-    """Limits of the voltage at the piezo, which the limits of the command keep, see `passes`.
-
-    Parameters
-    ----------
-    lower, upper : float, volts
-        Limits; infinite (the default) for no limit.
-    """
+    """Limits of the voltage at the piezo, which the limits of the command keep, see `passes`."""
 
     name: ClassVar[str] = "saturation"
     acts_on: ClassVar[Signal] = "voltage"
     side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "the amplifier clips"
+    compensated: ClassVar[str] = "no voltage undoes it: displacements beyond it are out of reach"
+    excitation: ClassVar[Excitation] = Excitation(
+        "Peaks that come up to both limits in steps, slow and fast, with a hold at each: a clipped amplifier stops "
+        "at one voltage at any speed, where hysteresis and lag go on to the peak.",
+        _draw,
+    )
 
-    lower: float = -inf
-    upper: float = inf
+    lower: float = _limit(-inf)
+    upper: float = _limit(inf)
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require_rules(
+        """Validate the limits."""
+        super().__post_init__()
+        require(
             self,
-            ("lower", not isnan(self.lower) and self.lower < inf, "a voltage, or -inf for none"),
+            ("lower", self.lower < inf, "a voltage, or -inf for none"),
             ("upper", self.upper > self.lower, f"more than lower, {self.lower} V"),
         )
 
@@ -62,6 +80,16 @@ class Saturation(EffectBase):
         if upper > lower and (at_top or at_bottom):
             for shift in np.linspace(-1.0, 1.0, 9).tolist():
                 yield cls(lower + shift * width, upper - shift * width)
+
+    def plausible(self, view: FitView) -> bool:
+        """Return whether the stage stands still while the voltage changes beyond the limits."""
+        middle, dv, dy = outward_steps(view.v, view.y, view.used)
+        inside = (middle > self.lower) & (middle < self.upper)
+        usual = float(dv[inside] @ dy[inside] / max(float(dv[inside] @ dv[inside]), 1e-300))
+        for beyond in (middle >= self.upper, middle <= self.lower):
+            if beyond.any() and float(dv[beyond] @ dy[beyond]) > STILL * usual * float(dv[beyond] @ dv[beyond]):
+                return False
+        return True
 
     @property
     def passes(self) -> tuple[float, float]:

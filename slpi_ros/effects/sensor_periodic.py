@@ -12,54 +12,79 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
+    FitView,
     FloatArray,
     ResidualView,
+    Sharing,
     Side,
     Signal,
     StreamingBase,
     amplitude_and_phase,
-    require,
     strongest_lines,
     wave,
 )
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining
+from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Shortest and longest period (m), number of spectral peaks, and number of displacement bins of the candidates.
 SHORTEST, LONGEST, LINES, BINS = 50e-9, 2e-6, 4, 2**14
+# Shortest period in rms rounding errors: rounding repeats with every digit, which is sqrt(12) times its rms.
+ROUNDING_PERIOD = 1.3 * 12**0.5
+# Largest difference of the zeros of records, as a share of the period, for a common error.
+IN_PHASE = 0.1
 
 # Newton's method converges quadratically once the error is small.
 _STEPS = 60
 _CLOSE = 1e-12
 
 
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    for share in (1 / 6, 1 / 3):
+        loops(path, 0.0, 1.0, share * remaining(limits), 1, straight=True)
+
+
 @dataclass(frozen=True)
 class SensorPeriodic(EffectBase):
-    """Periodic sensor error, ``y = x + amplitude sin(2 pi x / period + phase)``.
-
-    Parameters
-    ----------
-    period : float, metres
-        Period in displacement; half or a quarter of the wavelength for an interferometer.
-    amplitude : float, metres
-        Less than ``period / 2 pi``, so that the reading increases with the displacement.
-    phase : float, radians, at displacement 0
-    """
+    """Periodic sensor error, ``y = x + amplitude sin(2 pi x / period + phase)``."""
 
     name: ClassVar[str] = "sensor_periodic"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "sensor"
+    what: ClassVar[str] = "interferometer error, periodic in the displacement"
+    compensated: ClassVar[str] = (
+        "not the stage: the readings are corrected, as long as the zero of the sensor does not move"
+    )
+    # A sensor may start each record with another phase.
+    sharing: ClassVar[Sharing] = "either"
+    excitation: ClassVar[Excitation] = Excitation(
+        "Slow ramps of constant speed over the whole range, at two speeds: an error of the sensor has the same "
+        "period in displacement at both speeds, hum the same in time, and hysteresis is smooth.",
+        _draw,
+    )
 
-    period: float
-    amplitude: float
-    phase: float
+    period: float = parameter(
+        "m", "period in displacement, such as half a wavelength", 1e-12, 1e3,
+        fit=Fit("relative", lambda value, _: 1e-5 * abs(value), 1e-9),
+    )  # fmt: skip
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0))
+    phase: float = parameter("rad", "phase at displacement 0", -1e3, 1e3, fit=Fit("angle", 1e-4))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require(
-            self,
-            ("period", 1e-12 <= self.period <= 1e3, "from 1e-12 to 1000 m"),
-            ("amplitude", 0 <= self.amplitude * 2 * pi < 0.99 * self.period, "0 or more, less than period / 2 pi"),
-            ("phase", abs(self.phase) <= 1e3, "within 1000 rad"),
-        )
+        """Validate the parameters, including invertibility."""
+        super().__post_init__()
+        require(self, ("amplitude", self.amplitude * 2 * pi < 0.99 * self.period, "less than period / 2 pi"))
+
+    def plausible(self, view: FitView) -> bool:
+        """Return whether the period is longer than that of rounding."""
+        return bool(self.period > ROUNDING_PERIOD * view.rounding)
+
+    def in_phase(self, view: FitView) -> bool:
+        """Return whether the phase is the same in all records.
+
+        If the zeros of the records differ, so may those of other records, and the phase there is unknown.
+        """
+        return float(np.ptp(view.zeros())) <= IN_PHASE * self.period
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the sensor reading, shape (N,), metres."""

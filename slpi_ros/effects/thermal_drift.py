@@ -7,40 +7,73 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FloatArray, ResidualView, Side, Signal, require
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectBase,
+    EffectContext,
+    FitView,
+    FloatArray,
+    ResidualView,
+    Side,
+    Signal,
+)
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
+from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Numbers of knots of the candidates.
 KNOTS = (2, 3, 5, 8, 13)
+# Shortest duration (s), and highest rate (share of the motion per second).
+TAKES, RATE = 10.0, 1e-2
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    # Motion takes 0.6 of each cycle.
+    shortest = 2 * max(limits.quickest(1.0), safe_duration(1.0)) / 0.6
+    repeats = min(max(int(remaining(limits) / shortest), 3), 8)
+    each = remaining(limits) / repeats
+    for _ in range(repeats):
+        path.to(1.0, 0.3 * each)
+        path.hold(0.2 * each)
+        path.to(0.0, 0.3 * each)
+        path.hold(0.2 * each)
 
 
 @dataclass(frozen=True)
 class ThermalDrift(EffectBase):
-    """A displacement that depends on time only, linear between knots and constant outside.
-
-    Parameters
-    ----------
-    times : tuple of float, length K >= 1, seconds
-        Knots from the record's start, strictly increasing.
-    values : tuple of float, length K, metres, displacement at the knots
-    """
+    """A displacement that depends on time only, linear between knots and constant outside."""
 
     name: ClassVar[str] = "thermal_drift"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "record"
+    what: ClassVar[str] = "slow change that does not follow the voltage"
+    compensated: ClassVar[str] = "no"
+    needs_feedback: ClassVar[bool] = True
+    excitation: ClassVar[Excitation] = Excitation(
+        "The same full loop over and over, with the same holds: voltage, memory and creep repeat, so what differs "
+        "from one repeat to the next follows time alone.",
+        _draw,
+        separates=("creep",),
+        order=1,
+    )
 
-    times: tuple[float, ...]
-    values: tuple[float, ...]
+    times: tuple[float, ...] = parameter("s", "times of the knots from the record's start", -1e9, 1e9)
+    values: tuple[float, ...] = parameter("m", "displacements at the knots", -1e3, 1e3, fit=Fit("linear", 1e-9))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Validate the knots."""
+        super().__post_init__()
         rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
         require(
             self,
-            ("times", 1 <= len(self.times) <= 10000 and rising, "1 to 10000 numbers, strictly increasing"),
-            ("times", all(abs(time) <= 1e9 for time in self.times), "within 1e9 s"),
+            ("times", rising, "strictly increasing"),
             ("values", len(self.values) == len(self.times), "one for each time"),
-            ("values", all(abs(value) <= 1e3 for value in self.values), "within 1000 m"),
         )
+
+    def plausible(self, view: FitView) -> bool:
+        """Return whether it is slow."""
+        pairs = zip(np.diff(self.values).tolist(), np.diff(self.times).tolist(), strict=True)
+        return self.times[-1] >= TAKES and all(abs(dy) <= RATE * view.motion * dt for dy, dt in pairs)
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with drift, shape (N,), metres."""

@@ -5,11 +5,11 @@ from itertools import cycle
 
 import numpy as np
 
+from slpi_ros.effects.excitation import MEAN_SPEED
 from slpi_ros.excitation.legs import DriveSpec, FloatArray, Path
 
-# Mean speed in voltage ranges per second, and the sequence of relative speeds: for a 100 V stage a mean of 70 V/s and
-# at most about 250 V/s. Different speeds separate time-dependent effects from hysteresis.
-MEAN_SPEED = 0.8
+# Sequence of speeds relative to the mean speed: for a 100 V stage a mean of 70 V/s and at most about 250 V/s. Different
+# speeds separate time-dependent effects from hysteresis.
 SPEEDS = (0.6, 1.0, 1.8)
 FAST, SLOW = 1.8, 0.6
 # Shorter moves take the time of a move over this share of the range, for several samples each.
@@ -29,7 +29,7 @@ def calibration(spec: DriveSpec, rng: np.random.Generator) -> Path:
     A sweep over the whole range comes first, to set a known hysteresis state. Reversal curves follow in random order,
     rising from minima and falling from maxima over the whole range, so that drift is not correlated with voltage; then
     nested loops. A longer duration gives more of each. `rng` draws the position of each reversal within its part of the
-    range, and the order.
+    range, and the order; the path starts and ends at the low end.
     """
     seed = int(rng.integers(2**63))
 

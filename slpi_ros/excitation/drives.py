@@ -5,10 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slpi_ros.effects.excitation import FEWEST_STEPS, MEAN_SPEED
+from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import UsageError
-from slpi_ros.excitation.calibration import MEAN_SPEED, calibration, sweep
-from slpi_ros.excitation.effects import EFFECTS, for_effect
-from slpi_ros.excitation.legs import FEWEST_STEPS, DriveSpec, FloatArray, Path
+from slpi_ros.excitation.calibration import calibration, sweep
+from slpi_ros.excitation.effects import effect_path, for_effect
+from slpi_ros.excitation.legs import DriveSpec, FloatArray, Path
 
 CALIBRATION, SWEEP = "calibration", "sweep"
 # Default slew limit: the voltage range in this time, seconds. Share of a slew limit that drives use: a late sample is
@@ -26,16 +28,14 @@ _WHY = {
 
 @dataclass(frozen=True)
 class Drive:
-    """Voltage signals of all axes of a stage.
-
-    The times `t` (s), shape (N,), are evenly spaced from 0. `voltage` (V), shape (N,) for each axis, starts and ends at
-    the rest voltage of the axis. `specs` are the limits and the rate of each axis, with the duration of the whole
-    drive; `why` is the purpose of the drive in one sentence.
-    """
+    """Voltage signals of all axes of a stage, shape (N,): times from 0, evenly spaced (s), and voltages by axis (V)."""
 
     t: FloatArray
+    # They start and end at the rest voltage of the axis.
     voltage: dict[str, FloatArray]
+    # With the duration of the whole drive.
     specs: dict[str, DriveSpec]
+    # Purpose of the drive in one sentence.
     why: str
 
     @property
@@ -133,7 +133,7 @@ def _turn(spec: DriveSpec, rest: float, drive: str, rng: np.random.Generator) ->
         case "sweep":
             inner = sweep(within)
         case _:
-            inner = for_effect(drive).path(within)
+            inner = effect_path(drive, within)
     path.legs += inner.legs
     if start:
         path.to(start, approach)
@@ -143,8 +143,8 @@ def _turn(spec: DriveSpec, rest: float, drive: str, rng: np.random.Generator) ->
 def _check(axes: Sequence[str], drive: str) -> None:
     if not axes or not all(axes) or len(set(axes)) != len(axes):
         raise UsageError(f"drive: axes are {list(axes)}; name at least one, each by a name of its own")
-    if drive not in DRIVES:
-        raise UsageError(f"no drive '{drive}'; choose one of {', '.join(DRIVES)}")
+    if drive not in (known := (*_WHY, *EFFECTS)):
+        raise UsageError(f"no drive '{drive}'; choose one of {', '.join(known)}")
     least = 1 if drive in _WHY else for_effect(drive).least_axes
     if len(axes) < least:
         raise UsageError(f"drive '{drive}': it takes {least} axes, not {len(axes)}; name them")
@@ -169,10 +169,9 @@ def _why(drive: str) -> str:
 
 
 class Playback:
-    """Playback of a drive sample by sample, within the limits of the drive.
+    """Playback of a drive sample by sample, within its limits; with `repeat` it restarts at the end until stopped.
 
-    With `repeat`, it restarts at the end until stopped. `stopping` tells whether the axes are returning to their rest
-    voltages after `stop`.
+    After `stop` it is `stopping` while the axes return to their rest voltages.
     """
 
     def __init__(self, drive: Drive, *, repeat: bool = False) -> None:

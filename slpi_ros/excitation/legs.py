@@ -6,14 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.effects.excitation import FEWEST_STEPS, STEEPEST
 from slpi_ros.errors import UsageError
 
 FloatArray = NDArray[np.float64]
 
-# Ratio of largest to mean slope of a raised cosine.
-STEEPEST = math.pi / 2
-# Smallest number of steps of a raised cosine.
-FEWEST_STEPS = 3
 # Largest number of samples of a drive.
 MOST_STEPS = 10_000_000
 # Largest magnitude of a voltage limit, volts.
@@ -22,24 +19,20 @@ MOST_VOLTAGE = 10_000.0
 
 @dataclass(frozen=True)
 class Leg:
-    """One move, or a hold if the target is the current position.
-
-    The target `to` is a share of the voltage range, 0..1; `seconds` is the desired duration, which the slew limit may
-    extend. A `straight` move has constant speed with sharp corners; otherwise it is a raised cosine, with zero speed at
-    both ends.
-    """
+    """One move, or a hold if the target, a share of the voltage range, is the current position."""
 
     to: float
+    # Desired duration, which the slew limit may extend.
     seconds: float
+    # Constant speed with sharp corners; else a raised cosine, with zero speed at both ends.
     straight: bool = False
 
 
 @dataclass(frozen=True)
 class DriveSpec:
-    """Voltage limits (V), duration (s), sampling rate (Hz) and slew limit (V/s) of one axis.
+    """Voltage limits (V), time of the last sample (s), sampling rate (Hz) and slew limit (V/s; 0: none) of one axis.
 
-    The first sample is at 0, the last at `duration`. `slew_limit` is the largest rate of change between samples, 0 for
-    no limit. UsageError if a value is invalid.
+    UsageError if a value is invalid.
     """
 
     low: float
@@ -85,7 +78,7 @@ class DriveSpec:
 
 
 class Path:
-    """A sequence of legs; `start` and `at`, the position after the last leg, are shares of the voltage range."""
+    """A sequence of legs; `start` and `at`: position (share of the range) before the first and after the last one."""
 
     def __init__(self, start: float = 0.0) -> None:
         self.start = self.at = start
@@ -115,11 +108,10 @@ class Path:
         return np.array(fewest, dtype=np.int64)
 
     def voltages(self, spec: DriveSpec) -> FloatArray:
-        """Return the voltages (V) along all legs, shape (spec.steps + 1,), with the duration of the drive.
+        """Return the voltages (V) along all legs, shape (spec.steps + 1,); every reversal coincides with a sample.
 
-        The time beyond the shortest durations is distributed in proportion to desired minus shortest duration; every
-        reversal coincides with a sample. UsageError if the duration is too short for the legs at this slew limit and
-        rate.
+        The time beyond the shortest durations is distributed in proportion to desired minus shortest duration.
+        UsageError if the duration is too short for the legs at this slew limit and rate.
         """
         fewest = self.fewest_steps(spec)
         spare = spec.steps - int(fewest.sum())

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.resources import files
 from itertools import islice
+from operator import ge, gt, le, lt
 from typing import Any
 
 from slpi_ros.errors import ModelError, UsageError, dependencies_needed
@@ -71,6 +72,7 @@ _TYPES = {"object": (dict,), "array": (list,), "string": (str,), "number": (floa
 _TYPES |= {"integer": (int,), "boolean": (bool,)}
 # Keywords that restrict nothing, or that are evaluated with another one.
 _NEUTRAL = frozenset(("description", "title", "$schema", "$defs", "then"))
+_BOUNDS = {"minimum": ge, "maximum": le, "exclusiveMinimum": gt, "exclusiveMaximum": lt}
 _SIZES = {"minItems": list, "maxItems": list, "minProperties": dict, "maxProperties": dict, "maxLength": str}
 
 
@@ -96,14 +98,8 @@ def _satisfies(value: Any, keyword: str, schema: Mapping[str, Any], root: Mappin
             return isinstance(value, str) and value == wanted
         case "enum":
             return isinstance(value, str) and value in wanted
-        case "minimum" | "maximum" | "exclusiveMinimum":
-            if type(value) not in (int, float):
-                return True
-            return bool(
-                value <= wanted
-                if keyword == "maximum"
-                else value > wanted or (keyword == "minimum" and value == wanted)
-            )
+        case _ if keyword in _BOUNDS:
+            return type(value) not in (int, float) or bool(_BOUNDS[keyword](value, wanted))
         case _ if keyword in _SIZES:
             if not isinstance(value, _SIZES[keyword]):
                 return True

@@ -18,8 +18,6 @@ from slpi_ros.model.sensor import Sensor
 from slpi_ros.model.stage_model import StageModel
 
 SCHEMA, EARLIER = "slpi_ros/model/2", "slpi_ros/model/1"
-# Effects whose parameters are a list since version 2: name of the list, and what version 1 meant without saying it.
-LISTS: dict[str, tuple[str, dict[str, float]]] = {"resonance": ("modes", {"gain": 1.0}), "hum": ("lines", {})}
 # Names of the fields of `FitQuality`, in order.
 QUALITY = ("rms_m", "maximum_m", "held_out_rms_m", "floor_rms_m", "samples", "covered", "source")
 
@@ -73,18 +71,13 @@ def _update(document: dict[str, Any], source: str) -> None:
             name, given, spread = (
                 effect.get(key) if isinstance(effect, dict) else None for key in ("name", "parameters", "uncertainty")
             )
-            if not isinstance(name, str) or not isinstance(given, dict):
+            if not isinstance(name, str) or name not in registry.EFFECTS or not isinstance(given, dict):
                 continue
-            if name == "rate_dependence" and "exponent" in given:
-                raise ModelError(
-                    f"{source}: axis {axis[:40]!r}: rate_dependence has a retired form (a power of the rate); identify "
-                    "and diagnose again from its bags"
-                )
-            if name in LISTS and "gain" not in given:
-                key, unsaid = LISTS[name]
-                effect["parameters"] = {key: [given | unsaid]}
-                if isinstance(spread, dict):
-                    effect["uncertainty"] = {f"{key}.0.{part}": deviation for part, deviation in spread.items()}
+            try:
+                parameters, uncertainty = registry.EFFECTS[name].from_version_1(given, spread)
+            except ModelError as error:
+                raise ModelError(f"{source}: axis {axis[:40]!r}: {error}") from None
+            effect |= {"parameters": parameters} | ({"uncertainty": uncertainty} if "uncertainty" in effect else {})
 
 
 def model_from(document: dict[str, Any], source: str) -> StageModel:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, Mask, StartMemory
+from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.sensor import Sensor, corrected
 from slpi_ros.model.streaming import StageStream, StreamingInverse

@@ -8,10 +8,10 @@ from typing import Any
 
 from slpi_ros.effects.base import Effect, StreamingAround, StreamingEffect
 from slpi_ros.effects.chain import Chain
-from slpi_ros.effects.cross_coupling import Coupling
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
 from slpi_ros.hysteresis.turning_points import Memory, MemoryState
 from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 
 StreamingEffects = dict[str, StreamingEffect]

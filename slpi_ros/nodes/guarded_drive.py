@@ -15,8 +15,8 @@ from std_msgs.msg import Float64MultiArray
 
 from slpi_ros.calibration.drive_watch import DriveWatch
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
+from slpi_ros.effects.excitation import MEAN_SPEED
 from slpi_ros.errors import RecordError, SlpiError
-from slpi_ros.excitation.calibration import MEAN_SPEED
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, RateLimiter
 from slpi_ros.nodes.common import COMMANDS

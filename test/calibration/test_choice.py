@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from calibration.stages import settings
 
-from slpi_ros.calibration.choice import UNCOVERED, next_drive
+from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.settings import CALIBRATION, EFFECT
 from slpi_ros.diagnosis.result import AMBIGUOUS, NAMED, NOTHING_FOUND, UNEXPLAINED, AxisDiagnosis, NamedEffect, Traces
 from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.registry import EFFECTS
 
 NOTHING = np.empty(0)
+# Effects whose conditions the calibration drive lacks.
+UNCOVERED = [name for name, effect in EFFECTS.items() if effect.excitation.lacking]
 SURVEY = [(drive, ("x",)) for drive in UNCOVERED]
 
 

@@ -7,6 +7,7 @@ import pytest
 import slpi_ros
 from benchmarks.hidden import hide
 from slpi_ros.diagnosis import diagnose as module
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.io.tables import import_table
 
 pytestmark = pytest.mark.slow
@@ -30,7 +31,7 @@ def test_causes_that_make_the_fitted_record_worse_are_dropped(hidden, monkeypatc
         return replace(found, effects=effects)
 
     def drifting(origin):
-        return module.GainDrift((0.0,), (0.2,), origin)
+        return GainDrift((0.0,), (0.2,), origin)
 
     (sound,) = slpi_ros.diagnose(record, model).axes.values()
     assert "creep" in [one.name for one in sound.effects]

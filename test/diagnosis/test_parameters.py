@@ -1,19 +1,18 @@
 """The free parameters of every effect as one vector."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from effects.cases import EVERY
 from hypothesis import given
 
-from slpi_ros.diagnosis.effect_parameters import FREE, bounded, certain, free, moved, names, of_starts, steps
+from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, names, of_starts, steps
+from slpi_ros.effects.parameters import facts_of
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS
 
 T, V = np.linspace(0, 10, 1001), np.linspace(0, 100, 1001)
-
-
-def test_every_effect_has_free_parameters():
-    assert FREE.keys() == EFFECTS.keys()
 
 
 @given(EVERY)
@@ -53,5 +52,7 @@ def test_the_uncertainty_of_a_logarithm_is_in_the_unit_of_the_parameter():
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_free_parameters_are_fields(name):
-    assert set(FREE[name]) <= set(EFFECTS[name].__dataclass_fields__)
+def test_every_field_but_the_uncertainty_is_a_parameter_with_facts(name):
+    facts = facts_of(EFFECTS[name])
+    assert {*facts, "uncertainty"} == {each.name for each in fields(EFFECTS[name])}
+    assert all(each.meaning and each.count[0] <= each.count[1] for each in facts.values())

@@ -1,10 +1,13 @@
 """What records say before anything is fitted to them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from slpi_ros.diagnosis.prepare import Evidence, Part, excited_frequency
-from slpi_ros.diagnosis.selection import _is_harmonic
+from slpi_ros.diagnosis.selection import seen
+from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.identification.bases import SurfaceBasis
 
 T = np.arange(20_000) / 1000
@@ -29,7 +32,8 @@ def test_a_sine_excites_its_own_frequency(frequency):
 @pytest.mark.parametrize(("frequency", "expected"), [(2.5, True), (12.5, True), (3.1, False), (50.0, False)])
 def test_only_low_multiples_of_the_drive_may_be_hysteresis(frequency, expected):
     triangle = np.abs((1.25 * T) % 1.0 - 0.5) * 100
-    assert _is_harmonic(frequency, evidence(triangle)) is expected
+    view = seen(SimpleNamespace(evidence=evidence(triangle), t=T, u=0, h=0, y=0, used=0, effects=()))
+    assert Hum((Line(frequency, 1e-9, 0.0),)).plausible(view) is not expected
 
 
 def test_the_fastest_record_counts():

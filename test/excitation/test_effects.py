@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from excitation.loops import fastest, holds, turning_points
 
-from slpi_ros.effects.registry import EFFECTS as REGISTRY
+from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import UsageError
 from slpi_ros.excitation.drives import CALIBRATION, DRIVES, SWEEP, excite
-from slpi_ros.excitation.effects import EFFECTS, for_effect
+from slpi_ros.excitation.effects import for_effect, separating
 from slpi_ros.simulation.dynamics import FlexureMode, Relaxation
 
 RATE = 200.0
@@ -46,13 +46,30 @@ def bursts(v):
 
 
 def test_there_is_a_drive_for_every_effect():
-    assert set(EFFECTS) == set(REGISTRY) and set(DRIVES) == set(REGISTRY) | {CALIBRATION, SWEEP}
-    for name, effect in EFFECTS.items():
-        assert for_effect(name) is effect and effect.effect == name
+    assert set(DRIVES) == set(EFFECTS) | {CALIBRATION, SWEEP}
+    for name in EFFECTS:
+        effect = for_effect(name)
         assert effect.why.endswith(".") and effect.why.count(". ") == 0 and len(effect.why) > 80
         json.dumps(effect.why)
     with pytest.raises(UsageError, match="friction"):
         for_effect("friction")
+
+
+@pytest.mark.parametrize(
+    ("names", "drive"),
+    [
+        (("delay", "lag"), "lag"),
+        (("delay", "rate_dependence", "lag", "creep"), "lag"),
+        (("delay", "rate_dependence"), "rate_dependence"),
+        (("creep", "thermal_drift", "gain_drift"), "gain_drift"),
+        (("creep", "thermal_drift", "lag"), "thermal_drift"),
+        (("rate_dependence", "creep"), "creep"),
+        (("delay", "resonance"), "resonance"),
+        (("hum", "sensor_periodic"), "hum"),
+    ],
+)
+def test_the_drive_that_separates_ambiguous_effects(names, drive):
+    assert separating(names) == drive
 
 
 def test_a_sweep_visits_both_ends_once():
@@ -78,7 +95,7 @@ def test_each_keeps_to_its_limits_and_wipes_the_memory_first(effect, duration, s
         assert turning_points(v)[0] == 80.0
 
 
-@pytest.mark.parametrize("effect", sorted(set(REGISTRY) - {"resonance"}))
+@pytest.mark.parametrize("effect", sorted(set(EFFECTS) - {"resonance"}))
 def test_no_move_but_a_small_step_is_abrupt(effect):
     t, v, _ = drive(effect)
     assert fastest(t, v) < 600.0

@@ -1,0 +1,48 @@
+"""Linear coupling of the axes of a stage."""
+
+from collections.abc import Mapping
+from typing import TypeVar
+
+import numpy as np
+
+from slpi_ros.effects.base import FloatArray
+
+Motion = TypeVar("Motion", float, FloatArray)
+
+
+class Coupling:
+    """Linear coupling of all axes: the observed motions are ``(I + G) m``, with ``m`` the motions without coupling.
+
+    ``gains[x][y]`` is the displacement of x per metre of y; axes that are not in the mapping have no coupling, and
+    without any gain it is not `on`.
+    """
+
+    def __init__(self, gains: Mapping[str, Mapping[str, float]]) -> None:
+        self._gains = {
+            name: {other: gain for other, gain in row.items() if other in gains and other != name and gain}
+            for name, row in gains.items()
+        }
+        self.on = any(self._gains.values())
+        self._solutions: dict[tuple[str, ...], list[list[float]]] = {}
+
+    def part(self, name: str, motions: Mapping[str, Motion]) -> Motion | float:
+        """Return the displacement (m) of axis `name` caused by the own motions of the others, 0 for missing axes."""
+        return sum((gain * motions[other] for other, gain in self._gains[name].items() if other in motions), 0.0)
+
+    def decouple(self, seen: Mapping[str, Motion], resting: Mapping[str, Motion]) -> dict[str, Motion]:
+        """Return the own motions (m), those without coupling, that produce the observed ones, `seen` (m).
+
+        Each from the start, a number or of shape (N,). `resting` are own motions (m) of axes held in position.
+        """
+        left = {name: motion - self.part(name, resting) for name, motion in seen.items()}
+        rows = self._solution(tuple(seen))
+        return {
+            name: sum(share * motion for share, motion in zip(row, left.values(), strict=True))  # type: ignore[misc]
+            for name, row in zip(seen, rows, strict=True)
+        }
+
+    def _solution(self, names: tuple[str, ...]) -> list[list[float]]:
+        if names not in self._solutions:
+            matrix = [[float(one == other) + self._gains[one].get(other, 0.0) for other in names] for one in names]
+            self._solutions[names] = np.linalg.inv(np.array(matrix)).tolist()
+        return self._solutions[names]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.hysteresis import compilation, rate_law
 from slpi_ros.hysteresis.rate_law import LARGEST
-from slpi_ros.hysteresis.turning_points import END, Branches
+from slpi_ros.hysteresis.shapes import END, Branches
 
 FloatArray = NDArray[np.float64]
 Function = TypeVar("Function", bound=Callable[..., Any])

@@ -18,7 +18,8 @@ from slpi_ros.hysteresis import multi_slope as smpi
 from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.hysteresis.turning_points import FAR, Memory
+from slpi_ros.hysteresis.shapes import FAR
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.limits import Limits, decaying_turns
 from slpi_ros.model.sensor import IDEAL, Sensor, StreamingSensor
 from slpi_ros.model.streaming import ROUNDING, StreamingInverse, accepted_range, refusal

@@ -106,8 +106,8 @@ class RateDependence(EffectBase):
 
         The inverse of the law and of the hysteresis, from equilibrium at the present state of `memory`, which moves.
         """
-        law = np.array([self.threshold, self.onset_rate, self.reversible_gain])
-        return memory.inverse_of_law_array(t, h, law, limits)
+        dt = np.diff(t, prepend=t[:1])
+        return memory.inverse_of_law_array(dt, h, self.laws()["rate"], limits)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the applied voltage, shape (N,), volts, for the felt voltage `signal`; it starts at equilibrium."""
@@ -154,6 +154,10 @@ class RateDependence(EffectBase):
             f"above {self.onset_rate:.3g} V/s the loops are wider by {decade:.3g} V on either side for each decade of "
             f"the rate; {self.reversible_gain * 1e9:.3g} nm/V of the motion does not wait"
         )
+
+    def laws(self) -> Mapping[str, FloatArray]:
+        """Return threshold (V), onset rate (V/s) and reversible gain (m/V) for the compiled inverse."""
+        return {"rate": np.array([self.threshold, self.onset_rate, self.reversible_gain])}
 
     def streaming(self) -> "StreamingRateDependence":
         """Return the streaming rate law."""

@@ -347,8 +347,8 @@ class Memory:
         if coordinate and not lower <= self._v <= upper:
             self.forward(min(max(self._v, lower), upper))
         out = np.empty_like(x)
-        direction, point, turns, depth = self._arrays(x.size)
-        shape = self._shape_arrays()
+        direction, point, turns, depth = self.arrays(x.size)
+        shape = self.shape_arrays()
         done, direction, depth, _ = through(
             *(x, coordinate, float(lower), float(upper), out, direction, point, turns, depth),
             np.empty((3, 0), dtype=np.int64) if walk is None else walk,
@@ -365,7 +365,7 @@ class Memory:
         return out
 
     def inverse_of_law_array(
-        self, t: FloatArray, h: FloatArray, law: FloatArray, limits: tuple[float, float]
+        self, dt: FloatArray, h: FloatArray, law: FloatArray, limits: tuple[float, float]
     ) -> tuple[FloatArray, FloatArray]:
         """Return the voltages (V) before a rate law, and the displacements (m) that they reach, shape (N,) each.
 
@@ -374,22 +374,23 @@ class Memory:
         from slpi_ros.hysteresis.compiled import through_law
 
         v, reached = np.empty_like(h), np.empty_like(h)
-        direction, point, turns, depth = self._arrays(2 * h.size + 2)
-        done = through_law(
-            *(t, h, law, float(limits[0]), float(limits[1]), v, reached, direction, point, turns, depth),
-            *self._shape_arrays(),
+        direction, point, turns, depth = self.arrays(2 * h.size + 2)
+        state = np.array([self._v, 0.0, 0.0, 0.0, np.nan])
+        done, _, _ = through_law(
+            *(dt, h, law, float(limits[0]), float(limits[1]), v, reached, state, direction, point, turns, depth),
+            *self.shape_arrays(),
         )
         if done < h.size:
             raise UsageError(f"displacement {h[done]} m cannot be reached by this model; leave such samples out")
         return v, reached
 
-    def _arrays(self, more: int) -> tuple[float, FloatArray, FloatArray, int]:
+    def arrays(self, more: int) -> tuple[float, FloatArray, FloatArray, int]:
         """Return direction, current point, stack with room for `more` reversals, and depth, for the compiled engine."""
         turns = np.empty((2, self.depth + more))
         turns[:, : self.depth] = self._turns
         return float(self._direction), np.array([self._v, self._y]), turns, self.depth
 
-    def _shape_arrays(self) -> tuple[FloatArray, bool, FloatArray, Branches]:
+    def shape_arrays(self) -> tuple[FloatArray, bool, FloatArray, Branches]:
         """Return rest point, symmetry, knots of the first rise, and branches, for the compiled engine."""
         first = np.ascontiguousarray(self._shape.first_rise(self._rest[0]).knots)
         return np.array(self._rest, dtype=np.float64), self._shape.symmetric_rest, first, self._shape.branches

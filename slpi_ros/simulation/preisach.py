@@ -431,6 +431,16 @@ class PreisachStage:
         self._relays.step(v)
         return self._displacement()
 
+    # Alone in its stage, or beside others that do not move it; it does not drift.
+    coupling = 0.0
+
+    def begin_drift(self, t: float) -> None:
+        """Do nothing."""
+
+    def read(self, t: float, motion: float) -> float:
+        """Return the displacement (m), which is the reading without noise."""
+        return motion
+
     def measure(self, y_true: float) -> float:
         """Return the sensor reading (m) at a displacement (m)."""
         return float(self._sensor.read(np.asarray(y_true)))

@@ -15,7 +15,6 @@ from strategies import axis_model, cases, paths
 
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.cross_coupling import CrossCoupling
-from slpi_ros.effects.delay import Delay
 from slpi_ros.model.axis_model import START_MEMORIES, AxisModel
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel

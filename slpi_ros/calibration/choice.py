@@ -7,6 +7,7 @@ from slpi_ros.calibration.settings import CALIBRATION, EFFECT, CalibrationSettin
 from slpi_ros.diagnosis.result import AMBIGUOUS, SEPARATES, UNEXPLAINED, AxisDiagnosis
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.effects import EFFECTS
+from slpi_ros.model.axis_model import ABOVE_FLOOR
 
 COUPLING = "cross_coupling"
 # Conditions that the calibration drive lacks, with the drive that has them and what it may reveal at least, as a share
@@ -18,8 +19,6 @@ UNCOVERED = {
 # A cause that is named is worth this part of its share until the drive for it has been recorded; nothing below
 # LEAST is worth a record. No drive is recorded more often than MOST.
 CONFIRMED, LEAST, MOST = 0.3, 0.05, 2
-# An error up to this multiple of the repeatability floor has nothing more to tell.
-AT_FLOOR = 1.5
 
 
 @dataclass(frozen=True)
@@ -91,10 +90,10 @@ def _promises(found: AxisDiagnosis | None) -> list[tuple[str, float, str]]:
                 drive = next((chosen for pair, chosen in SEPARATES if pair <= names), named.name)
                 others = ", ".join(named.alternatives)
                 offers.append((drive, named.share_of_residual, f"{named.name} may as well be {others}"))
-    if found.verdict == UNEXPLAINED and found.after_rms > AT_FLOOR * found.floor_rms:
+    if found.verdict == UNEXPLAINED and found.after_rms > ABOVE_FLOOR * found.floor_rms:
         share = 1.0 - (found.floor_rms / found.after_rms) ** 2
         offers.append((CALIBRATION_DRIVE, share, "an error that no known cause explains; more loops of every size"))
-    if found.after_rms > AT_FLOOR * found.floor_rms:
+    if found.after_rms > ABOVE_FLOOR * found.floor_rms:
         for named in found.effects:
             if not named.alternatives and named.name in EFFECTS:
                 share = CONFIRMED * named.share_of_residual

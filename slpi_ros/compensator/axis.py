@@ -12,7 +12,7 @@ from slpi_ros.compensator.model_swap import continue_from, require_near, take_ov
 from slpi_ros.compensator.persistence import RESETTING, MemoryConfidence
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
-from slpi_ros.compensator.statistics import TrackingError
+from slpi_ros.compensator.statistics import TrackingStatistics
 from slpi_ros.compensator.validation import Stamps, implausible
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.lag import Lag
@@ -77,7 +77,7 @@ class Axis:
         Time of the next `tick`; None if nothing follows.
     point_ns : int or None, nanoseconds
         Deadline of the last sample on the trajectory clock; None if it was not a trajectory point.
-    tracking : TrackingError
+    tracking : TrackingStatistics
         Statistics of measured - desired displacement.
     fault : Fault or None
         Fault of the sensor for which the feedback was switched off.
@@ -103,7 +103,7 @@ class Axis:
         self.given_ns = 0
         self.due_ns: int | None = None
         self.point_ns: int | None = None
-        self.tracking = TrackingError()
+        self.tracking = TrackingStatistics()
         self.fault: Fault | None = None
         self._loop_settings = loop_settings
         self._feedback: Feedback | None = None

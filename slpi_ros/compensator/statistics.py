@@ -135,7 +135,7 @@ class TrackingReport:
     maximum: float
 
 
-class TrackingError:
+class TrackingStatistics:
     """Collect the tracking error, measured - desired, of one axis.
 
     Attributes

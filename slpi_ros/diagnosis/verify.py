@@ -37,7 +37,7 @@ SCHEMA = "slpi_ros/verification/1"
 # Default tolerance as a multiple of the repeatability floor.
 TIMES_THE_FLOOR = 3.0
 # A delay is accepted if it reduces the difference between model and desired displacement by this factor.
-BETTER = 1.1
+SMALLER_DIFFERENCE = 1.1
 # A change of gain contributes to the offset if the error after fitting it is below this share of the error before.
 MOSTLY = 0.5
 # Approximate number of samples from which tables are computed.
@@ -567,7 +567,7 @@ def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
     shifts = np.linspace(0.0, longest, DELAY_STEPS + 1)
     misses = [_rms(model - np.interp(t - shift, t, desired)) for shift in shifts.tolist()]
     best = int(np.argmin(misses))
-    return float(shifts[best]) if misses[best] < misses[0] / BETTER else 0.0
+    return float(shifts[best]) if misses[best] < misses[0] / SMALLER_DIFFERENCE else 0.0
 
 
 def _at_limit(v: FloatArray, command: FloatArray) -> Mask:

@@ -160,7 +160,7 @@ def p11_stage(seed: int = 0) -> Stage:
 
 
 def p11_axes(seed: int = 0) -> dict[str, PreisachStage]:
-    """Return the axes of a stage similar to the P11.XY100 of the MPI paper: two axes, 0 to 120 V nominal, with creep and resonance.
+    """Return axes similar to those of the P11.XY100 of the MPI paper: 0 to 120 V nominal, with creep and resonance.
 
     - -20 to 150 V: stated (section 2.1).
     - Peak of 89.189 µm for a triangle of 120 V at 1 Hz: Table 1, where ``a`` is the peak at 1 Hz. The stroke of the

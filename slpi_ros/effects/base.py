@@ -228,11 +228,6 @@ class AroundHysteresis(Effect, Protocol):
     def beside(self, v: FloatArray, u: FloatArray) -> FloatArray:
         """Return the displacement (m) beside the hysteresis for applied and felt voltages (V), shape (N,) each."""
 
-    def command(
-        self, t: FloatArray, h: FloatArray, memory: Memory, limits: tuple[float, float]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the applied voltages (V) for displacements `h` (m), and what they reach (m), shape (N,) each."""
-
 
 @dataclass(frozen=True)
 class Candidate:

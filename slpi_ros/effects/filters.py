@@ -95,26 +95,22 @@ class Mode:
         rate = self.omega * sqrt(1 - self.damping**2)
         return np.asarray(np.exp(-decay_rate * t) * (np.cos(rate * t) + decay_rate / rate * np.sin(rate * t)))
 
-    def transfer(
-        self, dt: float, direct: float = 0.0, position: float = 1.0, velocity: float = 0.0
-    ) -> tuple[FloatArray, FloatArray]:
+    def transfer(self, dt: float) -> tuple[FloatArray, FloatArray]:
         """Return the discrete transfer function with step `dt` (s), numerator and denominator, shape (3,) each.
 
-        For an input linear between samples; the output is a weighted sum of the input, `position` and `velocity` (s).
+        For an input linear between samples.
         """
         m11, m12, m21, m22 = mode_transition(self.omega, self.damping, dt)
         late = self.lag / dt
         # Response of position and velocity to the input at the start and at the end of a step.
         p0, p1 = late - m11 * (1 + late) + m12 / dt, 1 - late + m11 * late - m12 / dt
-        v0, v1 = -1 / dt - m21 * (1 + late) + m22 / dt, 1 / dt + m21 * late - m22 / dt
+        v1 = 1 / dt + m21 * late - m22 / dt
+        v0 = -1 / dt - m21 * (1 + late) + m22 / dt
         total, product = mode_poles(self.omega, self.damping, dt)
         denominator = np.array([1.0, -total, product])
         moved = np.array([p1, p0 - m22 * p1 + m12 * v1, m12 * v0 - m22 * p0])
-        moving = np.array([v1, v0 - m11 * v1 + m21 * p1, m21 * p0 - m11 * v0])
-        # Remove rounding errors from the static gains.
-        moved *= denominator.sum() / moved.sum()
-        moving[1] -= moving.sum()
-        return direct * denominator + position * moved + velocity * moving, denominator
+        # Remove rounding errors from the static gain.
+        return moved * (denominator.sum() / moved.sum()), denominator
 
 
 class StreamingMode:

@@ -1,7 +1,7 @@
 """Compiled evaluation of whole paths through effects with a state that changes from sample to sample.
 
 `inverse_path` does at each sample what `slpi_ros.model.streaming.StreamingInverse.move` does, with the same rounding:
-changes of one are changes of both.
+changes of one are changes of both. The machine code is kept until this file changes, not those that it calls.
 """
 
 from typing import NamedTuple
@@ -248,6 +248,7 @@ def inverse_path(
     upper: float,
     longest: float,
     rounding: tuple[float, float],
+    far: float,
     laws: Laws,
     out: FloatArray,
     held: NDArray[np.bool_],
@@ -272,6 +273,8 @@ def inverse_path(
         Longest step that counts: before, the voltage is held.
     rounding : (float, float), metres and 1
         Differences of displacements, and relative ones of voltages, up to which they are equal.
+    far : float, metres
+        Largest distance of a displacement of the hysteresis from rest.
     out : ndarray, shape (N,), volts
         Output: the commands.
     held : ndarray of bool, shape (N,)
@@ -323,6 +326,8 @@ def inverse_path(
             h = resonance_inverse(counted, h, factors, inputs, times, values)
         if k:
             h = creep_inverse(counted, h, creep)
+        if not abs(h - rest[1]) < far:
+            return n
         v_0, y_0, s_0, depth_0, rate_0 = point[0], point[1], at[0], at[1], rate[0]
         at[3] = 0
         if has_rate:

@@ -99,16 +99,6 @@ class RateDependence(EffectBase):
         lead *= self.reversible_gain
         return lead
 
-    def command(
-        self, t: FloatArray, h: FloatArray, memory: "Memory", limits: tuple[float, float]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the applied voltage (V), and what it reaches of the displacements `h` (m), shape (N,) each.
-
-        The inverse of the law and of the hysteresis, from equilibrium at the present state of `memory`, which moves.
-        """
-        dt = np.diff(t, prepend=t[:1])
-        return memory.inverse_of_law_array(dt, h, self.laws()["rate"], limits)
-
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the applied voltage, shape (N,), volts, for the felt voltage `signal`; it starts at equilibrium."""
         whole = []

@@ -99,6 +99,11 @@ class Memory:
         """Number of reversals on the stack."""
         return len(self._turns[0])
 
+    @property
+    def far(self) -> float:
+        """Largest distance of a displacement from rest, metres."""
+        return self._far[1]
+
     def snapshot(self) -> MemoryState:
         """Return the complete state for `restore`."""
         return MemoryState(self._direction, self._v, self._y, tuple(self._turns[0]), tuple(self._turns[1]))

@@ -255,7 +255,7 @@ class StreamingInverse:
                 return v, self._beyond(v, h - reached)
             direction, point, turns, depth = self.memory.arrays(4 * y.size + 4)
             done = inverse_path(
-                *(dt, h, *voltages, MAX_DT, (self._rounding, ROUNDING), Laws(**laws), v, held),
+                *(dt, h, *voltages, MAX_DT, (self._rounding, ROUNDING), self.memory.far, Laws(**laws), v, held),
                 *(point, turns, direction, depth, *self.memory.shape_arrays()),
             )
             if done < y.size:

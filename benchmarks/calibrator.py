@@ -24,7 +24,7 @@ from slpi_ros.identification.fit import identify
 from slpi_ros.io.record import Record
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.simulation.character import CharacterStage
+from slpi_ros.simulation.stage import Stage
 
 RATE, NOISE, BUDGET, FIXED = 200.0, 8e-9, 300.0, 30.0
 LIMITS = Limits(0.0, 100.0, 1000.0, 1e5)
@@ -39,7 +39,7 @@ ALIKE, UNDONE, RATIO = {"delay", "lag"}, 5e-4, 1.5
 class Bench:
     """A simulated stage in stage time, and the voltages that it was given."""
 
-    def __init__(self, stage: CharacterStage) -> None:
+    def __init__(self, stage: Stage) -> None:
         self.stage, self.now = stage, 1000.0
         self.requests: list[Request] = []
 
@@ -65,9 +65,9 @@ class Bench:
         return y
 
 
-def hidden(axes: Sequence[str], seed: int) -> CharacterStage:
+def hidden(axes: Sequence[str], seed: int) -> Stage:
     """Return the stage of a seed, at rest."""
-    return CharacterStage.hidden(axes, seed, NOISE, rate=RATE, voltage_max=LIMITS.upper)
+    return Stage.hidden(axes, seed, NOISE, rate=RATE, voltage_max=LIMITS.upper)
 
 
 def settings_for(axes: Sequence[str]) -> CalibrationSettings:

@@ -28,7 +28,8 @@ from slpi_ros.hysteresis.branches import trace
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import MultiSlope, thresholds_for
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.hysteresis.turning_points import Memory, Shape
+from slpi_ros.hysteresis.shapes import Shape
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 
 FloatArray = NDArray[np.float64]

@@ -13,7 +13,7 @@ from math import inf, nan, sin
 
 import numpy as np
 
-from slpi_ros.compensator.controller import Controller, Mode
+from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.persistence import SavedAxis
 from slpi_ros.compensator.ramps import Safety
@@ -369,7 +369,7 @@ class Episode:
         self.wait(self.rng.choice([0.01, 0.1, 1.0, 1.0]))
 
     def reset(self) -> None:
-        if not self.made.active or self.made.mode is Mode.TRAJECTORY:
+        if not self.made.active or self.made.mode is OperatingMode.TRAJECTORY:
             return
         span = self.rng.choice([[], [(30.0, 40.0)] * 2])
         try:

@@ -18,7 +18,7 @@ from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, excite
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, RateLimiter
-from slpi_ros.simulation.character import CharacterStage
+from slpi_ros.simulation.stage import Stage
 
 LIES = ("replayed", "frozen", "stale stamps", "sign flipped", "moved by 1 mm", "effort 0", "effort stays", "silent")
 DRIVERS = ("exciter", "calibrator")
@@ -99,7 +99,7 @@ def drives_of(driver: str, axes: Sequence[str], seed: int, slew: float, drive: s
     return [checking(settings), exciting(settings, drive, seconds, axes, seed)]
 
 
-def driven(stage: CharacterStage, drive: Drive, limits: Limits, begun: float) -> _Truth:
+def driven(stage: Stage, drive: Drive, limits: Limits, begun: float) -> _Truth:
     """Return what the stage does during a drive through the rate limiter; it rests two seconds afterwards."""
     goals = np.column_stack(list(drive.voltage.values()))
     goals = np.vstack([goals, np.repeat(goals[-1:], round(0.3 / PERIOD), axis=0)])
@@ -114,7 +114,7 @@ def driven(stage: CharacterStage, drive: Drive, limits: Limits, begun: float) ->
 
 
 def live(
-    driver: str, lie: str, stage: CharacterStage, sensor: Sensor, seed: int,
+    driver: str, lie: str, stage: Stage, sensor: Sensor, seed: int,
     *, slew: float = 1000.0, drive: str = "calibration", seconds: float = 30.0, at: float = 0.5,
 ) -> Life:  # fmt: skip
     """Return what the watch finds in a run in which a sensor begins to lie at a share of the last drive; "" : none."""
@@ -224,9 +224,9 @@ def _told(
     return stamp, v, reading
 
 
-def stage_of(seed: int) -> CharacterStage:
+def stage_of(seed: int) -> Stage:
     """Return a stage with one or two hidden effects."""
-    return CharacterStage.hidden(["x"], seed, 8e-9, rate=1.0 / PERIOD, voltage_max=HIGH)
+    return Stage.hidden(["x"], seed, 8e-9, rate=1.0 / PERIOD, voltage_max=HIGH)
 
 
 def lies(count: int) -> None:

@@ -30,7 +30,7 @@ import slpi_ros  # noqa: E402
 from benchmarks.paths import scan_path  # noqa: E402
 from slpi_ros.reports.page import Page, png  # noqa: E402
 from slpi_ros.reports.text import describe_model  # noqa: E402
-from slpi_ros.simulation.character import CharacterStage  # noqa: E402
+from slpi_ros.simulation.stage import Stage  # noqa: E402
 
 RATE = 100.0
 V_MIN, V_MAX, SLEW = 0.0, 100.0, 1000.0
@@ -147,7 +147,7 @@ def write_page(
 
 def hidden_and_found(seed: int, model: slpi_ros.StageModel) -> str:
     """Return a sentence about the effects of the stage, and those in the model."""
-    hidden = CharacterStage.hidden(("x",), seed, NOISE, rate=RATE, voltage_max=V_MAX).effects["x"]
+    hidden = Stage.hidden(("x",), seed, NOISE, rate=RATE, voltage_max=V_MAX).effects["x"]
     found = [effect.name for effect in model.axes["x"].effects]
     return f"Hidden in the stage: {', '.join(hidden)}. In the model: {', '.join(found) or 'none'}."
 

@@ -12,7 +12,7 @@ from slpi_ros.compensator.model_swap import continue_from, require_near, take_ov
 from slpi_ros.compensator.persistence import RESETTING, MemoryConfidence
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
-from slpi_ros.compensator.statistics import TrackingError
+from slpi_ros.compensator.statistics import TrackingStatistics
 from slpi_ros.compensator.validation import Stamps, implausible
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
@@ -72,7 +72,7 @@ class Axis:
         self.given_ns = 0
         self.due_ns: int | None = None
         self.point_ns: int | None = None
-        self.tracking = TrackingError()
+        self.tracking = TrackingStatistics()
         self.fault: Fault | None = None
         self._loop_settings = loop_settings
         self._feedback: Feedback | None = None

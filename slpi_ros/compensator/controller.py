@@ -40,7 +40,7 @@ from slpi_ros.model.streaming import StageStream
 OPEN_LOOP = LoopSettings(False, PidGains(0.0), 0.1)
 
 
-class Mode(Enum):
+class OperatingMode(Enum):
     """Operating mode of the whole stage."""
 
     UNCONFIGURED = "unconfigured"
@@ -85,7 +85,7 @@ class Controller:
         self._checks: list[PaceCheck] = []
         self.too_fast = ""
         self.voltages = array("d", [0.0] * len(self.axes))
-        self.mode = Mode.UNCONFIGURED
+        self.mode = OperatingMode.UNCONFIGURED
         self.counts = Counts()
         self.model: StageModel | None = None
         self.trajectory = TrajectoryExecutor(period, self._place)
@@ -106,7 +106,7 @@ class Controller:
     @property
     def active(self) -> bool:
         """Whether the compensator is activated."""
-        return self.mode not in (Mode.UNCONFIGURED, Mode.INACTIVE)
+        return self.mode not in (OperatingMode.UNCONFIGURED, OperatingMode.INACTIVE)
 
     @property
     def driven(self) -> bool:
@@ -115,15 +115,15 @@ class Controller:
 
     def configure(self) -> None:
         """Enter the inactive mode."""
-        self.mode = Mode.INACTIVE
+        self.mode = OperatingMode.INACTIVE
 
     def cleanup(self) -> None:
         """Discard the model; the voltages are unchanged."""
-        self.mode, self.model = Mode.UNCONFIGURED, None
+        self.mode, self.model = OperatingMode.UNCONFIGURED, None
 
     def activate(self, now_ns: int) -> None:
         """Start processing messages at `now_ns` (ns), with all axes at rest at their present voltages."""
-        self.mode = Mode.STREAMING
+        self.mode = OperatingMode.STREAMING
         self.watchdog.start(now_ns)
         self._rest_all(now_ns)
         self.ownership.await_start(now_ns)
@@ -134,7 +134,7 @@ class Controller:
         self._rest_all(now_ns)
         for axis in self.axes:
             axis.amplifier.forget_output()
-        self.mode = Mode.INACTIVE
+        self.mode = OperatingMode.INACTIVE
 
     def use_model(
         self,
@@ -189,13 +189,13 @@ class Controller:
         if not self.ownership.lost():
             return False
         self._end_reset()
-        if self.mode is Mode.TRAJECTORY:
+        if self.mode is OperatingMode.TRAJECTORY:
             self._end_trajectory()
         for axis in self.axes:
             axis.stop_ramp()
             axis.drop_goal()
         if self.active:
-            self.mode = Mode.STREAMING
+            self.mode = OperatingMode.STREAMING
         return True
 
     def locate(self, now_ns: int) -> None:
@@ -293,7 +293,7 @@ class Controller:
         except RejectedError as error:
             counts.by_cause[error.cause] += 1
             raise
-        self.mode = Mode.STREAMING
+        self.mode = OperatingMode.STREAMING
         for axis in axes:
             axis.stop_ramp()
         aheads = [axis.stamps.accept(stamp_ns) if stamp_ns else axis.stamps.arrive(arrival_ns) for axis in axes]
@@ -335,9 +335,9 @@ class Controller:
 
     def _axes_of(self, names: Sequence[str], count: int, now_ns: int) -> list[Axis]:
         """Return the named axes; RejectedError unless they can accept `count` desired displacements now."""
-        if self.mode is not Mode.STREAMING or self.model is None or not self.ownership.owned:
+        if self.mode is not OperatingMode.STREAMING or self.model is None or not self.ownership.owned:
             self._require_ready()
-            if self.mode is Mode.TRAJECTORY:
+            if self.mode is OperatingMode.TRAJECTORY:
                 raise RejectedError(
                     rejection.FOLLOWING, f"{self.activity(now_ns)}; wait, or cancel it with an empty one"
                 )
@@ -378,7 +378,7 @@ class Controller:
             raise RejectedError(rejection.INACTIVE, "the compensator is not active; activate it")
         if self.model is None:
             raise RejectedError(rejection.NO_MODEL, "there is no model yet; give model_file, or publish stage_model")
-        if self.mode is Mode.RESETTING:
+        if self.mode is OperatingMode.RESETTING:
             raise RejectedError(rejection.RESETTING, "the memory is being reset; wait until reset_memory answers")
 
     def _move(
@@ -440,7 +440,7 @@ class Controller:
             self.counts.trajectories_rejected += 1
             raise
         self.too_fast = ""
-        self.mode, self._clock_ahead_ns = Mode.TRAJECTORY, clock_ns - now_ns
+        self.mode, self._clock_ahead_ns = OperatingMode.TRAJECTORY, clock_ns - now_ns
         self.watchdog.feed(now_ns)
         wait = (start_ns - clock_ns) * 1e-9 if start_ns else 0.0
         self._checks = [
@@ -458,7 +458,7 @@ class Controller:
 
     def activity(self, now_ns: int) -> str:
         """Return a text that describes the present activity."""
-        if self.mode is Mode.RESETTING:
+        if self.mode is OperatingMode.RESETTING:
             return "resetting the memory"
         deadline_ns = self.trajectory.next_deadline_ns
         if deadline_ns is None:
@@ -471,14 +471,14 @@ class Controller:
     def cancel(self, now_ns: int) -> None:
         """Cancel the trajectory, if any; its axes decelerate to rest within their acceleration limit."""
         self.watchdog.feed(now_ns)
-        if self.mode is Mode.TRAJECTORY:
+        if self.mode is OperatingMode.TRAJECTORY:
             self._end_trajectory()
             self._release((), now_ns)
 
     def _end_trajectory(self) -> None:
         self.trajectory.cancel()
         self._checks = []
-        self.mode = Mode.STREAMING
+        self.mode = OperatingMode.STREAMING
         for axis in self.axes:
             axis.stamps.restart()
             axis.point_ns = None
@@ -532,7 +532,7 @@ class Controller:
         new, self._clock_ahead_ns = False, clock_ns - now_ns
         if not self.ownership.owned:
             return False
-        following = self.trajectory.moving if self.mode is Mode.TRAJECTORY else ()
+        following = self.trajectory.moving if self.mode is OperatingMode.TRAJECTORY else ()
         due = [axis for axis in self.axes if axis.due_ns is not None and axis.due_ns <= now_ns]
         if due:
             new = self._tick([axis for axis in due if axis.ramp or axis.name not in following], now_ns)
@@ -540,7 +540,7 @@ class Controller:
                 # The samples of its trajectory move the axis on.
                 if axis.due_ns is not None and axis.due_ns <= now_ns:
                     axis.due_ns = None
-        if self.mode is Mode.TRAJECTORY:
+        if self.mode is OperatingMode.TRAJECTORY:
             new = self._step_trajectory(now_ns, clock_ns) or new
         return new
 
@@ -549,7 +549,7 @@ class Controller:
         self.cancel(now_ns)
         self._release((), now_ns)
         if self.active:
-            self.mode = Mode.STREAMING
+            self.mode = OperatingMode.STREAMING
 
     def ramp(self, voltages: Sequence[float], rate: float, now_ns: int) -> None:
         """Start a ramp to `voltages` (V, one per axis, clipped to the limits) at `rate` (V/s).
@@ -557,7 +557,7 @@ class Controller:
         RejectedError if the present voltages are not known, or somebody else moves the stage.
         """
         self._begin_output(now_ns)
-        self._start_ramps([Ramp([voltage], rate) for voltage in voltages], Mode.RAMPING, now_ns)
+        self._start_ramps([Ramp([voltage], rate) for voltage in voltages], OperatingMode.RAMPING, now_ns)
 
     def reset_memory(
         self,
@@ -577,7 +577,7 @@ class Controller:
         ramps = []
         for final, limits in zip(finals, self.reset_limits(spans), strict=True):
             ramps.append(Ramp(decaying_turns(limits, limits.clip(final), cycles), rate))
-        self._start_ramps(ramps, Mode.RESETTING, now_ns)
+        self._start_ramps(ramps, OperatingMode.RESETTING, now_ns)
         for axis in self.axes:
             axis.confidence = MemoryConfidence(RESETTING)
         self._spans = [(axis.stream.voltage,) * 2 for axis in self.axes]
@@ -597,7 +597,7 @@ class Controller:
 
         A trajectory counts as a command until its last point. The watchdog is suspended during a reset of the memory.
         """
-        waiting = self.mode in (Mode.STREAMING, Mode.RAMPING)
+        waiting = self.mode in (OperatingMode.STREAMING, OperatingMode.RAMPING)
         before = self.watchdog.safe_voltages
         news = self.watchdog.update(safety, now_ns, waiting)
         if news and self.watchdog.safe_voltages != before:
@@ -605,11 +605,11 @@ class Controller:
                 self.ramp(safety.voltages, safety.rate, now_ns)
             else:
                 self._release((), now_ns)
-                self.mode = Mode.STREAMING
+                self.mode = OperatingMode.STREAMING
         return news
 
-    def _start_ramps(self, ramps: Sequence[Ramp], mode: Mode, now_ns: int) -> None:
-        if self.mode is Mode.TRAJECTORY:
+    def _start_ramps(self, ramps: Sequence[Ramp], mode: OperatingMode, now_ns: int) -> None:
+        if self.mode is OperatingMode.TRAJECTORY:
             self._end_trajectory()
         self._end_reset()
         for axis, ramp in zip(self.axes, ramps, strict=True):
@@ -633,26 +633,26 @@ class Controller:
                 self.counts.excursions += 1
         if not ramping:
             return new
-        if self.mode is Mode.RESETTING:
+        if self.mode is OperatingMode.RESETTING:
             reached = [axis.voltage for axis in self.axes]
             self._spans = [(min(low, v), max(high, v)) for (low, high), v in zip(self._spans, reached, strict=True)]
         if all(axis.ramp is None or axis.ramp.done for axis in self.axes):
             self._end_reset()
             for axis in self.axes:
                 axis.stop_ramp()
-            if self.mode in (Mode.RAMPING, Mode.RESETTING):
+            if self.mode in (OperatingMode.RAMPING, OperatingMode.RESETTING):
                 self._end_ramping(now_ns)
         return new
 
     def _end_ramping(self, now_ns: int) -> None:
-        if self.mode is Mode.RESETTING:
+        if self.mode is OperatingMode.RESETTING:
             # The watchdog is suspended during a reset.
             self.watchdog.feed(now_ns)
-        self.mode = Mode.STREAMING
+        self.mode = OperatingMode.STREAMING
 
     def _end_reset(self) -> None:
         """Set the memory confidence of each axis after a completed or interrupted reset."""
-        if self.mode is not Mode.RESETTING:
+        if self.mode is not OperatingMode.RESETTING:
             return
         for axis, span in zip(self.axes, self._spans, strict=True):
             axis.confidence = MemoryConfidence(doubt=INTERRUPTED)
@@ -673,7 +673,7 @@ class Controller:
                     axis.return_inside(now_ns)
             else:
                 axis.stop_ramp()
-        if self.mode is Mode.RESETTING:
+        if self.mode is OperatingMode.RESETTING:
             self._end_ramping(now_ns)
 
     def _rest_all(self, now_ns: int) -> None:

@@ -5,7 +5,8 @@ from dataclasses import replace
 from math import inf
 
 from slpi_ros.errors import ModelError, UsageError
-from slpi_ros.hysteresis.turning_points import FAR, Memory
+from slpi_ros.hysteresis.shapes import FAR
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.axis_model import AxisModel, StartMemory
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.streaming import TOLERATED_SHARE, StreamingInverse

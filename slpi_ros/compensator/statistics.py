@@ -109,7 +109,7 @@ class TrackingReport:
     maximum: float
 
 
-class TrackingError:
+class TrackingStatistics:
     """Collect the tracking error, measured - desired, of one axis.
 
     `desired` (m) is the present setpoint, None while the axis does not follow desired displacements; `fresh` tells

@@ -28,7 +28,7 @@ FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
 # Smallest relative reduction of the held-out error by an effect.
 LEAST_GAIN = 0.05
 # A fit from other initial parameters, or with another effect, is preferred if it lowers the error by this share.
-BETTER = 0.01
+LEAST_FALL = 0.01
 # Largest number of effects that are selected; records cannot determine more.
 MOST_EFFECTS = 4
 # Largest p-value for a gain to be significant, and for two effects to differ; number of random sign patterns.
@@ -436,7 +436,7 @@ def _without_needless(now: Explanation, names: Collection[str], *, restart: bool
         # The others may reach their best parameters only without it.
         anew = contenders(without, [name]) if without.effects and (restart or not needed) else []
         for one in anew:
-            if one.counts_beside(without) and (not needed or gain(now.held_out, one.score) > BETTER):
+            if one.counts_beside(without) and (not needed or gain(now.held_out, one.score) > LEAST_FALL):
                 now, needed = one.explanation, True
         if not needed:
             now = without
@@ -456,7 +456,7 @@ def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation
             for one in _tried(name, now, rest, rivals[name])
             if one.counts_beside(rest)
             and (
-                one.rms < (1.0 - BETTER) * best.rms
+                one.rms < (1.0 - LEAST_FALL) * best.rms
                 or (one.parameters < best.parameters and alike(best, one, rest.held_out, one_speed=alone))
             )
         ]

@@ -45,16 +45,28 @@ class EffectContext:
     records: "tuple[EffectContext, ...]" = ()
     # Grid that covers `t`, if already computed.
     grid: Uniform | None = None
+    start: float | None = None
 
     @classmethod
-    def since_start(cls, t: FloatArray, others: Mapping[str, FloatArray] | None = None) -> "EffectContext":
+    def since_start(
+        cls, t: FloatArray, others: Mapping[str, FloatArray] | None = None, start: float | None = None
+    ) -> "EffectContext":
         """Return the context for stamps `t`, shape (N,), seconds, counted from the first one."""
-        return cls(t - t[0] if t.size and t[0] else t, others or {})
+        return cls(t - t[0] if t.size and t[0] else t, others or {}, start=start)
 
     @property
     def uniform(self) -> Uniform:
         """Uniform grid that covers `t`."""
         return self.grid or Uniform.over(self.t)
+
+    @property
+    def since(self) -> FloatArray:
+        """Time from the first stamp, shape (N,), seconds."""
+        return self.t - self.t[:1]
+
+    def step(self, signal: FloatArray) -> float:
+        """Return the step of a signal at the first stamp, from `start` to its first sample; 0 without one."""
+        return float(signal[0]) - self.start if self.start is not None and signal.size else 0.0
 
     def split(self, signal: NDArray[Any]) -> list[NDArray[Any]]:
         """Split a signal, shape (N, ..), into its records and return the list of parts."""
@@ -229,6 +241,22 @@ class EffectBase(Protocol):
         """Return the `StreamingEffect` or `StreamingAround`; None if it is not compensated sample by sample."""
         return
 
+    def laws(self) -> Mapping[str, Any] | None:
+        """Return the fields of `slpi_ros.effects.paths.Laws` for the compiled inverse; None if it has no such form."""
+        return None
+
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the input, shape (N,), volts or metres, for an output signal, sample by sample from equilibrium."""
+        whole: list[float] = []
+        for t, wanted in zip(around.split(around.t), around.split(signal), strict=True):
+            streaming, dt = self.streaming(), np.diff(t, prepend=t[:1]).tolist()
+            for k, sample in enumerate(zip(dt, wanted.tolist(), strict=True)):
+                if not k:
+                    streaming.start(sample[1] if around.start is None else around.start)
+                whole.append(streaming.inverse(*sample))
+                streaming.forward(sample[0], whole[-1])
+        return np.array(whole)
+
     @property
     def lasting(self) -> "Effect | None":
         """The effect as it is after its record; None if it ends with it."""
@@ -286,7 +314,7 @@ class Effect(EffectBase, Protocol):
         """Return the output of the effect for an input signal, shape (N,), volts or metres, starting at equilibrium."""
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the input signal for an output signal, shape (N,), volts or metres, using the whole path."""
+        """Return the input signal for an output signal, shape (N,), volts or metres."""
 
     @classmethod
     def fit(cls, left: "ResidualView") -> "Iterator[Candidate | Effect]":
@@ -301,11 +329,6 @@ class AroundHysteresis(Effect, Protocol):
 
     def beside(self, v: FloatArray, u: FloatArray) -> FloatArray:
         """Return the displacement (m) beside the hysteresis for applied and felt voltages (V), shape (N,) each."""
-
-    def command(
-        self, t: FloatArray, h: FloatArray, memory: Memory, limits: tuple[float, float]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the applied voltages (V) for displacements `h` (m), and what they reach (m), shape (N,) each."""
 
 
 @dataclass(frozen=True)

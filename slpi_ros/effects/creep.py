@@ -103,21 +103,11 @@ class Creep(EffectBase):
         from slpi_ros.effects.paths import relaxed
 
         crept = relaxed(moved, np.array(self.gains), np.array(self._holds(grid.dt)))
-        if self.initial:
-            since = grid.grid - grid.grid[:1]
+        crept, step = grid.off(crept), around.step(signal)
+        if step or self.initial:
             for gain, tau in zip(self.gains, self.time_constants, strict=True):
-                crept -= gain * self.initial * np.exp(-since / tau)
-        return signal + grid.off(crept)
-
-    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement before creep, shape (N,), metres."""
-        from slpi_ros.effects.paths import unrelaxed
-
-        grid = around.uniform
-        crept = grid.on(signal)
-        crept = crept - crept[:1]
-        moved = unrelaxed(crept, np.array(self.gains), np.array(self._holds(grid.dt)))
-        return signal - grid.off(crept - moved)
+                crept += gain * (step - (step + self.initial) * np.exp(-around.since / tau))
+        return signal + crept
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
@@ -203,6 +193,10 @@ class Creep(EffectBase):
         span = f"{fast:.3g} s" if slow == fast else f"{fast:.3g} to {slow:.3g} s"
         return f"after a move the stage creeps on by {sum(self.gains) * 100:.3g} % of it, with time constants of {span}"
 
+    def laws(self) -> Mapping[str, FloatArray]:
+        """Return time constants (s) and gains for the compiled inverse."""
+        return {"relaxations": np.array([self.time_constants, self.gains])}
+
     def streaming(self) -> "StreamingCreep":
         """Return the streaming creep."""
         return StreamingCreep(self)
@@ -270,8 +264,11 @@ class StreamingCreep(StreamingBase):
     def _over(self, dt: float) -> None:
         gains, self._dt, self._holds = self._creep.gains, dt, self._creep._holds(dt)
         self._kept = [gain * one.kept for gain, one in zip(gains, self._holds, strict=True)]
-        self._now = sum(gain * one.now for gain, one in zip(gains, self._holds, strict=True))
-        self._before = sum(gain * one.before for gain, one in zip(gains, self._holds, strict=True))
+        self._now = self._before = 0.0
+        # Not `sum`, which rounds otherwise than the compiled inverse.
+        for gain, one in zip(gains, self._holds, strict=True):
+            self._now += gain * one.now
+            self._before += gain * one.before
 
 
 def _reduced(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[float, ...]:

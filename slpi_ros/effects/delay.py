@@ -55,8 +55,8 @@ class Delay(EffectBase):
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Delay the signal, shape (N,), volts or metres; the first value is held before the start."""
-        return np.interp(around.t - self.seconds, around.t, signal) if signal.size else signal.copy()
+        """Delay the signal, shape (N,), volts or metres; before the start it is constant."""
+        return np.interp(around.t - self.seconds, around.t, signal, around.start) if signal.size else signal.copy()
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Advance the signal, shape (N,), volts or metres, using its future samples; the last value is held."""

@@ -20,6 +20,11 @@ EVEN = 0.01
 FINEST = 4
 # Smallest share of the motion of a fitted mode: smaller ones, near the drive, imitate errors of the hysteresis.
 LEAST_GAIN = 0.01
+# The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
+# of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
+DAMPING = 1 / 8
+# From this step times the frequency (rad/s) on a mode is not resolved, and only its lag is compensated.
+WIDEST = 3.0
 
 
 class Hold(NamedTuple):
@@ -34,8 +39,22 @@ def hold(dt: float, time_constant: float) -> Hold:
     """Return the coefficients of a first-order lag over `dt` (s); for ``dt = 0`` the output is unchanged."""
     x = dt / time_constant
     moved = -expm1(-x)
-    now = x / 2 - x**2 / 6 + x**3 / 24 - x**4 / 120 if x < _SMALL else 1 - moved / x
+    now = x * (1 / 2 - x * (1 / 6 - x * (1 / 24 - x / 120))) if x < _SMALL else 1 - moved / x
     return Hold(now, moved - now, exp(-x))
+
+
+def mode_transition(omega: float, damping: float, dt: float) -> tuple[float, float, float, float]:
+    """Return the state transition matrix of position and velocity of a mode over `dt` (s), row by row."""
+    decay_rate, rate = damping * omega, omega * sqrt(1 - damping * damping)
+    decay = exp(-decay_rate * dt)
+    cosine, sine = decay * cos(rate * dt), decay * sin(rate * dt) / rate
+    return cosine + decay_rate * sine, sine, -(omega * omega) * sine, cosine - decay_rate * sine
+
+
+def mode_poles(omega: float, damping: float, dt: float) -> tuple[float, float]:
+    """Return sum and product of the two discrete poles ``exp(s dt)`` of a mode."""
+    decay = exp(-damping * omega * dt)
+    return 2 * decay * cos(omega * sqrt(1 - damping * damping) * dt), decay * decay
 
 
 def filtered(numerator: ArrayLike, denominator: ArrayLike, signal: FloatArray) -> FloatArray:
@@ -68,38 +87,28 @@ class Mode:
         """Steady-state delay of the response to a ramp, seconds."""
         return 2 * self.damping / self.omega
 
-    def free(self, dt: float) -> tuple[float, float, float, float]:
-        """Return the state transition matrix of position and velocity over `dt` (s), row by row."""
-        decay_rate, rate = self.damping * self.omega, self.omega * sqrt(1 - self.damping**2)
-        decay = exp(-decay_rate * dt)
-        cosine, sine = decay * cos(rate * dt), decay * sin(rate * dt) / rate
-        return cosine + decay_rate * sine, sine, -(self.omega**2) * sine, cosine - decay_rate * sine
+    def release(self, t: FloatArray) -> FloatArray:
+        """Return the position, shape (N,), at times `t` (s) after a release from 1 at rest, with input 0."""
+        decay_rate = self.damping * self.omega
+        rate = self.omega * sqrt(1 - self.damping**2)
+        return np.asarray(np.exp(-decay_rate * t) * (np.cos(rate * t) + decay_rate / rate * np.sin(rate * t)))
 
-    def ringing(self, dt: float) -> tuple[float, float]:
-        """Return sum and product of the two discrete poles ``exp(s dt)``."""
-        decay = exp(-self.damping * self.omega * dt)
-        return 2 * decay * cos(self.omega * sqrt(1 - self.damping**2) * dt), decay * decay
-
-    def transfer(
-        self, dt: float, direct: float = 0.0, position: float = 1.0, velocity: float = 0.0
-    ) -> tuple[FloatArray, FloatArray]:
+    def transfer(self, dt: float) -> tuple[FloatArray, FloatArray]:
         """Return the discrete transfer function with step `dt` (s), numerator and denominator, shape (3,) each.
 
-        For an input linear between samples; the output is a weighted sum of the input, `position` and `velocity` (s).
+        For an input linear between samples.
         """
-        m11, m12, m21, m22 = self.free(dt)
+        m11, m12, m21, m22 = mode_transition(self.omega, self.damping, dt)
         late = self.lag / dt
         # Response of position and velocity to the input at the start and at the end of a step.
         p0, p1 = late - m11 * (1 + late) + m12 / dt, 1 - late + m11 * late - m12 / dt
-        v0, v1 = -1 / dt - m21 * (1 + late) + m22 / dt, 1 / dt + m21 * late - m22 / dt
-        total, product = self.ringing(dt)
+        v1 = 1 / dt + m21 * late - m22 / dt
+        v0 = -1 / dt - m21 * (1 + late) + m22 / dt
+        total, product = mode_poles(self.omega, self.damping, dt)
         denominator = np.array([1.0, -total, product])
         moved = np.array([p1, p0 - m22 * p1 + m12 * v1, m12 * v0 - m22 * p0])
-        moving = np.array([v1, v0 - m11 * v1 + m21 * p1, m21 * p0 - m11 * v0])
-        # Remove rounding errors from the static gains.
-        moved *= denominator.sum() / moved.sum()
-        moving[1] -= moving.sum()
-        return direct * denominator + position * moved + velocity * moving, denominator
+        # Remove rounding errors from the static gain.
+        return moved * (denominator.sum() / moved.sum()), denominator
 
 
 class StreamingMode:
@@ -107,7 +116,7 @@ class StreamingMode:
 
     def __init__(self, mode: Mode) -> None:
         self._lag, self._mode = mode.lag, mode
-        self._dt, self._free = 0.0, mode.free(0.0)
+        self._dt, self._free = 0.0, mode_transition(mode.omega, mode.damping, 0.0)
         self.start(0.0)
 
     def start(self, x: float) -> None:
@@ -120,7 +129,7 @@ class StreamingMode:
         if dt <= 0.0:
             return x, position, velocity
         if dt != self._dt:
-            self._dt, self._free = dt, self._mode.free(dt)
+            self._dt, self._free = dt, mode_transition(self._mode.omega, self._mode.damping, dt)
         m11, m12, m21, m22 = self._free
         slope = (x - before) / dt
         behind = self._lag * slope

@@ -152,6 +152,10 @@ class GainDrift(EffectBase):
             f"{self.times[-1]:.3g} s of this record, half of it in the first {half:.3g} s{back}"
         )
 
+    def laws(self) -> Mapping[str, FloatArray]:
+        """Return origin (m) and last factor for the compiled inverse."""
+        return {"gain": np.array([self.origin, 1.0 + self.gains[-1]])}
+
     def streaming(self) -> "StreamingGainDrift":
         """Return the sensitivity at the end of the record as a streaming effect."""
         return StreamingGainDrift(self.origin, 1.0 + self.gains[-1])

@@ -23,12 +23,9 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
-from slpi_ros.effects.filters import Hold, filtered, hold
+from slpi_ros.effects.filters import DAMPING, Hold, filtered, hold
 from slpi_ros.effects.parameters import Fit, in_samples, parameter
 
-# The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
-# of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
-DAMPING = 1 / 8
 # Number of time constants after which the piezo has the voltage of the command.
 SETTLED = 5.0
 
@@ -65,18 +62,8 @@ class Lag(EffectBase):
         """Return the lagged voltage, shape (N,), volts; exact if the command is linear between samples."""
         grid = around.uniform
         now, before, kept = hold(grid.dt, self.time_constant)
-        return grid.off(_filter(np.array([now, before]), np.array([1.0, -kept]), grid.on(signal)))
-
-    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the command, shape (N,), volts: ``u + tau du/dt``."""
-        grid = around.uniform
-        if not grid.dt:
-            return signal.copy()
-        real = hold(grid.dt, self.time_constant)
-        now, before, kept = _damped(real)
-        # The update law of `StreamingLag.inverse`, which uses the voltage actually reached, as one filter.
-        law = np.convolve([now, before], [1.0, -kept]) + kept * np.array([0.0, real.now, real.before])
-        return grid.off(_filter(np.array([1.0, -kept, 0.0]), law, grid.on(signal)))
+        lagged = grid.off(_filter(np.array([now, before]), np.array([1.0, -kept]), grid.on(signal)))
+        return lagged - around.step(signal) * np.exp(-around.since / self.time_constant)
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
@@ -108,6 +95,10 @@ class Lag(EffectBase):
         """Describe the time constant."""
         return f"the piezo's voltage lags behind the command with a time constant of {self.time_constant * 1e3:.3g} ms"
 
+    def laws(self) -> Mapping[str, float]:
+        """Return the time constant (s) for the compiled inverse."""
+        return {"lag": self.time_constant}
+
     def streaming(self) -> "StreamingLag":
         """Return the streaming lag."""
         return StreamingLag(self.time_constant)
@@ -127,17 +118,19 @@ class StreamingLag(StreamingBase):
 
     def forward(self, dt: float, x: float) -> float:
         """Advance by `dt` (s) to the command `x` (V) and return the lagged voltage (V)."""
-        now, before, kept = self._over(dt)
-        self._output = now * x + before * self._input + kept * self._output
+        now, before, _ = self._over(dt)
+        # In differences: at rest exact.
+        output = self._output
+        self._output = output = output + (now * (x - output) + before * (self._input - output))
         self._input = x
-        return self._output
+        return output
 
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the command (V) for the lagged voltage `wanted` (V); for ``dt = 0`` return `wanted`."""
         if dt <= 0.0:
             return wanted
         now, before, kept = _damped(self._over(dt))
-        return (wanted - kept * self._output - before * self._input) / now
+        return wanted + (kept * (wanted - self._output) + before * (wanted - self._input)) / now
 
     def snapshot(self) -> tuple[float, float]:
         """Return command and lagged voltage (V)."""

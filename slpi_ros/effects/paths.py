@@ -1,11 +1,50 @@
-"""Compiled batch evaluation of effects with a state that changes from sample to sample."""
+"""Compiled evaluation of whole paths through effects with a state that changes from sample to sample.
+
+`inverse_path` does at each sample what `slpi_ros.model.streaming.StreamingInverse.move` does, with the same rounding:
+changes of one are changes of both. The machine code is kept until this file changes, not those that it calls.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.effects import filters
+from slpi_ros.effects.filters import DAMPING, WIDEST
+from slpi_ros.hysteresis import compiled as engine
 from slpi_ros.hysteresis.compiled import compiled
+from slpi_ros.hysteresis.shapes import Branches
 
 FloatArray = NDArray[np.float64]
+
+
+class Laws(NamedTuple):
+    """Parameters of the effects of an axis, each as its method `laws` returns them; without the effect: empty or 0.
+
+    Parameters
+    ----------
+    lag : float, seconds
+    rate : ndarray, shape (0,) or (3,), V, V/s and m/V
+        Threshold, onset rate and reversible gain.
+    relaxations : ndarray, shape (2, K), seconds and 1
+        Time constants and gains of the creep.
+    modes : ndarray, shape (M, 4)
+        0, angular frequency (rad/s), damping and gain of each mode of a resonance.
+    rest : float
+        Share of the motion beside the modes.
+    factors : ndarray, shape (F, 8)
+        Factors of the inverse of the resonance, see `Exact.law` and `Unringing.law`.
+    gain : ndarray, shape (2,), metres and 1
+        Origin and factor of the sensitivity.
+    """
+
+    lag: float = 0.0
+    rate: FloatArray = np.empty(0)
+    relaxations: FloatArray = np.empty((2, 0))
+    modes: FloatArray = np.empty((0, 4))
+    rest: float = 1.0
+    factors: FloatArray = np.empty((0, 8))
+    gain: FloatArray = np.array([0.0, 1.0])
 
 
 @compiled
@@ -24,21 +63,331 @@ def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArr
     return crept
 
 
+hold, mode_transition, mode_poles = (
+    compiled(filters.hold),
+    compiled(filters.mode_transition),
+    compiled(filters.mode_poles),
+)
+
+
+# Functions that are called at each sample take few arrays: counting references to each costs as much as the arithmetic.
+# Columns of the array of a creep: time constant, gain, coefficients of `Hold`, gain times the last of them, and state;
+# its last row holds origin, last input, step, and the sums of the gains times the first and the second coefficient.
+TAU, GAIN, NOW, BEFORE, KEPT, SHARE, STATE = range(7)
+ORIGIN, INPUT, STEP, SUM_NOW, SUM_BEFORE = range(5)
+# Columns of an array of modes: angular frequency, damping, then as given, and from `MOVED` on input, position and
+# velocity, step and transition matrix; of a factor that looks back, spacing and taps, first and end of its inputs.
+OMEGA, DAMPED, MOVED, MATRIX, WIDTH = 1, 2, 8, 11, 18
+
+
 @compiled
-def unrelaxed(crept: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArray:
-    """Return the displacement, shape (N,), metres, whose sum with its relaxations, as in `relaxed`, is `crept`."""
-    moved, last, states = np.empty_like(crept), 0.0, np.zeros(gains.size)
-    # `states` are without the part of the present input, which is added with the next sample.
-    step, kept, direct = np.empty(gains.size), np.empty(gains.size), 1.0
-    for i in range(gains.size):
-        step[i], kept[i] = holds[i, 1] + holds[i, 2] * holds[i, 0], holds[i, 2]
-        direct += gains[i] * holds[i, 0]
-    if crept.size:
-        moved[0] = last = crept[0] / direct
-    for k in range(1, crept.size):
-        total = 0.0
-        for i in range(gains.size):
-            states[i] = step[i] * last + kept[i] * states[i]
-            total += gains[i] * states[i]
-        moved[k] = last = (crept[k] - total) / direct
-    return moved
+def creep_over(dt: float, creep: FloatArray) -> None:
+    """Set the coefficients for a step `dt` (s)."""
+    last = creep.shape[0] - 1
+    creep[last, STEP], creep[last, SUM_NOW], creep[last, SUM_BEFORE] = dt, 0.0, 0.0
+    for k in range(last):
+        gain, one = creep[k, GAIN], hold(dt, creep[k, TAU])
+        creep[k, NOW], creep[k, BEFORE], creep[k, KEPT], creep[k, SHARE] = (
+            one.now,
+            one.before,
+            one.kept,
+            gain * one.kept,
+        )
+        creep[last, SUM_NOW] += gain * one.now
+        creep[last, SUM_BEFORE] += gain * one.before
+
+
+@compiled
+def creep_inverse(dt: float, wanted: float, creep: FloatArray) -> float:
+    """Return the displacement before creep (m), as `StreamingCreep.inverse`."""
+    last = creep.shape[0] - 1
+    if dt != creep[last, STEP]:
+        creep_over(dt, creep)
+    crept = creep[last, SUM_BEFORE] * creep[last, INPUT]
+    for k in range(last):
+        crept += creep[k, SHARE] * creep[k, STATE]
+    origin = creep[last, ORIGIN]
+    return float(origin + (wanted - origin - crept) / (1.0 + creep[last, SUM_NOW]))
+
+
+@compiled
+def creep_forward(dt: float, x: float, creep: FloatArray) -> float:
+    """Return the displacement with creep (m), as `StreamingCreep.forward`."""
+    last = creep.shape[0] - 1
+    if dt != creep[last, STEP]:
+        creep_over(dt, creep)
+    moved, before = x - creep[last, ORIGIN], creep[last, INPUT]
+    crept = creep[last, SUM_BEFORE] * before
+    for k in range(last):
+        crept += creep[k, SHARE] * creep[k, STATE]
+    crept += creep[last, SUM_NOW] * moved
+    for k in range(last):
+        creep[k, STATE] = creep[k, NOW] * moved + creep[k, BEFORE] * before + creep[k, KEPT] * creep[k, STATE]
+    creep[last, INPUT] = moved
+    return float(x + crept)
+
+
+@compiled
+def mode_after(dt: float, x: float, modes: FloatArray, k: int) -> tuple[float, float, float]:
+    """Return the state of a mode after `dt` (s), as `StreamingMode.after`."""
+    before, position, velocity = modes[k, MOVED], modes[k, MOVED + 1], modes[k, MOVED + 2]
+    if dt <= 0.0:
+        return x, position, velocity
+    omega, damping = modes[k, OMEGA], modes[k, DAMPED]
+    if dt != modes[k, MATRIX]:
+        m11, m12, m21, m22 = mode_transition(omega, damping, dt)
+        modes[k, MATRIX], modes[k, MATRIX + 1], modes[k, MATRIX + 2] = dt, m11, m12
+        modes[k, MATRIX + 3], modes[k, MATRIX + 4] = m21, m22
+    slope = (x - before) / dt
+    behind = 2 * damping / omega * slope
+    position, velocity = position - before + behind, velocity - slope
+    return (
+        x,
+        x - behind + modes[k, MATRIX + 1] * position + modes[k, MATRIX + 2] * velocity,
+        slope + modes[k, MATRIX + 3] * position + modes[k, MATRIX + 4] * velocity,
+    )
+
+
+@compiled
+def unringing(dt: float, wanted: float, factors: FloatArray, f: int, times: FloatArray, values: FloatArray) -> float:
+    """Return the input (m) of a mode, as `Unringing.inverse`."""
+    first, last, taps = int(factors[f, MATRIX + 5]), int(factors[f, MATRIX + 6]), MATRIX + 1
+    spacing = max(dt, factors[f, 4])
+    if spacing != factors[f, MATRIX]:
+        a, b, c = 1.0, 0.0, 0.0
+        if spacing * factors[f, OMEGA] < WIDEST:
+            total, product = mode_poles(factors[f, OMEGA], factors[f, DAMPED], spacing)
+            a, b, c = 1.0 / (1 - total + product), -total / (1 - total + product), product / (1 - total + product)
+        delay = factors[f, 3] / spacing + b + 2 * c
+        factors[f, MATRIX], factors[f, taps], factors[f, taps + 1] = (
+            spacing,
+            a * (1 + delay),
+            b * (1 + delay) - a * delay,
+        )
+        factors[f, taps + 2], factors[f, taps + 3] = c * (1 + delay) - b * delay, -c * delay
+    now = times[f, last - 1]
+    later, value, at = now + dt, wanted, now + dt - spacing
+    needed, k = factors[f, taps] * wanted, 1
+    for place in range(last - 1, first - 1, -1):
+        earlier, before = times[f, place], values[f, place]
+        while at >= earlier:
+            share = (at - earlier) / (later - earlier) if later > earlier else 0.0
+            needed += factors[f, taps + k] * (before + (value - before) * share)
+            k += 1
+            if k == 4:
+                return float(needed)
+            at -= spacing
+        later, value = earlier, before
+    left = 0.0
+    for tap in range(k, 4):
+        left += factors[f, taps + tap]
+    return float(needed + left * value)
+
+
+@compiled
+def resonance_inverse(
+    dt: float, wanted: float, factors: FloatArray, inputs: FloatArray, times: FloatArray, values: FloatArray
+) -> float:
+    """Return the input (m) of the modes, as `StreamingResonance.inverse`."""
+    for f in range(factors.shape[0]):
+        inputs[f] = wanted
+        if factors[f, 0] > 0.0:
+            wanted = unringing(dt, wanted, factors, f, times, values)
+        elif dt >= factors[f, 7]:
+            wanted = wanted + (wanted - factors[f, MOVED]) * (factors[f, 6] / dt)
+        else:
+            _, position, velocity = mode_after(dt, wanted, factors, f)
+            wanted = factors[f, 3] * wanted + factors[f, 4] * position + factors[f, 5] * velocity
+    return wanted
+
+
+@compiled
+def factors_forward(dt: float, factors: FloatArray, inputs: FloatArray, times: FloatArray, values: FloatArray) -> None:
+    """Advance the factors of the inverse of a resonance, as `move` of each."""
+    for f in range(factors.shape[0]):
+        if not factors[f, 0] > 0.0:
+            x, position, velocity = mode_after(dt, inputs[f], factors, f)
+            factors[f, MOVED], factors[f, MOVED + 1], factors[f, MOVED + 2] = x, position, velocity
+            continue
+        first, last = int(factors[f, MATRIX + 5]), int(factors[f, MATRIX + 6])
+        now = times[f, last - 1] + dt
+        if dt <= 0.0:
+            last -= 1
+        times[f, last], values[f, last] = now, inputs[f]
+        oldest = now - 4 * max(factors[f, 4], dt)
+        while last + 1 - first > 2 and times[f, first + 1] <= oldest:
+            first += 1
+        factors[f, MATRIX + 5], factors[f, MATRIX + 6] = first, last + 1
+
+
+@compiled
+def modes_forward(dt: float, x: float, rest: float, modes: FloatArray) -> float:
+    """Return the position of the stage (m) for the input of its modes (m), as `StreamingResonance.forward`."""
+    y = rest * x
+    for k in range(modes.shape[0]):
+        _, position, velocity = mode_after(dt, x, modes, k)
+        modes[k, MOVED], modes[k, MOVED + 1], modes[k, MOVED + 2] = x, position, velocity
+        y += modes[k, 3] * position
+    return y
+
+
+@compiled
+def lag_forward(dt: float, x: float, time_constant: float, lag: FloatArray) -> float:
+    """Return the lagged voltage (V), as `StreamingLag.forward`; `lag`: command and lagged voltage."""
+    one = hold(dt, time_constant)
+    output: float = lag[1] + (one.now * (x - lag[1]) + one.before * (lag[0] - lag[1]))
+    lag[0], lag[1] = x, output
+    return output
+
+
+@compiled
+def inverse_path(
+    dt: FloatArray,
+    wanted: FloatArray,
+    lower: float,
+    upper: float,
+    longest: float,
+    rounding: tuple[float, float],
+    far: float,
+    laws: Laws,
+    out: FloatArray,
+    held: NDArray[np.bool_],
+    point: FloatArray,
+    turns: FloatArray,
+    direction: float,
+    depth: int,
+    rest: FloatArray,
+    symmetric_rest: bool,
+    first: FloatArray,
+    branches: Branches,
+) -> int:
+    """Compensate the effects and the hysteresis of an axis along a path, from equilibrium at the present point.
+
+    Parameters
+    ----------
+    dt, wanted : ndarray, shape (N,), seconds and metres
+        Time from the sample before, and desired displacement of the axis without cross-coupling.
+    lower, upper : float, volts
+        Limits of the command.
+    longest : float, seconds
+        Longest step that counts: before, the voltage is held.
+    rounding : (float, float), metres and 1
+        Differences of displacements, and relative ones of voltages, up to which they are equal.
+    far : float, metres
+        Largest distance of a displacement of the hysteresis from rest.
+    out : ndarray, shape (N,), volts
+        Output: the commands.
+    held : ndarray of bool, shape (N,)
+        Output: whether the command is held at the limit beyond which the desired displacement lies.
+    turns : ndarray, shape (2, depth + 4 N + 4), volts and metres
+    point, direction, depth, rest, symmetric_rest, first, branches
+        As in `slpi_ros.hysteresis.compiled.through`.
+
+    Returns
+    -------
+    done : int
+        Number of samples evaluated; less than N if the model cannot reach the next one.
+    """
+    shape = (rest, symmetric_rest, first, branches)
+    at = np.array([int(direction), depth, 0, 0])
+    ends, knots = np.empty((2, 2)), engine.room(first, branches)
+    has_rate, has_lag = laws.rate.size > 0, laws.lag > 0.0
+    x, k, m, f = point[1], laws.relaxations.shape[1], laws.modes.shape[0], laws.factors.shape[0]
+    creep = np.zeros((k + 1, 7))
+    creep[:k, TAU], creep[:k, GAIN] = laws.relaxations[0], laws.relaxations[1]
+    creep[k, ORIGIN], creep[k, STEP] = x, -1.0
+    modes, factors, rest_share = np.zeros((m, WIDTH)), np.zeros((f, WIDTH)), laws.rest
+    modes[:, :4], factors[:, :8] = laws.modes, laws.factors
+    modes[:, MOVED : MOVED + 2] = factors[:, MOVED : MOVED + 2] = x
+    factors[:, MATRIX + 6] = 1.0
+    # Inputs of the factors, now and before.
+    inputs, times, values = np.full(f, x), np.zeros((f, 2 * dt.size + 4)), np.empty((f, 2 * dt.size + 4))
+    values[:, 0] = x
+    origin, factor = laws.gain[0], laws.gain[1]
+    lag, command, beside = np.array([point[0], point[0]]), point[0], 0.0
+    # As `StreamingRateDependence`: applied voltage, last three ``w``, last desired displacement.
+    rate = np.array([point[0], 0.0, 0.0, 0.0, np.nan])
+    one_dt, one_h, one_v, one_y = np.empty(1), np.empty(1), np.empty(1), np.empty(1)
+    for n in range(dt.size):
+        counted = min(dt[n], longest)
+        if n == 0 or dt[n] > longest:
+            # At the start, and during a pause, the voltage is held.
+            pause, axis = dt[n] - counted, point[1] + beside
+            if has_lag and n:
+                lag_forward(pause, command, laws.lag, lag)
+            if k:
+                axis = creep_forward(pause, axis, creep)
+            if m:
+                axis = modes_forward(pause, axis, rest_share, modes)
+                resonance_inverse(pause, axis, factors, inputs, times, values)
+                factors_forward(pause, factors, inputs, times, values)
+        h = origin + (wanted[n] - origin) / factor
+        if m:
+            h = resonance_inverse(counted, h, factors, inputs, times, values)
+        if k:
+            h = creep_inverse(counted, h, creep)
+        if not abs(h - rest[1]) < far:
+            return n
+        v_0, y_0, s_0, depth_0, rate_0 = point[0], point[1], at[0], at[1], rate[0]
+        at[3] = 0
+        if has_rate:
+            one_dt[0], one_h[0] = dt[n], h
+            done, turned, deep = engine.through_law(
+                one_dt, one_h, laws.rate, lower, upper, one_v, one_y, rate, float(at[0]), point, turns, at[1], *shape
+            )
+            at[0], at[1], at[2], at[3] = int(turned), deep, 0, 1
+            if done < 1:
+                return n
+            v, beside = one_v[0], laws.rate[2] * (one_v[0] - point[0])
+        else:
+            straight = engine.along(h, 1, lower, upper, point, at, ends, knots)
+            if not straight and not engine.moved(h, 1, lower, upper, point, turns, at, ends, knots, *shape):
+                return n
+            v = point[0]
+        missing = h - (point[1] + beside)
+        if not abs(missing) > rounding[0]:
+            missing = 0.0
+        if has_lag:
+            inside, goal = v, v
+            if counted > 0.0:
+                one = hold(counted, laws.lag)
+                shift = DAMPING * one.before
+                goal = v + (one.kept * (v - lag[1]) + (one.before - shift) * (v - lag[0])) / (one.now + shift)
+            v = min(max(goal, lower), upper)
+            if missing == 0.0 and abs(goal - v) > rounding[1] * (1.0 + abs(goal)):
+                missing = goal - v
+            reached = lag_forward(counted, v, laws.lag, lag)
+            if reached != inside:
+                point[0], point[1], at[0], at[1] = v_0, y_0, s_0, depth_0
+                if at[3]:
+                    at[2] = 0
+                if has_rate:
+                    applied, u = reached, v_0
+                    scale, way = laws.rate[1] * dt[n], reached - v_0
+                    rate[1] = rate[2] = rate[3] = 0.0
+                    if scale > 0.0:
+                        if way != 0.0:
+                            rate[1] = engine.solved(scale, laws.rate[0], abs(way), 0.0)
+                            u = reached - (laws.rate[0] * rate[1] if way > 0.0 else -(laws.rate[0] * rate[1]))
+                    else:
+                        u = v_0 + (reached - rate_0)
+                    rate[0], rate[4] = applied, np.nan
+                    reached = u
+                straight = engine.along(reached, 0, lower, upper, point, at, ends, knots)
+                if not straight and not engine.moved(reached, 0, lower, upper, point, turns, at, ends, knots, *shape):
+                    return n
+                if has_rate:
+                    beside = laws.rate[2] * (rate[0] - point[0])
+        out[n] = command = v
+        axis = point[1] + beside
+        if k:
+            axis = creep_forward(counted, axis, creep)
+        if m:
+            axis = modes_forward(counted, axis, rest_share, modes)
+            factors_forward(counted, factors, inputs, times, values)
+        short = wanted[n] - (origin + factor * (axis - origin))
+        if min(missing, short) > 0.0:
+            held[n] = v >= upper - rounding[1] * (1.0 + abs(upper))
+        else:
+            held[n] = max(missing, short) < 0.0 and v <= lower + rounding[1] * (1.0 + abs(lower))
+    return dt.size

@@ -147,16 +147,6 @@ class RateDependence(EffectBase):
         lead *= self.reversible_gain
         return lead
 
-    def command(
-        self, t: FloatArray, h: FloatArray, memory: "Memory", limits: tuple[float, float]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the applied voltage (V), and what it reaches of the displacements `h` (m), shape (N,) each.
-
-        The inverse of the law and of the hysteresis, from equilibrium at the present state of `memory`, which moves.
-        """
-        law = np.array([self.threshold, self.onset_rate, self.reversible_gain])
-        return memory.inverse_of_law_array(t, h, law, limits)
-
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the applied voltage, shape (N,), volts, for the felt voltage `signal`; it starts at equilibrium."""
         whole = []
@@ -202,6 +192,10 @@ class RateDependence(EffectBase):
             f"above {self.onset_rate:.3g} V/s the loops are wider by {decade:.3g} V on either side for each decade of "
             f"the rate; {self.reversible_gain * 1e9:.3g} nm/V of the motion does not wait"
         )
+
+    def laws(self) -> Mapping[str, FloatArray]:
+        """Return threshold (V), onset rate (V/s) and reversible gain (m/V) for the compiled inverse."""
+        return {"rate": np.array([self.threshold, self.onset_rate, self.reversible_gain])}
 
     def streaming(self) -> "StreamingRateDependence":
         """Return the streaming rate law."""

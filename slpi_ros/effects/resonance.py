@@ -26,12 +26,11 @@ from slpi_ros.effects.base import (
     usual_step,
 )
 from slpi_ros.effects.excitation import FEWEST_STEPS, DriveLimits, DrivePath, Excitation, loops, move, remaining
-from slpi_ros.effects.filters import LEAST_GAIN, Mode, StreamingMode, filtered
+from slpi_ros.effects.filters import LEAST_GAIN, WIDEST, Mode, StreamingMode, filtered, mode_poles
 from slpi_ros.effects.parameters import as_list, parameter, require
 
-# Smallest spacing of taps, in units of 1 / w: smaller ones make larger taps without benefit. From the step `WIDEST` on
-# a mode is not resolved, and only its lag is compensated.
-SPACING, WIDEST = 0.5, 3.0
+# Smallest spacing of taps, in units of 1 / w: smaller ones make larger taps without benefit.
+SPACING = 0.5
 # A zero is near a mode up to this ratio of the squared frequencies, which is the largest gain of `Exact`.
 NEAR = 10.0
 # Largest number of modes, and the smallest share of the motion beside the modes that is none by rounding.
@@ -46,16 +45,15 @@ class Exact(StreamingMode):
 
     def __init__(self, mode: Mode, zero: Mode) -> None:
         super().__init__(zero)
+        self._zero = zero
         high = (zero.omega / mode.omega) ** 2
         self._weights, self._late = (high, 1 - high, mode.lag - high * zero.lag), mode.lag - zero.lag
         self._longest = WIDEST / zero.omega
 
-    def invert(self, desired: FloatArray, dt: float) -> FloatArray:
-        """Return the input, shape (N,), metres, for a desired displacement on a grid of `dt` (s)."""
-        start = desired[:1]
-        if dt >= self._longest:
-            return desired + np.diff(desired, prepend=start) * (self._late / dt)
-        return np.asarray(start + filtered(*self._mode.transfer(dt, *self._weights), desired - start))
+    @property
+    def law(self) -> tuple[float, ...]:
+        """Numbers for the compiled inverse: 0, the zero's frequency and damping, weights, delay and longest step."""
+        return 0.0, self._zero.omega, self._zero.damping, *self._weights, self._late, self._longest
 
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the input (m) for `wanted` (m) after `dt` (s); keep the state."""
@@ -67,35 +65,30 @@ class Exact(StreamingMode):
 
 
 class Unringing:
-    """Inverse of a mode as a finite impulse response, ``sum_k taps[k] y(t + preview - k spacing)``.
+    """Inverse of a mode as a finite impulse response, ``sum_k taps[k] y(t - k spacing)``.
 
     The sum of the taps is 1. Two zeros are at the poles of the mode, and one more compensates the remaining delay but
     `known` (s).
     """
 
     def __init__(self, mode: Mode, known: float) -> None:
-        self._mode, self._known = mode, known
+        self._mode, self._late = mode, mode.lag - known
         self._spacing = self._shortest = SPACING / mode.omega
         self._taps = self._of(self._shortest)
 
-    def _of(self, spacing: float, preview: float = 0.0) -> tuple[float, float, float, float]:
-        """Return the taps for a spacing (s), if the desired displacement is known a `preview` (s) in advance."""
+    @property
+    def law(self) -> tuple[float, ...]:
+        """Numbers for the compiled inverse: 1, frequency and damping, delay and shortest spacing."""
+        return 1.0, self._mode.omega, self._mode.damping, self._late, self._shortest, 0.0, 0.0, 0.0
+
+    def _of(self, spacing: float) -> tuple[float, float, float, float]:
+        """Return the taps for a spacing (s)."""
         a, b, c = 1.0, 0.0, 0.0
         if spacing * self._mode.omega < WIDEST:
-            total, product = self._mode.ringing(spacing)
+            total, product = mode_poles(self._mode.omega, self._mode.damping, spacing)
             a, b, c = (part / (1 - total + product) for part in (1.0, -total, product))
-        delay = (self._mode.lag - self._known - preview) / spacing + b + 2 * c
+        delay = self._late / spacing + b + 2 * c
         return a * (1 + delay), b * (1 + delay) - a * delay, c * (1 + delay) - b * delay, -c * delay
-
-    def invert(self, desired: FloatArray, dt: float) -> FloatArray:
-        """Return the input, shape (N,), metres, for a desired displacement on a grid of `dt` (s)."""
-        between = max(1, round(self._shortest / dt))
-        padded = np.pad(desired, (2 * between, 0), mode="edge")
-        # The path is extrapolated by reflection at its end.
-        padded = np.pad(padded, (0, between), mode="reflect", reflect_type="odd")
-        taps = enumerate(self._of(between * dt, preview=between * dt))
-        parts = (tap * padded[(3 - k) * between :][: desired.size] for k, tap in taps)
-        return sum(parts, np.zeros_like(desired))
 
     def start(self, x: float) -> None:
         """Initialise to equilibrium at `x` (m)."""
@@ -112,7 +105,7 @@ class Unringing:
         self._desired = deque((-age, y) for age, y in zip(*state, strict=True))
 
     def inverse(self, dt: float, wanted: float) -> float:
-        """Return the input (m) for `wanted` (m) after `dt` (s), without preview; keep the state."""
+        """Return the input (m) for `wanted` (m) after `dt` (s); keep the state."""
         spacing = max(dt, self._shortest)
         if spacing != self._spacing:
             self._spacing, self._taps = spacing, self._of(spacing)
@@ -129,7 +122,11 @@ class Unringing:
                     return needed
                 at -= spacing
             later, value = earlier, before
-        return needed + sum(taps[k:]) * value
+        # Not `sum`, which rounds otherwise than the compiled inverse.
+        left = 0.0
+        for tap in taps[k:]:
+            left += tap
+        return needed + left * value
 
     def move(self, dt: float, wanted: float) -> None:
         """Advance by `dt` (s) to `wanted` (m), and forget what is older than all taps."""
@@ -278,17 +275,11 @@ class Resonance(EffectBase):
             return np.full_like(signal, signal[0]) if signal.size else signal.copy()
         start, moved = signal[0], grid.on(signal) - signal[0]
         parts = (mode.gain * filtered(*mode.transfer(grid.dt), moved) for mode in self.modes)
-        return grid.off(start + sum(parts, self.rest * moved))
-
-    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the input of the modes, shape (N,), metres, for the displacement `signal`, shape (N,), metres."""
-        grid = around.uniform
-        if not grid.dt:
-            return signal.copy()
-        desired = grid.on(signal)
-        for factor in self.factors():
-            desired = factor.invert(desired, grid.dt)
-        return grid.off(desired)
+        y = grid.off(start + sum(parts, self.rest * moved))
+        if step := around.step(signal):
+            for mode in self.modes:
+                y -= step * mode.gain * mode.release(around.since)
+        return y
 
     def factors(self) -> list[Unringing | Exact]:
         """Return the factors of the inverse, one for each mode, in equilibrium at 0 m."""
@@ -299,7 +290,6 @@ class Resonance(EffectBase):
             else Unringing(mode, zero.lag if zero else 0.0)
             for mode, zero in zip_longest(ordered, zeros(ordered, self.rest))
         ]
-        # First those that look ahead.
         return sorted(found, key=lambda factor: isinstance(factor, Exact))
 
     @classmethod
@@ -321,6 +311,11 @@ class Resonance(EffectBase):
         """Describe frequency, damping and share of each mode."""
         parts = (f"{one.frequency:.4g} Hz (damping {one.damping:.3g}, share {one.gain:.3g})" for one in self.modes)
         return f"the stage rings after reversals, at {' and '.join(parts)}"
+
+    def laws(self) -> Mapping[str, Any]:
+        """Return modes, share beside them and factors for the compiled inverse."""
+        modes = np.array([(0.0, mode.omega, mode.damping, mode.gain) for mode in self.modes])
+        return {"modes": modes, "rest": self.rest, "factors": np.array([each.law for each in self.factors()])}
 
     def streaming(self) -> StreamingResonance:
         """Return the streaming modes."""

@@ -5,7 +5,8 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.hysteresis.turning_points import END, Branches, Curve, Memory, worth_compiling
+from slpi_ros.hysteresis.shapes import END, Branches, Curve
+from slpi_ros.hysteresis.turning_points import Memory, worth_compiling
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -40,7 +41,7 @@ def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> tuple
     v : ndarray, shape (N,), volts
         Voltage; the first value, which may be repeated, is the rest voltage.
     symmetric_rest : bool
-        As in `slpi_ros.hysteresis.turning_points.Shape`.
+        As in `slpi_ros.hysteresis.shapes.Shape`.
     primed : bool
         As in `slpi_ros.hysteresis.turning_points.Memory`.
 

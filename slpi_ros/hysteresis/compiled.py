@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.hysteresis import compilation, rate_law
 from slpi_ros.hysteresis.rate_law import LARGEST
-from slpi_ros.hysteresis.turning_points import END, Branches
+from slpi_ros.hysteresis.shapes import END, Branches
 
 FloatArray = NDArray[np.float64]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -235,6 +235,89 @@ def through(
     return n, s, depth, i
 
 
+@compiled
+def along(
+    target: float,
+    coordinate: int,
+    lower: float,
+    upper: float,
+    point: FloatArray,
+    at: NDArray[np.int64],
+    ends: FloatArray,
+    knots: FloatArray,
+) -> bool:
+    """Move a memory on its present straight piece; return whether neither its end, a loop closure nor a limit is met.
+
+    Arguments as in `moved`.
+    """
+    s, i, other = float(at[0]), at[2], 1 - coordinate
+    if i == 0 or not s * (target - point[coordinate]) > 0.0 or not s * (target - ends[coordinate, 1]) < 0.0:
+        return False
+    u, u_a, f_a = s * (target - ends[coordinate, 0]), knots[coordinate, i - 1], knots[other, i - 1]
+    if not u_a <= u < knots[coordinate, i]:
+        return False
+    slope = (knots[other, i] - f_a) / (knots[coordinate, i] - u_a)
+    answer = ends[other, 0] + s * (f_a + (u - u_a) * slope)
+    if coordinate == 1 and not lower <= answer <= upper:
+        return False
+    point[coordinate], point[other] = target, answer
+    return True
+
+
+@compiled
+def moved(
+    target: float,
+    coordinate: int,
+    lower: float,
+    upper: float,
+    point: FloatArray,
+    turns: FloatArray,
+    at: NDArray[np.int64],
+    ends: FloatArray,
+    knots: FloatArray,
+    rest: FloatArray,
+    symmetric_rest: bool,
+    first: FloatArray,
+    branches: Branches,
+) -> bool:
+    """Move a memory to one voltage or displacement, as `Memory.forward` and `Memory.inverse` do.
+
+    Parameters
+    ----------
+    target : float, volts or metres
+    coordinate : int
+        Coordinate of `target`: 0 voltage, 1 displacement.
+    at : ndarray of int, shape (4,)
+        Direction, depth of the stack, index of the knot after the present point (0: `ends` and `knots` are not those of
+        the present branch), and 1 once the branch or its piece may have changed. Modified in place.
+    lower, upper, point, turns, ends, knots, rest, symmetric_rest, first, branches
+        As in `through`; `point` may lie outside the limits.
+
+    Returns
+    -------
+    done : bool
+        False if the model cannot reach the target.
+    """
+    one, out, walk = np.empty(1), np.empty(1), np.empty((3, 0), dtype=np.int64)
+    ways = 1 if coordinate == 0 or lower <= point[0] <= upper else 2
+    for way in range(ways):
+        driven = coordinate if way == ways - 1 else 0
+        one[0] = target if way == ways - 1 else min(max(point[0], lower), upper)
+        before, ends[0, 0] = ends[0, 0], np.nan
+        done, direction, depth, knot = through(
+            *(one, driven, lower, upper, out, float(at[0]), point, turns, at[1], walk, ends, knots),
+            *(rest, symmetric_rest, first, branches),
+        )
+        if np.isnan(ends[0, 0]):
+            ends[0, 0] = before
+        else:
+            at[2], at[3] = knot, 1
+        at[0], at[1] = int(direction), depth
+        if done < 1:
+            return False
+    return True
+
+
 solved = compiled(rate_law.solved)
 
 
@@ -271,13 +354,14 @@ def felt(t: FloatArray, v: FloatArray, threshold: float, onset_rate: float, lead
 
 @compiled
 def through_law(
-    t: FloatArray,
+    dt: FloatArray,
     h: FloatArray,
     law: FloatArray,
     lower: float,
     upper: float,
     out: FloatArray,
     reached: FloatArray,
+    state: FloatArray,
     direction: float,
     point: FloatArray,
     turns: FloatArray,
@@ -286,18 +370,21 @@ def through_law(
     symmetric_rest: bool,
     first: FloatArray,
     branches: Branches,
-) -> int:
-    """Compensate the rate law and the hysteresis along a path, as `StreamingInverse.move` does at each sample.
+) -> tuple[int, float, int]:
+    """Compensate the rate law and the hysteresis along a path, as `StreamingRateDependence.inverse` at each sample.
 
     Parameters
     ----------
-    t : ndarray, shape (N,), seconds
+    dt : ndarray, shape (N,), seconds
+        Time from the sample before.
     h : ndarray, shape (N,), metres
         Desired displacement of hysteresis and reversible part.
     law : ndarray, shape (3,), V, V/s, m/V
         Threshold, onset rate and reversible gain.
     out, reached : ndarray, shape (N,), volts and metres
         Output: applied voltages within the limits, and the displacements that they give.
+    state : ndarray, shape (5,)
+        Applied voltage, magnitudes of ``w`` of the last three samples, and the last `h` (NaN: none). Modified in place.
     turns : ndarray, shape (2, depth + 2 N + 2), volts and metres
     lower, upper, direction, point, depth, rest, symmetric_rest, first, branches
         As in `through`.
@@ -306,6 +393,8 @@ def through_law(
     -------
     done : int
         Number of samples evaluated; less than N if the model cannot reach the next one.
+    direction : float
+    depth : int
     """
     threshold, onset_rate, reversible = law[0], law[1], law[2]
     s, shape = direction, (rest, symmetric_rest, first, branches)
@@ -313,22 +402,24 @@ def through_law(
     ends, knots, known, knot = np.empty((2, 2)), room(first, branches), False, 0
     # Start of the branch, first knot of its present piece, end (V) and inverse slope (V/m; 0 if flat) of the piece.
     v_begin, y_begin, u_knot, f_knot, end_piece, rise = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    v, u, y, closes = point[0], point[0], point[1], False
-    w, w_before, w_earlier, kept = 0.0, 0.0, 0.0, False
+    u, y, closes = point[0], point[1], False
+    v, w, w_before, w_earlier, last = state
     for n in range(h.size):
-        scale, u0, y0, s_0, depth_0 = onset_rate * (t[n] - t[n - 1]) if n else 0.0, u, y, s, depth
+        scale, u0, y0, s_0, depth_0 = onset_rate * dt[n], u, y, s, depth
         lead = v - u0
-        if kept and not scale > 0.0 and h[n] == h[n - 1]:
-            out[n], reached[n] = out[n - 1], reached[n - 1]
+        if not scale > 0.0 and h[n] == last:
+            out[n], reached[n] = v, y + reversible * lead
             continue
+        last = h[n]
         gain = reversible * threshold if scale > 0.0 else 0.0
         target = h[n] if scale > 0.0 else h[n] - reversible * lead
         turn = 1.0 if target > y0 else -1.0
         limit = upper if turn > 0.0 else lower
         if not scale > 0.0:
             limit -= lead
-        guess = 3.0 * w_before - 2.0 * w_earlier
-        w_earlier, w_before, w = w_before, w, 0.0
+        guess, w_kept = 3.0 * w_before - 2.0 * w_earlier, w
+        if scale > 0.0:
+            w_earlier, w_before, w = w_before, w, 0.0
         if target != y0 and turn * (limit - u0) > 0.0:
             # The smallest step enters the branch.
             enter, known, next_piece = not known or turn != s, True, False
@@ -340,7 +431,7 @@ def through_law(
                         one, 0, lower, upper, other, s, point, turns, depth, walk, ends, knots, *shape
                     )
                     if not done:
-                        return n
+                        return n, s, depth
                     u, y = point[0], point[1]
                     if step == limit:
                         known = False
@@ -394,7 +485,11 @@ def through_law(
                     one, 0, lower, upper, other, s, point, turns, depth, walk, ends, knots, *shape
                 )
                 if not done:
-                    return n
+                    return n, s, depth
             u, y = point[0], point[1]
+        if not scale > 0.0:
+            w = w_kept
         out[n], reached[n] = v, y + reversible * (v - u)
-    return h.size
+    point[0], point[1] = u, y
+    state[:] = v, w, w_before, w_earlier, last
+    return h.size, s, depth

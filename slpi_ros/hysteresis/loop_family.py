@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.turning_points import END, FAR, Branches, Curve
+from slpi_ros.hysteresis.shapes import END, FAR, Branches, Curve
 
 FloatArray = NDArray[np.float64]
 # Knots and change of a row of `Branches`.

@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.hysteresis.turning_points import END, FAR, Branches, Curve, Memory
+from slpi_ros.hysteresis.shapes import END, FAR, Branches, Curve
+from slpi_ros.hysteresis.turning_points import Memory
 
 FloatArray = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.turning_points import END, Branches, Curve
+from slpi_ros.hysteresis.shapes import END, Branches, Curve
 
 FloatArray = NDArray[np.float64]
 

@@ -13,10 +13,8 @@ reversals gives both displacement from voltage and voltage from displacement, ex
 
 import sys
 from bisect import bisect_right
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import asinh, copysign, inf, sinh
-from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,103 +23,15 @@ from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.compilation import compiler
 from slpi_ros.hysteresis.rate_law import LARGEST, solved
 from slpi_ros.hysteresis.reversals import require_finite
+from slpi_ros.hysteresis.shapes import FAR, Branches, Curve, Shape
 
 FloatArray = NDArray[np.float64]
 
-# Largest distance of a voltage from rest (V); the last knot of every branch lies `END` beyond the others.
-FAR = 1e5
-END = 4 * FAR
 # Number of cached branch curves; reversals can be numerous and curves are large.
 KEPT_CURVES = 64
 # Fewest samples of a path for which loading the compiled engine, and calling it once loaded, takes less time than the
 # loop over samples.
 LOADED_FROM, COMPILED_FROM = 20_000, 200
-
-
-class Curve(NamedTuple):
-    """A branch shape ``F`` as knots (V, m), increasing from ``u[0] = f[0] = 0``; the last lies `END` beyond the others.
-
-    The knots are stored as lists for a fast scalar search and as an array, shape (2, k).
-    """
-
-    u: list[float]
-    f: list[float]
-    knots: FloatArray
-
-    @classmethod
-    def of(cls, knots: FloatArray) -> "Curve":
-        """Return the curve through knots, shape (2, k), volts and metres."""
-        u, f = knots.tolist()
-        return cls(u, f, knots)
-
-
-class Branches(NamedTuple):
-    """All branches of a shape as arrays, for the compiled engine; first index 0 rising, 1 falling.
-
-    Voltages of the falling branches are negated. A branch is interpolated between vertices or composed of operators.
-
-    Parameters
-    ----------
-    vertices : ndarray, shape (2, n), volts
-        Ascending. Row k of the other arrays is for branches that start above vertex k - 1, up to vertex k.
-    knots : ndarray, shape (2, n + 1, 2, m), volts and metres
-        Knots of the branch that starts at vertex k.
-    change : ndarray, shape (2, n + 1, 2, m)
-        Derivative of the knots with respect to the distance (V) of the start below vertex k.
-    last : ndarray of int, shape (2, n + 1)
-        Index of the last knot.
-    operators : ndarray, shape (2, k)
-        Thresholds (V) and weights (m/V) of a `MultiSlope` model.
-    scale : (float, float), volts
-        Origin and amplitude of that model.
-    """
-
-    vertices: FloatArray = np.empty((2, 0))
-    knots: FloatArray = np.empty((2, 0, 2, 0))
-    change: FloatArray = np.empty((2, 0, 2, 0))
-    last: NDArray[np.int64] = np.empty((2, 0), dtype=np.int64)
-    operators: FloatArray = np.empty((2, 0))
-    scale: tuple[float, float] = (0.0, 0.0)
-
-    @classmethod
-    def interpolated(cls, vertices: FloatArray, rows: Sequence[Sequence[tuple[FloatArray, FloatArray]]]) -> "Branches":
-        """Return the branches for `rows` of knots and change, shape (2, k) each, n + 1 rows for each direction."""
-        last = np.array([[knots.shape[1] - 1 for knots, _ in side] for side in rows], dtype=np.int64)
-        packed = np.zeros((2, *last.shape, 2, int(last.max()) + 1))
-        for side, of_side in enumerate(rows):
-            for row, pair in enumerate(of_side):
-                packed[:, side, row, :, : last[side, row] + 1] = pair
-        return cls(vertices, packed[0], packed[1], last)
-
-    def curve(self, direction: int, v_turn: float) -> Curve:
-        """Return the interpolated branch that starts in `direction` at `v_turn` (V)."""
-        side, u_turn = int(direction < 0), direction * v_turn
-        vertices = self.vertices[side]
-        row = int(vertices.searchsorted(u_turn))
-        distance = vertices[row] - u_turn if row < vertices.size else 0.0
-        count = self.last[side, row] + 1
-        return Curve.of(self.knots[side, row, :, :count] + self.change[side, row, :, :count] * distance)
-
-
-class Shape(Protocol):
-    """Shapes of the branches of a hysteresis model, as `Memory` requires them."""
-
-    @property
-    def symmetric_rest(self) -> bool:
-        """Whether the first loop closes at the mirror image of its reversal about the rest point (symmetric rest).
-
-        If not, the rest point is the low end of all loops: a rise after a fall from rest closes at the rest point.
-        """
-
-    @property
-    def branches(self) -> Branches:
-        """All branches as arrays."""
-
-    def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return the shape of the branch that starts in `direction` at the reversal `v_turn` (V)."""
-
-    def first_rise(self, v_rest: float) -> Curve:
-        """Return the shape of the first rise from rest at `v_rest` (V)."""
 
 
 @dataclass(frozen=True)
@@ -188,6 +98,11 @@ class Memory:
     def depth(self) -> int:
         """Number of reversals on the stack."""
         return len(self._turns[0])
+
+    @property
+    def far(self) -> float:
+        """Largest distance of a displacement from rest, metres."""
+        return self._far[1]
 
     def snapshot(self) -> MemoryState:
         """Return the complete state for `restore`."""
@@ -437,8 +352,8 @@ class Memory:
         if coordinate and not lower <= self._v <= upper:
             self.forward(min(max(self._v, lower), upper))
         out = np.empty_like(x)
-        direction, point, turns, depth = self._arrays(x.size)
-        shape = self._shape_arrays()
+        direction, point, turns, depth = self.arrays(x.size)
+        shape = self.shape_arrays()
         done, direction, depth, _ = through(
             *(x, coordinate, float(lower), float(upper), out, direction, point, turns, depth),
             np.empty((3, 0), dtype=np.int64) if walk is None else walk,
@@ -455,7 +370,7 @@ class Memory:
         return out
 
     def inverse_of_law_array(
-        self, t: FloatArray, h: FloatArray, law: FloatArray, limits: tuple[float, float]
+        self, dt: FloatArray, h: FloatArray, law: FloatArray, limits: tuple[float, float]
     ) -> tuple[FloatArray, FloatArray]:
         """Return the voltages (V) before a rate law, and the displacements (m) that they reach, shape (N,) each.
 
@@ -464,22 +379,23 @@ class Memory:
         from slpi_ros.hysteresis.compiled import through_law
 
         v, reached = np.empty_like(h), np.empty_like(h)
-        direction, point, turns, depth = self._arrays(2 * h.size + 2)
-        done = through_law(
-            *(t, h, law, float(limits[0]), float(limits[1]), v, reached, direction, point, turns, depth),
-            *self._shape_arrays(),
+        direction, point, turns, depth = self.arrays(2 * h.size + 2)
+        state = np.array([self._v, 0.0, 0.0, 0.0, np.nan])
+        done, _, _ = through_law(
+            *(dt, h, law, float(limits[0]), float(limits[1]), v, reached, state, direction, point, turns, depth),
+            *self.shape_arrays(),
         )
         if done < h.size:
             raise UsageError(f"displacement {h[done]} m cannot be reached by this model; leave such samples out")
         return v, reached
 
-    def _arrays(self, more: int) -> tuple[float, FloatArray, FloatArray, int]:
+    def arrays(self, more: int) -> tuple[float, FloatArray, FloatArray, int]:
         """Return direction, current point, stack with room for `more` reversals, and depth, for the compiled engine."""
         turns = np.empty((2, self.depth + more))
         turns[:, : self.depth] = self._turns
         return float(self._direction), np.array([self._v, self._y]), turns, self.depth
 
-    def _shape_arrays(self) -> tuple[FloatArray, bool, FloatArray, Branches]:
+    def shape_arrays(self) -> tuple[FloatArray, bool, FloatArray, Branches]:
         """Return rest point, symmetry, knots of the first rise, and branches, for the compiled engine."""
         first = np.ascontiguousarray(self._shape.first_rise(self._rest[0]).knots)
         return np.array(self._rest, dtype=np.float64), self._shape.symmetric_rest, first, self._shape.branches

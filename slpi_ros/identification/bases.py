@@ -41,7 +41,7 @@ class Basis(Protocol):
 
     @property
     def symmetric_rest(self) -> bool:
-        """As in `slpi_ros.hysteresis.turning_points.Shape`."""
+        """As in `slpi_ros.hysteresis.shapes.Shape`."""
 
     def branch_part(self, walk: Walk) -> sp.csr_array:
         """Return the displacement increment along each sample's branch per unit of each parameter, shape (N, size)."""

@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 # Cycles of the decaying oscillation that represents an initial state near the middle of the loop.
 MIDDLE_LOOPS = 20
 # A history other than rest is chosen if its rms error is below this share of the error from rest.
-BETTER = 0.9
+SMALLER_ERROR = 0.9
 # Ratio of the errors before and after the hysteresis state is reset, above which a warning is issued.
 DISAGREES = 3.0
 # Samples before the reset of the hysteresis state are excluded if they increase the error after it by this factor.
@@ -94,7 +94,7 @@ def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> InitialHis
     residuals = [_residual(pose(samples.after(history)), samples) for history in candidates]
     rms = [np.sqrt(np.mean(residual[samples.fitted] ** 2)) for residual in residuals]
     best = int(np.argmin(rms))
-    if rms[best] > BETTER * rms[0]:
+    if rms[best] > SMALLER_ERROR * rms[0]:
         best = 0
     unseen = not np.any(samples.fitted & ~samples.wiped)
     if unseen:

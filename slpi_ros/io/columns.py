@@ -10,7 +10,7 @@ from slpi_ros.io.input_limits import MOST_AXES
 
 
 @dataclass(frozen=True, eq=False)
-class Quantity:
+class ColumnQuantity:
     """A physical quantity that a column can hold.
 
     `name` is that in messages, and of the option that selects its columns. `default` is the unit if neither the column
@@ -52,15 +52,15 @@ _COMMON = frozenset({"%", "percent", "pct", "count", "counts", "lsb", "bit", "bi
 _LENGTHS = {"in", "inch", "inches", "mil", "mils", "ft", "cm", "dm", "km", "å", "angstrom"}
 _ANGLES = {"rad", "mrad", "urad", "µrad"}
 
-TIME = Quantity(
+TIME = ColumnQuantity(
     "time",
     "s",
     {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
     ("time",),
     _COMMON | {"m", "d", "day", "days", "ps"},
 )
-VOLTAGE = Quantity("voltage", "V", {"V": 1.0, "mV": 1e-3, "kV": 1e3}, ("voltage",), _COMMON | {"uv", "µv", "nv"})
-DISPLACEMENT = Quantity(
+VOLTAGE = ColumnQuantity("voltage", "V", {"V": 1.0, "mV": 1e-3, "kV": 1e3}, ("voltage",), _COMMON | {"uv", "µv", "nv"})
+DISPLACEMENT = ColumnQuantity(
     "displacement",
     "um",
     {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12},
@@ -104,7 +104,9 @@ class Column:
     assumed: bool
 
 
-def parse_column(name: str, quantity: Quantity, *, given_unit: str | None = None, source: str = "table") -> Column:
+def parse_column(
+    name: str, quantity: ColumnQuantity, *, given_unit: str | None = None, source: str = "table"
+) -> Column:
     """Parse the name of a column; units as in ``x_nm``, ``x (nm)``, ``x [nm]``, ``x in nm``, ``x / nm``.
 
     `given_unit` is that of an option, for a name without a unit; `source` is the name of the table, for messages.
@@ -132,22 +134,22 @@ def is_unit(text: str) -> bool:
     return any(quantity.unit(text) or quantity.is_other_unit(text) for quantity in QUANTITIES)
 
 
-def unit_in(name: str, quantity: Quantity) -> str:
+def unit_in(name: str, quantity: ColumnQuantity) -> str:
     """Return the known unit in the name of a column; "" if there is none."""
     return quantity.unit(_split(name, quantity)[1])
 
 
-def axis_of(name: str, quantity: Quantity) -> str:
+def axis_of(name: str, quantity: ColumnQuantity) -> str:
     """Return the part of a column name that is neither quantity nor unit; ``x`` if there is none."""
     return _axis(_split(name, quantity)[0])
 
 
-def begins(name: str, quantity: Quantity) -> bool:
+def begins(name: str, quantity: ColumnQuantity) -> bool:
     """Return whether a name begins with a word for the quantity."""
     return name.lower().startswith(quantity.prefixes)
 
 
-def _split(name: str, quantity: Quantity) -> tuple[str, str]:
+def _split(name: str, quantity: ColumnQuantity) -> tuple[str, str]:
     """Return a column name without its unit, and the unit as written, or "" if there is none."""
     index = _INDEX_OF_A_MATRIX.search(name)
     body, index_text = (name[: index.start()], index.group()) if index else (name, "")
@@ -157,7 +159,7 @@ def _split(name: str, quantity: Quantity) -> tuple[str, str]:
     return body + index_text, ""
 
 
-def _written_units(name: str, quantity: Quantity) -> Iterator[tuple[int, int, str]]:
+def _written_units(name: str, quantity: ColumnQuantity) -> Iterator[tuple[int, int, str]]:
     """Yield begin, end and text of each possible unit in a name, the most likely one first."""
 
     def is_any(text: str) -> bool:
@@ -289,7 +291,7 @@ def _voltage_columns(names: Sequence[str], time: Column, moved: Sequence[Column]
     return [names[0] for names in of_axes] if all(len(names) == 1 for names in of_axes) else found
 
 
-def _missing(names: Sequence[str], source: str, quantity: Quantity) -> NoReturn:
+def _missing(names: Sequence[str], source: str, quantity: ColumnQuantity) -> NoReturn:
     option = quantity.name
     raise RecordError(
         f"{source}: no {option} column; there is {joined(names)}; name one of them (--{option} or {option}=)"

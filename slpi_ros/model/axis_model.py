@@ -18,13 +18,13 @@ from slpi_ros.hysteresis import multi_slope as smpi
 from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.hysteresis.turning_points import FAR, Memory
+from slpi_ros.hysteresis.shapes import FAR
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.limits import Limits, decaying_turns
 from slpi_ros.model.sensor import IDEAL, Sensor, StreamingSensor
-from slpi_ros.model.streaming import ROUNDING, StreamingInverse, accepted_range, refusal
+from slpi_ros.model.streaming import ROUNDING, Mask, StreamingInverse, accepted_range, refusal
 
 FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 StartMemory = Literal["end", "start", "wiped"]
 START_MEMORIES: tuple[StartMemory, ...] = ("end", "start", "wiped")
 
@@ -192,6 +192,12 @@ class AxisModel:
         """Return a streaming inverse within `limits` and the identified voltage range, from `initial(start_memory)`."""
         return self.stream_from(self.memory(start_memory), self._allowed(limits))
 
+    def rest(self, limits: Limits | None = None, start_memory: StartMemory = "end") -> float:
+        """Return the displacement (m) without cross-coupling from which `command` begins."""
+        if not self.causal:
+            return self.initial(start_memory).displacement
+        return self.stream(limits, start_memory).uncoupled_displacement
+
     def stream_from(self, memory: Memory, allowed: Limits) -> StreamingInverse:
         """Return a streaming inverse that continues from a memory of this axis; the effects start in equilibrium."""
         return StreamingInverse(memory, self.displacement_range, allowed, self.effects)
@@ -213,11 +219,12 @@ class AxisModel:
 
     def _uncoupled_displacement(self, chain: Chain, t: FloatArray, v: FloatArray) -> FloatArray:
         if not self.effects:
-            return self._forward_array(v)
-        around = EffectContext.since_start(t)
+            return self._path().forward_array(v)
+        require_finite(v)
+        around = EffectContext.since_start(t, start=self.start.voltage)
         u, beside = chain.reaching(v, around)
-        beside += self._forward_array(u)
-        return forward(chain.own, beside, around)
+        beside += self._path().forward_array(u)
+        return forward(chain.own, beside, replace(around, start=self.start.displacement))
 
     def seen(self, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
         """Return what the sensor says, shape (N,), metres, at times `t` (s) for a result of `uncoupled_displacement`.
@@ -287,43 +294,42 @@ class AxisModel:
             raise UnreachableError(f"sample {at}: {refusal(float(y[at]), accepted)}")
 
     def command(
-        self, t: FloatArray, own: FloatArray, limits: Limits | None = None, start_memory: StartMemory = "end"
+        self,
+        t: FloatArray,
+        y: FloatArray,
+        limits: Limits | None = None,
+        start_memory: StartMemory = "end",
+        coupled: FloatArray | float = 0.0,
     ) -> tuple[FloatArray, Mask]:
-        """Return the voltage for a displacement (m), (N,), without cross-coupling, and where it is held at a limit."""
-        if start_memory != "start":
-            return replace(self, start=self.initial(start_memory)).command(t, own, limits, "start")
-        allowed = self._allowed(limits)
-        if not self.effects:
-            return self._invert_hysteresis(own, allowed)
-        chain, (lowest, highest) = self.chain, self.chain.clipped
-        between = replace(allowed, lower=max(allowed.lower, lowest), upper=max(min(allowed.upper, highest), lowest))
-        around = EffectContext.since_start(t)
-        h = backward(chain.own, own, around)
-        if chain.around:
-            # The axis may start outside its limits; the first output voltage is inside.
-            memory = StreamingInverse(self.memory("start"), self.displacement_range, between).memory
-            u, reached = chain.around.command(t, h, memory, (between.lower, between.upper))
-            held = self._held(u, h, reached, between)
-            if not chain.before:
-                return u, held
-        else:
-            u, held = self._invert_hysteresis(h, between)
-        return self._kept(backward(chain.before, u, around), held, allowed)
+        """Return the voltage, as `compensate`, and where it is held at a limit, shape (N,) each.
 
-    def _held(self, v: FloatArray, h: FloatArray, reached: FloatArray, limits: Limits) -> Mask:
-        """Return where voltages (V) are held at the limit beyond which a displacement `h` (m) lies, shape (N,) each."""
-        above = limits.upper - ROUNDING * (1.0 + abs(limits.upper))
-        below = limits.lower + ROUNDING * (1.0 + abs(limits.lower))
-        if not v.size or (v.max() < above and v.min() > below):
-            return np.zeros(v.size, dtype=bool)
-        low, high = self.displacement_range
-        missed, rounding = h - reached, ROUNDING * (high - low)
-        return np.asarray(((missed > rounding) & (v >= above)) | ((missed < -rounding) & (v <= below)))
+        It is that of `stream`, but for a delay, which is compensated by preview, and for models that are not causal.
+        `coupled` (m), a number or of shape (N,), is the displacement that other axes add.
+        """
+        allowed, around = self._allowed(limits), EffectContext.since_start(t)
+        if not self.causal and max(allowed.slew, allowed.acceleration) == inf and not self.chain.around:
+            return self._command_known_path(y - coupled, around, allowed, self.initial(start_memory))
+        v, held = self.stream(limits, start_memory).run(t, y, coupled)
+        return backward([effect for effect in self.chain.before if effect.shift], v, around), held
 
-    def _kept(self, wanted: FloatArray, held: Mask, allowed: Limits) -> tuple[FloatArray, Mask]:
+    def _command_known_path(
+        self, y: FloatArray, around: EffectContext, allowed: Limits, start: Start
+    ) -> tuple[FloatArray, Mask]:
+        """Return the result of `command` for a model that is not causal; limits do not act back on the effects."""
+        (lowest, highest), axis = self.chain.clipped, replace(self, start=start)
+        limits = replace(allowed, lower=max(allowed.lower, lowest), upper=max(min(allowed.upper, highest), lowest))
+        h = backward(self.chain.own, y, replace(around, start=start.displacement))
+        u = axis._path().inverse_array(h, limits.lower, limits.upper)
+        held = (u <= limits.lower) | (u >= limits.upper)
+        rounding = ROUNDING * (self.displacement_range[1] - self.displacement_range[0])
+        if held.any():
+            with warnings.catch_warnings():
+                # The warning for loops that were not identified has already been issued.
+                warnings.simplefilter("ignore", slpi.UnidentifiedLoopWarning)
+                held &= np.abs(axis._path().forward_array(u) - h) > rounding
+        wanted = backward(self.chain.before, u, replace(around, start=start.voltage))
         v = np.clip(wanted, allowed.lower, allowed.upper)
-        width = self.voltage_range[1] - self.voltage_range[0]
-        return v, held | (np.abs(v - wanted) > ROUNDING * width)
+        return v, held | (np.abs(v - wanted) > ROUNDING * (self.voltage_range[1] - self.voltage_range[0]))
 
     @cached_property
     def chain(self) -> Chain:
@@ -339,34 +345,8 @@ class AxisModel:
     def _allowed(self, limits: Limits | None) -> Limits:
         return (limits or Limits(-inf, inf)).within(self.voltage_range)
 
-    def _forward_array(self, v: FloatArray) -> FloatArray:
-        return (self._known_path() or self.memory("start")).forward_array(v)
-
-    def _known_path(self) -> slpi.KnownPath | smpi.KnownPath | None:
-        """Return the path operator of a model that is not causal; None for a causal one."""
+    def _path(self) -> slpi.KnownPath | smpi.KnownPath | Memory:
+        """Return the hysteresis operator at the start of the record."""
         if isinstance(self.hysteresis, PathModel):
             return self.hysteresis.along(self.start.voltage, self.start.displacement)
-        return None
-
-    def _path(self, allowed: Limits) -> slpi.KnownPath | smpi.KnownPath | Memory:
-        """Return the hysteresis operator at the start, within the `allowed` voltages."""
-        # The axis may start outside its limits; the first output voltage is inside.
-        return self._known_path() or StreamingInverse(self.memory("start"), self.displacement_range, allowed).memory
-
-    def _invert_hysteresis(self, h: FloatArray, allowed: Limits) -> tuple[FloatArray, Mask]:
-        """Return the voltage for a displacement without effects, (N,), metres, and where it is held at a limit."""
-        u = self._path(allowed).inverse_array(h, allowed.lower, allowed.upper)
-        return u, self._missed(h, u, allowed)
-
-    def _missed(self, h: FloatArray, u: FloatArray, allowed: Limits) -> Mask:
-        """Return the mask of samples at which a voltage at a limit does not give the desired displacement."""
-        held = (u <= allowed.lower) | (u >= allowed.upper)
-        if held.any():
-            # A desired displacement may be reached exactly at a limit.
-            with warnings.catch_warnings():
-                # The warning for loops that were not identified has already been issued.
-                warnings.simplefilter("ignore", slpi.UnidentifiedLoopWarning)
-                missed = self._path(allowed).forward_array(u) - h
-            low, high = self.displacement_range
-            held &= np.abs(missed) > ROUNDING * (high - low)
-        return held
+        return self.memory("start")

@@ -1,7 +1,7 @@
 """Linear coupling of the axes of a stage."""
 
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,19 +27,32 @@ class Coupling:
 
     def part(self, name: str, motions: Mapping[str, Motion]) -> Motion | float:
         """Return the displacement (m) of axis `name` caused by the own motions of the others, 0 for missing axes."""
-        return sum((gain * motions[other] for other, gain in self._gains[name].items() if other in motions), 0.0)
+        part: Motion | float = 0.0
+        for other, gain in self._gains[name].items():
+            if other in motions:
+                part = part + gain * motions[other]
+        return part
 
-    def decouple(self, seen: Mapping[str, Motion], resting: Mapping[str, Motion]) -> dict[str, Motion]:
+    def parts(self, seen: Mapping[str, Motion], resting: Mapping[str, Any]) -> dict[str, Motion | float]:
+        """Return the displacement (m) of each axis that the others cause; arguments as in `decouple`."""
+        motions: dict[str, Any] = {**(self.decouple(seen, resting) if seen else {}), **resting}
+        return {name: self.part(name, motions) for name in self._gains}
+
+    def decouple(self, seen: Mapping[str, Motion], resting: Mapping[str, Any]) -> dict[str, Motion]:
         """Return the own motions (m), those without coupling, that produce the observed ones, `seen` (m).
 
         Each from the start, a number or of shape (N,). `resting` are own motions (m) of axes held in position.
         """
         left = {name: motion - self.part(name, resting) for name, motion in seen.items()}
         rows = self._solution(tuple(seen))
-        return {
-            name: sum(share * motion for share, motion in zip(row, left.values(), strict=True))  # type: ignore[misc]
-            for name, row in zip(seen, rows, strict=True)
-        }
+        own = {}
+        for name, row in zip(seen, rows, strict=True):
+            # Not `sum`, which rounds numbers otherwise than arrays.
+            motion: Any = 0.0
+            for share, each in zip(row, left.values(), strict=True):
+                motion = motion + share * each
+            own[name] = motion
+        return own
 
     def _solution(self, names: tuple[str, ...]) -> list[list[float]]:
         if names not in self._solutions:

@@ -1,6 +1,5 @@
 """Model of a stage: the models of all axes and their cross-coupling."""
 
-import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.record import Record
-from slpi_ros.model.axis_model import AxisModel, Mask, StartMemory
+from slpi_ros.model.axis_model import AxisModel, StartMemory
 from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.sensor import Sensor, corrected
-from slpi_ros.model.streaming import StageStream, StreamingInverse
+from slpi_ros.model.streaming import Mask, StageStream, StreamingInverse
 
 FloatArray = NDArray[np.float64]
 Signal = ArrayLike | Mapping[str, ArrayLike]
@@ -112,37 +111,23 @@ class StageModel:
         acceleration limit the voltage is that of `streams`: it begins at the voltage of the start memory.
         """
         time, desired = self._signals(t, y, "displacement")
-        if limits is not None and min(limits.slew, limits.acceleration) < math.inf:
-            return self._streamed(time, desired, limits, start_memory)
-        own: dict[str, FloatArray] = {}
         for name, signal in desired.items():
             with _naming(name, "displacement"):
                 self.axis(name).require_reachable(signal)
-                own[name] = signal
+        parts: dict[str, FloatArray | float] = {}
         if self.coupling.on:
-            starts = {name: self.axes[name].start.displacement for name in own}
-            apart = self.coupling.decouple({name: z - starts[name] for name, z in own.items()}, {})
-            own = {name: starts[name] + motion for name, motion in apart.items()}
+            origins = self.origins
+            moving = {name: signal - origins[name] for name, signal in desired.items()}
+            resting = {
+                name: axis.rest(limits, start_memory) - origins[name]
+                for name, axis in self.axes.items()
+                if name not in moving
+            }
+            parts = self.coupling.parts(moving, resting)
         answers: dict[str, tuple[FloatArray, Mask]] = {}
-        for name, z in own.items():
+        for name, signal in desired.items():
             with _naming(name, "displacement"):
-                answers[name] = self.axes[name].command(time, z, limits, start_memory)
-        return answers
-
-    def _streamed(
-        self, t: FloatArray, desired: Mapping[str, FloatArray], limits: Limits, start_memory: StartMemory
-    ) -> dict[str, tuple[FloatArray, Mask]]:
-        """Return the result of `command`, sample by sample, within limits of the rate."""
-        streams = {name: axis.stream(limits, start_memory) for name, axis in self.axes.items()}
-        stage = StageStream(streams, self.coupling, self.origins)
-        answers = {name: (np.empty(t.size), np.zeros(t.size, dtype=bool)) for name in desired}
-        for number, time in enumerate(t.tolist()):
-            try:
-                step = stage.step(time, {name: float(y[number]) for name, y in desired.items()})
-            except SlpiError as error:
-                raise type(error)(f"sample {number}: {error}") from None
-            for name, (v, held) in answers.items():
-                v[number], held[number] = step[name], streams[name].held
+                answers[name] = self.axes[name].command(time, signal, limits, start_memory, parts.get(name, 0.0))
         return answers
 
     def correct(self, record: Record) -> Record:

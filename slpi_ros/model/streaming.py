@@ -6,14 +6,19 @@ from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from slpi_ros.effects.base import Effect, StreamingAround, StreamingEffect
 from slpi_ros.effects.chain import Chain
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
-from slpi_ros.hysteresis.turning_points import Memory, MemoryState
+from slpi_ros.hysteresis.turning_points import Memory, MemoryState, worth_compiling
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 StreamingEffects = dict[str, StreamingEffect]
 
 # A desired displacement outside the identified range by more than this share of its span is refused as an error (wrong
@@ -82,7 +87,7 @@ class StreamingInverse:
         effects: tuple[Effect, ...] = (),
     ) -> None:
         chain = Chain.of(effects)
-        self.memory, self._clipped = memory, chain.clipped
+        self.memory, self._chain, self._clipped = memory, chain, chain.clipped
         self.accepted = self._lowest, self._highest = accepted_range(displacement_range)
         self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
         self._t = -inf
@@ -230,6 +235,67 @@ class StreamingInverse:
         self._follow(counted)
         self._short = displacement - self._displacement
         return v
+
+    def run(self, t: FloatArray, y: FloatArray, coupled: FloatArray | float = 0.0) -> tuple[FloatArray, Mask]:
+        """Return what `step` gives for each sample of a path, and where it is `held`, shape (N,) each.
+
+        `t` (s) and `y` (m) have shape (N,); `coupled` (m) is as the attribute. For a new stream only, whose state
+        afterwards is not defined: long paths are evaluated by compiled code, equal to `step` but for rounding errors.
+        """
+        limits, timeless = self.pace.limits, min(self.pace.limits.slew, self.pace.limits.acceleration) == inf
+        if timeless and not self._streaming:
+            return self._run_hysteresis(y - coupled)
+        v, held = np.empty(y.size), np.zeros(y.size, dtype=bool)
+        if timeless and (laws := self._laws()) is not None and worth_compiling(y.size):
+            from slpi_ros.effects.paths import Laws, inverse_path
+
+            h, dt, voltages = y - coupled, np.diff(t, prepend=t[:1]), (float(limits.lower), float(limits.upper))
+            if self._direct:
+                v, reached = self.memory.inverse_of_law_array(dt, h, laws["rate"], voltages)
+                return v, self._beyond(v, h - reached)
+            direction, point, turns, depth = self.memory.arrays(4 * y.size + 4)
+            done = inverse_path(
+                *(dt, h, *voltages, MAX_DT, (self._rounding, ROUNDING), self.memory.far, Laws(**laws), v, held),
+                *(point, turns, direction, depth, *self.memory.shape_arrays()),
+            )
+            if done < y.size:
+                raise UsageError(
+                    f"sample {done}: displacement {y[done]} m cannot be reached by this model; leave it out"
+                )
+            return v, held
+        parts = np.broadcast_to(np.asarray(coupled, dtype=np.float64), y.shape).tolist()
+        for k, (now, desired, self.coupled) in enumerate(zip(t.tolist(), y.tolist(), parts, strict=True)):
+            try:
+                v[k], held[k] = self.step(now, desired), self.held
+            except SlpiError as error:
+                raise type(error)(f"sample {k}: {error}") from None
+        return v, held
+
+    def _laws(self) -> dict[str, Any] | None:
+        """Return the fields of `slpi_ros.effects.paths.Laws`; None if an effect has no compiled form."""
+        chain, found = self._chain, dict[str, Any]()
+        for effect in (*chain.before, *([chain.around] if chain.around else []), *chain.own):
+            if effect.name in self._streaming:
+                laws = effect.laws()
+                if laws is None:
+                    return None
+                found |= laws
+        return found
+
+    def _run_hysteresis(self, h: FloatArray) -> tuple[FloatArray, Mask]:
+        """Return the result of `run` without effects, for displacements (m), shape (N,)."""
+        limits, again = self.pace.limits, copy(self.memory)
+        again.restore(self.memory.snapshot())
+        v = self.memory.inverse_array(h, limits.lower, limits.upper)
+        if not v.size or (v.min() > limits.lower and v.max() < limits.upper):
+            return v, np.zeros(v.size, dtype=bool)
+        return v, self._beyond(v, h - again.forward_array(v))
+
+    def _beyond(self, v: FloatArray, missing: FloatArray) -> Mask:
+        """Return where voltages (V) are at the limit beyond which the displacement `missing` (m) lies, shape (N,)."""
+        lower, upper = self.pace.limits.lower, self.pace.limits.upper
+        above = (missing > self._rounding) & (v >= upper - ROUNDING * (1.0 + abs(upper)))
+        return np.asarray(above | ((missing < -self._rounding) & (v <= lower + ROUNDING * (1.0 + abs(lower)))))
 
     def approach(self, dt: float, now_ns: int) -> float:
         """Go on towards `goal`, `dt` (s) after the last sample, as `pace` allows at `now_ns` (ns); return the voltage.
@@ -428,15 +494,15 @@ class StageStream:
         """Set `coupled` of every axis for the desired displacements `y` (m) of the named axes."""
         if not self._coupling.on:
             return
-        streams, origins = self.streams, self._origins
+        origins = self._origins
         moving = {name: desired - origins[name] for name, desired in y.items()}
         resting = {
-            name: each.uncoupled_displacement - origins[name] for name, each in streams.items() if name not in moving
+            name: each.uncoupled_displacement - origins[name]
+            for name, each in self.streams.items()
+            if name not in moving
         }
-        motions = self._coupling.decouple(moving, resting) if moving else {}
-        motions.update(resting)
-        for name, stream in streams.items():
-            stream.coupled = float(self._coupling.part(name, motions))
+        for name, part in self._coupling.parts(moving, resting).items():
+            self.streams[name].coupled = part
 
     def snapshot(self) -> dict[str, StreamState]:
         """Return the complete state for `restore`."""

@@ -27,7 +27,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.compensator.amplifier import Calibration
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.controller import Controller, Mode
+from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis, model_id
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import ModelError, SlpiError, shown
@@ -249,7 +249,7 @@ class Compensator(LifecycleNode):
         """Deactivate as `on_deactivate` does, destroy publisher and subscriptions, and finalize."""
         self._end_activity()
         result = super().on_shutdown(state)
-        if self._controller.mode is not Mode.UNCONFIGURED:
+        if self._controller.mode is not OperatingMode.UNCONFIGURED:
             self._leave_topics()
         self._reporter.finalized = True
         self._report()
@@ -270,7 +270,7 @@ class Compensator(LifecycleNode):
             controller.ramp(safety.voltages, safety.rate, now_ns)
         else:
             controller.hold(now_ns)
-        if before is Mode.RESETTING:
+        if before is OperatingMode.RESETTING:
             self._answer_reset()
         while controller.ramping and controller.ownership.owned and self.context.ok():
             time.sleep(self._settings.period)
@@ -337,7 +337,7 @@ class Compensator(LifecycleNode):
             return
         if controller.report(state.name, state.effort, now_ns) and controller.ownership.obstacle:
             self.get_logger().error(f"nothing more is published: {controller.ownership.obstacle[1]}")
-            if before is Mode.RESETTING:
+            if before is OperatingMode.RESETTING:
                 self._answer_reset()
             self._report()
 
@@ -482,7 +482,7 @@ class Compensator(LifecycleNode):
         if controller.next_due_ns(0, 0) is None:
             return
         now_ns, clock_ns = self._clocks()
-        if before is Mode.TRAJECTORY and self._on_simulated != self._simulated:
+        if before is OperatingMode.TRAJECTORY and self._on_simulated != self._simulated:
             controller.cancel(now_ns)
             self.get_logger().error("use_sim_time was changed: trajectory canceled, as its times are no longer valid")
         # One point per call, so that callbacks run even if points are due faster than they can be processed.
@@ -490,14 +490,14 @@ class Compensator(LifecycleNode):
         held = controller.counts.points_held
         if controller.advance(now_ns, clock_ns):
             self._publish()
-            if before is Mode.TRAJECTORY and deadline_ns is not None and deadline_ns <= clock_ns:
+            if before is OperatingMode.TRAJECTORY and deadline_ns is not None and deadline_ns <= clock_ns:
                 self._reporter.lateness.note(deadline_ns, clock_ns)
             if controller.counts.points_held > held or controller.counts.excursions > self._excursions:
                 self._warn_held()
             if controller.too_fast:
                 self._tell_too_fast()
         if controller.mode is not before:
-            if before is Mode.RESETTING:
+            if before is OperatingMode.RESETTING:
                 self._answer_reset()
             self._report()
 
@@ -577,7 +577,7 @@ class Compensator(LifecycleNode):
             self.executor.create_task(self._take_model, coming)
 
     def _take_model(self, coming: Future[Read | None]) -> None:
-        if self._controller.mode is Mode.UNCONFIGURED:
+        if self._controller.mode is OperatingMode.UNCONFIGURED:
             return
         try:
             read = coming.result()
@@ -627,7 +627,7 @@ class Compensator(LifecycleNode):
         """Warn once about an assumed memory, or start a reset if `reset_on_start`; only when active with a model."""
         controller = self._controller
         unsure = [axis for axis in controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
-        if controller.model is None or controller.mode is not Mode.STREAMING or not unsure:
+        if controller.model is None or controller.mode is not OperatingMode.STREAMING or not unsure:
             return
         # As soon as the voltages are known.
         self._memory_waits = controller.ownership.obstacle is not None
@@ -671,9 +671,9 @@ class Compensator(LifecycleNode):
         controller = self._controller
         if not controller.active or controller.model is None:
             return "not reset: a model is required, and the node must be active"
-        if controller.mode is Mode.TRAJECTORY:
+        if controller.mode is OperatingMode.TRAJECTORY:
             return f"not reset: {controller.activity(time.monotonic_ns())}; wait, or cancel it with an empty one"
-        if controller.mode is not Mode.RESETTING:
+        if controller.mode is not OperatingMode.RESETTING:
             try:
                 self._start_reset()
             except RejectedError as error:

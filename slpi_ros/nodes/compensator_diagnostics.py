@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from rclpy.node import Node
 
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.controller import Controller, Mode
+from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.statistics import Timing, TimingReport
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
@@ -68,14 +68,14 @@ class Reporter:
         mode = self._controller.mode
         if self.finalized:
             return "finalized"
-        return mode.value if mode in (Mode.UNCONFIGURED, Mode.INACTIVE) else "active"
+        return mode.value if mode in (OperatingMode.UNCONFIGURED, OperatingMode.INACTIVE) else "active"
 
     def _summary(self) -> str:
         controller = self._controller
         if not controller.active or self.finalized:
             return self._state
         activity = controller.activity(time.monotonic_ns())
-        if controller.mode is Mode.RESETTING:
+        if controller.mode is OperatingMode.RESETTING:
             return activity
         if controller.model and controller.ownership.obstacle:
             return f"not moving: {controller.ownership.obstacle[1]}"
@@ -89,11 +89,11 @@ class Reporter:
     def _silence(self) -> str:
         """Return the watchdog message; "" while commands arrive."""
         controller, watchdog = self._controller, self._controller.watchdog
-        if not watchdog.expired or controller.mode not in (Mode.STREAMING, Mode.RAMPING):
+        if not watchdog.expired or controller.mode not in (OperatingMode.STREAMING, OperatingMode.RAMPING):
             return ""
         reaction = "are held"
         if watchdog.safe_voltages:
-            reaction = "go to the safe ones" if controller.mode is Mode.RAMPING else "are the safe ones"
+            reaction = "go to the safe ones" if controller.mode is OperatingMode.RAMPING else "are the safe ones"
         yet = "" if watchdog.commanded else " yet"
         return f"no command{yet} for {watchdog.silence(time.monotonic_ns()):.3g} s; voltages {reaction}"
 

@@ -21,7 +21,7 @@ from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes.common import COMMANDS, run
 from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
-from slpi_ros.simulation.character import Character, CharacterStage
+from slpi_ros.simulation.character import Character, CharacterAxis
 from slpi_ros.simulation.stage import Stage, p11_stage
 
 LOG_PERIOD = 5.0
@@ -136,17 +136,15 @@ class StageSimulator(Node):
         history = self._initial_history(values["initial_history"])
         self._state = JointState(name=axes)
         self._state.header.frame_id = values["hardware_id"] or f"simulated-{preset or seed}{identity}"
-        if values["character"] == DRAWN and isinstance(self._stage, CharacterStage):
-            for axis, one in self._stage.axes.items():
+        for axis, one in self._stage.axes.items():
+            if values["character"] == DRAWN and isinstance(one, CharacterAxis):
                 self.get_logger().info(f"axis {axis}: {one.character}")
         self._speed, self._begun_ns = values["speed"], time.monotonic_ns()
         self._origin_ns, self._latest_ns = self.get_clock().now().nanoseconds, 0
         begun = self._now_ns() * 1e-9
         for v in (*history, self._clip(0.0)):
             self._stage.step(begun - DAY, [v] * len(axes))
-        if isinstance(self._stage, CharacterStage):
-            for one in self._stage.axes.values():
-                one.begin_drift(begun)
+        self._stage.begin_drift(begun)
         self._apply([self._clip(0.0)] * len(axes))
         self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
         self._answers, self._commanded_at = values["answer_commands"], -math.inf
@@ -225,7 +223,7 @@ def _time(nanoseconds: int) -> Time:
     return Time(sec=seconds, nanosec=rest)
 
 
-def _make_stage(values: Values) -> tuple[Stage | CharacterStage, str]:
+def _make_stage(values: Values) -> tuple[Stage, str]:
     """Return the stage, and what its hardware id says of its character."""
     axes, preset, seed, noise = list(values["axes"]), values["preset"], values["seed"], values["noise_rms"]
     names = [effect.name for effect in fields(Character)]
@@ -246,12 +244,12 @@ def _make_stage(values: Values) -> tuple[Stage | CharacterStage, str]:
         return Stage.random(axes, seed, noise), ""
     if values["character"] == GIVEN:
         digest = hashlib.sha256(repr(given).encode()).hexdigest()[:8]
-        return CharacterStage.of(axes, given, seed, noise), f"-{digest}"
-    drawn = CharacterStage.hidden(axes, seed, noise, rate=values["rate"], voltage_max=values["voltage_max"])
+        return Stage.of(axes, given, seed, noise), f"-{digest}"
+    drawn = Stage.hidden(axes, seed, noise, rate=values["rate"], voltage_max=values["voltage_max"])
     return drawn, f"-{values['character']}"
 
 
-def _limits(stage: Stage | CharacterStage, low: float, high: float) -> tuple[float, float]:
+def _limits(stage: Stage, low: float, high: float) -> tuple[float, float]:
     lowest, highest = stage.voltage_range
     if not lowest <= low < high <= highest:
         raise UsageError(

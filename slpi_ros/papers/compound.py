@@ -34,7 +34,7 @@ from slpi_ros.papers.mpi_study import (
 from slpi_ros.reports.chart import COLOURS, DESIRED
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage
-from slpi_ros.simulation.stage import p11_stage
+from slpi_ros.simulation.stage import p11_axes
 
 FloatArray = NDArray[np.float64]
 
@@ -256,7 +256,7 @@ def scheme() -> Figure:
 
 def exhibits(seed: int = 0) -> list[Exhibit]:
     """Run the experiments and return their exhibits; `seed` is the seed of the sensor noise."""
-    return present({name: run_study(axis, name) for name, axis in p11_stage(seed).axes.items()})
+    return present({name: run_study(axis, name) for name, axis in p11_axes(seed).items()})
 
 
 def present(studies: Mapping[str, AxisStudy]) -> list[Exhibit]:

@@ -20,17 +20,17 @@ from slpi_ros.effects.registry import to_document
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import format_document
+from slpi_ros.model.axis_model import ABOVE_FLOOR
 from slpi_ros.model.document import format_model
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, NOISE
 from slpi_ros.reports.page import Page, Severity, Share
 from slpi_ros.reports.text import above_floor, nm
-from slpi_ros.reports.views import Curve, Motion
+from slpi_ros.reports.views import Motion, Series
 
 FloatArray = NDArray[np.float64]
 
-# With effects, errors up to this multiple of the floor count as noise; relative difference of equal errors.
-_NOISE_ONLY = 1.5
+# Relative difference of equal errors.
 _SAME = 0.01
 
 BEFORE_NAME, AFTER_NAME = "without effects", "with effects"
@@ -74,7 +74,7 @@ def _severity(found: AxisDiagnosis) -> Severity:
     if found.verdict == NOTHING_FOUND:
         return "good"
     if found.verdict == NAMED:
-        return "good" if found.after_rms <= _NOISE_ONLY * found.floor_rms else "warn"
+        return "good" if found.after_rms <= ABOVE_FLOOR * found.floor_rms else "warn"
     return "warn" if found.verdict == AMBIGUOUS else "bad"
 
 
@@ -210,10 +210,10 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
         page.text("The record holds no sample: there are no charts.")
         return
     motion = Motion.of(t, v)
-    models = [Curve(BEFORE_NAME, traces.before, BEFORE)]
+    models = [Series(BEFORE_NAME, traces.before, BEFORE)]
     if found.effects:
-        models.append(Curve(AFTER_NAME, traces.after, AFTER))
-    left = [Curve(model.name, y - model.values, model.colour) for model in models]
+        models.append(Series(AFTER_NAME, traces.after, AFTER))
+    left = [Series(model.name, y - model.values, model.colour) for model in models]
     parts = _parts(traces)
     drawings = {
         "time": views.over_time(t, y, models, found.floor_rms, parts),
@@ -237,7 +237,7 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
     page.chart(f"{name}-loops", loops, f"{views.LOOPS} {said}")
 
 
-def _parts(traces: Traces) -> list[Curve]:
+def _parts(traces: Traces) -> list[Series]:
     """Return the contribution of each effect to the residual of the model without effects.
 
     The part absorbed by the hysteresis fitted alone is subtracted from the effects with which it is correlated.
@@ -250,7 +250,7 @@ def _parts(traces: Traces) -> list[Curve]:
     weights = np.array([max(float(values @ imitated), 0.0) for values in effects.values()])
     weights = weights / weights.sum() if weights.any() else np.full(len(effects), 1.0 / len(effects))
     return [
-        Curve(name, values - weight * imitated, colour)
+        Series(name, values - weight * imitated, colour)
         for (name, values), weight, colour in zip(
             effects.items(), weights.tolist(), _colours(len(effects)), strict=True
         )

@@ -10,19 +10,19 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.identification.cross_validation import CLASSICAL, CrossValidationReport, Slice
 from slpi_ros.identification.record_quality import Finding, assess, findings
 from slpi_ros.io.record import Record
-from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.axis_model import ABOVE_FLOOR, AxisModel
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE
 from slpi_ros.reports.page import Page, Severity
 from slpi_ros.reports.text import describe_axis, nm
-from slpi_ros.reports.views import Curve
+from slpi_ros.reports.views import Series
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Held-out errors up to the first multiple of the noise count as noise; from the second on, diagnosis is advised.
-_NOISE_ONLY, _MORE_THAN_NOISE = 1.5, 3.0
+# From held-out errors of this multiple of the noise on, diagnosis is advised.
+_MORE_THAN_NOISE = 3.0
 
 
 def write_report(
@@ -99,7 +99,7 @@ def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None)
     said = f"Axis {name}: the held-out error is {nm(error)} rms ({share} of the stroke)"
     if not floor > 0.0:
         return f"{said}; the record has no noise for comparison.{beside}", "warn"
-    if error <= _NOISE_ONLY * floor:
+    if error <= ABOVE_FLOOR * floor:
         return f"{said}; {floor_is}, so the error is close to the noise.{beside}", "good"
     said = f"{said}; {floor_is}, and the error is {error / floor:.1f} times {noise}."
     if error <= _MORE_THAN_NOISE * floor:
@@ -160,9 +160,9 @@ def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> No
         caption="Free-run held-out errors; the classical PI model on the same blocks. "
         f"Floor: {nm(floor.rms)} rms, {floor.source}.",
     )
-    curves = [Curve(held_out.kind, -held_out.error, AFTER)]
+    curves = [Series(held_out.kind, -held_out.error, AFTER)]
     if held_out.kind != CLASSICAL and np.isfinite(held_out.classical).any():
-        curves.insert(0, Curve("classical PI", -held_out.classical, BEFORE))
+        curves.insert(0, Series("classical PI", -held_out.classical, BEFORE))
     chart, said = views.held_out(held_out.t, curves, floor.rms)
     page.chart(
         f"{name}-held-out",

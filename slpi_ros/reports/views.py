@@ -126,7 +126,7 @@ def _speed(t: FloatArray, v: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Curve:
+class Series:
     """A signal over the samples of a record, shape (N,), metres, with its name and colour."""
 
     name: str
@@ -150,7 +150,7 @@ def show_model(
     evaluated (`fitted`) have the shape (N,). `name` is the first part of the charts' names; `noise` (m) is the
     half-width of the shaded noise band, 0 for none.
     """
-    motion, models = Motion.of(t, v), [Curve("model", simulated, AFTER)]
+    motion, models = Motion.of(t, v), [Series("model", simulated, AFTER)]
     chart, said = loops(v, y, models, motion, fitted)
     page.chart(f"{name}-loops", chart, f"{LOOPS} {said}")
     chart, said = over_time(t, y, models, noise, fitted=fitted)
@@ -165,7 +165,7 @@ def show_model(
 
 
 def loops(
-    v: FloatArray, y: FloatArray, models: Sequence[Curve], motion: Motion, fitted: Mask | None = None
+    v: FloatArray, y: FloatArray, models: Sequence[Series], motion: Motion, fitted: Mask | None = None
 ) -> tuple[Chart, str]:
     """Draw displacement over voltage, and the deviation from a straight-line fit in a second panel.
 
@@ -180,11 +180,11 @@ def loops(
     across = np.where(gaps, np.nan, v[at])
     fitted = np.ones(v.size, dtype=bool) if fitted is None else fitted
     line = _straight(v, np.where(fitted, y, np.nan))[at]
-    curves = [(Curve("measured", y, MEASURED), 3.0), *((model, 1.1) for model in models)]
+    curves = [(Series("measured", y, MEASURED), 3.0), *((model, 1.1) for model in models)]
     if not fitted.all():
         colours = [UNUSED_MEASURED, *(UNUSED_MODEL for _ in models)]
         others = [
-            (Curve(f"{one.name}, {UNUSED}", one.values, colour), width)
+            (Series(f"{one.name}, {UNUSED}", one.values, colour), width)
             for (one, width), colour in zip(curves, colours, strict=True)
         ]
         _add_loops(chart, others, across, line, at, ~fitted)
@@ -194,7 +194,7 @@ def loops(
 
 def _add_loops(
     chart: Chart,
-    curves: Sequence[tuple[Curve, float]],
+    curves: Sequence[tuple[Series, float]],
     across: FloatArray,
     line: FloatArray,
     at: NDArray[np.int64],
@@ -235,9 +235,9 @@ def _some_runs(v: FloatArray, y: FloatArray, motion: Motion) -> tuple[FloatArray
 def over_time(
     t: FloatArray,
     y: FloatArray,
-    models: Sequence[Curve],
+    models: Sequence[Series],
     noise: float,
-    parts: Sequence[Curve] = (),
+    parts: Sequence[Series] = (),
     fitted: Mask | None = None,
 ) -> tuple[Chart, str]:
     """Draw displacement over time, and the residuals of models below.
@@ -288,11 +288,11 @@ def over_voltage(v: FloatArray, left: FloatArray, motion: Motion, noise: float, 
         if part.size:
             chart.dots(0, name, v[part], left[part], colour)
     chart.band(0, noise)
-    histogram(chart, 1, Curve("used samples", left[fitted], MEASURED))
+    histogram(chart, 1, Series("used samples", left[fitted], MEASURED))
     return chart, focus(chart, (0, 1), [left], fitted)
 
 
-def held_out(t: FloatArray, models: Sequence[Curve], noise: float) -> tuple[Chart, str]:
+def held_out(t: FloatArray, models: Sequence[Series], noise: float) -> tuple[Chart, str]:
     """Draw held-out residuals of `models` over time (s), and their histograms."""
     chart = Chart([Panel(TIME, ERROR, 3.0), Panel(SAMPLES, ERROR, 1.0)], height=420)
     steps = np.abs(np.diff(t))
@@ -307,7 +307,7 @@ def held_out(t: FloatArray, models: Sequence[Curve], noise: float) -> tuple[Char
     return chart, focus(chart, (0, 1), [model.values for model in models])
 
 
-def histogram(chart: Chart, panel: int, curve: Curve) -> None:
+def histogram(chart: Chart, panel: int, curve: Series) -> None:
     """Add a histogram as an outline."""
     x = curve.values[np.isfinite(curve.values)]
     if not x.size:
@@ -359,7 +359,7 @@ def focus(chart: Chart, panels: Sequence[int], errors: Sequence[FloatArray], cho
     return f"{beyond} samples{each} lie outside the initial view; double-click shows all."
 
 
-def over_motion(v: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], motion: Motion) -> tuple[Chart, str]:
+def over_motion(v: FloatArray, curves: Sequence[Series], parts: Sequence[Series], motion: Motion) -> tuple[Chart, str]:
     """Draw residuals over voltage (V), shape (N,), and over its speed, with means for rising and falling voltage.
 
     `curves` are the residuals, `parts` contributions to them, of which only the means are drawn. The text is a note on
@@ -374,13 +374,13 @@ def over_motion(v: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], 
 
 
 def over_frequency(
-    t: FloatArray, curves: Sequence[Curve], parts: Sequence[Curve], motion: Motion, noise: float
+    t: FloatArray, curves: Sequence[Series], parts: Sequence[Series], motion: Motion, noise: float
 ) -> tuple[Chart, str]:
     """Draw residuals over the time since the last reversal, and their spectra; `noise` (m rms) is the floor."""
     chart = Chart([Panel(SINCE, ERROR), Panel(FREQUENCY, DENSITY)], height=430)
     later = np.flatnonzero(motion.since_turn > 0.0)
     since = motion.since_turn[later]
-    chosen = [Curve(curve.name, curve.values[later], curve.colour) for curve in (*curves, *parts)]
+    chosen = [Series(curve.name, curve.values[later], curve.colour) for curve in (*curves, *parts)]
     first, rest = chosen[: len(curves)], chosen[len(curves) :]
     _add(chart, 0, since, first, rest, lambda values: _means(since, values, alike=True))
     spectra = [_spectrum(t, curve.values) for curve in (*curves, *parts)]
@@ -400,8 +400,8 @@ def _add(
     chart: Chart,
     panel: int,
     x: FloatArray,
-    curves: Sequence[Curve],
-    parts: Sequence[Curve],
+    curves: Sequence[Series],
+    parts: Sequence[Series],
     means: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
 ) -> None:
     """Add the dots of curves, with means of curves and parts on top."""

@@ -1,9 +1,9 @@
-"""A simulated stage with a character: hysteresis, and any of the effects that real stages have, sample by sample."""
+"""One axis of a simulated stage with a character: hysteresis, and any of the effects that real stages have."""
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -18,8 +18,6 @@ from slpi_ros.simulation.surroundings import Hum, Interferometer
 REFERENCE_RATE, ONSET, SETTLING = 100.0, 5.0, 2e-3
 # Creep continues from the shortest to the longest of these times, seconds.
 CREEP_TIMES = (0.1, 100.0)
-# Seeds of the axes of one stage differ by this number.
-NEXT_AXIS = 1000
 
 
 @dataclass(frozen=True)
@@ -211,6 +209,11 @@ class CharacterAxis:
             y = self._mode.step(dt, y)
         return y * (1.0 + self.character.gain_drift * self._drifted(t))
 
+    @property
+    def coupling(self) -> float:
+        """Share of the motion of every other axis."""
+        return self.character.coupling
+
     def begin_drift(self, t: float) -> None:
         """Begin the drifts at time `t` (s); they begin with the first sample otherwise."""
         self._start = t
@@ -260,102 +263,3 @@ class CharacterAxis:
         width = self.character.rate_dependence * math.log1p(self._rate / ONSET) / math.log1p(REFERENCE_RATE / ONSET)
         self._played = min(max(self._played, v - width), v + width)
         return min(max(self._played, self.parameters.threshold_min), self.parameters.threshold_max)
-
-
-class CharacterStage:
-    """A stage whose axes have characters, and may be coupled.
-
-    Parameters
-    ----------
-    axes : mapping of axis name to CharacterAxis
-        In the order of the voltages.
-
-    Attributes
-    ----------
-    axes : dict of axis name to CharacterAxis
-    """
-
-    def __init__(self, axes: Mapping[str, CharacterAxis]) -> None:
-        self.axes = dict(axes)
-
-    @classmethod
-    def of(cls, names: Sequence[str], characters: Sequence[Character], seed: int, noise_rms: float) -> "CharacterStage":
-        """Return a stage at rest with random hysteresis.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Names of the axes.
-        characters : sequence of Character
-            One for each axis.
-        seed : int
-            Seed of hysteresis and noise; the first axis has the hysteresis of ``Stage.random(names, seed)``.
-        noise_rms : float, metres
-            Sensor noise of every axis.
-        """
-        axes = {}
-        for index, (name, character) in enumerate(zip(names, characters, strict=True)):
-            own = seed + NEXT_AXIS * index
-            axes[name] = CharacterAxis(replace(StageParameters.random(own), noise_rms=noise_rms), character, own)
-        return cls(axes)
-
-    @classmethod
-    def hidden(
-        cls, names: Sequence[str], seed: int, noise_rms: float, *, rate: float, voltage_max: float
-    ) -> "CharacterStage":
-        """Return a random stage whose axes have one or two effects each; several axes are coupled.
-
-        Parameters
-        ----------
-        names, seed, noise_rms
-            As for `of`.
-        rate, voltage_max
-            As for `draw`.
-        """
-        rng = np.random.default_rng([seed, 15])
-        others = [name for name in STRENGTHS if name != "cross_coupling"]
-        characters = []
-        for _ in names:
-            count = int(rng.integers(1, 3))
-            if len(names) > 1:
-                effects = ["cross_coupling", *rng.choice(others, count - 1, replace=False).tolist()]
-            else:
-                effects = rng.choice(others, count, replace=False).tolist()
-            characters.append(draw(rng, effects, rate=rate, voltage_max=voltage_max))
-        return cls.of(names, characters, seed, noise_rms)
-
-    @property
-    def effects(self) -> dict[str, tuple[str, ...]]:
-        """Names of the effects of each axis."""
-        return {name: axis.character.effects for name, axis in self.axes.items()}
-
-    @property
-    def voltage_range(self) -> tuple[float, float]:
-        """Voltage range accepted by all axes, lowest and highest, volts."""
-        parameters = [axis.parameters for axis in self.axes.values()]
-        return max(p.threshold_min for p in parameters), min(p.threshold_max for p in parameters)
-
-    def step(self, t: float, voltages: Sequence[float]) -> list[float]:
-        """Apply one voltage to each axis.
-
-        Parameters
-        ----------
-        t : float, seconds
-            Time of the sample, non-decreasing.
-        voltages : sequence of float, length of `axes`, volts
-
-        Returns
-        -------
-        list of float, length of `axes`, metres
-            Readings without noise.
-        """
-        axes = list(self.axes.values())
-        motion = [axis.step(t, v) for axis, v in zip(axes, voltages, strict=True)]
-        whole = sum(motion)
-        return [
-            axis.read(t, own + axis.character.coupling * (whole - own)) for axis, own in zip(axes, motion, strict=True)
-        ]
-
-    def measure(self, readings: Sequence[float]) -> list[float]:
-        """Return the readings (m) with noise and resolution of the sensors, in the order of `axes`."""
-        return [axis.measure(y) for axis, y in zip(self.axes.values(), readings, strict=True)]

@@ -35,19 +35,9 @@ class Relaxation:
         self._state: FloatArray = np.zeros_like(self._rate)
 
     def step(self, duration: float, value: float) -> FloatArray:
-        """Advance the elements while the input changes linearly to a value.
+        """Advance by `duration` (s) with the input changing linearly to `value`; return the elements, shape (n,).
 
-        Parameters
-        ----------
-        duration : float, seconds
-            Step, 0 or more; below `SHORTEST_STEP` the input jumps and the elements are unchanged.
-        value : float
-            Input at the end of the step.
-
-        Returns
-        -------
-        ndarray, shape (n,), in the unit of the input
-            Elements at the end of the step.
+        In less than `SHORTEST_STEP` the input jumps, and the elements are unchanged.
         """
         if duration >= SHORTEST_STEP:
             x = duration * self._rate
@@ -81,19 +71,9 @@ class FlexureMode:
         self._input = self._position = self._velocity = 0.0
 
     def step(self, duration: float, value: float) -> float:
-        """Advance the mode while the input changes linearly to a value.
+        """Advance by `duration` (s) with the input changing linearly to `value` (m); return the position (m).
 
-        Parameters
-        ----------
-        duration : float, seconds
-            Step, 0 or more; below `SHORTEST_STEP` the input jumps and the position is unchanged.
-        value : float, metres
-            Input at the end of the step.
-
-        Returns
-        -------
-        float, metres
-            Position at the end of the step.
+        In less than `SHORTEST_STEP` the input jumps, and the position is unchanged.
         """
         if duration >= SHORTEST_STEP:
             slope = (value - self._input) / duration
@@ -153,35 +133,11 @@ class Creep:
         self._chain.rest()
 
     def step(self, duration: float, value: float) -> float:
-        """Advance the creep while the hysteresis displacement changes linearly to a value.
-
-        Parameters
-        ----------
-        duration : float, seconds
-            Step, 0 or more.
-        value : float, metres
-            Displacement without creep at the end of the step.
-
-        Returns
-        -------
-        float, metres
-            Displacement with creep at the end of the step.
-        """
+        """Advance by `duration` (s) with the input changing linearly to `value` (m); return it with creep (m)."""
         return value + float(self.gains @ self._chain.step(duration, value))
 
     def after_ramp(self, duration: float) -> float:
-        """Return the ratio of the displacement with creep to that without, at the end of a ramp from rest.
-
-        Parameters
-        ----------
-        duration : float, seconds
-            Duration of the ramp, more than 0.
-
-        Returns
-        -------
-        float
-            The ratio, 1 or more for positive creep.
-        """
+        """Return the ratio of displacements with and without creep at the end of a ramp from rest in `duration` (s)."""
         chain = Relaxation(self.time_constants)
         return 1.0 + float(self.gains @ chain.step(duration, 1.0))
 
@@ -210,22 +166,9 @@ class Dynamics:
                 part.rest()
 
     def advance(self, t: float) -> float:
-        """Set the clock and return the time step.
+        """Set the clock to `t` (s) and return the time (s) since the previous call, 0 after a reset.
 
-        Parameters
-        ----------
-        t : float, seconds
-            Time of the sample, non-decreasing.
-
-        Returns
-        -------
-        float, seconds
-            Time since the previous call; 0 for the first call after a reset.
-
-        Raises
-        ------
-        UsageError
-            If the time is not finite or decreases.
+        UsageError if the time is not finite or decreases.
         """
         last = t if self._time is None else self._time
         if not last <= t < math.inf:

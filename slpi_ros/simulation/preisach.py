@@ -39,18 +39,7 @@ class ExponentialMaterial:
         self._centre, self._half_range = (low + high) / 2, (high - low) / 2
 
     def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
-        """Return relay weights.
-
-        Parameters
-        ----------
-        bias, width : ndarray, one shape, volts
-            Mean of the two thresholds and their distance.
-
-        Returns
-        -------
-        ndarray, same shape
-            Weights in arbitrary units.
-        """
+        """Return relay weights, arbitrary unit, for mean and distance (V) of the thresholds, arrays of one shape."""
         # The decay with width varies with bias, because a product of the two would be unrealistically simple.
         b = (bias - self._centre) / self._half_range
         scale = self._parameters.width_scale * (1 + self._parameters.width_growth * b)
@@ -93,19 +82,9 @@ class PowerLawMaterial:
         self._half_cell = (parameters.threshold_max - parameters.threshold_min) / parameters.levels / 2
 
     def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
-        """Return relay weights, integrated over the cells of the grid.
+        """Return relay weights, integrated over cells with mean and distance (V) of the thresholds at the centre.
 
         The density at the centre of a cell is inaccurate close to the origin, which determines small loops.
-
-        Parameters
-        ----------
-        bias, width : ndarray, one shape, volts
-            Mean and distance of the two thresholds at the centre of each cell.
-
-        Returns
-        -------
-        ndarray, same shape
-            Weights in arbitrary units.
         """
         up, down = bias + width / 2, bias - width / 2
         up_low, up_high = up - self._half_cell, up + self._half_cell
@@ -114,18 +93,7 @@ class PowerLawMaterial:
         return np.maximum(outer - self.everett(up_low, down_low) - self.everett(up_high, down_high), 0.0)
 
     def everett(self, up: FloatArray, down: FloatArray) -> FloatArray:
-        """Return the sum of the relays that switch during a fall from one voltage to another.
-
-        Parameters
-        ----------
-        up, down : ndarray, one shape, volts
-            Start and end of the fall; the sum is 0 if `down` exceeds `up`.
-
-        Returns
-        -------
-        ndarray, same shape
-            Sum in arbitrary units.
-        """
+        """Return the sum of the relays that switch in a fall from `up` to `down` (V); 0 if `down` exceeds `up`."""
         a, b = up - self._origin, down - self._origin
         return self._above_origin(a, b) + self._above_origin(-b, -a)
 
@@ -143,18 +111,7 @@ class PowerLawMaterial:
 
 
 def material(parameters: StageParameters) -> Material:
-    """Return the material of a stage.
-
-    Parameters
-    ----------
-    parameters : StageParameters
-        Parameters; with an `exponent` other than 0 the power law applies, else the exponential density.
-
-    Returns
-    -------
-    Material
-        Relay density and reversible curve.
-    """
+    """Return the material of a stage: with an `exponent` other than 0 the power law, else the exponential density."""
     return PowerLawMaterial(parameters) if parameters.exponent else ExponentialMaterial(parameters)
 
 
@@ -223,22 +180,9 @@ class RelayTriangle:
             raise UsageError(f"stage: {voltage} V is not within {self._low} to {self._high} V; clip it")
 
     def step(self, voltage: float) -> float:
-        """Apply a voltage and switch the relays between the previous voltage and this one.
+        """Apply a voltage (V); return the weighted sum of the states, in the unit of the density.
 
-        Parameters
-        ----------
-        voltage : float, volts
-            Any value within the threshold range.
-
-        Returns
-        -------
-        float
-            Weighted sum of the states, in the unit of the density.
-
-        Raises
-        ------
-        UsageError
-            If the voltage is not a number within the threshold range.
+        UsageError if the voltage is not a number within the threshold range.
         """
         self.check(voltage)
         position = (voltage - self._low) / self._spacing
@@ -286,18 +230,7 @@ class Sensor:
         self._rng = np.random.default_rng(seed)
 
     def read(self, displacement: FloatArray) -> FloatArray:
-        """Return the readings for displacements, in order.
-
-        Parameters
-        ----------
-        displacement : ndarray, any shape, metres
-            True displacement.
-
-        Returns
-        -------
-        ndarray, same shape, metres
-            Sensor reading.
-        """
+        """Return the readings (m) for true displacements (m), in order, arrays of one shape."""
         reading = displacement + self._noise_rms * self._rng.standard_normal(displacement.shape)
         if self._quantisation:
             reading = self._quantisation * np.round(reading / self._quantisation)
@@ -341,19 +274,9 @@ class LoopFigure:
 
 
 def measure_loop(respond: Callable[[float], float], low: float, high: float) -> LoopFigure:
-    """Drive two major loops and return the characteristic values of the second.
+    """Drive two major loops from `low` to `high` (V); return the values of the second, which is closed.
 
-    Parameters
-    ----------
-    respond : callable
-        Maps a voltage (V) to the displacement (m), starting at rest at `low` or below.
-    low, high : float, volts
-        Ends of the loop.
-
-    Returns
-    -------
-    LoopFigure
-        Values of the second loop, which is closed.
+    `respond` maps a voltage (V) to the displacement (m), starting at rest at `low` or below.
     """
     middle = (low + high) / 2
     start, _, bottom = respond(low), respond(high), respond(low)
@@ -406,57 +329,35 @@ class PreisachStage:
             self._dynamics.rest()
 
     def step(self, t: float, v: float) -> float:
-        """Apply one voltage.
+        """Apply the voltage `v` (V) at time `t` (s); return the displacement (m) without sensor errors.
 
-        Parameters
-        ----------
-        t : float, seconds
-            Time of the sample, ignored without dynamics. With dynamics, voltage and displacement are linear since the
-            previous call; the first call after a reset has no duration.
-        v : float, volts
-            Voltage within the threshold range.
-
-        Returns
-        -------
-        float, metres
-            Displacement without sensor errors.
-
-        Raises
-        ------
-        UsageError
-            If `v` is not a number within the threshold range or, with dynamics, `t` decreases.
+        Without dynamics the time is ignored. With dynamics, voltage and displacement are linear since the previous
+        call; the first call after a reset has no duration. UsageError if `v` is not a number within the threshold
+        range or, with dynamics, `t` decreases.
         """
         if self._dynamics:
             return self._step_in_time(self._dynamics, t, v)
         self._relays.step(v)
         return self._displacement()
 
+    # Alone in its stage, or beside others that do not move it; it does not drift.
+    coupling = 0.0
+
+    def begin_drift(self, t: float) -> None:
+        """Do nothing."""
+
+    def read(self, t: float, motion: float) -> float:
+        """Return the displacement (m), which is the reading without noise."""
+        return motion
+
     def measure(self, y_true: float) -> float:
         """Return the sensor reading (m) at a displacement (m)."""
         return float(self._sensor.read(np.asarray(y_true)))
 
     def run(self, t: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Apply a voltage signal, continuing from the current state.
+        """Apply voltages (V) at times (s) to the current state; return displacements and readings (m), (N,) each.
 
-        Parameters
-        ----------
-        t : ndarray, shape (N,), seconds
-            Times of the samples.
-        v : ndarray, shape (N,), volts
-            Voltages within the threshold range.
-
-        Returns
-        -------
-        y_true : ndarray, shape (N,), metres
-            Displacement without sensor errors.
-        y_measured : ndarray, shape (N,), metres
-            Sensor reading.
-
-        Raises
-        ------
-        UsageError
-            If the lengths differ, a voltage is not a number within the threshold range or, with dynamics, a time
-            decreases.
+        UsageError as for `step`, or if the lengths differ.
         """
         if t.shape != v.shape:
             raise UsageError(f"stage: {t.shape} times for {v.shape} voltages; give one time for each voltage")
@@ -465,19 +366,9 @@ class PreisachStage:
         return y_true, self._sensor.read(y_true)
 
     def respond(self, v: FloatArray, relay_voltage: FloatArray) -> FloatArray:
-        """Apply separate voltages to the relays and to the reversible part, without amplifier and dynamics.
+        """Apply one voltage (V) to the reversible part and another to the relays; return displacements (m), (N,) each.
 
-        Parameters
-        ----------
-        v : ndarray, shape (N,), volts
-            Voltage of the reversible part.
-        relay_voltage : ndarray, shape (N,), volts
-            Voltage of the relays, within the threshold range.
-
-        Returns
-        -------
-        ndarray, shape (N,), metres
-            Displacement without sensor errors.
+        Amplifier and dynamics are left out.
         """
         y = np.empty_like(v)
         for index, (voltage, seen) in enumerate(zip(v.tolist(), relay_voltage.tolist(), strict=True)):

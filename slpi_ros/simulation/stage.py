@@ -3,24 +3,25 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from slpi_ros.errors import UsageError
+from slpi_ros.simulation.character import STRENGTHS, Character, CharacterAxis, draw
 from slpi_ros.simulation.dynamics import Creep
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage
 
+# Seeds of the axes of one stage differ by this number.
+NEXT_AXIS = 1000
+
 
 class Stage:
-    """Independent axes, each with hysteresis and a sensor.
+    """Axes, each with hysteresis, other effects and a sensor, which may move each other.
 
     Parameters
     ----------
-    axes : mapping of axis name to PreisachStage
+    axes : mapping of axis name to PreisachStage or CharacterAxis
         Axes, in the order of the voltages.
-
-    Attributes
-    ----------
-    axes : dict of axis name to PreisachStage
-        As given.
 
     Raises
     ------
@@ -28,43 +29,51 @@ class Stage:
         If there is no axis.
     """
 
-    def __init__(self, axes: Mapping[str, PreisachStage]) -> None:
+    def __init__(self, axes: Mapping[str, PreisachStage] | Mapping[str, CharacterAxis]) -> None:
         if not axes:
             raise UsageError("stage: it has no axis; name at least one")
-        self.axes = dict(axes)
+        self.axes: dict[str, PreisachStage | CharacterAxis] = dict(axes)
 
     @classmethod
     def random(cls, names: Sequence[str], seed: int, noise_rms: float | None = None) -> "Stage":
-        """Return a random plausible stage.
+        """Return a random plausible stage at rest, without effects but hysteresis.
 
         Parameters
         ----------
         names : sequence of str
-            Names of the axes.
+            Unique names of the axes, else UsageError.
         seed : int
             Seed; the first axis equals ``StageParameters.random(seed)``, the others differ.
         noise_rms : float, metres, optional
             Sensor noise of every axis; by default that of StageParameters.
-
-        Returns
-        -------
-        Stage
-            The stage at rest.
-
-        Raises
-        ------
-        UsageError
-            If the names are not unique.
         """
-        if len(set(names)) != len(names):
-            raise UsageError(f"stage: axes {', '.join(names)} are not unique; give each axis its own name")
-        axes = {}
-        for index, name in enumerate(names):
-            parameters = StageParameters.random(seed + 1000 * index)
-            if noise_rms is not None:
-                parameters = replace(parameters, noise_rms=noise_rms)
-            axes[name] = PreisachStage(parameters, seed + 1000 * index)
-        return cls(axes)
+        return cls({name: PreisachStage(*each) for name, each in _drawn(names, seed, noise_rms).items()})
+
+    @classmethod
+    def of(cls, names: Sequence[str], characters: Sequence[Character], seed: int, noise_rms: float) -> "Stage":
+        """Return a stage at rest with the hysteresis of `random`, and one character for each axis."""
+        drawn = zip(_drawn(names, seed, noise_rms).items(), characters, strict=True)
+        return cls({name: CharacterAxis(own, character, number) for (name, (own, number)), character in drawn})
+
+    @classmethod
+    def hidden(cls, names: Sequence[str], seed: int, noise_rms: float, *, rate: float, voltage_max: float) -> "Stage":
+        """Return a random stage whose axes have one or two effects each, as from `draw`; several axes are coupled."""
+        rng = np.random.default_rng([seed, 15])
+        others = [name for name in STRENGTHS if name != "cross_coupling"]
+        characters = []
+        for _ in names:
+            count = int(rng.integers(1, 3))
+            if len(names) > 1:
+                effects = ["cross_coupling", *rng.choice(others, count - 1, replace=False).tolist()]
+            else:
+                effects = rng.choice(others, count, replace=False).tolist()
+            characters.append(draw(rng, effects, rate=rate, voltage_max=voltage_max))
+        return cls.of(names, characters, seed, noise_rms)
+
+    @property
+    def effects(self) -> dict[str, tuple[str, ...]]:
+        """Names of the effects of each axis that has a character."""
+        return {name: axis.character.effects for name, axis in self.axes.items() if isinstance(axis, CharacterAxis)}
 
     @property
     def voltage_range(self) -> tuple[float, float]:
@@ -72,26 +81,35 @@ class Stage:
         parameters = [axis.parameters for axis in self.axes.values()]
         return max(p.threshold_min for p in parameters), min(p.threshold_max for p in parameters)
 
+    def begin_drift(self, t: float) -> None:
+        """Begin the drifts of all axes at time `t` (s)."""
+        for axis in self.axes.values():
+            axis.begin_drift(t)
+
     def step(self, t: float, voltages: Sequence[float]) -> list[float]:
-        """Apply one voltage to each axis.
+        """Apply one voltage (V) to each axis at time `t` (s), which does not decrease; return readings without noise.
 
-        Parameters
-        ----------
-        t : float, seconds
-            Time of the sample.
-        voltages : sequence of float, length of `axes`, volts
-            Voltages in the order of `axes`.
-
-        Returns
-        -------
-        list of float, length of `axes`, metres
-            Displacements without sensor errors.
+        Voltages and readings (m) are in the order of `axes`.
         """
-        return [axis.step(t, v) for axis, v in zip(self.axes.values(), voltages, strict=True)]
+        axes = list(self.axes.values())
+        motion = [axis.step(t, v) for axis, v in zip(axes, voltages, strict=True)]
+        whole = sum(motion)
+        return [axis.read(t, own + axis.coupling * (whole - own)) for axis, own in zip(axes, motion, strict=True)]
 
-    def measure(self, displacements: Sequence[float]) -> list[float]:
-        """Return the readings of all sensors (m) for displacements (m), both in the order of `axes`."""
-        return [axis.measure(y) for axis, y in zip(self.axes.values(), displacements, strict=True)]
+    def measure(self, readings: Sequence[float]) -> list[float]:
+        """Return the readings (m) with noise and resolution of the sensors, in the order of `axes`."""
+        return [axis.measure(y) for axis, y in zip(self.axes.values(), readings, strict=True)]
+
+
+def _drawn(names: Sequence[str], seed: int, noise_rms: float | None) -> dict[str, tuple[StageParameters, int]]:
+    """Return hysteresis and seed of each axis."""
+    if len(set(names)) != len(names):
+        raise UsageError(f"stage: axes {', '.join(names)} are not unique; give each axis its own name")
+    drawn = {}
+    for own, name in zip(range(seed, seed + NEXT_AXIS * len(names), NEXT_AXIS), names, strict=True):
+        parameters = StageParameters.random(own)
+        drawn[name] = parameters if noise_rms is None else replace(parameters, noise_rms=noise_rms), own
+    return drawn
 
 
 _P11_PEAK = 89.189e-6
@@ -137,7 +155,12 @@ def flexure_stage(seed: int = 0) -> PreisachStage:
 
 
 def p11_stage(seed: int = 0) -> Stage:
-    """Return a stage similar to the P11.XY100 of the MPI paper: two axes, 0 to 120 V nominal, with creep and resonance.
+    """Return the stage with the axes of `p11_axes`."""
+    return Stage(p11_axes(seed))
+
+
+def p11_axes(seed: int = 0) -> dict[str, PreisachStage]:
+    """Return axes similar to those of the P11.XY100 of the MPI paper: 0 to 120 V nominal, with creep and resonance.
 
     - -20 to 150 V: stated (section 2.1).
     - Peak of 89.189 µm for a triangle of 120 V at 1 Hz: Table 1, where ``a`` is the peak at 1 Hz. The stroke of the
@@ -164,8 +187,8 @@ def p11_stage(seed: int = 0) -> Stage:
 
     Returns
     -------
-    Stage
-        Stage with axes ``x`` and ``y``, at rest at 0 V.
+    dict of axis name to PreisachStage
+        Axes ``x`` and ``y``, at rest at 0 V.
     """
     x = StageParameters(
         hysteresis=0.11,
@@ -187,4 +210,4 @@ def p11_stage(seed: int = 0) -> Stage:
     creep = Creep(x.creep_gain, x.creep_shortest, x.creep_longest)
     x = replace(x, stroke=_P11_PEAK / creep.after_ramp(_P11_HALF_PERIOD))
     y = replace(x, stroke=0.97 * x.stroke, hysteresis=0.115, exponent=1.14, creep_gain=0.040, resonance_frequency=330.0)
-    return Stage({"x": PreisachStage(x, seed), "y": PreisachStage(y, seed + 1000)})
+    return {"x": PreisachStage(x, seed), "y": PreisachStage(y, seed + NEXT_AXIS)}

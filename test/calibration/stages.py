@@ -6,7 +6,8 @@ from slpi_ros.calibration.run import Recording, Request
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.io.record import Record
 from slpi_ros.model.limits import Limits
-from slpi_ros.simulation.character import Character, CharacterStage
+from slpi_ros.simulation.character import Character
+from slpi_ros.simulation.stage import Stage
 
 RATE = 200.0
 # The stage rests this long between two drives, while the calibration computes, seconds.
@@ -24,14 +25,14 @@ def settings(axes=("x",), **changes):
     return CalibrationSettings(**values | changes)
 
 
-def stage_of(*characters: Character, seed: int = 3, noise_rms: float = 8e-9) -> CharacterStage:
-    return CharacterStage.of("xyz"[: len(characters)], characters, seed, noise_rms)
+def stage_of(*characters: Character, seed: int = 3, noise_rms: float = 8e-9) -> Stage:
+    return Stage.of("xyz"[: len(characters)], characters, seed, noise_rms)
 
 
 class SimulatedRecorder:
     """Drives a simulated stage and keeps what it was asked for."""
 
-    def __init__(self, stage: CharacterStage) -> None:
+    def __init__(self, stage: Stage) -> None:
         self.stage, self.now = stage, 1000.0
         self.requests: list[Request] = []
         self.recordings: list[Recording] = []

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model
 
 from benchmarks.episodes import Episode, Ratios, Wire
-from slpi_ros.compensator.controller import Controller, Mode
+from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.persistence import MemoryFile, SavedAxis
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.lag import Lag
@@ -186,10 +186,10 @@ def test_a_reset_starts_from_the_report_and_stays_within_its_bounds(span):
     """With `reset_on_start` it went from 80 to 32 V at once."""
     stage = Stage(80.0)
     stage.made.reset_memory(3, 1e4, [50.0], stage.now_ns, [span] if span else ())
-    assert stage.made.mode is Mode.RESETTING
+    assert stage.made.mode is OperatingMode.RESETTING
     stage.run(10.0)
     stage.check()
-    assert stage.made.mode is Mode.STREAMING and stage.made.voltages[0] == pytest.approx(50.0, abs=1e-9)
+    assert stage.made.mode is OperatingMode.STREAMING and stage.made.voltages[0] == pytest.approx(50.0, abs=1e-9)
     v = np.array([v for _, v in stage.given])
     low, high = span or (0.0, 100.0)
     inside = v[np.argmax(v <= high) :]

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model, cases, fractions, paths, stream_forward
 
-from slpi_ros.compensator.controller import Controller, Mode
+from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.persistence import ASSUMED, INTERRUPTED, KNOWN, RESETTING, MemoryConfidence
 from slpi_ros.compensator.ramps import Ramp
 from slpi_ros.errors import UsageError
@@ -133,11 +133,11 @@ def reset(limits: Limits, model: StageModel, swaps_to: StageModel | None = None,
     for k in range(1, steps):
         assert made.axes[0].confidence.state == RESETTING
         made.advance(k * 10**7, 0)
-        if made.mode is not Mode.RESETTING:
+        if made.mode is not OperatingMode.RESETTING:
             break
         if swaps_to and k == 10:
             made.use_model(swaps_to)
-    assert made.mode is Mode.STREAMING or steps < 10**6
+    assert made.mode is OperatingMode.STREAMING or steps < 10**6
     made.hold(steps * 10**7)
     return made
 

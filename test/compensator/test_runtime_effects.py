@@ -7,7 +7,7 @@ import pytest
 from strategies import FAMILY_CASE, PI_CASE, axis_model
 
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.controller import Controller, Mode
+from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.model_swap import take_over
 from slpi_ros.effects.creep import Creep
@@ -101,7 +101,7 @@ def test_trajectories_are_followed_as_messages_are():
     follow(made)
     expected = np.array([move(twin, k) for k in range(T.size)])
     np.testing.assert_allclose(give(made), expected, rtol=0, atol=1e-9)
-    assert made.counts.points_held == made.counts.points_slewing == 0 and made.mode is Mode.STREAMING
+    assert made.counts.points_held == made.counts.points_slewing == 0 and made.mode is OperatingMode.STREAMING
 
 
 def test_a_path_reckons_with_axes_that_another_path_brings_elsewhere():
@@ -145,7 +145,7 @@ def test_axes_with_delays_of_their_own_arrive_together():
     follow(made, start_ns=START + 50 * MS)
     assert made.trajectory.remaining == T.size
     given = give(made, T.size + 60)
-    assert made.trajectory.skipped == 0 and made.mode is Mode.STREAMING
+    assert made.trajectory.skipped == 0 and made.mode is OperatingMode.STREAMING
     seen = model.simulate(DT * np.arange(len(given)), {"x": given[:, 0], "y": given[:, 1]})
     for name, path in PATHS.items():
         np.testing.assert_allclose(seen[name][50 : 50 + T.size], path, rtol=0, atol=1e-9)
@@ -237,7 +237,7 @@ def test_reset_and_ramps_move_the_effects_too(effects):
     (axis,) = made.axes
     stage, now_ns = axis.model.stream(), 0
     made.reset_memory(3, 2000.0, [0.0], now_ns)
-    while made.mode is Mode.RESETTING:
+    while made.mode is OperatingMode.RESETTING:
         now_ns += 4 * MS
         made.advance(now_ns, 0)
         stage.drive(axis.voltage, 4 * DT)

@@ -12,7 +12,7 @@ from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import OPEN_LOOP
 from slpi_ros.compensator.model_swap import take_over, turning_voltages
 from slpi_ros.errors import SlpiError, UsageError
-from slpi_ros.hysteresis.turning_points import FAR
+from slpi_ros.hysteresis.shapes import FAR
 from slpi_ros.model.limits import Limits
 
 OPEN = Limits(-1e4, 1e4)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from strategies import two_axes
 
 from slpi_ros.compensator.controller import Controller
-from slpi_ros.compensator.statistics import TRACKED, TrackingError
+from slpi_ros.compensator.statistics import TRACKED, TrackingStatistics
 from slpi_ros.model.limits import Limits
 
 MS = 1_000_000
@@ -17,7 +17,7 @@ MS = 1_000_000
 
 @given(st.lists(st.tuples(st.none() | st.floats(-1e-5, 1e-5), st.floats(-1e-5, 1e-5)), max_size=20), st.integers(1, 60))
 def test_the_statistics_are_those_of_the_last_measurements_with_a_setpoint(pairs, repeats):
-    tracking, errors = TrackingError(), []
+    tracking, errors = TrackingStatistics(), []
     for desired, measured in pairs * repeats:
         tracking.desired = desired
         tracking.measure(measured)

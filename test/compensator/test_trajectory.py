@@ -10,7 +10,7 @@ from strategies import FAMILY_CASE, PI_CASE, axis_model, fractions
 
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.controller import OPEN_LOOP, Controller, Mode
+from slpi_ros.compensator.controller import OPEN_LOOP, Controller, OperatingMode
 from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
@@ -149,7 +149,7 @@ def test_points_are_compensated_as_commands_are(limits):
     made = controller(**limits)
     send(made, "xy")
     voltages = follow(made, START + 300 * MS)
-    assert voltages.shape == (300, 2) and made.mode is Mode.STREAMING
+    assert voltages.shape == (300, 2) and made.mode is OperatingMode.STREAMING
     np.testing.assert_array_equal(voltages, np.column_stack([expected_of(twin(**limits))] * 2))
 
 
@@ -192,7 +192,7 @@ def test_a_late_clock_skips_points_but_never_exceeds_a_limit(steps, limits):
     now, last_ns, last_v, given_points = START, START - 1000 * MS, 0.0, 0  # last_ns: of the last change
     for step in steps:
         now += step
-        following = made.mode is Mode.TRAJECTORY
+        following = made.mode is OperatingMode.TRAJECTORY
         if not made.advance(now, now):
             continue
         # After the last point follows what the limits have held back.
@@ -221,7 +221,7 @@ def test_a_cancelled_trajectory_leaves_the_axis_where_its_points_led(done, share
     follow(made, START + done * MS)
     made.follow([], [], [], 0, START + done * MS, START + done * MS)
     expected_of(other, PATH[:done])
-    assert made.mode is Mode.STREAMING and not made.trajectory.on
+    assert made.mode is OperatingMode.STREAMING and not made.trajectory.on
     assert made.axes[0].stream.memory.snapshot() == other.stream.memory.snapshot()
     # No time has passed at the next command.
     y = 3e-6 + share * 10e-6
@@ -276,7 +276,7 @@ def test_points_far_apart_are_interpolated_at_the_output_rate_and_reached_at_the
     points, times = np.array([5e-6, 9e-6, 7e-6]), np.array([20, 50, 55]) * MS
     made.follow(["x"], times, points[:, None], 0, START, START)
     seen = {}
-    while (due_ns := made.next_due_ns(START, START)) is not None and made.mode is Mode.TRAJECTORY:
+    while (due_ns := made.next_due_ns(START, START)) is not None and made.mode is OperatingMode.TRAJECTORY:
         assert made.advance(due_ns, due_ns)
         seen[(due_ns - START) / MS] = made.axes[0].stream.memory.displacement
     expected = np.interp(np.arange(1, 56), [0, 20, 50, 55], [4e-6, *points])
@@ -307,7 +307,7 @@ def test_what_a_trajectory_that_is_too_fast_has_not_reached_follows_after_it():
     while (due_ns := made.next_due_ns(now, now)) is not None:
         now = due_ns
         made.advance(now, now)
-    assert made.mode is Mode.STREAMING and now > START + 500 * MS
+    assert made.mode is OperatingMode.STREAMING and now > START + 500 * MS
     assert made.axes[0].stream.memory.displacement == pytest.approx(10e-6, abs=1e-13)
 
 

@@ -8,7 +8,8 @@ from strategies import Case, cases_and_paths, stream_forward, stream_inverse
 
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii, play
-from slpi_ros.hysteresis.turning_points import FAR, Memory
+from slpi_ros.hysteresis.shapes import FAR
+from slpi_ros.hysteresis.turning_points import Memory
 
 STREAMED = (stream_forward, stream_inverse)
 IN_BATCHES = (Memory.forward_array, Memory.inverse_array)

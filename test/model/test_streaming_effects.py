@@ -10,6 +10,7 @@ from strategies import FAMILY_CASE
 
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.filters import Mode
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
@@ -22,6 +23,7 @@ from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
 MS = 1_000_000
 LAG, MODE = Lag(0.015), Resonance((Mode(150.0, 0.02),))
 RATE = RateDependence(1.0, 0.1, 2e-8)
+SENSITIVE = GainDrift((0.0,), (0.1,), 0.0)
 SENSOR = SensorPeriodic(3e-7, 5e-9, 1.0)
 EVERY = (LAG, RATE, CREEP, MODE)
 # That of the sensor changes nothing, alone or beside others: see test_model_effects.
@@ -36,12 +38,11 @@ def followed(stream, y, t=T):
     return np.array([stream.step(now, wish) for now, wish in zip(t.tolist(), y.tolist(), strict=True)])
 
 
-@pytest.mark.parametrize("effects", [(LAG,), (RATE,), (CREEP,), (SENSOR,), (RATE, CREEP), (LAG, CREEP)], ids=ids)
+@pytest.mark.parametrize("effects", [*SETS, (SENSOR,), (RATE, CREEP), (LAG, RATE)], ids=ids)
 def test_stream_gives_what_compensate_gives(effects):
     axis = with_effects(*effects)
     batch, _ = axis.compensate(T, path())
-    # Turning points of the lagged voltage are not those of the wish.
-    np.testing.assert_allclose(followed(axis.stream(), path()), batch, rtol=0, atol=0.02 if LAG in effects else 1e-7)
+    np.testing.assert_allclose(followed(axis.stream(), path()), batch, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("effects", SETS, ids=ids)
@@ -78,6 +79,25 @@ def test_drive_does_what_simulate_does(effects):
     np.testing.assert_allclose(got, axis.simulate(T, v), rtol=0, atol=1e-6 * SPAN)
     assert stream.voltage == v[-1]
     assert not stream.missed
+
+
+@pytest.mark.parametrize("effects", SETS, ids=ids)
+def test_a_first_voltage_other_than_that_of_the_start_is_a_step(effects):
+    axis, v = with_effects(*effects), 50 + 20 * np.sin(6 * T)
+    assert axis.initial("end").voltage < 20.0
+    stream = axis.stream()
+    got = [stream.drive(each, DT if k else 0.0) for k, each in enumerate(v.tolist())]
+    np.testing.assert_allclose(got, axis.simulate(T, v), rtol=0, atol=1e-6 * SPAN)
+
+
+@pytest.mark.parametrize(
+    "effects", [(CREEP,), (RATE,), (RATE, CREEP), (GainDrift((0.0,), (0.1,), 0.0), CREEP)], ids=ids
+)
+def test_a_path_that_begins_with_a_step_is_reached_from_its_start(effects):
+    axis, y = with_effects(*effects), np.maximum(path(), 6e-6)
+    assert y[0] - axis.rest() > 3e-6
+    for v in (axis.compensate(T, y)[0], followed(axis.stream(), y)):
+        np.testing.assert_allclose(axis.simulate(T, v), y, rtol=0, atol=1e-9 * SPAN)
 
 
 @pytest.mark.parametrize(

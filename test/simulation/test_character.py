@@ -5,7 +5,7 @@ import pytest
 
 from slpi_ros.errors import UsageError
 from slpi_ros.excitation.drives import excite
-from slpi_ros.simulation.character import STRENGTHS, Character, CharacterAxis, CharacterStage, draw
+from slpi_ros.simulation.character import STRENGTHS, Character, CharacterAxis, draw
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.stage import Stage
 
@@ -18,7 +18,7 @@ def driven(stage, drive):
 
 
 def stage_with(names=("x",), **effects):
-    return CharacterStage.of(names, [Character(**effects)] * len(names), seed=3, noise_rms=0.0)
+    return Stage.of(names, [Character(**effects)] * len(names), seed=3, noise_rms=0.0)
 
 
 DRIVE = excite(voltage_min=0.0, voltage_max=100.0, duration=10.0, rate=RATE)
@@ -91,7 +91,7 @@ def test_a_gain_drift_grows_with_the_displacement():
 
 @pytest.mark.parametrize("names", [("x",), ("x", "y")])
 def test_hidden_stages_are_drawn_from_their_seed(names):
-    stages = [CharacterStage.hidden(names, seed, 8e-9, rate=RATE, voltage_max=100.0) for seed in (*range(12), 0)]
+    stages = [Stage.hidden(names, seed, 8e-9, rate=RATE, voltage_max=100.0) for seed in (*range(12), 0)]
     found = [tuple(axis.character for axis in stage.axes.values()) for stage in stages]
     assert found[0] == found[-1] and len(set(found)) == 12
     for stage in stages:

@@ -25,12 +25,12 @@ LAYERS = (
     {"model", "excitation"},
     {"effects"},
     {"hysteresis", "io", "simulation"},
-    {"errors"},
+    {"errors", "arrays"},
 )
 # Modules beside the folders.
 BESIDE_FOLDERS = {"__init__.py", "errors.py"}
 # Modules that import each other, wherever in the file. None is to come in, and each is to go.
-KNOWN_CIRCLES = ({"hysteresis/compiled.py", "hysteresis/turning_points.py"},)
+KNOWN_CIRCLES: tuple[set[str], ...] = ()
 
 # Modules outside the package that only one part of it may import.
 ONLY_NODES = {"ament_index_python", "launch", "launch_ros", "rclpy", "rosidl_runtime_py"}

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 from math import inf, isfinite, nan
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.amplifier import Amplifier
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits
-
-FloatArray = NDArray[np.float64]
 
 # A displacement beyond this is none in metres.
 FARTHEST = 0.1

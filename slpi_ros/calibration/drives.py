@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.settings import CHECK, VERIFICATION, CalibrationSettings
 from slpi_ros.compensator.controller import Controller
 from slpi_ros.errors import UsageError
@@ -15,8 +15,6 @@ from slpi_ros.excitation.legs import DriveSpec, Path
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, RateLimiter
 from slpi_ros.model.stage_model import StageModel
-
-FloatArray = NDArray[np.float64]
 
 # Share of the voltage range that the check moves.
 CHECK_MOVE = 0.1

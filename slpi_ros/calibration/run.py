@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
@@ -26,8 +27,6 @@ from slpi_ros.model.stage_model import StageModel
 from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 from slpi_ros.workflows.identify import IdentifyRequest, identify
 from slpi_ros.workflows.records import Source
-
-FloatArray = NDArray[np.float64]
 
 CHECK_DRIVE, VERIFICATION_DRIVE = "check", "verification"
 # A displacement follows if it moves by this multiple of its noise.

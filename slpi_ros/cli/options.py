@@ -11,8 +11,8 @@ from slpi_ros.errors import SlpiError, UsageError
 
 # Each command imports its modules when it runs: the numerical and plotting modules load slowly.
 if TYPE_CHECKING:
+    from slpi_ros.arrays import FloatArray
     from slpi_ros.io.alignment import SeparateTopics
-    from slpi_ros.io.record import FloatArray
     from slpi_ros.model.stage_model import StageModel
     from slpi_ros.workflows.records import Source
 

@@ -4,11 +4,9 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.io.messages import SECOND_NS
-
-FloatArray = NDArray[np.float64]
 
 # The model has to move by this share of the displacement range, and by this many times the noise of the sensor, before
 # a reading that stays or moves the other way is a fault.

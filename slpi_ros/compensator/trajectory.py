@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.validation import RejectedError, require_names
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import PERIOD, Limits, RateLimiter
 from slpi_ros.model.streaming import StreamingInverse, refusal
 
-FloatArray = NDArray[np.float64]
 TimeArray = NDArray[np.int64]
 
 # Upper limit of valid times; the sum of two times does not overflow int64.

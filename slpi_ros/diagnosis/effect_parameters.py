@@ -6,8 +6,8 @@ from math import exp, log
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
     Candidate,
     Effect,
@@ -20,8 +20,6 @@ from slpi_ros.effects.base import (
     usual_step,
 )
 from slpi_ros.effects.parameters import Fit, Leaf, Scales
-
-FloatArray = NDArray[np.float64]
 
 # Largest change of a parameter in one step, relative to its magnitude, and of the logarithm of one that ranges over
 # decades.

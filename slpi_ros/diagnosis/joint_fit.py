@@ -19,6 +19,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, of_starts, steps
 from slpi_ros.diagnosis.prepare import Evidence
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
@@ -31,7 +32,6 @@ from slpi_ros.identification.least_squares import FOLDS, Problem, blocked_folds
 from slpi_ros.identification.linear_kinds import SMOOTHNESS
 from slpi_ros.identification.samples import Samples
 
-FloatArray = NDArray[np.float64]
 Factor = tuple[FloatArray, bool]
 
 # Effects and hysteresis are updated in turn: largest number of iterations, and change (share of the error) below which

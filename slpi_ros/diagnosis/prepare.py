@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import EffectContext, usual_step
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import RecordError
@@ -24,8 +25,6 @@ from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.identification.signal_statistics import digit
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel
-
-FloatArray = NDArray[np.float64]
 
 # Smallest numbers of samples and of reversals that allow a cross-validation.
 FEWEST_SAMPLES, FEWEST_TURNS = 1000, 4

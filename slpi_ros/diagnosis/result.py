@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import Evidence, one_speed
@@ -25,8 +25,6 @@ from slpi_ros.excitation.effects import for_effect, separating
 from slpi_ros.identification.repeatability_floor import Floor
 from slpi_ros.model.axis_model import ABOVE_FLOOR, RESOLUTION
 from slpi_ros.model.stage_model import StageModel
-
-FloatArray = NDArray[np.float64]
 
 OTHER_FREQUENCIES = "This record has one drive frequency; other frequencies tell these apart. "
 UP_TO_DATE = "`slpi refit` with this record brings the model up to date; no other one is needed for that."

@@ -6,8 +6,8 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency, one_speed
@@ -16,8 +16,6 @@ from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.identification.progress import report_progress
-
-FloatArray = NDArray[np.float64]
 
 # Defect of other kinds of hysteresis model than the loop family.
 BIAS = "loops that depend on bias"

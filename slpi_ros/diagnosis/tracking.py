@@ -5,12 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import RecordError
-
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # A delay is accepted if it reduces the difference between model and desired displacement by this factor.
 BETTER = 1.1

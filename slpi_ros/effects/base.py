@@ -9,12 +9,11 @@ from typing import Any, ClassVar, Literal, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.excitation import Excitation
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.effects.parameters import Leaf, facts_of, leaves, require_facts, with_leaves
 from slpi_ros.hysteresis.turning_points import Memory
-
-FloatArray = NDArray[np.float64]
 
 # The voltage, the hysteresis itself (between the voltage that it feels and its displacement), or the displacement.
 Signal = Literal["voltage", "hysteresis", "displacement"]

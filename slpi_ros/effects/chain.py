@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import AroundHysteresis, Effect, EffectContext
 from slpi_ros.effects.registry import in_order
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

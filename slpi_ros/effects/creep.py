@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    FloatArray,
     ResidualView,
     Side,
     Signal,

@@ -7,11 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    FloatArray,
     ResidualView,
     Side,
     Signal,

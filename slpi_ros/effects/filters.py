@@ -6,11 +6,10 @@ from math import cos, exp, expm1, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.parameters import Fit, parameter
-
-FloatArray = NDArray[np.float64]
 
 # Below this ratio of step to time constant a series is used, because differences lose precision.
 _SMALL = 1e-3

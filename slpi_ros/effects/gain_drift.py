@@ -7,12 +7,12 @@ from typing import ClassVar
 
 import numpy as np
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
     FitView,
-    FloatArray,
     ResidualView,
     Sharing,
     Side,

@@ -8,12 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
     FitView,
-    FloatArray,
     ResidualView,
     Side,
     Signal,

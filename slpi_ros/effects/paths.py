@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects import filters
 from slpi_ros.effects.filters import DAMPING, WIDEST
 from slpi_ros.hysteresis import compiled as engine
 from slpi_ros.hysteresis.compiled import compiled
 from slpi_ros.hysteresis.shapes import Branches
-
-FloatArray = NDArray[np.float64]
 
 
 class Laws(NamedTuple):

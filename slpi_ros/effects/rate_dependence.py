@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    FloatArray,
     ResidualView,
     Side,
     Signal,

@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.effects.base import EffectBase, EffectContext, FitView, FloatArray, ResidualView, Side, Signal
+from slpi_ros.arrays import FloatArray
+from slpi_ros.effects.base import EffectBase, EffectContext, FitView, ResidualView, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
 

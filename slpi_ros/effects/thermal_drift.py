@@ -7,16 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    FitView,
-    FloatArray,
-    ResidualView,
-    Side,
-    Signal,
-)
+from slpi_ros.arrays import FloatArray
+from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FitView, ResidualView, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
 

@@ -5,8 +5,9 @@ from itertools import cycle
 
 import numpy as np
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.excitation import MEAN_SPEED
-from slpi_ros.excitation.legs import DriveSpec, FloatArray, Path
+from slpi_ros.excitation.legs import DriveSpec, Path
 
 # Sequence of speeds relative to the mean speed: for a 100 V stage a mean of 70 V/s and at most about 250 V/s. Different
 # speeds separate time-dependent effects from hysteresis.

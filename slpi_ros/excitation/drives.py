@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.excitation import FEWEST_STEPS, MEAN_SPEED
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import UsageError
 from slpi_ros.excitation.calibration import calibration, sweep
 from slpi_ros.excitation.effects import effect_path, for_effect
-from slpi_ros.excitation.legs import DriveSpec, FloatArray, Path
+from slpi_ros.excitation.legs import DriveSpec, Path
 
 CALIBRATION, SWEEP = "calibration", "sweep"
 # Default slew limit: the voltage range in this time, seconds. Share of a slew limit that drives use: a late sample is

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.excitation import FEWEST_STEPS, STEEPEST
 from slpi_ros.errors import UsageError
-
-FloatArray = NDArray[np.float64]
 
 # Largest number of samples of a drive.
 MOST_STEPS = 10_000_000

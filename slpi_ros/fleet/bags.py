@@ -17,7 +17,6 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.diagnosis.verify import Verification
@@ -34,8 +33,6 @@ from slpi_ros.workflows.identify import IdentifyRequest, identify
 from slpi_ros.workflows.records import Source, assess_record
 from slpi_ros.workflows.refit import RefitRequest, refit
 from slpi_ros.workflows.verify import VerifyRequest, verify
-
-FloatArray = NDArray[np.float64]
 
 # Verdicts of a row. REFUSED: no number can be given; IDENTIFIED: its model is the stage's reference; PASSED: the
 # reference describes the record within the limit; CHANGED: it does so after changes of gain, loop width or zero;

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-FloatArray = NDArray[np.float64]
+from slpi_ros.arrays import FloatArray
+
 IntArray = NDArray[np.int64]
 
 # A change is told if noise alone would show one in a series with this probability at most.

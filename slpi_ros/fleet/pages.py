@@ -5,9 +5,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from slpi_ros.fleet.bags import REFUSED, Row, plain_name
 from slpi_ros.fleet.cluster import run
 from slpi_ros.fleet.results import TABLE, Results
@@ -27,8 +24,6 @@ from slpi_ros.io.schemas import format_document
 from slpi_ros.reports.chart import CAUSES, COLOURS, MEASURED, NOISE, Chart, Panel, Quantity
 from slpi_ros.reports.page import Page, Severity
 from slpi_ros.reports.text import nm
-
-FloatArray = NDArray[np.float64]
 
 PAGE, DOCUMENT = "index.html", "fleet.json"
 # Order of the stages on the page, colour of their health, and what is to be done.

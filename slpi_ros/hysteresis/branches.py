@@ -5,10 +5,10 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.hysteresis.shapes import END, Branches, Curve
 from slpi_ros.hysteresis.turning_points import Memory, worth_compiling
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Origins of branches that started before the first sample.

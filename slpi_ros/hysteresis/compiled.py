@@ -10,11 +10,11 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.hysteresis import compilation, rate_law
 from slpi_ros.hysteresis.rate_law import LARGEST
 from slpi_ros.hysteresis.shapes import END, Branches
 
-FloatArray = NDArray[np.float64]
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.shapes import END, FAR, Branches, Curve
 
-FloatArray = NDArray[np.float64]
 # Knots and change of a row of `Branches`.
 Row = tuple[FloatArray, FloatArray]
 

@@ -18,14 +18,13 @@ from math import inf
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.hysteresis.reversals import require_finite
 from slpi_ros.hysteresis.shapes import END, FAR, Branches, Curve
 from slpi_ros.hysteresis.turning_points import Memory
-
-FloatArray = NDArray[np.float64]
 
 # Slopes and constants of the falling envelope, Eq. 2.
 STEEP, GENTLE, AMPLITUDE_SHARE, THRESHOLD_SHARE = 1.2, 0.8, 0.2, 0.6

@@ -6,12 +6,10 @@ SLPI paper, Eq. 1 (play operator), Eq. 8 (PI model), Eq. 10-12 (analytic inverse
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.shapes import END, Branches, Curve
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 

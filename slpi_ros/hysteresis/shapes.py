@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from slpi_ros.arrays import FloatArray
 
 # Largest distance of a voltage from rest (V); the last knot of every branch lies `END` beyond the others.
 FAR = 1e5

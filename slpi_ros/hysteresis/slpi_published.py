@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import ModelError, RecordError
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.reversals import count_before, monotone_runs, require_finite, without_small_reversals
 from slpi_ros.hysteresis.turning_points import Memory
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Values of column ``sp`` of a separated record.

@@ -19,13 +19,12 @@ from math import asinh, copysign, inf, sinh
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.compilation import compiler
 from slpi_ros.hysteresis.rate_law import LARGEST, solved
 from slpi_ros.hysteresis.reversals import require_finite
 from slpi_ros.hysteresis.shapes import FAR, Branches, Curve, Shape
-
-FloatArray = NDArray[np.float64]
 
 # Number of cached branch curves; reversals can be numerous and curves are large.
 KEPT_CURVES = 64

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
 from scipy.special import betainc, ndtri
 
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.signal_statistics import ENOUGH, FEWEST, digit, median_rms, noise, spread
-
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Expected number of false alarms of each test on a clean record.
 FALSE_ALARMS = 0.01

@@ -9,12 +9,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.design_matrix import Walk
-
-FloatArray = NDArray[np.float64]
 
 # Least slope of a branch as a share of the mean gain, so that every branch has an inverse.
 LEAST_GAIN = 0.02

@@ -15,9 +15,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, trace
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

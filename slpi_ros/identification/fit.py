@@ -6,7 +6,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
@@ -19,8 +18,6 @@ from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.sensor import Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
-
-FloatArray = NDArray[np.float64]
 
 FITS: dict[str, Callable[[Sequence[Samples]], Fitted]] = {
     "slpi": fit_family,

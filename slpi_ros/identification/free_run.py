@@ -12,10 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.identification.samples import FEWEST, Samples
 from slpi_ros.model.axis_model import AxisModel, Start
-
-FloatArray = NDArray[np.float64]
 
 # Cycles of the decaying oscillation that represents an initial state near the middle of the loop.
 MIDDLE_LOOPS = 20

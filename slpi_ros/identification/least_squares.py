@@ -11,6 +11,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.identification.bases import Basis
@@ -18,8 +19,6 @@ from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.samples import Samples
 from slpi_ros.model.axis_model import Start
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
 from slpi_ros.identification.free_run import InitialHistory, choose_start, warn_of_initial_history, warn_of_rest
@@ -13,8 +12,6 @@ from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import MultiSlopeBasis
 from slpi_ros.identification.samples import Samples
 from slpi_ros.model.axis_model import Start
-
-FloatArray = NDArray[np.float64]
 
 # Candidate numbers of grid vertices and roughness weights of the loop family, for cross-validation.
 VERTICES = (21, 31, 41)

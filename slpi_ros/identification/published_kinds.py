@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.hysteresis.multi_slope import (
     BACK,
@@ -34,8 +35,6 @@ from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, RIDGE, Fitted, Problem, held_out_errors, solve_qp
 from slpi_ros.identification.samples import FEWEST, NEVER_TURNS, Samples, only_one
 from slpi_ros.model.axis_model import Start
-
-FloatArray = NDArray[np.float64]
 
 OPERATORS = 10
 # Spacing of the thresholds (V) for outer loops with a span of 10 to 40 spacings.

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import IdentificationError
 from slpi_ros.identification import bad_readings, drive, signal_statistics
 from slpi_ros.identification.drive import SPEED_FACTOR
 from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, WINDOW, bounds, select_thinned, windows
 from slpi_ros.io.record import Record, release
-
-FloatArray = NDArray[np.float64]
 
 # Time steps, in periods, above which samples are missing, and above which the step is a gap.
 _LOST, _GAP = 1.5, 5.0

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.chain import forward, lasting
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
@@ -27,8 +27,6 @@ from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, Start
 from slpi_ros.model.stage_model import StageModel
-
-FloatArray = NDArray[np.float64]
 
 # Standard deviations of the prior, for the gain (relative) and for the smooth deviation of each parameter (share of the
 # displacement range): if the stage has changed, and if the old model still agrees with the record.

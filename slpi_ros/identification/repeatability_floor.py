@@ -7,12 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn
 from slpi_ros.identification.signal_statistics import FEWEST, digit, noise
-
-FloatArray = NDArray[np.float64]
 
 _FEWEST_READINGS = 5
 # Largest number of moves and of holds used, evenly spread over the record; number of earlier moves searched.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.identification.bad_readings import (
@@ -20,8 +21,6 @@ from slpi_ros.identification.bad_readings import (
 )
 from slpi_ros.identification.signal_statistics import without_noise
 from slpi_ros.io.record import Record, each_block, first_step_back, release
-
-FloatArray = NDArray[np.float64]
 
 # Fewest samples for a fit.
 FEWEST = 50

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter1d
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.reversals import without_small_reversals
 
@@ -54,9 +55,6 @@ def error_metrics(measured: ArrayLike, model: ArrayLike) -> ErrorMetrics:
         r_squared=float(1.0 - np.sum(error**2) / total),
     )
 
-
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Number of readings from which noise and resolution are estimated.
 ENOUGH = 100_000

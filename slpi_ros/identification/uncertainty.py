@@ -8,17 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
 from slpi_ros.identification.least_squares import Problem
 from slpi_ros.identification.linear_kinds import SMOOTHNESS, choose, plays, surfaces
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.samples import Samples, select_thinned
 from slpi_ros.io.record import Record
-
-FloatArray = NDArray[np.float64]
 
 RESAMPLES = 50
 BLOCKS = 80

@@ -8,9 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.io.record import Record
 
 TimeArray = NDArray[np.int64]
 

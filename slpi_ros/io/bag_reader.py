@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.alignment import SeparateTopics, Signals, combine, held_at
 from slpi_ros.io.bag_files import absolute_name, locate, match_topic, require_bounded, translated, unpacked
 from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.input_limits import MOST_AXES, require_count
 from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, SECOND_NS, Message, read_message
-from slpi_ros.io.record import BLOCK, FloatArray, Record, each_block, first_step_back, new_column, release
+from slpi_ros.io.record import BLOCK, Record, each_block, first_step_back, new_column, release
 
 _Path = str | os.PathLike[str]
 

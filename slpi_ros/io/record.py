@@ -11,10 +11,9 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.input_limits import LONGEST_NAME, MOST_AXES
-
-FloatArray = NDArray[np.float64]
 
 # Columns of this size and above, in bytes, are kept in a temporary file.
 MAPPED_FROM = 32 * 2**20

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.columns import is_unit, joined, printable
 from slpi_ros.io.input_limits import (
@@ -29,7 +30,6 @@ from slpi_ros.io.input_limits import (
     read_input,
     require_count,
 )
-from slpi_ros.io.record import FloatArray
 
 # The comma is last: in tables with another separator it may be the decimal mark.
 _SEPARATORS = (";", "\t", ",")

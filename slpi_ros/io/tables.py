@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.columns import Column, ColumnChoice, ColumnOptions, choose_columns, match_column
 from slpi_ros.io.input_limits import MOST_AXES
-from slpi_ros.io.record import FloatArray, Record
+from slpi_ros.io.record import Record
 from slpi_ros.io.table_files import CsvTable, MatTable, load_csv, load_mat
 
 # message stamps count seconds in int32

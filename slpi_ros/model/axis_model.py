@@ -8,8 +8,8 @@ from math import inf
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.chain import Chain, backward, forward, lasting
 from slpi_ros.effects.registry import in_order
@@ -22,9 +22,8 @@ from slpi_ros.hysteresis.shapes import FAR
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.limits import Limits, decaying_turns
 from slpi_ros.model.sensor import IDEAL, Sensor, StreamingSensor
-from slpi_ros.model.streaming import ROUNDING, Mask, StreamingInverse, accepted_range, refusal
+from slpi_ros.model.streaming import ROUNDING, StreamingInverse, accepted_range, refusal
 
-FloatArray = NDArray[np.float64]
 StartMemory = Literal["end", "start", "wiped"]
 START_MEMORIES: tuple[StartMemory, ...] = ("end", "start", "wiped")
 

@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from slpi_ros.effects.base import FloatArray
+from slpi_ros.arrays import FloatArray
 
 Motion = TypeVar("Motion", float, FloatArray)
 

@@ -6,16 +6,14 @@ from dataclasses import dataclass, fields, replace
 from math import exp, isfinite
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import Effect, EffectContext, usual_step
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import UsageError
 from slpi_ros.io.record import Record, first_step_back
-
-FloatArray = NDArray[np.float64]
 
 # Longest delay and longest lag, seconds.
 LONGEST = 1.0

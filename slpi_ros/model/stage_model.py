@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, StartMemory
 from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.sensor import Sensor, corrected
-from slpi_ros.model.streaming import Mask, StageStream, StreamingInverse
+from slpi_ros.model.streaming import StageStream, StreamingInverse
 
-FloatArray = NDArray[np.float64]
 Signal = ArrayLike | Mapping[str, ArrayLike]
 
 

@@ -7,8 +7,8 @@ from math import inf, isfinite
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects.base import Effect, StreamingAround, StreamingEffect
 from slpi_ros.effects.chain import Chain
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
@@ -17,8 +17,6 @@ from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 StreamingEffects = dict[str, StreamingEffect]
 
 # A desired displacement outside the identified range by more than this share of its span is refused as an error (wrong

@@ -9,16 +9,14 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.kept import REMEDY
 from slpi_ros.calibration.run import Progress, Recording, Request, aligned, calibrate
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.errors import RecordError, SlpiError
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.nodes.jobs import WorkerProcess
-
-FloatArray = NDArray[np.float64]
 
 # Topics of a bag. The second one, only in bags of a verification, holds the desired displacement, NaN before and after
 # the path, and the commanded voltage.

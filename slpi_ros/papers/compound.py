@@ -8,8 +8,8 @@ from itertools import product
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, cycles
 from slpi_ros.identification.fit import identify
@@ -35,8 +35,6 @@ from slpi_ros.reports.chart import COLOURS, DESIRED
 from slpi_ros.simulation.parameters import StageParameters
 from slpi_ros.simulation.preisach import PreisachStage
 from slpi_ros.simulation.stage import p11_axes
-
-FloatArray = NDArray[np.float64]
 
 # Sampling rate of the controller, hertz.
 RATE = 2000.0

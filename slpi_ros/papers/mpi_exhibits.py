@@ -7,8 +7,8 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.identification.signal_statistics import ErrorMetrics
 from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, outer_legend, panels, um
 from slpi_ros.papers.mpi_study import (
@@ -33,8 +33,6 @@ from slpi_ros.papers.mpi_study import (
 )
 from slpi_ros.reports.chart import COLOURS, DESIRED, MEASURED
 from slpi_ros.simulation.stage import p11_axes
-
-FloatArray = NDArray[np.float64]
 
 COLOUR = {
     **dict(zip((MPI, PI, FAMILY, SMPI), COLOURS, strict=True)),

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.fit import identify
@@ -51,7 +51,6 @@ TABLE_6 = ((60, 1), (80, 1), (100, 1), (80, 2), (80, 3))
 FEEDFORWARD_MEAN, FEEDFORWARD_ROOT, FEEDFORWARD_BAND = 0.0485, 0.1201, 1.0
 COMPOUND_MEAN, COMPOUND_ROOT, COMPOUND_BAND = 0.1192, 0.2949, 0.5
 
-FloatArray = NDArray[np.float64]
 
 # Amplitudes (V) and frequencies (Hz) of Fig. 4. Models are fitted at the highest frequency.
 AMPLITUDES = (20, 40, 60, 80, 100, 120)

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.hysteresis.slpi_published import Loop, SeparatedLoops, Separation
 from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import least_iterations
@@ -34,8 +34,6 @@ from slpi_ros.papers.slpi_study import (
     unseen_paths,
 )
 from slpi_ros.reports.chart import COLOURS, DESIRED, MEASURED
-
-FloatArray = NDArray[np.float64]
 
 COLOUR = dict(zip((CLASSICAL, AT_REST, CLOSING, FAMILY), COLOURS, strict=True))
 ROMAN = ("0", "I", "II", "III", "IV", "V")

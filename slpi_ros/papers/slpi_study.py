@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.hysteresis.slpi_published import (
@@ -24,8 +24,6 @@ from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import default_thresholds, fit_plays, least_iterations
 from slpi_ros.io.record import Record
 from slpi_ros.simulation.stage import flexure_stage
-
-FloatArray = NDArray[np.float64]
 
 # Tables 2 (level II), 3 (level I), 4 (level 0) and 5 (classical PI). They give no unit for the weights, which are taken
 # as micrometres per volt.

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import shown
 
 MEASURED, DESIRED, NOISE = "#8a97a5", "#1b2733", "#c9d2da"
@@ -26,7 +27,6 @@ CAUSES = ("#3b6ea5", "#d99a26", "#8d5fb0", "#1f9aa6", "#b5467d", "#7a6a53")
 SCALE = ((0.0, "#c3d8ea"), (0.5, "#5b8db8"), (1.0, "#173a5c"))
 ERROR_SCALE = ((0.0, "#c9e4d8"), (0.5, "#e0b04a"), (1.0, "#a8321c"))
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Largest number of points of a line, and of dots of a scatter plot, each of which is an element of the page.

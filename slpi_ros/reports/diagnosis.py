@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.result import (
     AMBIGUOUS,
@@ -27,8 +26,6 @@ from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, NOISE
 from slpi_ros.reports.page import Page, Severity, Share
 from slpi_ros.reports.text import above_floor, nm
 from slpi_ros.reports.views import Motion, Series
-
-FloatArray = NDArray[np.float64]
 
 # Relative difference of equal errors.
 _SAME = 0.01

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.drive_watch import FARTHEST
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.identification.record_quality import assess, findings
@@ -14,7 +14,6 @@ from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.text import model_limits
 
-FloatArray = NDArray[np.float64]
 Range = tuple[float, float]
 
 OK, NOTE, MEND = "ok", "note", "mend"

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import SlpiError
 from slpi_ros.identification.cross_validation import CLASSICAL, CrossValidationReport, Slice
 from slpi_ros.identification.record_quality import Finding, assess, findings
@@ -17,9 +17,6 @@ from slpi_ros.reports.chart import AFTER, BEFORE
 from slpi_ros.reports.page import Page, Severity
 from slpi_ros.reports.text import describe_axis, nm
 from slpi_ros.reports.views import Series
-
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # From held-out errors of this multiple of the noise on, diagnosis is advised.
 _MORE_THAN_NOISE = 3.0

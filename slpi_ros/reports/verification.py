@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slpi_ros.diagnosis.tracking import CAUSES, ErrorPart, Tracking
 from slpi_ros.diagnosis.verify import (
@@ -38,8 +37,6 @@ from slpi_ros.reports.chart import (
 from slpi_ros.reports.chart import CAUSES as COLOURS
 from slpi_ros.reports.page import Page, Severity, Share
 from slpi_ros.reports.text import nm
-
-FloatArray = NDArray[np.float64]
 
 FILES = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn
@@ -39,9 +40,7 @@ from slpi_ros.reports.chart import (
 )
 from slpi_ros.reports.page import Page
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 RISING, FALLING = COLOURS[3], COLOURS[0]
 OPENED = Quantity("displacement - straight line", "µm", 1e6, ".4f")

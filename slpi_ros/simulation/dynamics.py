@@ -3,12 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
 from slpi_ros.simulation.parameters import StageParameters
-
-FloatArray = NDArray[np.float64]
 
 # Shortest step (s); in a shorter one the input jumps, because its slope would cause a loss of precision.
 SHORTEST_STEP = 1e-12

@@ -5,13 +5,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
 from slpi_ros.simulation.dynamics import Dynamics
 from slpi_ros.simulation.parameters import StageParameters
-
-FloatArray = NDArray[np.float64]
 
 
 class Material(Protocol):

@@ -22,16 +22,16 @@ from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.repeatability_floor import Floor, floor_of
 from slpi_ros.io.record import Record, common_stage
-from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.axis_model import ABOVE_FLOOR, AxisModel, Start
 from slpi_ros.model.sensor import IDEAL, corrected
 from slpi_ros.model.stage_model import StageModel
 
 # Kinds that are refitted together with the effects. Any other kind is reported as unsuitable if its error exceeds that
 # of the loop family by this factor.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
-# Effects are part of the model if they leave at most this multiple of the repeatability floor, or this share of the
-# error (a third of its mean square), and if the free run of the extended model shows this share of the held-out gain.
-LEFT_BY_NOISE, LEFT_OF_ERROR, GAIN_SHOWN = 1.5, 0.6, 0.5
+# Effects that leave more than noise are part of the model if they leave at most this share of the error (a third of its
+# mean square), and if the free run of the extended model shows this share of the held-out gain.
+LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
 # A zero has moved if its shift exceeds this multiple of the error; number of parts for the uncertainty of a gain;
 # fewest samples of a comparison.
 ZERO, STRETCHES, FEWEST = 4.0, 8, 50
@@ -165,7 +165,7 @@ def _of_another_kind(selection: Selection) -> bool:
 
 def _more_than_noise(selection: Selection) -> bool:
     """Return whether there are effects, and they leave more than what does not repeat."""
-    return bool(selection.named) and selection.now.held_out.rms_of_records > LEFT_BY_NOISE * _floor(selection.now).rms
+    return bool(selection.named) and selection.now.held_out.rms_of_records > ABOVE_FLOOR * _floor(selection.now).rms
 
 
 def _left(selection: Selection) -> float:

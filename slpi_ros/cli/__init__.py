@@ -83,10 +83,7 @@ class _Parser(argparse.ArgumentParser):
 def parser(command: str | None = None) -> argparse.ArgumentParser:
     """Return the parser of all commands; its result contains the name of the chosen command as ``command``.
 
-    Parameters
-    ----------
-    command : str, optional
-        Add the options of this command only; default: of all commands.
+    With `command`, only the options of this command are added; default: of all commands.
     """
     whole = _Parser(
         prog="slpi",

@@ -22,22 +22,11 @@ MOST_LINES = 10
 
 @dataclass(frozen=True)
 class Result:
-    """What a command has to say.
+    """What a command has to say: its `lines`, the most important first, and its exit code, 0 if `passed`, else 1.
 
-    Parameters
-    ----------
-    lines : sequence of str
-        In words, the most important first.
-    document : str or mapping
-        The figures, for ``--json``: the text of a document, or what becomes one; SI units.
-    next : str
-        The command that follows, or what to do.
-    verdict : str
-        First line; "" (default): none.
-    details : sequence of str, optional
-        All lines, printed instead of `lines` with ``-v``; default: `lines`.
-    passed : bool
-        Whether the exit code is 0, else 1; default True.
+    `document` holds the figures for ``--json``, in SI units: the text of a document, or what becomes one. `next` is the
+    command that follows, or what to do; `verdict` is the first line, "" (default): none. `details` are all lines,
+    printed instead of `lines` with ``-v``; default: `lines`.
     """
 
     lines: Sequence[str]

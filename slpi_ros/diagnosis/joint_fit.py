@@ -64,15 +64,10 @@ BLOCKS = 40
 class Score:
     """Held-out errors of a joint fit of hysteresis and columns.
 
-    Parameters
-    ----------
-    losses : ndarray, shape (blocks,), m^2
-        Mean square held-out error of each block.
-    gains : ndarray, shape (k,)
-        Gains of the columns, fitted to all samples.
-    records : ndarray, shape (records,), m^2
-        Mean square error of each record without its offset, from a fit to the other records; NaN if these cover too
-        little of it, empty if there is only one record.
+    `losses`, shape (blocks,), m^2, are the mean square held-out errors of the blocks, and `gains`, shape (k,), those of
+    the columns, fitted to all samples. `records`, shape (records,), m^2, are the mean square errors of each record
+    without its offset, from a fit to the other records: NaN if these cover too little of it, empty if there is only one
+    record.
     """
 
     losses: FloatArray
@@ -93,13 +88,8 @@ class Score:
 class Joint:
     """Normal equations of the hysteresis of one axis, to which columns of effects can be added.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    u : ndarray, shape (N,), volts
-        Voltage that drives the hysteresis.
-    like : Joint, optional
-        Equations of the same records, from which the mask `predictable` is reused.
+    The voltage `u`, shape (N,), volts, drives the hysteresis. The mask `predictable` is reused from `like`, equations
+    of the same records.
     """
 
     def __init__(self, evidence: Evidence, u: FloatArray, like: "Joint | None" = None) -> None:
@@ -195,17 +185,11 @@ class Joint:
         return Columns(self, self.sampled(np.column_stack(signals)))
 
     def score(self, signals: Sequence["Columns"], *, positive: int = 0, starting: Sequence[int] = ()) -> Score:
-        """Return the held-out errors of a joint fit of hysteresis and columns.
+        """Return the held-out errors of a joint fit of hysteresis and all other columns to the very first column.
 
-        Parameters
-        ----------
-        signals : sequence of Columns
-            The very first column is the target, to which hysteresis and all other columns are fitted.
-        positive : int
-            Number of trailing columns whose gains must be non-negative.
-        starting : sequence of int
-            Indices of the columns, without counting the target, that describe the state before a record. Together with
-            an offset, they are fitted to a held-out record itself.
+        The gains of the last `positive` columns are non-negative. The columns `starting`, indices without counting the
+        first one, describe the state before a record; together with an offset, they are fitted to a held-out record
+        itself.
         """
         at = self.grouped(np.column_stack([one.at for one in signals]))
         projected = [np.column_stack(parts) for parts in zip(*(one.projected for one in signals), strict=True)]
@@ -256,14 +240,7 @@ class _HeldOut:
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of a joint fit with the hysteresis.
-
-    Parameters
-    ----------
-    joint : Joint
-    at : ndarray, shape (n, k)
-        Columns at the fitted samples, as returned by `Joint.sampled`.
-    """
+    """Columns of a joint fit with the hysteresis, shape (n, k), `at` the fitted samples, from `Joint.sampled`."""
 
     joint: Joint
     at: FloatArray
@@ -305,11 +282,8 @@ class Columns:
     def fit(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Fit hysteresis and columns to all samples of `y`, shape (N,), metres.
 
-        Returns
-        -------
-        x : ndarray, shape (p,)
-            Hysteresis parameters in units of the problem's scale, without the constraint of monotone branches.
-        gains : ndarray, shape (k,)
+        Return the hysteresis parameters, shape (p,), in units of the problem's scale, without the constraint of
+        monotone branches, and the gains, shape (k,).
         """
         own = self.joint.columns(y)
         solved = np.column_stack([own.solved, self.solved])
@@ -327,14 +301,8 @@ def _missed(gains: FloatArray) -> FloatArray:
 def _gains(projected: FloatArray, products: FloatArray, solved: FloatArray, positive: int = 0) -> FloatArray:
     """Return the gains, shape (k,), of the columns in a joint fit with the hysteresis to the first column.
 
-    Parameters
-    ----------
-    projected, solved : ndarray, shape (p, 1 + k)
-        ``A'J``, and the hysteresis parameters of the best fit to each column.
-    products : ndarray, shape (1 + k, 1 + k)
-        ``J'J``.
-    positive : int
-        Number of trailing columns whose gains must be non-negative.
+    `projected` is ``A'J``, `solved` the hysteresis parameters of the best fit to each column, shape (p, 1 + k) each,
+    and `products` is ``J'J``, shape (1 + k, 1 + k). The gains of the last `positive` columns are non-negative.
     """
     if products.shape[0] == 1:
         return np.empty(0)
@@ -388,18 +356,10 @@ def _predicted(
 ) -> NDArray[np.bool_]:
     """Return the mask of the rows of a record, shape (n,), that the other records can predict.
 
-    Parameters
-    ----------
-    own : Rows
-        Rows of the record.
-    known : ndarray of bool, shape (n,)
-        Rows to which the initial history only adds a constant.
-    rest, factor : ndarray, shape (p, p), and its factor with the penalty
-        Normal equations of the other records.
-    size : int
-        Number of hysteresis parameters; the remaining parameters are the displacements at rest.
-    every : int
-        Step between the rows at which the prediction variance is computed.
+    The record has the rows `own`; to those where `known`, shape (n,), the initial history only adds a constant. `rest`,
+    shape (p, p), are the normal equations of the other records, and `factor` is their factor with the penalty; after
+    the first `size` parameters, of the hysteresis, follow the displacements at rest. The prediction variance is
+    computed at every `every`-th row.
     """
     if not known.any():
         return known
@@ -434,25 +394,11 @@ def _sum(parts: Sequence[FloatArray]) -> FloatArray:
 class Explanation:
     """Joint fit of the hysteresis and of effects, which are in the order of the signal chain.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    effects : sequence of Effect
-    like : Explanation, optional
-        Fit to the same evidence, whose equations are reused if the same voltage drives the hysteresis.
-
-    Attributes
-    ----------
-    u : ndarray, shape (N,), volts
-        Voltage that drives the hysteresis.
-    h : ndarray, shape (N,), metres
-        Displacement of the hysteresis.
-    added : ndarray, shape (N,), metres
-        Contribution of the effects on the displacement, and of the reversible path parallel to the hysteresis.
-    settling : ndarray, shape (N,), metres
-        Relaxation in each record from moves before it, and the additional columns `beside` of the evidence.
-    began : mapping of effect name to ndarray, shape (k,), metres
-        Amplitudes of that relaxation, record by record.
+    The equations of `like`, a fit to the same evidence, are reused if the same voltage `u` (V) drives the hysteresis.
+    All signals have shape (N,): `h` (m) is the displacement of the hysteresis, `added` (m) the contribution of the
+    effects on the displacement and of the reversible path parallel to the hysteresis, and `settling` (m) the relaxation
+    in each record from moves before it, with the additional columns `beside` of the evidence. `began` (m) holds the
+    amplitudes of that relaxation, record by record, shape (k,), by effect name.
     """
 
     joint: Joint

@@ -56,32 +56,16 @@ AT_LIMIT, AT_LIMIT_TIMES = 20, 5
 
 @dataclass(frozen=True)
 class Part:
-    """Data of one axis from one record.
+    """Data of one axis from one record, signals and masks of shape (N,).
 
-    Parameters
-    ----------
-    source : str
-    t : ndarray, shape (N,), seconds
-        From the first stamp.
-    v : ndarray, shape (N,), volts
-        As commanded or read.
-    y : ndarray, shape (N,), metres
-    used : ndarray of bool, shape (N,)
-        Samples to be fitted. The others (outliers, drop-outs, samples before the hysteresis state is known) only drive
-        the hysteresis state.
-    seen : ndarray of bool, shape (N,)
-        Samples with a valid displacement within the selected time.
-    wiped : ndarray of bool, shape (N,)
-        Samples after both ends of the voltage range have been visited, which resets the hysteresis state: the initial
-        history only adds a constant to these.
-    history : tuple of float, volts
-        Initial history, as in `slpi_ros.model.axis_model.Start`.
-    others : mapping of axis name to ndarray, shape (N,), metres
-        Displacement of the other axes relative to the start of the record.
-    digit : float, metres
-        Resolution of the sensor readings; 0 if they are continuous.
-    mixed : float
-        Share of the readings that are early, late or a mixture of two neighbouring values; these are not used.
+    `t` (s) begins at the first stamp, `v` (V) is as commanded or read, `y` (m) is the displacement. Samples that are
+    not `used` in the fit (outliers, drop-outs, samples before the hysteresis state is known) only drive the hysteresis
+    state. `seen` marks a valid displacement within the selected time, and `wiped` the samples after both ends of the
+    voltage range have been visited, which resets the hysteresis state: the initial `history`
+    (V, as in `slpi_ros.model.axis_model.Start`) only adds a constant to these. `others` (m) are the displacements of
+    the other axes relative to the start of the record, by name. `digit` (m) is the resolution of the sensor readings, 0
+    if they are continuous; `mixed` is the share of the readings that are early, late or a mixture of two neighbouring
+    values, which are not used.
     """
 
     source: str
@@ -101,18 +85,9 @@ class Part:
 class Evidence:
     """Data of one axis for a joint fit; signals of shape (N,) are concatenated from all records.
 
-    Parameters
-    ----------
-    parts : tuple of Part
-        Data of each record.
-    basis : Basis
-        Basis of the hysteresis.
-    smoothness : float
-        Weight of the roughness penalty of the hysteresis.
-    beside : ndarray, shape (N, k), metres
-        Additional columns of the joint fit, whose gains are free.
-    older_moves : bool
-        Whether creep may continue from moves long before a record, in addition to one just before it.
+    `basis` is that of the hysteresis, and `smoothness` the weight of its roughness penalty. `beside`, shape (N, k),
+    metres, are additional columns of the joint fit, whose gains are free. With `older_moves`, creep may continue from
+    moves long before a record, in addition to one just before it.
     """
 
     parts: tuple[Part, ...]
@@ -228,10 +203,7 @@ def evidence_of(
 ) -> Evidence:
     """Return the data of one axis from records, with the hysteresis basis of `model` or, by default, of a loop family.
 
-    Raises
-    ------
-    RecordError, IdentificationError
-        If the records contain too little data.
+    RecordError or IdentificationError if the records contain too little data; `start`, `stop` (s) as in `diagnose`.
     """
     read = [_readings(record, axis, start, stop) for record in records]
     _require_enough(read)

@@ -24,20 +24,10 @@ FOREIGN = 0.1
 
 
 def doubt_about(model: StageModel, in_use: StageModel, records: Sequence[Record] = ()) -> str:
-    """Return the reason not to replace the model in use.
+    """Return the reason not to replace the model in use: axis, what, value and limit; "" if there is none.
 
-    Parameters
-    ----------
-    model : StageModel
-        New model, with all axes of the one in use.
-    in_use : StageModel
-    records : sequence of Record, optional
-        Records of the new model; the model in use is judged on them as well. Default: none, and no such judgement.
-
-    Returns
-    -------
-    str
-        Axis, what, value and limit; "" if there is no reason.
+    The new `model` has all axes of the one `in_use`, which is also judged on `records`, those of the new model;
+    default: none, and no such judgement.
     """
     for name, old in in_use.axes.items():
         reason = (

@@ -114,33 +114,13 @@ class RecordOutcome:
 class AxisDiagnosis:
     """Diagnosis of the model of one axis.
 
-    Parameters
-    ----------
-    verdict : str
-        `NAMED`, `AMBIGUOUS`, `UNEXPLAINED` or `NOTHING_FOUND`.
-    summary : str
-        Result in a few sentences.
-    floor_rms : float, metres
-        Repeatability floor, which no model can explain.
-    floor_source : str
-        Data from which the floor was estimated.
-    given_rms : float, metres
-        Free-run rms error of the given model as it is, without the offset of each record.
-    before_rms, after_rms : float, metres
-        Held-out, free-run rms error of the refitted hysteresis without effects, and with effects; on held-out blocks
-        or, if there are several records, on held-out records.
-    effects : tuple of NamedEffect
-        Identified effects, the largest gain first.
-    next_experiment : str or None
-        Recommended next recording or other action.
-    traces : Traces
-        Signals of the first record.
-    records : tuple of RecordOutcome
-        Errors of each record.
-    dropped : tuple of str
-        Effects that were found on some records but do not carry over to others.
-    given : Given or None
-        Comparison of the given model with the records.
+    `verdict` is `NAMED`, `AMBIGUOUS`, `UNEXPLAINED` or `NOTHING_FOUND`, and `summary` the result in a few sentences.
+    `floor_rms` (m) is the repeatability floor, which no model can explain, estimated from `floor_source`. `given_rms`
+    (m) is the free-run rms error of the given model as it is, without the offset of each record. `before_rms` and
+    `after_rms` (m) are held-out, free-run rms errors of the refitted hysteresis without and with effects, on held-out
+    blocks or, if there are several records, on held-out records. `effects` begin with the largest gain,
+    `next_experiment` is the recommended next recording or other action, `traces` are the signals of the first record,
+    and `dropped` are effects that were found on some records but do not carry over to others.
     """
 
     verdict: str
@@ -206,21 +186,13 @@ class Diagnosis:
 class Given:
     """Comparison of the given model with the records.
 
-    Parameters
-    ----------
-    rms : float, metres
-        Free-run rms error of the model as it is, without the offset of each record.
-    hysteresis_rms, refitted_rms : float, metres
-        Rms error of the model's hysteresis and of a refitted one, on samples to which the initial history only adds a
-        constant; with the identified effects if the error is then lower.
-    gain, gain_deviation : float
-        Relative change of the gain of the stage with respect to the model, and its standard deviation.
-    zero_moved : float or None, metres
-        Largest shift of the zero among the records; None if it is small or the initial history can explain it.
-    motion : float, metres
-        Range of the measured displacement.
-    own_rms : float, metres
-        Rms error at the identification of the model, if the diagnosed records are those of the identification; else 0.
+    `rms` (m) is the free-run rms error of the model as it is, without the offset of each record. `hysteresis_rms` and
+    `refitted_rms` (m) are those of its hysteresis and of a refitted one, on samples to which the initial history only
+    adds a constant; with the identified effects if the error is then lower. `gain` is the relative change of the gain
+    of the stage with respect to the model, and `gain_deviation` its standard deviation. `zero_moved` (m) is the largest
+    shift of the zero among the records, None if it is small or the initial history can explain it. `motion` (m) is the
+    range of the measured displacement. `own_rms` (m) is the rms error at the identification of the model, if the
+    diagnosed records are those of the identification, else 0.
     """
 
     rms: float
@@ -251,22 +223,10 @@ def judged(
     left_out_of_model: Sequence[str],
     driven_alike: Sequence[str],
 ) -> AxisDiagnosis:
-    """Return the diagnosis of one axis.
+    """Return the diagnosis of one axis; `before_rms` (m) is the held-out rms error without effects.
 
-    Parameters
-    ----------
-    selection : Selection
-    floor : Floor
-        Repeatability floor of the records.
-    before_rms : float, metres
-        Held-out rms error without effects.
-    given : Given
-        Comparison of the given model with the records.
-    records : tuple of RecordOutcome
-    left_out_of_model : sequence of str
-        Identified effects that the extended model does not contain.
-    driven_alike : sequence of str
-        Other axes with the same drive as this one.
+    `floor` is the repeatability floor of the records. `left_out_of_model` are identified effects that the extended
+    model does not contain, and `driven_alike` other axes with the same drive as this one.
     """
     base, now = selection.base, selection.now
     effects = _named_effects(selection)

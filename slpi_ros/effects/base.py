@@ -205,9 +205,9 @@ class EffectBase(Protocol):
         return None
 
     def starting(self, around: EffectContext, used: NDArray[np.bool_], *, older: bool = False) -> FloatArray:
-        """Return what is left of its state before each record, shape (N, k), m, one column per unknown amplitude.
+        """Return what is left of its state before each record, with `older` also of that long before.
 
-        With `older` also of its state long before.
+        Shape (N, k), metres, one column per unknown amplitude.
         """
         return np.empty((around.t.size, 0))
 

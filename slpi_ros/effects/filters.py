@@ -142,14 +142,9 @@ class StreamingMode:
 
 @dataclass(frozen=True)
 class Uniform:
-    """A uniform grid that covers a sequence of stamps.
+    """A uniform `grid` (s), shape (M,), with step `dt` (s), that covers non-decreasing stamps `t` (s), shape (N,).
 
-    Parameters
-    ----------
-    t, grid : ndarray, shapes (N,) and (M,), seconds
-        Stamps, non-decreasing, and grid points, which are the stamps if these are uniform.
-    dt : float, seconds
-        Grid step; 0 if all stamps are equal.
+    The grid points are the stamps if these are uniform; `dt` is 0 if all stamps are equal.
     """
 
     t: FloatArray

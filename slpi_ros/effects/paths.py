@@ -20,21 +20,11 @@ from slpi_ros.hysteresis.shapes import Branches
 class Laws(NamedTuple):
     """Parameters of the effects of an axis, each as its method `laws` returns them; without the effect: empty or 0.
 
-    Parameters
-    ----------
-    lag : float, seconds
-    rate : ndarray, shape (0,) or (3,), V, V/s and m/V
-        Threshold, onset rate and reversible gain.
-    relaxations : ndarray, shape (2, K), seconds and 1
-        Time constants and gains of the creep.
-    modes : ndarray, shape (M, 4)
-        0, angular frequency (rad/s), damping and gain of each mode of a resonance.
-    rest : float
-        Share of the motion beside the modes.
-    factors : ndarray, shape (F, 8)
-        Factors of the inverse of the resonance, see `Exact.law` and `Unringing.law`.
-    gain : ndarray, shape (2,), metres and 1
-        Origin and factor of the sensitivity.
+    `lag` is in seconds. `rate`, shape (0,) or (3,), holds threshold (V), onset rate (V/s) and reversible gain (m/V),
+    and `relaxations`, shape (2, K), time constants (s) and gains of the creep. `modes`, shape (M, 4), holds 0, angular
+    frequency (rad/s), damping and gain of each mode of a resonance, `rest` the share of the motion beside the modes,
+    and `factors`, shape (F, 8), the factors of the inverse of the resonance, see `Exact.law` and `Unringing.law`.
+    `gain`, shape (2,), holds origin (m) and factor of the sensitivity.
     """
 
     lag: float = 0.0
@@ -262,30 +252,15 @@ def inverse_path(
 ) -> int:
     """Compensate the effects and the hysteresis of an axis along a path, from equilibrium at the present point.
 
-    Parameters
-    ----------
-    dt, wanted : ndarray, shape (N,), seconds and metres
-        Time from the sample before, and desired displacement of the axis without cross-coupling.
-    lower, upper : float, volts
-        Limits of the command.
-    longest : float, seconds
-        Longest step that counts: before, the voltage is held.
-    rounding : (float, float), metres and 1
-        Differences of displacements, and relative ones of voltages, up to which they are equal.
-    far : float, metres
-        Largest distance of a displacement of the hysteresis from rest.
-    out : ndarray, shape (N,), volts
-        Output: the commands.
-    held : ndarray of bool, shape (N,)
-        Output: whether the command is held at the limit beyond which the desired displacement lies.
-    turns : ndarray, shape (2, depth + 4 N + 4), volts and metres
-    point, direction, depth, rest, symmetric_rest, first, branches
-        As in `slpi_ros.hysteresis.compiled.through`.
+    Return the number of samples evaluated, less than N if the model cannot reach the next one. Outputs, shape (N,): the
+    commands `out` (V), and whether each is `held` at the limit beyond which the desired displacement lies.
 
-    Returns
-    -------
-    done : int
-        Number of samples evaluated; less than N if the model cannot reach the next one.
+    `dt` (s), shape (N,), is the time from the sample before; a step counts as at most `longest` (s), and before it the
+    voltage is held. `wanted` (m), shape (N,), is the desired displacement of the axis without cross-coupling, and
+    `lower`, `upper` (V) limit the command. `rounding` holds differences of displacements (m), and relative ones of
+    voltages, up to which they are equal, and `far` (m) is the largest distance of a displacement of the hysteresis from
+    rest. `turns`, shape (2, depth + 4 N + 4), V and m, and all arguments from `point` on are as in
+    `slpi_ros.hysteresis.compiled.through`.
     """
     shape = (rest, symmetric_rest, first, branches)
     at = np.array([int(direction), depth, 0, 0])

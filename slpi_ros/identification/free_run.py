@@ -54,14 +54,9 @@ def histories(samples: Samples) -> list[tuple[float, ...]]:
 
 @dataclass(frozen=True)
 class InitialHistory:
-    """Initial history that a fit assumes for a record.
+    """Initial `history` (V) that a fit assumes for a record, as in `slpi_ros.model.axis_model.Start`.
 
-    Parameters
-    ----------
-    history : tuple of float, volts
-        As in `slpi_ros.model.axis_model.Start`.
-    only_wiped : bool
-        Whether samples before the reset of the hysteresis state are excluded, because no history explains them.
+    `only_wiped`: samples before the reset of the hysteresis state are excluded, because no history explains them.
     """
 
     history: tuple[float, ...]
@@ -73,19 +68,9 @@ class InitialHistory:
 
 
 def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> InitialHistory:
-    """Choose the initial history with the lowest fit error.
+    """Choose the initial history with the lowest error of the fits that `pose` makes to samples without one.
 
-    Parameters
-    ----------
-    samples : Samples
-        Record without an initial history.
-    pose : callable
-        Function from samples to a fit.
-
-    Returns
-    -------
-    InitialHistory
-        Chosen history, and whether samples before the reset of the hysteresis state are excluded.
+    Samples before the reset of the hysteresis state are excluded if no history explains them.
     """
     wiped = samples.fitted & samples.wiped
     enough = np.count_nonzero(wiped) >= FEWEST and samples.mostly_wiped
@@ -233,29 +218,16 @@ LEVELS = 201
 class Match:
     """Comparison of a model with a record of unknown initial history.
 
-    Parameters
-    ----------
-    start : Start
-        Initial state with the lowest error, at the first voltage of the hysteresis; its displacement includes the
-        offset of the record.
-    offset, offset_uncertainty : float, metres
-        Zero of the record minus zero of the model, and its uncertainty: half the range due to the unknown initial
-        history plus `BEYOND_CHANCE` standard deviations.
-    gain_change, gain_uncertainty : float
-        Relative change of the loop height, and its standard deviation.
-    width_change, width_uncertainty : float
-        Relative change of the loop width in addition to `gain_change`, and its standard deviation.
-    rms : float, metres
-        Rms error of the model on the `known` samples, without the offset.
-    rms_explained : float, metres
-        Rms error that remains after fitting changes of gain and width, a lag and a linear drift.
-    known_from : int
-        First sample after which the initial history affects only the offset; N if there is none.
-    known : ndarray of bool, shape (N,)
-        Fitted samples, without outliers, of stretches between two new extremes of the voltage that are long enough for
-        a comparison; see `match`.
-    residual : ndarray, shape (N,), metres
-        Model minus measured, free-run from `start`; NaN where not fitted.
+    `start` is the initial state with the lowest error, at the first voltage of the hysteresis; its displacement
+    includes the offset of the record. `offset` (m) is the zero of the record minus that of the model, and
+    `offset_uncertainty` (m) half the range due to the unknown initial history plus `BEYOND_CHANCE` standard deviations.
+    `gain_change` is the relative change of the loop height, `width_change` that of the loop width in addition;
+    `gain_uncertainty` and `width_uncertainty` are their standard deviations. `rms` (m) is the error of the model on the
+    `known` samples, without the offset, and `rms_explained` (m) what remains of it after fitting changes of gain and
+    width, a lag and a linear drift. `known_from` is the first sample after which the initial history affects only the
+    offset; N if there is none. `known`, shape (N,), marks the fitted samples, without outliers, of stretches between
+    two new extremes of the voltage that are long enough for a comparison, see `match`. `residual` (m), shape (N,), is
+    model minus measured, free-run from `start`; NaN where not fitted.
     """
 
     start: Start
@@ -366,14 +338,8 @@ def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
 def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> NDArray[np.int64]:
     """Return the stretch number of each sample, shape (N,); in a stretch the initial history adds only a constant.
 
-    Parameters
-    ----------
-    v : ndarray, shape (N,), volts
-        Voltage.
-    apart : ndarray, shape (N,), metres
-        Range of the predicted displacements over all candidate histories.
-    tolerance : float, metres
-        Changes of `apart` below this value are ignored.
+    The voltage `v` (V) and the range `apart` (m) of the predicted displacements over all candidate histories have shape
+    (N,). Changes of `apart` below `tolerance` (m) are ignored.
     """
     extends = np.zeros(v.size, dtype=bool)
     for extreme in (np.maximum.accumulate(v), np.minimum.accumulate(v)):
@@ -451,14 +417,8 @@ def _changes(
 def _solved(matrices: FloatArray, vectors: FloatArray, own_error: float, count: int) -> tuple[FloatArray, FloatArray]:
     """Solve the sum of the normal equations of all parts; return the solution and its standard deviations (jackknife).
 
-    Parameters
-    ----------
-    matrices, vectors : ndarray, shapes (PARTS, c, c) and (PARTS, c)
-        Normal equations of each part, for columns with a mean square of 1.
-    own_error : float, metres
-        Held-out error of the model.
-    count : int
-        Number of samples.
+    `matrices`, shape (PARTS, c, c), and `vectors`, shape (PARTS, c), are those of each part, of `count` samples in all,
+    for columns with a mean square of 1. `own_error` (m) is the held-out error of the model.
     """
     ridge = 1e-9 * count * np.eye(matrices.shape[1])
     matrix, vector = matrices.sum(axis=0) + ridge, vectors.sum(axis=0)

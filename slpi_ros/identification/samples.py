@@ -88,7 +88,7 @@ class Samples:
     def without_outliers(self, path: FloatArray) -> "Samples":
         """Exclude outliers from the fit, using the displacement of a model, `path`, shape (N,), metres.
 
-        Samples with mixed readings are returned unchanged: outliers cannot be distinguished from mixed readings.
+        Samples with mixed readings are returned unchanged, because outliers cannot be distinguished from these.
         """
         if self.side:
             return self

@@ -37,13 +37,9 @@ WIPING_CYCLES = 10
 class Start:
     """Initial state of the hysteresis memory: `voltage` (V) and `displacement` (m) after `history`.
 
-    Parameters
-    ----------
-    history : tuple of float, volts
-        Earlier reversal voltages, oldest first. Empty (default): the stage has never moved.
-    from_rest : bool
-        Whether the stage had never moved before it left the first voltage of `history`. False (default): that voltage
-        was reached by a long fall, which erased the memory.
+    `history` holds earlier reversal voltages (V), oldest first; empty (default): the stage has never moved.
+    `from_rest`: the stage had never moved before it left the first voltage of `history`; False (default): that voltage
+    was reached by a long fall, which erased the memory.
     """
 
     voltage: float
@@ -62,14 +58,9 @@ RESOLUTION = 2e-4
 class FitQuality:
     """Free-run error of the model on the record, or records, `source` of its identification, at `samples` samples.
 
-    Parameters
-    ----------
-    rms, maximum : float, metres
-        Error of the fitted samples.
-    held_out_rms, floor_rms : float, metres
-        Held-out error, from cross-validation, and repeatability floor, estimated from the record.
-    covered : float
-        Share of the cells of the Everett function that the record visited, 0..1.
+    `rms` and `maximum` (m) are errors of the fitted samples, `held_out_rms` (m) is the held-out error, from
+    cross-validation, and `floor_rms` (m) the repeatability floor, estimated from the record. `covered` is the share of
+    the cells of the Everett function that the record visited, 0..1.
     """
 
     rms: float

@@ -30,12 +30,9 @@ ROUNDING = 1e-9
 class StreamState:
     """Complete state of a `StreamingInverse`: of its memory, and of its effects by name.
 
-    Parameters
-    ----------
-    voltage, goal : float, volts
-        Present command, and the voltage required by the last desired displacement.
-    desired, displacement : float, metres
-        Last setpoint of the hysteresis, and displacement of the axis without cross-coupling.
+    `voltage` (V) is the present command, and `goal` (V) the voltage required by the last desired displacement.
+    `desired` (m) is the last setpoint of the hysteresis, and `displacement` (m) that of the axis without
+    cross-coupling.
     """
 
     memory: MemoryState
@@ -53,28 +50,14 @@ class StreamingInverse:
     effects before it. The resulting voltage is limited and then propagated forward, so that the hysteresis memory and
     the effects follow the voltage that is really applied.
 
-    Parameters
-    ----------
-    memory : Memory
-        Hysteresis memory in its initial state, modified in place. The effects start in equilibrium.
-    displacement_range : (float, float), metres
-        Identified range. Displacements in the wider range `accepted` (m) are accepted.
-    limits : Limits
-        Limits of the command; further restricted to what passes the effects.
-    effects : tuple of Effect
-        Effects besides the hysteresis; those of sensor and record are ignored. Default: none.
+    `memory`, in its initial state, is modified in place; the effects start in equilibrium, and those of sensor and
+    record are ignored. Displacements in the range `accepted` (m), which is wider than the identified
+    `displacement_range` (m), are accepted. `limits` of the command are further restricted to what passes the effects.
 
-    Attributes
-    ----------
-    pace : RateLimiter
-        Limits of voltage, slew rate and acceleration; alone, in the time of the samples, of which at most `MAX_DT`
-        counts. A compensator gives it that of its output, on the steady clock.
-    goal : float, volts
-        Voltage that the last sample asked for, before slew rate and acceleration limits.
-    desired : float, metres
-        Last setpoint of the hysteresis.
-    coupled : float, metres
-        Displacement added by other axes; to be set before each sample, default 0.
+    `pace` limits voltage, slew rate and acceleration; alone, in the time of the samples, of which at most `MAX_DT`
+    counts. A compensator gives it that of its output, on the steady clock. `goal` (V) is the voltage that the last
+    sample asked for, before slew rate and acceleration limits, and `desired` (m) the last setpoint of the hysteresis.
+    `coupled` (m), the displacement added by other axes, is to be set before each sample; default 0.
     """
 
     def __init__(
@@ -457,12 +440,8 @@ def refusal(y: float, accepted: tuple[float, float], kind: str = "desired") -> s
 class StageStream:
     """Causal compensation of several axes: ``{axis: v} = step(t, {axis: y})``.
 
-    Parameters
-    ----------
-    streams : mapping of axis name to StreamingInverse
-        Streaming inverse of each axis, modified in place.
-    origins : mapping of axis name to float, metres
-        Displacement of each axis from which its motion is measured for cross-coupling.
+    The `streams` of the axes are modified in place. `origins` (m) are the displacements from which the motion of each
+    axis is measured for cross-coupling.
     """
 
     def __init__(

@@ -28,10 +28,10 @@ class DiagnoseOutcome:
 
 
 def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
-    """Find the causes of the errors of a model.
+    """Find the causes of the errors of a model; UsageError if a bag is given twice.
 
-    Raises UsageError if a bag is given twice. Raises RecordError, IdentificationError, ModelError if the records cannot
-    be read, do not allow a diagnosis, or do not match the model.
+    RecordError, IdentificationError or ModelError if the records cannot be read, do not allow a diagnosis, or do not
+    match the model.
     """
     source, model = request.source, request.model
     records = source.read(coupled=True)

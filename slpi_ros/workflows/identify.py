@@ -70,10 +70,9 @@ class IdentifyOutcome:
 
 
 def identify(request: IdentifyRequest) -> IdentifyOutcome:
-    """Identify a model.
+    """Identify a model; UsageError if the kind or an option is unknown, or a bag is given twice.
 
-    Raises UsageError if the kind or an option is unknown, or a bag is given twice. Raises RecordError,
-    IdentificationError if the records cannot be read, or do not allow a fit.
+    RecordError or IdentificationError if the records cannot be read, or do not allow a fit.
     """
     request.require_possible()
     source, sensor = request.source, request.sensor

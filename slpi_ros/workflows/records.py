@@ -43,11 +43,10 @@ class Source:
     assessed: bool = False
 
     def read(self, *, coupled: bool = False) -> tuple[Record, ...]:
-        """Return the records.
+        """Return the records; with `coupled`, also axes that are not in use, which may couple into the others.
 
-        `coupled`: whether axes that are not in use are read as well, since they may couple into the others; default
-        False. Raises UsageError if there is no bag, or one is given twice. Raises RecordError if a bag cannot be read,
-        or they are of several stages.
+        UsageError if there is no bag, or one is given twice; RecordError if a bag cannot be read, or they are of
+        several stages.
         """
         if self.records:
             return tuple(self.records)

@@ -40,10 +40,10 @@ class VerifyOutcome:
 
 
 def verify(request: VerifyRequest) -> VerifyOutcome:
-    """Verify a model.
+    """Verify a model; UsageError if a bag is given twice.
 
-    Raises UsageError if a bag is given twice. Raises RecordError, IdentificationError, ModelError if the records cannot
-    be read, allow no judgement, or do not match the model.
+    RecordError, IdentificationError or ModelError if the records cannot be read, allow no judgement, or do not match
+    the model.
     """
     source, model = request.source, request.model
     records = source.read(coupled=True)

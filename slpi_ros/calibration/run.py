@@ -39,10 +39,9 @@ MOST_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Recording:
-    """What the stage did during one drive.
+    """What the stage did during one drive, which may have been `kept` by an earlier run.
 
-    `desired` (m, shape (N,)): desired displacement at the samples of the record, NaN where there was none; empty
-    without compensator. `kept`: whether it is a recording of an earlier run; default False.
+    `desired` (m, shape (N,)) is at the samples of the record, NaN where there was none; empty without compensator.
     """
 
     record: Record
@@ -52,10 +51,9 @@ class Recording:
 
 @dataclass(frozen=True)
 class Request:
-    """A drive to be recorded.
+    """A drive to be recorded, by a `name` that is unique within a calibration.
 
-    `name`: name of the record, unique within a calibration. `desired` (m, shape (N,)): desired displacement at the
-    samples of the drive; empty without compensator.
+    `desired` (m, shape (N,)) is at the samples of the drive; empty without compensator.
     """
 
     name: str
@@ -68,9 +66,8 @@ class TrackingError:
     """Error of the compensated stage on one path, measured - desired without its median.
 
     `mean`, `rms`, `maximum` (m): of the magnitude. `offset` (m): median that was removed. `stroke` (m): displacement
-    range of the model. `goal` (m): largest mean error that meets the target. `t` (s, shape (N,)): time of the samples
-    along the path, from the first stamp of the record. `desired`, `error` (m, shape (N,)): desired displacement, and
-    measured - desired without the offset.
+    range of the model. `goal` (m): largest mean error that meets the target. `t` (s, from the first stamp of the
+    record), `desired` (m) and `error` (m, without the offset), shape (N,) each: at the samples along the path.
     """
 
     mean: float
@@ -91,10 +88,10 @@ class TrackingError:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of a calibration.
+    """One step of a calibration: what it was done for (`why`) and what it showed (`finding`).
 
-    `name`: name of the record, or of the computation. `seconds`: duration of the drive; 0 for a computation. `why`: why
-    this step. `finding`: what the step showed. `errors`: errors if the step was a verification, else empty.
+    `name` is that of the record or of the computation, `seconds` the duration of the drive, 0 for a computation.
+    `errors` are those of a verification, else None.
     """
 
     name: str
@@ -106,11 +103,10 @@ class Step:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a calibration.
+    """Result of a calibration: the model with the lowest verified error, and these `errors`.
 
-    `model`: model with the lowest verified error. `errors`: its verified errors. `diagnosis`: last diagnosis, of all
-    records before the last verification. `why`: why the target is met or not, and why the calibration ended, in one
-    line.
+    `diagnosis` is the last one, of all records before the last verification. `why` says in one line why the target is
+    met or not, and why the calibration ended.
     """
 
     settings: CalibrationSettings
@@ -133,10 +129,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a calibration.
+    """Progress of a calibration: the present step, and its number from 1.
 
-    `doing`: present step. `step`: its number, from 1. `seconds_left`: time left for drives. `error` (m): largest
-    verified mean error so far; None before the first verification.
+    `seconds_left` is the time left for drives, `error` (m) the largest verified mean error so far, None before the
+    first.
     """
 
     doing: str
@@ -151,10 +147,10 @@ Recorder = Callable[[Request], Recording]
 def calibrate(
     settings: CalibrationSettings, record: Recorder, report: Callable[[Progress], None] = lambda progress: None
 ) -> Outcome:
-    """Calibrate a stage by itself.
+    """Calibrate a stage by itself; SlpiError if it does not follow the voltages, or the records allow no model.
 
-    `record`: drives the stage and returns what it did; an exception ends the calibration. `report`: called at the
-    beginning of each step. Raises SlpiError if the stage does not follow the voltages, or the records allow no model.
+    `record` drives the stage and returns what it did; an exception ends the calibration. `report` is called at the
+    beginning of each step.
     """
     return _Calibration(settings, record, report).run()
 
@@ -364,11 +360,10 @@ def _follows(axis: str, drive: Drive, record: Record) -> str:
 
 
 def tracking_error(recording: Recording, axis: str, model: StageModel, goal: float) -> TrackingError:
-    """Return the error of an axis along the path of a recording.
+    """Return the error of an axis along the path of a recording, which has desired displacements.
 
-    `recording`: with desired displacements. `model`: model that the compensator used; what it knows of the sensor is
-    taken out of the readings. `goal` (m): largest mean error that meets the target. Raises RecordError if there are no
-    readings along the path.
+    What the `model` that the compensator used knows of the sensor is taken out of the readings. `goal` (m) is the
+    largest mean error that meets the target. RecordError if there are no readings along the path.
     """
     record, desired = recording.record, recording.desired[axis]
     error = model.axis(axis).correct(record.t, record.displacement[axis]) - desired
@@ -397,10 +392,9 @@ def aligned(
     """Return a recording whose desired displacements belong to the applied voltages.
 
     Commands take some time to the stage and readings some time back. The delay between commanded and applied voltages
-    is removed, so that only what the stage itself does is left.
-
-    `sent_ns` (ns, shape (M,)): stamps of the commands, on the clock of the record. `commands` (V, shape (M,)).
-    `desired` (m, shape (M,)): NaN where there was none.
+    is removed, so that only what the stage itself does is left. `sent_ns` (ns, shape (M,)) are the stamps of the
+    commands, on the clock of the record; `commands` (V) and `desired` (m, NaN where there was none) have the shape
+    (M,).
     """
     if not desired:
         return Recording(record, {})

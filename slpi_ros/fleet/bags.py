@@ -99,10 +99,9 @@ class Row:
 class Examined:
     """What is known of a bag without a model.
 
-    `stage`: name of the stage: of the list, else the bag's hardware id, else "". `date_ns` (ns): first time stamp, Unix
-    time; None if the bag cannot be read. `axes`: axes that can be used. `findings`: findings on the quality of the
-    record, other than "ok". `refused`: reason for each axis that cannot be used; axis "" if that is the whole bag.
-    `seconds`: computing time.
+    `stage`: its name in the list, else the bag's hardware id, else "". `date_ns` (ns): first stamp, Unix time; None if
+    the bag cannot be read. `axes`: those that can be used. `findings`: on the quality of the record, other than "ok".
+    `refused`: reason for each axis that cannot be used; axis "" if that is the whole bag. `seconds`: computing time.
     """
 
     bag: Bag
@@ -151,10 +150,7 @@ class Judged:
 
 
 def examine(bag: Bag, topic: str) -> Examined:
-    """Read a bag and assess the quality of its record.
-
-    `topic`: topic with voltage and displacement.
-    """
+    """Read a bag and assess the quality of its record; `topic` holds voltage and displacement."""
     began = time.process_time()
     try:
         with _quiet():
@@ -181,8 +177,7 @@ def examine(bag: Bag, topic: str) -> Examined:
 def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
     """Identify the reference model of a stage from a bag, and write it to the file `name` in the folder `output`.
 
-    `one`: examination of the bag. `output`, `name`: folder of the results, and path of the model within it. Returned:
-    its `model` is `name`, or "" if no axis can be identified.
+    The `model` of the result is `name`, or "" if no axis can be identified.
     """
     began = time.process_time()
     rows, axes = [], {}
@@ -210,8 +205,7 @@ def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
 def compare(one: Examined, topic: str, output: str, reference: str, name: str) -> Judged:
     """Verify the reference model of the stage on a bag, and refit it where it is beyond the limit.
 
-    `one`: examination of the bag. `reference`, `name`: paths of the reference model and of the refitted one within the
-    folder of the results.
+    `reference` and `name` are the paths of the reference model and of the refitted one within the folder `output`.
     """
     began = time.process_time()
     try:
@@ -251,9 +245,9 @@ def explain(
 ) -> Judged:
     """Explain the error of a bag that neither the reference model nor a changed gain, width or zero describes.
 
-    `rows`: rows from `identify_bag` or `compare`. `topic`, `output`, `reference`, `name`: as for `compare`. `others`:
-    paths of the reference models of all other stages. `diagnosed`: whether a diagnosis names the causes if no other
-    stage's model describes the record.
+    `rows` are from `identify_bag` or `compare`, and `others` the paths of the reference models of all other stages. If
+    `diagnosed`, a diagnosis names the causes if no other stage's model describes the record. The rest is as for
+    `compare`.
     """
     began = time.process_time()
     told = []

@@ -34,23 +34,11 @@ class _Straight:
 
 
 def trace(v: FloatArray, *, symmetric_rest: bool, primed: bool = False) -> tuple[IntArray, IntArray]:
-    """Return the branch of each sample of a voltage signal.
+    """Return the origin and the direction of the branch of each sample of a voltage `v` (V), shape (N,) each.
 
-    Parameters
-    ----------
-    v : ndarray, shape (N,), volts
-        Voltage; the first value, which may be repeated, is the rest voltage.
-    symmetric_rest : bool
-        As in `slpi_ros.hysteresis.shapes.Shape`.
-    primed : bool
-        As in `slpi_ros.hysteresis.turning_points.Memory`.
-
-    Returns
-    -------
-    origin : ndarray of int, shape (N,)
-        Sample at which the branch started, or `AT_REST` or `LONG_FALL`.
-    direction : ndarray of int, shape (N,)
-        +1 rising, -1 falling; 0 at rest, or -1 if `primed`.
+    The first voltage, which may be repeated, is the rest voltage. The origin is the sample at which the branch started,
+    or `AT_REST` or `LONG_FALL`; the direction is +1 rising, -1 falling, 0 at rest, or -1 at rest if `primed`.
+    `symmetric_rest` is as in `Shape`, `primed` as in `Memory`.
     """
     v = np.require(v, np.float64, ("C", "W"))
     # Row 2 is the stack: the sample of each reversal.

@@ -118,43 +118,20 @@ def through(
 ) -> tuple[int, float, int, int]:
     """Move a memory along a path, as `Memory.forward` or `Memory.inverse` does at each sample.
 
-    Parameters
-    ----------
-    x : ndarray, shape (N,), volts or metres
-    coordinate : int
-        Coordinate of `x`: 0 voltage, 1 displacement.
-    lower, upper : float, volts
-        Voltage limits of the inverse; `point` must lie within them.
-    out : ndarray, shape (N,)
-        Output: the other coordinate along the path.
-    direction : float
-        +1 rising, -1 falling, 0 at rest.
-    point : ndarray, shape (2,), volts and metres
-        Current point; overwritten with the last point of the path.
-    turns : ndarray, shape (2, depth + N), volts and metres
-        Stack of reversals; the first `depth` columns are in use. Modified in place.
-    depth : int
-    walk : ndarray of int, shape (3, depth + N), or (3, 0)
-        Rows 0 and 1 are set to each sample's branch: the sample at which it started and its direction. Row 2 holds the
-        sample of each reversal. A branch without reversal starts at sample -1.
-    ends : ndarray, shape (2, 2) or (2, 0), volts and metres
-        If the path moves, the columns are set to starting point and closing point of the last branch.
-    knots : ndarray, shape (2, k), volts and metres
-        As from `room`: overwritten with the knots of the last branch, relative to its starting point.
-    rest : ndarray, shape (2,), volts and metres
-    symmetric_rest, branches : bool, Branches
-        As in `Shape`.
-    first : ndarray, shape (2, k), volts and metres
-        Knots of the first rise from rest.
+    Return the number of samples evaluated (less than N if the model cannot reach the next one), the direction, the
+    depth and, if the path moves, the index of the knot after the last sample.
 
-    Returns
-    -------
-    done : int
-        Number of samples evaluated; less than N if the model cannot reach the next one.
-    direction : float
-    depth : int
-    knot : int
-        Index of the knot after the last sample, if the path moves.
+    The path `x`, shape (N,), is voltage (V; `coordinate` 0) or displacement (m; `coordinate` 1). `lower` and `upper`
+    (V) limit the voltage of the inverse; `point` must lie within them. `direction` is +1 rising, -1 falling, 0 at rest.
+    `rest`, shape (2,), and `first`, shape (2, k), the knots of the first rise from there, are in V and m;
+    `symmetric_rest` and `branches` are as in `Shape`.
+
+    Modified in place, V and m: `out`, shape (N,), the other coordinate along the path; `point`, shape (2,), the current
+    point; `turns`, shape (2, depth + N), the stack of reversals, of which the first `depth` columns are in use; if the
+    path moves, `ends`, shape (2, 2) or (2, 0), starting point and closing point of the last branch, as columns;
+    `knots`, shape (2, k), as from `room`, the knots of the last branch relative to its starting point. Of `walk`, shape
+    (3, depth + N) or (3, 0), rows 0 and 1 are set to each sample's branch: the sample at which it started, -1 without
+    reversal, and its direction; row 2 holds the sample of each reversal.
     """
     s, other = direction, 1 - coordinate
     low, high = (lower, upper) if coordinate else (-inf, inf)
@@ -280,23 +257,12 @@ def moved(
     first: FloatArray,
     branches: Branches,
 ) -> bool:
-    """Move a memory to one voltage or displacement, as `Memory.forward` and `Memory.inverse` do.
+    """Move a memory to a voltage (V; `coordinate` 0) or displacement (m; 1); return False if it cannot be reached.
 
-    Parameters
-    ----------
-    target : float, volts or metres
-    coordinate : int
-        Coordinate of `target`: 0 voltage, 1 displacement.
-    at : ndarray of int, shape (4,)
-        Direction, depth of the stack, index of the knot after the present point (0: `ends` and `knots` are not those of
-        the present branch), and 1 once the branch or its piece may have changed. Modified in place.
-    lower, upper, point, turns, ends, knots, rest, symmetric_rest, first, branches
-        As in `through`; `point` may lie outside the limits.
-
-    Returns
-    -------
-    done : bool
-        False if the model cannot reach the target.
+    It does what `Memory.forward` and `Memory.inverse` do. `at`, shape (4,), is modified in place: direction, depth of
+    the stack, index of the knot after the present point (0: `ends` and `knots` are not those of the present branch),
+    and 1 once the branch or its piece may have changed. The others are as in `through`; `point` may lie outside the
+    limits.
     """
     one, out, walk = np.empty(1), np.empty(1), np.empty((3, 0), dtype=np.int64)
     ways = 1 if coordinate == 0 or lower <= point[0] <= upper else 2
@@ -323,16 +289,10 @@ solved = compiled(rate_law.solved)
 
 @compiled
 def felt(t: FloatArray, v: FloatArray, threshold: float, onset_rate: float, lead: float) -> FloatArray:
-    """Return the voltage that the hysteresis feels, shape (N,), volts, by the rate law.
+    """Return the voltage that the hysteresis feels, shape (N,), volts, by the law of `slpi_ros.hysteresis.rate_law`.
 
-    Parameters
-    ----------
-    t, v : ndarray, shape (N,), seconds and volts
-        Applied voltage.
-    threshold, onset_rate : float, volts and V/s
-        Law, see `slpi_ros.hysteresis.rate_law`.
-    lead : float, volts
-        Difference of the two voltages, applied minus felt, at the first sample.
+    `t` (s) and the applied voltage `v` (V) have the shape (N,). `threshold` (V) and `onset_rate` (V/s) are those of the
+    law; `lead` (V) is the difference of the two voltages, applied minus felt, at the first sample.
     """
     felt_voltage, w, before, earlier = np.empty_like(v), 0.0, 0.0, 0.0
     u = v[0] - lead if v.size else 0.0
@@ -373,28 +333,12 @@ def through_law(
 ) -> tuple[int, float, int]:
     """Compensate the rate law and the hysteresis along a path, as `StreamingRateDependence.inverse` at each sample.
 
-    Parameters
-    ----------
-    dt : ndarray, shape (N,), seconds
-        Time from the sample before.
-    h : ndarray, shape (N,), metres
-        Desired displacement of hysteresis and reversible part.
-    law : ndarray, shape (3,), V, V/s, m/V
-        Threshold, onset rate and reversible gain.
-    out, reached : ndarray, shape (N,), volts and metres
-        Output: applied voltages within the limits, and the displacements that they give.
-    state : ndarray, shape (5,)
-        Applied voltage, magnitudes of ``w`` of the last three samples, and the last `h` (NaN: none). Modified in place.
-    turns : ndarray, shape (2, depth + 2 N + 2), volts and metres
-    lower, upper, direction, point, depth, rest, symmetric_rest, first, branches
-        As in `through`.
-
-    Returns
-    -------
-    done : int
-        Number of samples evaluated; less than N if the model cannot reach the next one.
-    direction : float
-    depth : int
+    Return the number of samples evaluated (less than N if the model cannot reach the next one), the direction and the
+    depth. `dt` (s, shape (N,)) is the time from the sample before, and `h` (m, shape (N,)) the desired displacement of
+    hysteresis and reversible part. `law` holds threshold (V), onset rate (V/s) and reversible gain (m/V). The outputs,
+    shape (N,), are the applied voltages within the limits, `out` (V), and the displacements that they give, `reached`
+    (m). `state`, shape (5,), is modified in place: applied voltage (V), magnitudes of ``w`` of the last three samples,
+    and the last `h` (NaN: none). `turns` has the shape (2, depth + 2 N + 2); all other arguments are as in `through`.
     """
     threshold, onset_rate, reversible = law[0], law[1], law[2]
     s, shape = direction, (rest, symmetric_rest, first, branches)

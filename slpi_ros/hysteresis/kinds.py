@@ -54,13 +54,7 @@ def to_document(model: Hysteresis) -> dict[str, Any]:
 
 
 def from_document(kind: str, parameters: Mapping[str, Any]) -> Hysteresis:
-    """Construct a model from the parameters of a validated model document.
-
-    Raises
-    ------
-    ModelError
-        If the kind is unknown or the parameters are inconsistent.
-    """
+    """Return the model of validated `parameters`; ModelError if they are inconsistent or the kind is unknown."""
     match kind:
         case "slpi":
             return _family_from(parameters)

@@ -24,22 +24,11 @@ Row = tuple[FloatArray, FloatArray]
 class LoopFamily:
     """An Everett function on a voltage grid, and the curve of the first rise.
 
-    Parameters
-    ----------
-    grid : ndarray, shape (n,), volts
-        Vertices, strictly increasing, n >= 2.
-    everett : ndarray, shape (n, n), metres
-        ``everett[i, j] = E(grid[i], grid[j])`` for ``j < i``; zero on the diagonal; above the diagonal not used.
-        Strictly increasing with ``i`` and strictly decreasing with ``j``.
-    rise : ndarray, shape (n,), metres
-        Displacement of the first rise at the vertices, strictly increasing; a constant offset has no effect.
-    edge_gain : float, metres per volt
-        Slope of the first rise outside the grid and of branches beyond it, positive.
-
-    Raises
-    ------
-    ModelError
-        If the arrays have inconsistent shapes or a branch is not strictly increasing.
+    `grid` (V, shape (n,), n >= 2) holds the vertices, strictly increasing. ``everett[i, j] = E(grid[i], grid[j])`` (m,
+    shape (n, n)) for ``j < i`` is strictly increasing with ``i`` and strictly decreasing with ``j``; it is zero on the
+    diagonal and not used above. `rise` (m, shape (n,)) is the displacement of the first rise at the vertices, strictly
+    increasing; a constant offset has no effect. `edge_gain` (m/V), positive, is the slope of the first rise outside the
+    grid and of branches beyond it. ModelError if the shapes are inconsistent or a branch is not strictly increasing.
     """
 
     grid: FloatArray

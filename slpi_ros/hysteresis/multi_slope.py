@@ -48,19 +48,10 @@ def rising_envelope(u: ArrayLike, thresholds: ArrayLike) -> FloatArray:
 
 
 def falling_envelope(u: ArrayLike, thresholds: ArrayLike, amplitude: float) -> FloatArray:
-    """Return the falling envelope, the inner minimum of Eq. 2, limited from below by the rising envelope.
+    """Return the falling envelope (V), the inner minimum of Eq. 2, limited from below by the rising envelope.
 
-    Its slope is 1 below ``u = -5 r``, 1.2 up to ``0.5 V_p + 1.5 r``, 0.8 up to ``V_p + 8 r``, and 1 beyond.
-
-    Parameters
-    ----------
-    u, thresholds : array_like, volts
-        Voltage above `MultiSlope.origin`, and thresholds, broadcast against each other.
-    amplitude : float, volts
-
-    Returns
-    -------
-    ndarray, broadcast shape, volts
+    Its slope is 1 below ``u = -5 r``, 1.2 up to ``0.5 V_p + 1.5 r``, 0.8 up to ``V_p + 8 r``, and 1 beyond. `u`, above
+    `MultiSlope.origin`, `thresholds`, and `amplitude` are in volts; the first two are broadcast against each other.
     """
     u, r = np.asarray(u, dtype=np.float64), np.asarray(thresholds, dtype=np.float64)
     gentle = GENTLE * u + AMPLITUDE_SHARE * amplitude + THRESHOLD_SHARE * r
@@ -77,21 +68,9 @@ class MultiSlope:
     There is no linear term: a branch is flat from its reversal until the first operator moves, except at the ends of
     the range. The inverse exists for every displacement, but its voltage jumps across the flat part.
 
-    Parameters
-    ----------
-    origin : float, volts
-        Lowest voltage of the range, at which ``u = 0``.
-    amplitude : float, volts
-        Highest voltage of the range relative to `origin`, ``V_p``.
-    thresholds : ndarray, shape (n,), volts
-        ``0 <= r_1 < r_2 < ...``
-    weights : ndarray, shape (n,), metres per volt
-        Non-negative, with at least one positive.
-
-    Raises
-    ------
-    ModelError
-        If the parameters are inconsistent.
+    `origin` (V) is the lowest voltage of the range, at which ``u = 0``, and `amplitude` (V) the highest one relative to
+    it, ``V_p``. `thresholds` (V, shape (n,)) are ``0 <= r_1 < r_2 < ...``; `weights` (m/V, shape (n,)) are
+    non-negative, with at least one positive. ModelError if they are inconsistent.
     """
 
     origin: float
@@ -187,19 +166,9 @@ def cycles(x: FloatArray, back: float) -> list[tuple[int, int]]:
 class AmplitudeScaled:
     """An MPI model scaled by the peak displacement ``X_p`` as a piecewise linear function of the amplitude.
 
-    Parameters
-    ----------
-    base : MultiSlope
-        Model of the amplitude ``base.amplitude``.
-    peak_voltages : ndarray, shape (m,), volts
-        Amplitudes relative to ``base.origin``, positive, strictly increasing, m >= 1.
-    peak_displacements : ndarray, shape (m,), metres
-        Peak displacement ``X_p`` at these amplitudes, positive, strictly increasing.
-
-    Raises
-    ------
-    ModelError
-        If the peaks have inconsistent shapes or are not increasing.
+    `base` is the model of the amplitude ``base.amplitude``. `peak_displacements` (m, shape (m,)) are ``X_p`` at the
+    amplitudes `peak_voltages` (V, shape (m,), m >= 1), relative to ``base.origin``; both are positive and strictly
+    increasing, else ModelError.
     """
 
     base: MultiSlope
@@ -234,15 +203,10 @@ class AmplitudeScaled:
 class KnownPath:
     """The SMPI model for paths known in advance: the amplitude of a cycle is known only at its peak.
 
-    A cycle starts at the low end, at the end point of the previous cycle. Every call starts from the initial point. A
-    voltage path is divided into cycles where it returns to the origin, a displacement path where it returns to the
-    displacement at the origin, with the same relative tolerance; both divisions agree except close to the tolerance.
-
-    Parameters
-    ----------
-    model : AmplitudeScaled
-    start_voltage : float, volts
-    start_displacement : float, metres
+    A cycle starts at the low end, at the end point of the previous cycle. Every call starts from the initial point,
+    `start_voltage` (V) and `start_displacement` (m). A voltage path is divided into cycles where it returns to the
+    origin, a displacement path where it returns to the displacement at the origin, with the same relative tolerance;
+    both divisions agree except close to the tolerance.
     """
 
     model: AmplitudeScaled
@@ -252,10 +216,7 @@ class KnownPath:
     def forward_array(self, v: FloatArray) -> FloatArray:
         """Return the displacements, shape (N,), metres, for the voltages `v`, shape (N,), volts.
 
-        Raises
-        ------
-        UsageError
-            If a voltage is not finite or out of range.
+        UsageError if a voltage is not finite or out of range.
         """
         v = np.asarray(v, dtype=np.float64)
         require_finite(v)
@@ -273,10 +234,7 @@ class KnownPath:
     def inverse_array(self, y: FloatArray, lower: float = -inf, upper: float = inf) -> FloatArray:
         """Return the voltages, shape (N,), volts, within `lower` and `upper` (V), for the displacements `y`, metres.
 
-        Raises
-        ------
-        UsageError
-            If a displacement is not finite or cannot be reached by the model.
+        UsageError if a displacement is not finite or cannot be reached by the model.
         """
         y = np.asarray(y, dtype=np.float64)
         require_finite(y)

@@ -17,18 +17,9 @@ class PrandtlIshlinskii:
     """A weighted sum of play operators, ``P[v] = sum_i w_i p_i[v]``; the one with threshold 0 is the linear term.
 
     At rest every operator is in the middle of its play and moves after ``r_i``. In a primed memory it is at the end of
-    its play, as after a long fall, and moves up after ``2 r_i``.
-
-    Parameters
-    ----------
-    thresholds : ndarray, shape (n,), volts
-        ``0 <= r_1 < r_2 < ...``
-    weights : ndarray, shape (n,), metres per volt
-
-    Raises
-    ------
-    ModelError
-        If thresholds and weights are inconsistent, or a cumulative sum of the weights is negative.
+    its play, as after a long fall, and moves up after ``2 r_i``. `thresholds` (V, shape (n,)) are
+    ``0 <= r_1 < r_2 < ...``. ModelError if they and the `weights` (m/V, shape (n,)) are inconsistent, or a cumulative
+    sum of the weights is negative.
     """
 
     thresholds: FloatArray
@@ -74,12 +65,7 @@ class PrandtlIshlinskii:
 
         ``r'_i = sum_{j<=i} w_j (r_i - r_j)``, ``w'_1 = 1 / w_1`` and ``w'_i = -w_i / (W_{i-1} W_i)``, where ``W_i`` is
         the sum of the first i weights (Eq. 12, the linear weight being that of threshold 0). It is valid for a memory
-        without previous motion; for a primed one use `Memory.inverse`.
-
-        Raises
-        ------
-        ModelError
-            If the model is not invertible.
+        without previous motion; for a primed one use `Memory.inverse`. ModelError if the model is not invertible.
         """
         if not self.invertible:
             raise ModelError("PI: no inverse without a threshold 0 of positive weight; add a linear term")
@@ -102,10 +88,5 @@ class PrandtlIshlinskii:
 
 
 def play(threshold: float) -> PrandtlIshlinskii:
-    """Return the play operator of `threshold` (V): ``p = max(v - r, min(v + r, p))``, Eq. 1; it is not invertible.
-
-    Parameters
-    ----------
-    threshold : float, volts
-    """
+    """Return the play operator of `threshold` (V): ``p = max(v - r, min(v + r, p))``, Eq. 1; it is not invertible."""
     return PrandtlIshlinskii(np.array([threshold]), np.array([1.0]))

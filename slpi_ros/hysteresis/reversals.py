@@ -12,21 +12,12 @@ IntArray = NDArray[np.int64]
 
 
 def reversals(x: FloatArray, dead_band: float = 0.0) -> IntArray:
-    """Return the samples at which a signal reverses.
+    """Return the samples at which a signal `x`, shape (N,), reverses, ascending and with its ends, shape (M,).
 
-    Parameters
-    ----------
-    x : ndarray, shape (N,), any unit
-    dead_band : float, unit of `x`
-        Reversals of at most this size are ignored; 0 by default.
-
-    Returns
-    -------
-    ndarray of int, shape (M,)
-        Reversals in ascending order, between the two ends of the signal. From one to the next, `x` changes by more than
-        `dead_band`, alternately up and down. A flat extremum gives its last sample. Without a dead band the ends are
-        the first and the last sample; with one, the extrema before the first and after the last change larger than the
-        dead band. A constant signal gives only sample 0.
+    Reversals of at most `dead_band` (unit of `x`) are ignored: from one sample to the next, `x` changes by more than
+    that, alternately up and down. A flat extremum gives its last sample. Without a dead band the ends are the first and
+    the last sample; with one, the extrema before the first and after the last change larger than the dead band. A
+    constant signal gives only sample 0.
     """
     if not x.size:
         return np.empty(0, dtype=np.int64)

@@ -35,20 +35,11 @@ class Branches(NamedTuple):
 
     Voltages of the falling branches are negated. A branch is interpolated between vertices or composed of operators.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (2, n), volts
-        Ascending. Row k of the other arrays is for branches that start above vertex k - 1, up to vertex k.
-    knots : ndarray, shape (2, n + 1, 2, m), volts and metres
-        Knots of the branch that starts at vertex k.
-    change : ndarray, shape (2, n + 1, 2, m)
-        Derivative of the knots with respect to the distance (V) of the start below vertex k.
-    last : ndarray of int, shape (2, n + 1)
-        Index of the last knot.
-    operators : ndarray, shape (2, k)
-        Thresholds (V) and weights (m/V) of a `MultiSlope` model.
-    scale : (float, float), volts
-        Origin and amplitude of that model.
+    `vertices` (V, shape (2, n)) ascend; row k of the other arrays is for branches that start above vertex k - 1, up to
+    vertex k. `knots` (V and m, shape (2, n + 1, 2, m)) are those of the branch that starts at vertex k, `change` (same
+    shape) their derivative with respect to the distance (V) of the start below vertex k, and `last` (shape (2, n + 1))
+    the index of the last one. `operators`, shape (2, k), are the thresholds (V) and weights (m/V) of a `MultiSlope`
+    model, `scale` its origin and amplitude (V).
     """
 
     vertices: FloatArray = np.empty((2, 0))

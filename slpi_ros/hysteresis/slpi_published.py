@@ -39,23 +39,12 @@ class UnidentifiedLoopWarning(UserWarning):
 class Loop:
     """One separated loop.
 
-    Parameters
-    ----------
-    level : int
-        0 for the outer loop, else one more than the level of the loop that contains its vertex.
-    vertex : int
-        Sample at which the loop starts.
-    direction : int
-        Direction of the first move from the vertex: +1 rising, -1 falling.
-    samples : ndarray of int, shape (m,)
-        Samples of this loop without its inner loops, in order. The vertex belongs to the loop that contains it, except
-        for the vertex of the outer loop, sample 0.
-    joined : ndarray of int, shape (n,)
-        Samples of this loop that are vertices of separated inner loops.
-    closed : bool
-        Whether the voltage returned to the vertex. The outer loop is open by definition.
-    below : int
-        Index of the loop that contains the vertex; 0 for the outer loop.
+    `level` is 0 for the outer loop, else one more than that of the loop that contains the vertex, whose index is
+    `below` (0 for the outer loop). `vertex` is the sample at which the loop starts, and `direction` that of the first
+    move from there: +1 rising, -1 falling. `samples`, shape (m,), are those of this loop without its inner loops, in
+    order; a vertex belongs to the loop that contains it, except for that of the outer loop, sample 0. `joined`, shape
+    (n,), are the samples of this loop that are vertices of separated inner loops. `closed` is whether the voltage
+    returned to the vertex; the outer loop is open by definition.
     """
 
     level: int
@@ -75,22 +64,13 @@ class Loop:
 
 @dataclass(frozen=True)
 class Separation:
-    """A record separated into loops, ``NewData(k) = [k, v, d, tr, lv, sp]`` (Eq. 4).
+    """A record separated into loops, ``NewData(k) = [k, v, d, tr, lv, sp]`` (Eq. 4); arrays of shape (N,).
 
-    Parameters
-    ----------
-    voltage : ndarray, shape (N,), volts
-        Voltage without the reversals within the dead band.
-    displacement : ndarray, shape (N,), metres
-    phase : ndarray of int, shape (N,)
-        ``tr``: +1 boost (rising), -1 back (falling); a reversal belongs to the phase that it starts.
-    level : ndarray of int, shape (N,)
-        ``lv``: the number of suspected vertices at that time. It is one higher for loops in the back phase of the outer
-        loop than in its boost phase; `Loop.level` is the nesting depth instead.
-    vertex : ndarray of int, shape (N,)
-        ``sp``: 0 none, 1 suspected, 2 true vertex.
-    loops : tuple of Loop
-        The outer loop first, then the others in the order of their vertices.
+    `voltage` (V) is without the reversals within the dead band; `displacement` is in metres. `phase` (``tr``) is +1
+    boost (rising) or -1 back (falling); a reversal belongs to the phase that it starts. `level` (``lv``) is the number
+    of suspected vertices at that time. It is one higher for loops in the back phase of the outer loop than in its boost
+    phase; `Loop.level` is the nesting depth instead. `vertex` (``sp``) is 0 none, 1 suspected, 2 true vertex. `loops`
+    holds the outer loop first, then the others in the order of their vertices.
     """
 
     voltage: FloatArray
@@ -110,26 +90,10 @@ class Separation:
 def separate(voltage: FloatArray, displacement: FloatArray | None = None, *, dead_band: float = 0.0) -> Separation:
     """Separate a record into single loops.
 
-    Parameters
-    ----------
-    voltage : ndarray, shape (N,), volts
-        Voltage, starting at rest at the vertex of the outer loop. For a desired path, pass the desired displacement
-        instead.
-    displacement : ndarray, shape (N,), metres, optional
-        Measured displacement, stored in the result without being used.
-    dead_band : float, volts
-        Reversals of at most this size are treated as measurement noise; 0 by default.
-
-    Returns
-    -------
-    Separation
-
-    Raises
-    ------
-    RecordError
-        If there is no sample, or the lengths differ.
-    UsageError
-        If a voltage is not finite.
+    `voltage` (V, shape (N,)) starts at rest at the vertex of the outer loop; for a desired path, pass the desired
+    displacement instead. `displacement` (m, shape (N,)) is stored in the result without being used. Reversals of at
+    most `dead_band` (V) are treated as measurement noise. RecordError if there is no sample, or the lengths differ;
+    UsageError if a voltage is not finite.
     """
     v = np.asarray(voltage, dtype=np.float64)
     d = np.zeros_like(v) if displacement is None else np.asarray(displacement, dtype=np.float64)
@@ -206,25 +170,16 @@ def _loops(closed: list[tuple[int, int]], suspects: list[int], falls_first: bool
 
 @dataclass(frozen=True)
 class SingleLoop:
-    """One identified loop.
+    """One identified loop; pairs are in volts and metres.
 
-    Parameters
-    ----------
-    level, direction : int
-        As in `slpi_ros.hysteresis.slpi_published.Loop`.
-    vertex : (float, float), volts and metres
-        Start of the loop.
-    span : (float, float), volts and metres
-        Distance from the vertex to the farthest point of the loop, both positive.
-    offset : (float, float), volts and metres
-        Distance of the vertex from the model of the containing loop, in voltage at the same displacement and in
-        displacement at the same voltage: every loop keeps its measured position, so that errors do not propagate.
-    model : PrandtlIshlinskii
-        Model in coordinates that are zero at the vertex and increase along the loop.
-    run_in : float or None, volts
-        None: the play operators start at rest, as published; an inner loop then misses its vertex by ``sum w_i r_i``.
-        0: they start primed and move after ``2 r``, as after a reversal; the loop closes. Positive: they are primed
-        this far below the vertex and driven up to it, for an outer loop with an initial history.
+    `level` and `direction` are as in `Loop`. `vertex` is the start of the loop, and `span` the distance from there to
+    its farthest point, both positive. `offset` is the distance of the vertex from the model of the containing loop, in
+    voltage at the same displacement and in displacement at the same voltage: every loop keeps its measured position, so
+    that errors do not propagate. The coordinates of `model` are zero at the vertex and increase along the loop.
+
+    With a `run_in` (V) of None the play operators start at rest, as published; an inner loop then misses its vertex by
+    ``sum w_i r_i``. With 0 they start primed and move after ``2 r``, as after a reversal; the loop closes. If positive,
+    they are primed this far below the vertex and driven up to it, for an outer loop with an initial history.
     """
 
     level: int
@@ -252,19 +207,10 @@ def at_vertex(model: PrandtlIshlinskii, run_in: float | None) -> Memory:
 
 @dataclass(frozen=True)
 class SeparatedLoops:
-    """The identified loops of an axis.
+    """The identified loops of an axis, at least one of level 0.
 
-    Parameters
-    ----------
-    loops : tuple of SingleLoop
-        Identified loops, at least one of level 0.
-    dead_band : float, volts
-        Reversals of at most this size are treated as measurement noise.
-
-    Raises
-    ------
-    ModelError
-        If there is no outer loop, or a loop has no extent or no inverse.
+    Reversals of at most `dead_band` (V) are treated as measurement noise. ModelError if there is no outer loop, or a
+    loop has no extent or no inverse.
     """
 
     loops: tuple[SingleLoop, ...]
@@ -298,14 +244,8 @@ class SeparatedLoops:
     def nearest(self, level: int, direction: int, vertex: float, span: float, coordinate: int) -> SingleLoop:
         """Return the identified loop nearest to a loop of a path.
 
-        Parameters
-        ----------
-        level, direction : int
-            Level and direction; each one that differs adds half the outer loop's span to the distance.
-        vertex, span : float
-            Position of the vertex and span, volts (`coordinate` 0) or metres (`coordinate` 1).
-        coordinate : int
-            Coordinate of `vertex` and `span`: 0 voltage, 1 displacement.
+        `vertex` and `span` are in volts (`coordinate` 0) or metres (`coordinate` 1). A `level` or `direction` that
+        differs adds half the outer loop's span to the distance.
         """
         scale = self.outer_span[coordinate]
 
@@ -325,14 +265,7 @@ class SeparatedLoops:
 
 
 class KnownPath:
-    """The published SLPI model for paths that are completely known in advance.
-
-    Parameters
-    ----------
-    model : SeparatedLoops
-    start : (float, float), volts and metres
-        Rest point from which every path starts.
-    """
+    """The published SLPI model for completely known paths, each from the rest point `start` (V and m)."""
 
     def __init__(self, model: SeparatedLoops, start: tuple[float, float]) -> None:
         self._model = model
@@ -341,20 +274,14 @@ class KnownPath:
     def forward_array(self, v: FloatArray) -> FloatArray:
         """Return the displacements, shape (N,), metres, along the voltages `v`, shape (N,), volts.
 
-        Warns
-        -----
-        UnidentifiedLoopWarning
-            If the path contains loops that were not identified.
+        UnidentifiedLoopWarning if the path contains loops that were not identified.
         """
         return self._through(v, 0)
 
     def inverse_array(self, y: FloatArray, lower: float = -np.inf, upper: float = np.inf) -> FloatArray:
         """Return the voltages, shape (N,), volts, for the displacements `y`, shape (N,), metres, within limits (V).
 
-        Warns
-        -----
-        UnidentifiedLoopWarning
-            If the path contains loops that were not identified.
+        UnidentifiedLoopWarning if the path contains loops that were not identified.
         """
         return np.clip(self._through(y, 1), lower, upper)
 

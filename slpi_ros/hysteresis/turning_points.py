@@ -47,15 +47,8 @@ class MemoryState:
 class Memory:
     """Reversal memory of one axis, driven by voltage (`forward`) or by displacement (`inverse`).
 
-    Parameters
-    ----------
-    shape : Shape
-        Branch shapes of the model.
-    rest_voltage : float, volts
-    rest_displacement : float, metres
-        Initial point.
-    primed : bool
-        False: no previous motion. True: the initial point was reached by a long fall, which erased the memory.
+    `rest_voltage` (V) and `rest_displacement` (m) are the initial point. If `primed`, it was reached by a long fall,
+    which erased the memory, else there was no previous motion.
     """
 
     __slots__ = (
@@ -116,8 +109,6 @@ class Memory:
         self._turn_curves: list[Curve | None] = [None] * len(state.turn_voltages)
         self._enter_branch()
 
-    # The stack
-
     def _turn_to(self, direction: int) -> None:
         """Push the current point as a reversal if the direction changes."""
         if direction == self._direction:
@@ -167,15 +158,10 @@ class Memory:
             return 2.0 * v_rest - self._turns[0][0], 2.0 * y_rest - self._turns[1][0]
         return (v_rest, y_rest) if s > 0 else (-inf, -inf)
 
-    # Forward: voltage to displacement
-
     def forward(self, v: float) -> float:
         """Move to the voltage `v` (V) and return the displacement (m).
 
-        Raises
-        ------
-        UsageError
-            If `v` is not finite or out of range; the memory is unchanged.
+        UsageError if `v` is not finite or out of range; the memory is unchanged.
         """
         s = self._direction
         u = s * (v - self._v0)
@@ -196,17 +182,11 @@ class Memory:
         self._y = y = self._y0 + s * (f_a + (u - u_a) * ((f_knots[i] - f_a) / (u_knots[i] - u_a)))
         return y
 
-    # Inverse: displacement to voltage
-
     def inverse(self, y: float, lower: float = -inf, upper: float = inf) -> float:
         """Move to the displacement `y` (m), or as near as `lower` and `upper` (V) allow; return that voltage (V).
 
-        The memory follows the returned voltage: for an unreachable displacement it stays at the limit.
-
-        Raises
-        ------
-        UsageError
-            If `y` is not finite or out of range; the memory is unchanged.
+        The memory follows the returned voltage: for an unreachable displacement it stays at the limit. UsageError if
+        `y` is not finite or out of range; the memory is unchanged.
         """
         s = self._direction
         f = s * (y - self._y0)
@@ -244,22 +224,9 @@ class Memory:
         """Move to the voltage ``u`` at which displacement plus ``gain w`` is `y` (m), and return ``w``.
 
         Here ``w = asinh(d / scale)`` for the change ``d`` (V) of ``u``; see `slpi_ros.hysteresis.rate_law`. The applied
-        voltage ``u + threshold w`` stays within its limits: where they hold it back, ``u`` follows it by the law.
-
-        Parameters
-        ----------
-        y, gain : float, metres
-        threshold, scale : float, volts
-            `scale` more than 0.
-        lower, upper : float, volts
-            Limits of the applied voltage.
-        guess : float
-            First value of the magnitude of ``w``.
-
-        Raises
-        ------
-        UsageError
-            If `y` is not finite or out of range; the memory is unchanged.
+        voltage ``u + threshold w`` stays within `lower` and `upper` (V): where they hold it back, ``u`` follows it by
+        the law. `gain` is in metres, `threshold` and `scale`, more than 0, in volts; `guess` is a first value of the
+        magnitude of ``w``. UsageError if `y` is not finite or out of range; the memory is unchanged.
         """
         if not abs(y - self._rest[1]) < self._far[1]:
             raise UsageError(f"displacement {y} m is out of range; leave such samples out")
@@ -311,8 +278,6 @@ class Memory:
         w = copysign(solved(scale, threshold, abs(way), 0.0), way)
         self.forward(limit - threshold * w)
         return w
-
-    # Whole paths
 
     def forward_array(self, v: FloatArray) -> FloatArray:
         """Move through the voltages `v`, shape (N,), volts; return the displacements, shape (N,), metres."""

@@ -25,10 +25,10 @@ STATE, PATH = "stage_state", "verification_path"
 
 @dataclass(frozen=True)
 class Wanted:
-    """A drive to be recorded.
+    """A drive to be recorded in the bag `name`.
 
-    `name`: name of the bag. `t` (s, shape (N,)). `voltage` (V, shape (N, axes)). `desired` (m, shape (N, axes)):
-    desired displacements; shape (N, 0) if there are none.
+    `t` (s) has the shape (N,), `voltage` (V) the shape (N, axes), and so has the `desired` displacement (m), or (N, 0)
+    if there is none.
     """
 
     name: str
@@ -39,10 +39,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class CalibrationRequest:
-    """What the worker needs.
-
-    `output`: folder of bags and results. `node`: connection to the node.
-    """
+    """What the worker needs; `output` is the folder of bags and results, `node` the connection to the node."""
 
     settings: CalibrationSettings
     output: str
@@ -61,10 +58,7 @@ class CalibrationOutcome:
 
 
 class CalibrationJob:
-    """A calibration in a worker process.
-
-    `output`: folder of bags and results.
-    """
+    """A calibration in a worker process; `output` is the folder of bags and results."""
 
     def __init__(self, settings: CalibrationSettings, output: Path) -> None:
         self._own, worker = multiprocessing.get_context("spawn").Pipe()

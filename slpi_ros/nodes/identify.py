@@ -87,11 +87,10 @@ DECLARATIONS = (
 
 @dataclass(frozen=True)
 class IdentifySettings:
-    """Validated settings of the node.
+    """Validated settings of the node; `request` is also used for bags of the watched folder.
 
-    `request`: settings of the identification, also used for bags of the watched folder. `watch_directory`: watched
-    folder; "" if none. `diagnosis_directory`: output folder of ~/diagnose; "" for a temporary folder.
-    `diagnostic_period` (s).
+    `watch_directory` is "" for none, `diagnosis_directory` "" for a temporary folder; `diagnostic_period` is in
+    seconds.
     """
 
     request: FitRequest
@@ -101,10 +100,7 @@ class IdentifySettings:
 
     @classmethod
     def of(cls, values: Values) -> "IdentifySettings":
-        """Return the settings from a mapping of parameter names to values.
-
-        Raises UsageError if a value is not valid.
-        """
+        """Return the settings from parameter names and values; UsageError if a value is not valid."""
         bags = tuple(bag for bag in values["bags"] if bag)
         if not values["topic"]:
             raise UsageError("parameter topic is empty; name the topic of the bag, as in stage_state")
@@ -151,10 +147,9 @@ NO_MODEL = "nothing to diagnose: no bag has been identified yet"
 class DiagnosisService:
     """Service ``~/diagnose``: find the causes of the model errors on the bags of the fit; respond when complete.
 
-    The diagnosis only writes files; it does not change the published model.
-
-    `identified`: returns the request for the published model and its bags; None if there is no model. `folder`: returns
-    the output folder; "" for a temporary folder. `report`: called at the start and at the end of a diagnosis.
+    The diagnosis only writes files; it does not change the published model. `identified` returns the request for that
+    model and its bags, None without a model; `folder` returns the output folder, "" for a temporary one. `report` is
+    called at the start and at the end of a diagnosis.
     """
 
     def __init__(

@@ -28,9 +28,8 @@ Outcome = TypeVar("Outcome")
 class WorkerProcess(Generic[Request, Outcome]):
     """Run a function in a worker process and return its outcome without blocking.
 
-    `work`: module-level function that returns the outcome of a request. `outcome`: dataclass of plain values; it is
-    created with only `error` set if the process ends without a result. `what`: description of the work for this error
-    message.
+    `work` is a module-level function that returns the outcome of a request. `outcome` is a dataclass of plain values,
+    created with only `error` set, which names `what` was done, if the process ends without a result.
     """
 
     def __init__(
@@ -86,10 +85,7 @@ def _run(sender: Connection, work: Callable[[Any], Any], request: Any) -> None:
 
 @dataclass(frozen=True)
 class StageIdentity:
-    """Identity of a stage: hardware id and axes.
-
-    `hardware_id`: "" if unknown.
-    """
+    """Identity of a stage: hardware id, "" if unknown, and axes."""
 
     hardware_id: str
     axes: tuple[str, ...]
@@ -116,14 +112,13 @@ class StageIdentity:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """Request of an identification.
+    """Request of an identification from all `bags` in one fit.
 
-    `bags`: paths of the bags, all used in one fit. `kind`: kind of hysteresis model. `start`, `stop` (s): start and end
-    of the fitted part of the record; None: first stamp, or last stamp. `output`: file for the model document; "" if
-    none. `stage`: stage that the bags must belong to; default: any. `in_use`: document of the model in use, with which
-    the new one is compared; "" (default): that in `output`, if any. `unconditional`: whether the new model is published
-    whatever the comparison says. Default False. `sensor_delay`, `sensor_lag` (s): known delay and lag of the sensor;
-    default 0.
+    `start`, `stop` (s): start and end of the fitted part of the record; None: first stamp, or last stamp. `output`:
+    file for the model document; "" if none. `stage`: stage that the bags must belong to; None: any. `in_use`: document
+    of the model in use, with which the new one is compared; "": that in `output`, if any. `unconditional`: the new
+    model is published whatever the comparison says. `sensor_delay`, `sensor_lag` (s): known delay and lag of the
+    sensor.
     """
 
     bags: tuple[str, ...]
@@ -199,11 +194,7 @@ def _in_use(request: FitRequest, records: Sequence[Record]) -> StageModel | None
 
 @dataclass(frozen=True)
 class DiagnosisRequest:
-    """Request of a diagnosis.
-
-    `bags`: paths of the bags, diagnosed together. `topic`: topic of the recorded voltages and displacements.
-    `document`: model document. `folder`: output folder; "" (default) if not chosen yet.
-    """
+    """Request of a diagnosis of the model `document` on all `bags` together; `folder`: "" if not chosen yet."""
 
     bags: tuple[str, ...]
     topic: str
@@ -272,11 +263,7 @@ def check(request: tuple[str, str]) -> CheckOutcome:
 
 
 class Reading:
-    """Validation of a model document in the background.
-
-    `document`, `source`: text of the document, and its name in messages. Raises ModelError if the document is too
-    large.
-    """
+    """Validation of a model document, called `source` in messages, in the background; ModelError if too large."""
 
     def __init__(self, document: str, source: str) -> None:
         if len(document) > TOPIC_MODEL_CHARACTERS:
@@ -292,10 +279,7 @@ class Reading:
         self._unwanted.set()
 
     def read(self) -> Read | None:
-        """Return the model and its fingerprint; None if canceled.
-
-        Raises ModelError if the document is not valid.
-        """
+        """Return the model and its fingerprint, None if canceled; ModelError if the document is not valid."""
         if self._unwanted.is_set():
             return None
         if len(self._document) <= SMALL:

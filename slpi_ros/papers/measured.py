@@ -55,10 +55,7 @@ class Scores:
 
 
 def score(folder: Path, case: Case, kind: str) -> Scores:
-    """Fit a kind of model to one part of a record and predict the others, free-run from the record's start.
-
-    SlpiError if the record cannot be read.
-    """
+    """Fit a model to one part of a record; predict the others, free-run from its start. SlpiError if unreadable."""
     record = import_table(folder / f"{case.name}.csv")
     end = float(record.t[-1]) + 1e-9
 

@@ -13,7 +13,6 @@ from slpi_ros.reports.page import Page
 
 FIRST = "Paper 1: Separated Level-loop Prandtl-Ishlinskii (SLPI) model"
 SECOND = "Paper 2: multi-slope Prandtl-Ishlinskii (MPI) model"
-# Files in the folder, and the columns of the table.
 PAGE, TABLE = "index.html", "separation.csv"
 COLUMNS = "k,voltage_V,displacement_m,tr,lv,sp"
 

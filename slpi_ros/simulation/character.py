@@ -22,41 +22,15 @@ CREEP_TIMES = (0.1, 100.0)
 
 @dataclass(frozen=True)
 class Character:
-    """Effects of one axis besides its hysteresis; 0 means none.
+    """Effects of one axis besides its hysteresis; 0 means none. UsageError if a value is out of range.
 
-    Parameters
-    ----------
-    delay : float, seconds
-        Time from the command to the amplifier.
-    lag : float, seconds
-        Time constant of the amplifier.
-    saturation : float, volts
-        Upper limit of the amplifier's output.
-    rate_dependence : float, volts
-        Growth of the coercivity at 100 V/s; logarithmic in the rate.
-    creep : float
-        Creep per decade of time from 0.1 s to 100 s, as a share of the displacement.
-    resonance : float, hertz
-        Undamped frequency of the flexure mode.
-    damping : float
-        Damping ratio of the flexure mode.
-    coupling : float
-        Share of the motion of every other axis.
-    thermal_drift : float, metres
-        Final displacement of an exponential drift that begins with the first sample.
-    gain_drift : float
-        Final relative change of the sensitivity, exponential from the first sample on.
-    drift_time : float, seconds
-        Time constant of both drifts.
-    sensor_period, sensor_amplitude : float, metres
-        Period and amplitude of the sensor's periodic error.
-    hum_frequency : float, hertz
-    hum_amplitude : float, metres
-
-    Raises
-    ------
-    UsageError
-        If a parameter is out of range.
+    `delay` (s): from the command to the amplifier. `lag` (s): time constant of the amplifier. `saturation` (V): upper
+    limit of its output. `rate_dependence` (V): growth of the coercivity at 100 V/s, logarithmic in the rate. `creep`:
+    per decade of time from 0.1 s to 100 s, as a share of the displacement. `resonance` (Hz), `damping`: undamped
+    frequency and damping ratio of the flexure mode. `coupling`: share of the motion of every other axis.
+    `thermal_drift` (m), `gain_drift`: final displacement, and final relative change of the sensitivity, of exponential
+    drifts that begin with the first sample; `drift_time` (s): their time constant. `sensor_period`, `sensor_amplitude`
+    (m): of the sensor's periodic error. `hum_frequency` (Hz), `hum_amplitude` (m).
     """
 
     delay: float = 0.0
@@ -116,21 +90,10 @@ SENSOR_PERIODS = (158e-9, 266e-9, 316e-9, 388e-9, 633e-9)
 
 
 def draw(rng: np.random.Generator, effects: Sequence[str], *, rate: float, voltage_max: float = 100.0) -> Character:
-    """Return a character with the given effects, each of a random strength.
+    """Return a character with the given effects, keys of `STRENGTHS` (else UsageError), each of a random strength.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    effects : sequence of str
-        Keys of `STRENGTHS`.
-    rate : float, hertz
-        Rate of the samples; a resonance lies below a sixth of it.
-    voltage_max : float, volts
-        Upper end of the voltage range, below which the amplifier saturates.
-
-    Returns
-    -------
-    Character
+    A resonance lies below a sixth of the sampling `rate` (Hz), a saturation below `voltage_max` (V), the upper end of
+    the voltage range.
     """
 
     def strength(low: float, high: float) -> float:
@@ -166,20 +129,8 @@ def draw(rng: np.random.Generator, effects: Sequence[str], *, rate: float, volta
 class CharacterAxis:
     """One axis of a stage: amplifier, hysteresis, creep, flexure and ageing, in the order of the signal.
 
-    Voltage and displacement are linear between samples.
-
-    Parameters
-    ----------
-    parameters : StageParameters
-        Hysteresis and sensor noise; its own dynamics must be off.
-    character : Character
-    seed : int
-        Seed of the sensor noise.
-
-    Attributes
-    ----------
-    parameters : StageParameters
-    character : Character
+    Voltage and displacement are linear between samples. `parameters` are hysteresis and sensor noise, with their own
+    dynamics off; `seed` is that of the sensor noise.
     """
 
     def __init__(self, parameters: StageParameters, character: Character, seed: int) -> None:

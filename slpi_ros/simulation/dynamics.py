@@ -16,11 +16,7 @@ class Relaxation:
     """First-order elements with a common input and individual time constants, ``tau_j dz_j/dt = u - z_j``.
 
     The update is exact for steps of any length if the input is linear between samples (first-order hold).
-
-    Parameters
-    ----------
-    time_constants : ndarray, shape (n,), seconds
-        Time constants, more than 0.
+    `time_constants`, shape (n,), are in seconds and more than 0.
     """
 
     def __init__(self, time_constants: FloatArray) -> None:
@@ -49,14 +45,8 @@ class FlexureMode:
     """A second-order mode, ``d2x/dt2 + 2 z w dx/dt + w^2 x = w^2 u``, with a static gain of 1.
 
     The update is exact for steps of any length if the input is linear between samples (first-order hold): the response
-    to the ramp in steady state is known, and the deviation decays by the closed-form matrix exponential.
-
-    Parameters
-    ----------
-    frequency : float, hertz
-        Undamped natural frequency, ``w / 2 pi``.
-    damping : float
-        Damping ratio ``z``, from 0 to below 1.
+    to the ramp in steady state is known, and the deviation decays by the closed-form matrix exponential. `frequency`
+    (Hz) is ``w / 2 pi``, undamped; `damping` is the ratio ``z``, from 0 to below 1.
     """
 
     def __init__(self, frequency: float, damping: float) -> None:
@@ -100,23 +90,10 @@ class Creep:
     """Logarithmic creep: parallel relaxations with logarithmically spaced time constants.
 
     The displacement is ``y = h + sum_j g_j z_j`` with ``tau_j dz_j/dt = h - z_j``, exact if ``h`` is linear between
-    samples. All ``g_j`` are equal, so that after a step of ``h`` the displacement grows by `gain` times the step per
-    decade of time between `shortest` and `longest`. Under a periodic input the peaks fall as ``f^b``, with ``b`` near
-    ``-gain / ln 10``.
-
-    Parameters
-    ----------
-    gain : float
-        Creep per decade of time, as a share of ``h``.
-    shortest, longest : float, seconds
-        Shortest and longest time constant; after the longest one the creep is complete.
-
-    Attributes
-    ----------
-    time_constants : ndarray, shape (n,), seconds
-        Time constants, at least two per decade.
-    gains : ndarray, shape (n,)
-        Shares of ``h``, with a sum of `gain` times the number of decades.
+    samples. All ``g_j`` (`gains`, shape (n,)) are equal, so that after a step of ``h`` the displacement grows by `gain`
+    times the step per decade of time between the time constants `shortest` and `longest` (s), after which the creep is
+    complete. `time_constants` (s, shape (n,)) are at least two per decade. Under a periodic input the peaks fall as
+    ``f^b``, with ``b`` near ``-gain / ln 10``.
     """
 
     def __init__(self, gain: float, shortest: float, longest: float) -> None:
@@ -141,13 +118,7 @@ class Creep:
 
 
 class Dynamics:
-    """Amplifier lag, creep and flexure mode of one axis; each is optional.
-
-    Parameters
-    ----------
-    parameters : StageParameters
-        Only `amplifier_lag` and the parameters of creep and resonance are used.
-    """
+    """Amplifier lag, creep and flexure mode of one axis; each is optional."""
 
     def __init__(self, parameters: StageParameters) -> None:
         p = parameters

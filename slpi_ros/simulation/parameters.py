@@ -10,61 +10,29 @@ from slpi_ros.errors import UsageError
 
 @dataclass(frozen=True)
 class StageParameters:
-    """Parameters of one axis of a simulated stage.
+    """Parameters of one axis of a simulated stage; UsageError if a value is not finite or out of range.
 
-    Parameters
-    ----------
-    stroke : float, metres
-        Height of the closed loop between 0 V and `nominal_voltage`.
-    hysteresis : float
-        Width of that loop at its middle voltage, as a share of the stroke.
-    nominal_voltage : float, volts
-        Upper end of the loop to which `stroke` and `hysteresis` refer.
-    threshold_min, threshold_max : float, volts
-        Range of the relay thresholds. A range that begins below 0 V leaves a remanence at 0 V.
-    levels : int
-        Levels of the relay grid.
-    width_scale : float, volts
-        Distance between the two thresholds of a relay at which the density has decreased to 1/e.
-    width_growth : float
-        Relative change of `width_scale` from the middle to the upper end of the threshold range.
-    bias_slope, bias_bow : float
-        Logarithm of the density at the upper end of the threshold range relative to its middle: the part odd in the
-        bias, and the part even in the bias.
-    curvature : float
-        Cubic share of the reversible part; negative values saturate towards the ends of the threshold range.
-    stiffening : float
-        Curvature of the displacement as a function of the summed relay and reversible parts, as a share of the stroke:
-        positive if the flexure stiffens towards the upper end. With curvature, loops between the same voltages differ.
-    noise_rms : float, metres
-        Standard deviation of the Gaussian sensor noise.
-    quantisation : float, metres
-        Resolution of the sensor; 0 for none.
-    offset : float, metres
-        Sensor reading at rest.
-    exponent : float
-        Exponent of the power-law material (see PowerLawMaterial), whose loops are similar at all amplitudes: peaks grow
-        as voltage to this power. 0 selects the exponential material, to which alone `width_scale`, `width_growth`,
-        `bias_slope`, `bias_bow` and `curvature` apply.
-    origin : float, volts
-        Voltage origin of the power law.
-    width_exponent : float
-        Exponent by which the density of the power law decreases with relay width.
-    creep_gain : float
-        Creep per decade of time, as a share of the displacement; 0 for none.
-    creep_shortest, creep_longest : float, seconds
-        Shortest and longest time constant of creep.
-    resonance_frequency : float, hertz
-        Undamped frequency of the flexure mode; 0 for none.
-    resonance_damping : float
-        Damping ratio of the flexure mode.
-    amplifier_lag : float, seconds
-        Time constant of the amplifier; 0 for none. The relays see the lagged voltage.
+    `stroke` (m), `hysteresis`: height of the closed loop between 0 V and `nominal_voltage` (V), and its width at the
+    middle voltage as a share of the stroke. `threshold_min`, `threshold_max` (V): range of the relay thresholds; one
+    that begins below 0 V leaves a remanence at 0 V. `levels`: of the relay grid. `width_scale` (V): distance between
+    the two thresholds of a relay at which the density has decreased to 1/e; `width_growth`: its relative change from
+    the middle to the upper end of the threshold range. `bias_slope`, `bias_bow`: parts, odd and even in the bias, of
+    the logarithm of the density at the upper end of the threshold range relative to its middle. `curvature`: cubic
+    share of the reversible part; negative values saturate towards the ends of the threshold range. `stiffening`:
+    curvature of the displacement as a function of the summed relay and reversible parts, as a share of the stroke:
+    positive if the flexure stiffens towards the upper end. With curvature, loops between the same voltages differ.
 
-    Raises
-    ------
-    UsageError
-        If a value is not finite or out of range.
+    `exponent`: of the power-law material (`PowerLawMaterial`), whose loops are similar at all amplitudes: peaks grow as
+    voltage, from `origin` (V), to this power. 0 selects the exponential material, to which alone `width_scale`,
+    `width_growth`, `bias_slope`, `bias_bow` and `curvature` apply. `width_exponent`: exponent by which the density of
+    the power law decreases with relay width.
+
+    `noise_rms` (m): standard deviation of the Gaussian sensor noise. `quantisation` (m): resolution of the sensor.
+    `offset` (m): sensor reading at rest. `creep_gain`: creep per decade of time, as a share of the displacement,
+    between the shortest and longest time constants `creep_shortest` and `creep_longest` (s). `resonance_frequency`
+    (Hz), `resonance_damping`: undamped frequency and damping ratio of the flexure mode. `amplifier_lag` (s): time
+    constant of the amplifier; the relays see the lagged voltage. A `quantisation`, `creep_gain`, `resonance_frequency`
+    or `amplifier_lag` of 0 means none.
     """
 
     stroke: float = 22e-6
@@ -133,15 +101,7 @@ class StageParameters:
     def random(cls, seed: int) -> "StageParameters":
         """Return a random plausible stage: 20 to 25 µm, 12 to 17 % hysteresis, a density that varies with bias.
 
-        Parameters
-        ----------
-        seed : int
-            The same seed gives the same stage.
-
-        Returns
-        -------
-        StageParameters
-            Parameters; sensor noise and quantisation have their default values.
+        The same `seed` gives the same stage; sensor noise and quantisation have their default values.
         """
         rng = np.random.default_rng(seed)
 

@@ -23,13 +23,7 @@ class Material(Protocol):
 
 
 class ExponentialMaterial:
-    """A relay density that decreases exponentially with width and varies with bias, and a cubic reversible curve.
-
-    Parameters
-    ----------
-    parameters : StageParameters
-        Only the threshold range, `width_scale`, `width_growth`, `bias_slope`, `bias_bow` and `curvature` are used.
-    """
+    """A relay density that decreases exponentially with width and varies with bias, and a cubic reversible curve."""
 
     def __init__(self, parameters: StageParameters) -> None:
         self._parameters = parameters
@@ -63,11 +57,6 @@ class PowerLawMaterial:
     homogeneous of degree ``p``. The rise from the origin is ``V^p``, nearly straight for ``p`` near 1; the slope of the
     fall, ``r^(p-1) - r^m``, is small after the reversal and then increases: for ``p = m = 1`` the parabola of
     Rayleigh's law, with a width that grows with the amplitude instead of its square.
-
-    Parameters
-    ----------
-    parameters : StageParameters
-        Only the threshold range, `levels`, `exponent`, `origin` and `width_exponent` are used.
 
     References
     ----------
@@ -123,22 +112,10 @@ class RelayTriangle:
     from ``low + i h`` to ``low + (i + 1) h`` and down-thresholds ``(i - j) h`` below; the state is the share of the
     group that is up. With discrete thresholds, the level spacing ``h`` would produce steps of tens of nanometres.
 
-    Parameters
-    ----------
-    low, high : float, volts
-        Range of the thresholds and of the accepted voltages.
-    levels : int
-        Number of rows and columns.
-    density : callable
-        ``density(bias, width)``, weight in arbitrary units of relays whose thresholds have the mean ``bias`` (V) and
-        the distance ``width`` (V); called once with arrays of shape (levels, levels).
-
-    Attributes
-    ----------
-    output : float
-        Weighted sum of the states, in the unit of `density`.
-    voltage : float, volts
-        Voltage of the last step.
+    `low` and `high` (V) are the range of the thresholds and of the accepted voltages. ``density(bias, width)``, called
+    once with arrays of shape (levels, levels), returns the weights, in arbitrary units, of relays whose thresholds have
+    the mean ``bias`` (V) and the distance ``width`` (V). `output` is the weighted sum of the states, in the unit of
+    `density`; `voltage` (V) is that of the last step.
 
     References
     ----------
@@ -210,17 +187,7 @@ class RelayTriangle:
 
 
 class Sensor:
-    """A sensor with Gaussian noise and quantisation.
-
-    Parameters
-    ----------
-    noise_rms : float, metres
-        Standard deviation of the noise.
-    quantisation : float, metres
-        Resolution of the readings; 0 for none.
-    seed : int
-        The same seed gives the same noise.
-    """
+    """A sensor with Gaussian noise of `noise_rms` (m), the same for the same `seed`, and quantisation (m; 0: none)."""
 
     def __init__(self, noise_rms: float, quantisation: float, seed: int) -> None:
         self._noise_rms = noise_rms
@@ -237,16 +204,10 @@ class Sensor:
 
 @dataclass(frozen=True)
 class LoopFigure:
-    """Characteristic values of a closed major loop.
+    """Displacements (m) that characterise a closed major loop.
 
-    Parameters
-    ----------
-    start : float, metres
-        Displacement at the lower voltage before the first rise.
-    bottom, top : float, metres
-        Displacement at the lower and the upper voltage of the closed loop.
-    rising_middle, falling_middle : float, metres
-        Displacement at the middle voltage on the rising and on the falling branch.
+    `start` is at the lower voltage before the first rise, `bottom` and `top` at the lower and the upper voltage of the
+    closed loop, `rising_middle` and `falling_middle` at the middle voltage on its rising and its falling branch.
     """
 
     start: float
@@ -286,24 +247,8 @@ def measure_loop(respond: Callable[[float], float], low: float, high: float) -> 
 class PreisachStage:
     """A stage whose displacement is a relay sum plus a reversible function of the voltage.
 
-    With the corresponding parameters, it includes the lag of the amplifier, creep, and the resonance of the flexure.
-
-    Parameters
-    ----------
-    parameters : StageParameters, optional
-        Parameters of the axis; by default those of StageParameters.
-    seed : int
-        Seed of the sensor noise.
-
-    Attributes
-    ----------
-    parameters : StageParameters
-        As given.
-
-    Raises
-    ------
-    UsageError
-        If the hysteresis would require a relay part larger than the stroke.
+    With the corresponding `parameters`, it includes the lag of the amplifier, creep, and the resonance of the flexure.
+    `seed` is that of the sensor noise. UsageError if the hysteresis would require a relay part larger than the stroke.
     """
 
     def __init__(self, parameters: StageParameters | None = None, seed: int = 0) -> None:

@@ -16,18 +16,7 @@ NEXT_AXIS = 1000
 
 
 class Stage:
-    """Axes, each with hysteresis, other effects and a sensor, which may move each other.
-
-    Parameters
-    ----------
-    axes : mapping of axis name to PreisachStage or CharacterAxis
-        Axes, in the order of the voltages.
-
-    Raises
-    ------
-    UsageError
-        If there is no axis.
-    """
+    """Axes, each with hysteresis, other effects and a sensor, which may move each other; UsageError without axes."""
 
     def __init__(self, axes: Mapping[str, PreisachStage] | Mapping[str, CharacterAxis]) -> None:
         if not axes:
@@ -38,14 +27,8 @@ class Stage:
     def random(cls, names: Sequence[str], seed: int, noise_rms: float | None = None) -> "Stage":
         """Return a random plausible stage at rest, without effects but hysteresis.
 
-        Parameters
-        ----------
-        names : sequence of str
-            Unique names of the axes, else UsageError.
-        seed : int
-            Seed; the first axis equals ``StageParameters.random(seed)``, the others differ.
-        noise_rms : float, metres, optional
-            Sensor noise of every axis; by default that of StageParameters.
+        The first axis equals ``StageParameters.random(seed)``, the others differ. `noise_rms` (m) is the sensor noise
+        of every axis, by default that of StageParameters. UsageError if `names` are not unique.
         """
         return cls({name: PreisachStage(*each) for name, each in _drawn(names, seed, noise_rms).items()})
 
@@ -129,15 +112,7 @@ def flexure_stage(seed: int = 0) -> PreisachStage:
     - Noise 5 nm rms, resolution 1 nm: chosen; the resolution of a laser interferometer such as the paper's is 1 nm,
       and the mean of two passes (2.2) leaves little noise.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the sensor noise; the stage does not depend on it.
-
-    Returns
-    -------
-    PreisachStage
-        The stage at rest at 0 V.
+    The stage is at rest at 0 V. `seed` is that of the sensor noise; the stage does not depend on it.
     """
     parameters = StageParameters(
         stroke=24e-6,
@@ -180,15 +155,8 @@ def p11_axes(seed: int = 0) -> dict[str, PreisachStage]:
       correspond to 100 µm (chosen).
     - The y axis differs by a few per cent: chosen; the paper says only that the axes are independent (2.2).
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the sensor noise, which differs between the axes; the stage does not depend on it.
-
-    Returns
-    -------
-    dict of axis name to PreisachStage
-        Axes ``x`` and ``y``, at rest at 0 V.
+    The axes ``x`` and ``y`` are at rest at 0 V. `seed` is that of the sensor noise, which differs between them; nothing
+    else depends on it.
     """
     x = StageParameters(
         hysteresis=0.11,

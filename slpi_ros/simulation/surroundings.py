@@ -10,15 +10,7 @@ from slpi_ros.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Hum:
-    """A sinusoidal disturbance.
-
-    Parameters
-    ----------
-    frequency : float, hertz
-    amplitude : float, metres
-    phase : float, radians
-        Phase of the sine at time 0.
-    """
+    """A sinusoidal disturbance: `frequency` (Hz), `amplitude` (m), and `phase` (rad) of the sine at time 0."""
 
     frequency: float
     amplitude: float
@@ -33,17 +25,10 @@ class Hum:
 class Interferometer:
     """An interferometer with imperfect quadrature signals.
 
-    Parameters
-    ----------
-    period : float, metres
-        Displacement per fringe: half or a quarter of the wavelength.
-    amplitude : float, metres
-        Amplitude of the error's first harmonic, less than ``period / 2 pi``.
-    phase : float, radians
-        Phase of the error at displacement 0, in ``amplitude sin(2 pi y / period + phase)``.
-    form : {"offsets", "sine"}
-        ``offsets``: both signals have an uncorrected offset, which gives an error with harmonics; ``sine``: an error
-        without harmonics.
+    `period` (m) is the displacement per fringe: half or a quarter of the wavelength. The first harmonic of the error is
+    ``amplitude sin(2 pi y / period + phase)``, with `amplitude` (m) less than ``period / 2 pi`` and `phase` (rad). With
+    the `form` ``offsets``, an uncorrected offset of both signals, the error has further harmonics; with ``sine`` it has
+    none.
     """
 
     period: float

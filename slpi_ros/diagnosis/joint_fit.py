@@ -147,9 +147,11 @@ class Joint:
             rest = whole - own.gram()
             factor = self._factored(rest, self._ends[-1] - rows.size)
             every = -(-rows.size // LOOKED_AT)
-            # The first rise, once in each record, is in the others, too.
-            known = self.problem.judged[rows] | (self.problem.design.walk.direction[rows] == 0)
-            predicted = _predicted(own, known, rest, factor, self.evidence.basis.size, every)
+            # The first rise, once in each record, may be in the others, too.
+            walk, size = self.problem.design.walk, self.evidence.basis.size
+            masks = _judged(self.problem)[rows], self.problem.judged[rows] | (walk.direction[rows] == 0)
+            tried = [_predicted(own, known, rest, factor, size, every) for known in masks]
+            predicted = max(tried, key=np.count_nonzero)
             # A sample that is not fitted is treated like the preceding fitted one.
             place = np.searchsorted(self._sample[rows], np.arange(samples.start, samples.stop), side="right") - 1
             found[samples] = predicted[np.maximum(place, 0)]

@@ -30,13 +30,12 @@ def error(model, record):
 
 
 def shift(effect):
-    """Return by how much (s) an effect shifts a ramp."""
+    """Return by how much (s) an effect shifts a ramp, and its standard uncertainty (s)."""
     match effect:
         case Delay():
-            return effect.seconds
+            return effect.seconds, effect.uncertainty["seconds"]
         case Lag():
-            return effect.time_constant
-    return 0.0
+            return effect.time_constant, effect.uncertainty["time_constant"]
 
 
 def test_two_records_predict_a_third(records):
@@ -48,7 +47,9 @@ def test_two_records_predict_a_third(records):
     named = {effect.name for effect in found.effects}
     assert "creep" in named and named & {"delay", "lag"}
     assert not named & {"thermal_drift", "saturation", "hum", "gain_drift", "resonance"}
-    assert 0.07e-3 <= sum(shift(effect) for effect in extended.effects) <= 0.14e-3
+    # The law without a creep beside it, fitted to another day of this stage, finds 0.109 ms.
+    ((seconds, uncertainty),) = [shift(effect) for effect in extended.effects if effect.name in ("delay", "lag")]
+    assert abs(seconds - 0.109e-3) <= 2.0 * uncertainty <= 0.08e-3
     of_plain, of_extended = (error(model, records["100hz"]) for model in (plain, diagnosis.extended))
     assert of_extended <= 0.27 and of_extended < 0.5 * of_plain
     assert all(0.0 < outcome.left_out_rms < outcome.before_rms for outcome in found.records)

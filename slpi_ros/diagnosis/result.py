@@ -280,7 +280,7 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) ->
     on = "records" if named.after.records.size and not named.own else "blocks"
     gained = (
         f"with it the error on held-out {on} falls from {before:.3g} to {after:.3g} nm rms "
-        f"(chance gains as much in {100 * chance:.2g} % of cases)"
+        f"(so much is gained by chance in {100 * chance:.2g} % of cases)"
     )
     if not named.runner_up:
         return f"{sentence}; {gained}, and no other effect comes near"
@@ -332,7 +332,9 @@ def _not_in_model(now: Explanation, left_out: Sequence[str], dropped: Sequence[s
     own = [effect.name for effect in now.effects if isinstance(effect, EachRecord) and effect.name not in left_out]
     said = f" Each record's own, and not in the extended model: {', '.join(own)}." if own else ""
     if left_out:
-        said += f" The extended model does without {', '.join(left_out)}: these data do not say what that is elsewhere."
+        said += (
+            f" Not in the extended model: {', '.join(left_out)}; these records do not tell how that acts on other ones."
+        )
     if dropped:
         said += f" Dropped, as what is gained does not hold elsewhere: {', '.join(dropped)}."
     return said

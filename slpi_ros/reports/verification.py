@@ -184,7 +184,7 @@ def _tracking_notes(tracking: Tracking) -> list[str]:
     told = sorted(tracking.shares.items(), key=lambda item: -item[1])
     shares = [f"{cause} {share:.0%}" for cause, share in told if abs(share) >= _SMALLEST_SHARE]
     notes = [
-        f"measured - desired is {nm(error.rms)} rms, {nm(error.maximum)} at most; of its mean square: "
+        f"measured - desired is {nm(error.rms)} rms, {nm(error.maximum)} at most; shares of the mean square: "
         f"{', '.join(shares) or 'nothing'}",
         f"largest contribution, {tracking.blame}: {CAUSES[tracking.blame]}",
     ]

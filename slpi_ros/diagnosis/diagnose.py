@@ -160,7 +160,7 @@ def _extension(model: AxisModel, selection: Selection, given: Given, source: str
 
 def _of_another_kind(selection: Selection) -> bool:
     """Return whether the effects leave so much that the physics is another, where they would not carry over."""
-    return _more_than_noise(selection) and _left(selection) > LEFT_OF_ERROR
+    return _more_than_noise(selection) and _share_left(selection) > LEFT_OF_ERROR
 
 
 def _more_than_noise(selection: Selection) -> bool:
@@ -168,7 +168,7 @@ def _more_than_noise(selection: Selection) -> bool:
     return bool(selection.named) and selection.now.held_out.rms_of_records > ABOVE_FLOOR * _floor(selection.now).rms
 
 
-def _left(selection: Selection) -> float:
+def _share_left(selection: Selection) -> float:
     """Return the share of the held-out error that the effects leave."""
     return selection.now.held_out.rms_of_records / selection.named[0].before.rms_of_records
 
@@ -197,7 +197,8 @@ def _not_as_judged(extended: AxisModel, runs: "Sequence[FreeRun]", selection: Se
     after = _runs(extended, selection.now)
     if any(one.rms > NO_WORSE * given.rms for one, given in zip(after, runs, strict=True)):
         return True
-    return _more_than_noise(selection) and 1.0 - rms_of(after) / rms_of(runs) < GAIN_SHOWN * (1.0 - _left(selection))
+    shown = 1.0 - rms_of(after) / rms_of(runs)
+    return _more_than_noise(selection) and shown < GAIN_SHOWN * (1.0 - _share_left(selection))
 
 
 def _ambiguous(selection: Selection) -> list[str]:

@@ -189,10 +189,6 @@ class Evidence:
         """Return the data of record `k` only."""
         return Evidence((self.parts[k],), self.basis, self.smoothness)
 
-    def without_record(self, k: int) -> "Evidence":
-        """Return the data of all records but record `k`."""
-        return Evidence((*self.parts[:k], *self.parts[k + 1 :]), self.basis, self.smoothness)
-
 
 def evidence_of(
     records: Sequence[Record],

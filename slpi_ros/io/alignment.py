@@ -122,7 +122,7 @@ def held_at(desired: Signals, record: Record, where: str) -> dict[str, FloatArra
     time = desired.logged if desired.stamp is None else desired.stamp
     if not _overlap(time, record.time_ns):
         raise RecordError(f"{where}: at no time were it and {record.source} both recorded; record them with one clock")
-    fields = (desired.fields.get(field, {}) for field in ("position", "data"))
+    fields = (desired.fields.get(field, {}) for field in ("position", "data", "vector"))
     columns = next(filter(None, fields), {})
     axes = [axis for axis in record.axes if axis in columns] if desired.named else record.axes
     order = np.argsort(time, kind="stable")

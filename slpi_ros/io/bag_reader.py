@@ -72,20 +72,6 @@ def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: 
     )
 
 
-def read_bags(
-    paths: Iterable[_Path], topic: str | SeparateTopics = "stage_state", *, axes: Sequence[str] | None = None
-) -> list[Record]:
-    """Read several bags of one stage, each as `read_bag` does, in the order of the paths.
-
-    UsageError if there is no path, or one is given twice; RecordError as for `read_bag`, and if the bags are of
-    different stages.
-    """
-    places = require_different(paths)
-    records = [read_bag(place, topic, axes=axes) for place in places]
-    require_one_stage(records)
-    return records
-
-
 def require_different(paths: Iterable[_Path]) -> list[Path]:
     """Return the paths of bags; UsageError if there is none, or one is given twice."""
     places = [Path(path) for path in paths]

@@ -17,7 +17,7 @@ from slpi_ros.reports.text import model_limits
 Range = tuple[float, float]
 
 OK, NOTE, MEND = "ok", "note", "mend"
-STATE_TYPE, COMMAND_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
+STATE_TYPE = "sensor_msgs/msg/JointState"
 # Largest share of the period by which 95 % of the steps of the stamps may differ from it, and longest gap in periods.
 JITTER, GAP = 0.5, 5.0
 # Seconds by which a stamp may lie before and after the time of its arrival.

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType
 from refusals import holds, refusal
 
-from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.io.bag_reader import read_bag, read_bags
+from slpi_ros.errors import RecordError
+from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.bag_storage import read_mcap
 
 COUNT = 900
@@ -186,15 +186,3 @@ def test_damaged_mcap_never_escapes(tmp_path_factory, data):
         assert all(
             column.shape == (count,) for columns in (read.voltage, read.displacement) for column in columns.values()
         )
-
-
-def test_several_bags(tmp_path):
-    bags = [rosbags_bag(tmp_path / name, {"/stage_state": STATES[:100]}) for name in ("one", "two")]
-    records = read_bags(bags, axes=["long"])
-    assert [record.source for record in records] == [str(bag) for bag in bags]
-    assert [record.axes for record in records] == [("long",)] * 2
-    refusal(UsageError, read_bags, [])
-    again = tmp_path / "two" / ".." / "one"
-    assert holds(refusal(UsageError, read_bags, [*bags, again]), again)
-    other = rosbags_bag(tmp_path / "other", {"/stage_state": [(1, joint_state(1, frame_id="another"))]})
-    assert holds(refusal(RecordError, read_bags, [*bags, other]), other, "'another'", bags[0], "'stage'")

@@ -7,7 +7,7 @@ import pytest
 from identification.records import calibration
 
 import slpi_ros
-from slpi_ros.reports.doctor import COMMAND_TYPE, MEND, STATE_TYPE, Graph, check_graph, check_model, check_record
+from slpi_ros.reports.doctor import MEND, STATE_TYPE, Graph, check_graph, check_model, check_record
 
 LIMITS = (0.0, 100.0)
 
@@ -45,7 +45,7 @@ STAMPS = graph().stamps
 FAULTS = {
     "nobody": ({"nodes": []}, "ROS_DOMAIN_ID"),
     "no driver": ({"state_publishers": {}, "stamps": STAMPS[:0], "arrivals": STAMPS[:0]}, "no publisher"),
-    "wrong type": ({"state_publishers": {"/driver": COMMAND_TYPE}}, COMMAND_TYPE),
+    "wrong type": ({"state_publishers": {"/driver": "std_msgs/msg/Float64MultiArray"}}, "Float64MultiArray"),
     "two drivers": ({"state_publishers": {"/driver": STATE_TYPE, "/other": STATE_TYPE}}, "/other"),
     "silence": ({"stamps": STAMPS[:0], "arrivals": STAMPS[:0]}, "nothing for 3 s"),
     "slow": ({"stamps": STAMPS[:4], "arrivals": STAMPS[:4]}, "4 states"),

@@ -122,3 +122,16 @@ def test_what_does_not_match_is_found_in_the_data(record, model):
         assert holds(refusal(ModelError, work, request(Source(records=[other]), named)), "another stage")
     with pytest.raises(UsageError):
         Source(["bag", "bag"]).read()
+
+
+def test_several_bags_of_one_stage(tmp_path, record):
+    bags = [str(tmp_path / name) for name in ("one", "two")]
+    for bag in bags:
+        write_bag(bag, replace(record, hardware_id="stage"))
+    assert [read.source for read in Source(bags).read()] == bags
+    refusal(UsageError, Source([]).read)
+    again = str(tmp_path / "two" / ".." / "one")
+    assert holds(refusal(UsageError, Source([*bags, again]).read), again)
+    other = str(tmp_path / "other")
+    write_bag(other, replace(record, hardware_id="another"))
+    assert holds(refusal(RecordError, Source([*bags, other]).read), other, "'another'", bags[0], "'stage'")

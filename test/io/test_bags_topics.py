@@ -11,7 +11,7 @@ from refusals import holds, refusal
 
 from slpi_ros.errors import RecordError
 from slpi_ros.io.alignment import SeparateTopics, Signals, combine
-from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.bag_reader import read_bag, read_desired
 
 BOTH = SeparateTopics("command", "sensor")
 MS = 10**6
@@ -234,3 +234,19 @@ def test_topics_that_hold_no_signal(tmp_path):
     text = {"/command": [(1, float64(1))], "/sensor": [(1, vector(1, 1, 1, 1).vector)]}
     message = refusal(RecordError, read_bag, rosbags_bag(tmp_path / "bag", text), BOTH)
     assert holds(message, "'/sensor'", "geometry_msgs/msg/Vector3", "sensor_msgs/msg/JointState")
+
+
+def test_a_desired_displacement_of_three_axes_in_a_vector(tmp_path):
+    stamps = [10**9 + k * 10 * MS for k in range(60)]
+
+    def state(k, stamp):
+        return joint_state(stamp, names=("x", "y", "z"), position=(1e-6, 2e-6, 3e-6), effort=(k, k, k))
+
+    topics = {
+        "/stage_state": [(stamp, state(k, stamp)) for k, stamp in enumerate(stamps)],
+        "/wanted": [(stamp, vector(stamp, 1e-6 * k, 2e-6 * k, 3e-6 * k)) for k, stamp in enumerate(stamps)],
+    }
+    bag = rosbags_bag(tmp_path / "bag", topics)
+    held = read_desired(bag, read_bag(bag), "wanted")
+    assert held.keys() == {"x", "y", "z"}
+    assert np.allclose(held["z"], 3e-6 * np.arange(60), rtol=0, atol=1e-18)

@@ -32,6 +32,7 @@ def test_a_long_life_in_short():
 
 @pytest.mark.slow
 @pytest.mark.ros
+@pytest.mark.long
 def test_two_lives():
     pytest.importorskip("rclpy")
     from benchmarks.faults import lives

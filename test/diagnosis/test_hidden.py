@@ -37,6 +37,7 @@ def test_a_hidden_effect_is_named_first(name, tmp_path):
     assert name in (found.effects[0].effect.name, *found.effects[0].alternatives), found.summary
 
 
+@pytest.mark.long
 def test_a_coupled_model_is_judged_with_the_motion_of_the_other_axis():
     hidden = hide(1, ["cross_coupling"], size=LARGE, samples=SAMPLES)
     (truth,) = hidden.truth

@@ -33,6 +33,7 @@ def test_it_is_as_large_as_the_error(recorded, found):
         assert 0.3 < rms(curve - truth) / rms(std) < 3.0
 
 
+@pytest.mark.long
 def test_it_is_as_large_as_the_spread_of_fits_to_other_noise(recorded, found):
     v = recorded.voltage["x"]
     true = stage(1, noise=0.0).run(recorded.t, v)[0]

@@ -95,6 +95,7 @@ def test_whoever_ends_it_the_stage_comes_to_rest(tmp_path, how):
 
 
 @pytest.mark.ros
+@pytest.mark.long
 def test_a_killed_calibration_is_resumed_with_the_bags_that_are_complete(tmp_path):
     parameters = {**PARAMETERS, "output": str(tmp_path / "out")}
     with on_graph() as graph:
@@ -120,6 +121,7 @@ def test_a_killed_calibration_is_resumed_with_the_bags_that_are_complete(tmp_pat
 
 
 @pytest.mark.ros
+@pytest.mark.long
 def test_a_kept_bag_that_is_no_use_is_named(tmp_path):
     parameters = {**PARAMETERS, "output": str(tmp_path / "out")}
     with on_graph() as graph:

@@ -63,12 +63,14 @@ def test_bows_are_those_of_a_loop_of_known_form():
     assert fall == pytest.approx(0.1, rel=1e-9)
 
 
+@pytest.mark.long
 def test_targets_are_met_at_all_amplitudes(study):
     assert set(study.fits[MPI]) == set(AMPLITUDES)
     assert all(fit.fitted.r_squared >= 0.996 for fit in study.fits[MPI].values())
     assert all(fit.errors.r_squared >= 0.9939 for fit in study.scaled.values())
 
 
+@pytest.mark.long
 def test_the_family_fits_a_cycle_and_the_next_one_better(study):
     for amplitude, fit in study.fits[FAMILY].items():
         assert fit.fitted.mean < 0.5 * study.fits[MPI][amplitude].fitted.mean
@@ -76,6 +78,7 @@ def test_the_family_fits_a_cycle_and_the_next_one_better(study):
 
 
 @pytest.mark.parametrize("name", KINDS)
+@pytest.mark.long
 def test_errors_of_fits_are_those_of_the_curves(study, name):
     for amplitude, fit in study.fits[name].items():
         apart = np.abs(fit.simulated - study.fastest[amplitude].settled[1])
@@ -86,6 +89,7 @@ def test_errors_of_fits_are_those_of_the_curves(study, name):
         assert (fit.following.maximum, fit.following.mean) == pytest.approx((apart.max(), apart.mean()))
 
 
+@pytest.mark.long
 def test_the_mpi_curve_is_the_sum_of_the_operators_of_eq_2(study):
     fit, (v, _) = study.fits[MPI][120], study.fastest[120].settled
     shape = fit.model.hysteresis
@@ -97,6 +101,7 @@ def test_the_mpi_curve_is_the_sum_of_the_operators_of_eq_2(study):
     np.testing.assert_allclose(np.ptp(fit.simulated - y), 0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_the_scaled_model_is_that_of_120_volts_with_the_measured_peaks(study):
     base = study.fits[MPI][120].simulated
     for amplitude, fit in study.scaled.items():
@@ -105,6 +110,7 @@ def test_the_scaled_model_is_that_of_120_volts_with_the_measured_peaks(study):
         assert np.median(fit.simulated - study.fastest[amplitude].settled[1]) == pytest.approx(0, abs=1e-15)
 
 
+@pytest.mark.long
 def test_the_variable_path_has_its_parts_and_models(study):
     path = study.variable
     assert [part.stop - part.start for part in path.parts] == [cycles * SAMPLES for _, _, cycles in VARIABLE]
@@ -124,6 +130,7 @@ def test_the_variable_path_has_its_parts_and_models(study):
     assert np.abs(path.models[ONE_MPI] - path.y)[middle].mean() > 1.5 * np.abs(own - path.y)[middle].mean()
 
 
+@pytest.mark.long
 def test_what_rings_is_the_mode(axis, study):
     assert study.ringing[20] > 5 * study.ringing[2] > 0
     # From one ramp to another, a mode w swings by the change of slope over w; here the turn is not quite so sharp.
@@ -140,6 +147,7 @@ def test_the_record_of_triangles_starts_and_ends_at_rest(axis):
     assert abs(record.displacement["x"][0]) < 1e-7
 
 
+@pytest.mark.long
 def test_every_exhibit_is_complete(study):
     shown = present(study)
     assert [re.match(r"Fig\. \d+", exhibit.title)[0] for exhibit in shown] == [
@@ -152,6 +160,7 @@ def test_every_exhibit_is_complete(study):
         assert "nan" not in f"{exhibit.ours}{exhibit.remark}{exhibit.tables}"
 
 
+@pytest.mark.long
 def test_exhibits_show_what_was_computed_beside_what_is_printed(study):
     shown = {exhibit.title.split(":")[0]: exhibit for exhibit in present(study)}
     fits = shown["Fig. 7, Tables 2 and 3"].tables[0].rows
@@ -162,6 +171,7 @@ def test_exhibits_show_what_was_computed_beside_what_is_printed(study):
     assert peaks[0] == ("20 V", "12.306", f"{study.peaks[20].a * 1e6:.3f}", "-0.017", f"{study.peaks[20].b:.4f}")
 
 
+@pytest.mark.long
 def test_a_missed_target_is_said(study):
     poor = replace(study.scaled[60], errors=replace(study.scaled[60].errors, r_squared=0.9))
     shown = present(replace(study, scaled={**study.scaled, 60: poor}))[-1]

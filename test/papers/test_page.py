@@ -25,6 +25,7 @@ def written(tmp_path_factory, random, slpi_shown):
         return page.write_experiments(tmp_path_factory.mktemp("page") / "new" / "folder", None)
 
 
+@pytest.mark.long
 def test_page_holds_every_exhibit(written):
     text = html.unescape(written.read_text(encoding="utf-8"))
     for words in ("Fig. 9", "Fig. 15", "Table 5", "what we found <1 µm", "No measured records", "Difference"):
@@ -33,6 +34,7 @@ def test_page_holds_every_exhibit(written):
     assert len(re.findall("<img ", text)) >= 8
 
 
+@pytest.mark.long
 def test_separation_table_beside_it(written):
     table = np.genfromtxt(written.parent / "separation.csv", delimiter=",", names=True)
     assert table.dtype.names == ("k", "voltage_V", "displacement_m", "tr", "lv", "sp")
@@ -40,6 +42,7 @@ def test_separation_table_beside_it(written):
     assert np.ptp(table["voltage_V"]) == 100.0 and 20e-6 < np.ptp(table["displacement_m"]) < 30e-6
 
 
+@pytest.mark.long
 def test_a_browser_shows_it(written, tmp_path):
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if not browser:
@@ -50,6 +53,7 @@ def test_a_browser_shows_it(written, tmp_path):
     assert "Separated Level-loop" in shown and shown.count("<figure>") >= 8
 
 
+@pytest.mark.long
 def test_measured_records_are_compared_where_they_are(measured_data):
     shown = measured.exhibits(measured_data)
     assert [exhibit.title for exhibit in shown] == [f"Measured: {case.name}" for case in measured.CASES]

@@ -210,26 +210,24 @@ def _figures(axis: AxisVerification) -> dict[str, str]:
 
 def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[str]], None, str]:
     header = (
-        "record", "", "samples", "judged", "rms (nm)", "maximum (nm)", "constant (µm)", "rest, rms (nm)", "limit (nm)",
-        "repeatability (nm)", "zero moved (µm)",
+        "record", "", "judged", "rms (nm)", "maximum (nm)", "constant (µm)", "rest (nm)", "limit (nm)",
     )  # fmt: skip
     rows: list[Sequence[str]] = [
         (
             record.error.name,
             record.verdict,
-            f"{record.error.samples:,}",
-            f"{record.share:.0%}",
+            f"{record.error.samples:,} ({record.share:.0%})",
             *(f"{x * 1e9:.1f}" for x in (record.error.rms, record.error.maximum)),
             _um(record.constant),
-            *(f"{x * 1e9:.1f}" for x in (record.rest.rms, record.limit, record.floor_rms)),
-            _um(record.offset) if record.zero_moved else "no",
+            *(f"{x * 1e9:.1f}" for x in (record.rest.rms, record.limit)),
         )
         for record in axis.records
     ]
     held_to = "rms" if axis.worst.absolute else "rms of the rest"
     caption = (
         f"Measured - model, free-run. The limit holds for the {held_to}: the tolerance, else {TIMES_THE_FLOOR:g} times "
-        f"the repeatability, but at least 0.02 % of the stroke. Repeatability: {axis.records[0].floor_source}."
+        f"the repeatability, but at least 0.02 % of the stroke. Repeatability: {nm(axis.records[0].floor_rms)}, "
+        f"{axis.records[0].floor_source}."
     )
     return header, rows, None, caption
 

@@ -1,7 +1,7 @@
 """What a stage reports during a drive, held against the voltages that it is commanded, without a model of the stage."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
 
@@ -43,6 +43,8 @@ SAME, SAME_MOVE = 10, 0.05
 # Slopes relative to the known one: of a frozen reading, and of one whose sign has changed. Multiple of its standard
 # error by which a slope is known, and time (s) for which a slope shows a fault.
 FROZEN, FLIPPED, KNOWN_ERRORS, SUSPECT = 0.05, -0.25, 8.0, 0.1
+# Smallest standard error of a slope that counts, m/V.
+TINY = 1e-18
 KEPT = 4096
 # Time between two judgements of a slope, seconds.
 JUDGED = 0.03
@@ -362,17 +364,14 @@ class DriveWatch:
         first = relation.window(v, t, (limits.lower, limits.upper), KNOWN_MOVE)
         if first < 0:
             return
-        found = [_slope(v[first:], y[first:], sign) for sign in (1.0, -1.0)]
-        (slope, error), sign = max(zip(found, (1.0, -1.0), strict=True), key=lambda each: each[0][0])
+        slope, error, sign = _surest_slope(v[first:], y[first:])
         if slope > KNOWN_ERRORS * error and slope > 0.0:
             relation.slope = sign * slope
             return
         first = relation.window(v, t, (limits.lower, limits.upper), ENDS + MOVE)
         if first < 0:
             return
-        (slope, error), sign = max(
-            ((_slope(v[first:], y[first:], sign), sign) for sign in (1.0, -1.0)), key=lambda each: each[0][0]
-        )
+        slope, error, _ = _surest_slope(v[first:], y[first:])
         if slope <= 3.0 * error or slope <= 0.0:
             self._found(
                 f"axis '{axis}' does not follow: {np.ptp(y[first:]) * 1e6:.3g} µm while the voltage moved by "
@@ -385,7 +384,21 @@ def _slope(v: FloatArray, y: FloatArray, sign: float) -> tuple[float, float]:
 
     The largest one counts over delays of the displacement by up to `SHIFTED` of the readings.
     """
-    best = (-inf, 0.0)
+    slopes = [(sign * slope, error) for slope, error in _slopes(v, y)]
+    return max(slopes, key=lambda each: each[0], default=(0.0, inf))
+
+
+def _surest_slope(v: FloatArray, y: FloatArray) -> tuple[float, float, float]:
+    """Return size (m/V), standard error and sign of the slope that is largest in its standard errors, over the delays.
+
+    At the beginning of a motion a wrong delay can make a slope many times too large.
+    """
+    slope, error = max(_slopes(v, y), key=lambda each: abs(each[0]) / max(each[1], TINY), default=(0.0, inf))
+    return abs(slope), error, float(np.sign(slope))
+
+
+def _slopes(v: FloatArray, y: FloatArray) -> Iterator[tuple[float, float]]:
+    """Yield slope (m/V) and standard error for delays of the displacement by up to `SHIFTED` of the readings."""
     latest = int(SHIFTED * v.size)
     for shift in sorted({round(share * latest) for share in np.linspace(0.0, 1.0, SHIFTS)}):
         early, late = v[: v.size - shift], y[shift:]
@@ -399,6 +412,4 @@ def _slope(v: FloatArray, y: FloatArray, sign: float) -> tuple[float, float]:
         slope = float(centred @ rest) / power
         left = rest - slope * centred
         error = float(np.sqrt(left @ left / max(early.size - 2, 1) / power))
-        if sign * slope > best[0]:
-            best = sign * slope, error
-    return best if best[0] > -inf else (0.0, inf)
+        yield slope, error

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.sensor_lies import DRIVERS, LIES, MARK, SENSORS, live, stage_of
-from slpi_ros.calibration.drive_watch import DriveWatch
+from slpi_ros.calibration.drive_watch import DriveWatch, _surest_slope
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits
 
@@ -108,3 +108,11 @@ def test_the_start_is_the_median_of_three_recent_reports_or_the_latest_of_a_slow
     for number in range(60):
         slow.check(number * 20_000_000)
     assert slow.started_from(1_180_000_000, 0) == [30.0]
+
+
+def test_the_slope_at_the_beginning_of_a_motion_is_the_true_one():
+    """Of displacements that are taken to be later, the slope would be 20 times too large."""
+    v = np.concatenate([np.zeros(60), np.linspace(0.0, 50.0, 30) ** 2 / 50.0])
+    slope, error, sign = _surest_slope(v, -1e-7 * v)
+    assert slope == pytest.approx(1e-7) and sign == -1.0 and error < 1e-3 * slope
+    assert _surest_slope(v, np.zeros(v.size))[0] == 0.0

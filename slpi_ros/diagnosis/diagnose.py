@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,31 +132,40 @@ def _diagnose_axis(
     given = _given(model, runs, selection)
     source = ", ".join(part.source for part in evidence.parts)
     extension = _extension(model, selection, given, source)
-    if extension and (_of_another_kind(selection) or _not_as_judged(extension[0], runs, selection)):
+    if extension and (_of_another_kind(selection) or _not_as_judged(extension.runs, runs, selection)):
         # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
         selection = _without_causes(selection)
         given = _given(model, runs, selection)
         extension = _extension(model, selection, given, source)
-        if extension and _not_as_judged(extension[0], runs, selection):
+        if extension and _not_as_judged(extension.runs, runs, selection):
             extension = None
     if not (extension or selection.named):
         # Nothing is explained, so that nothing is fitted beside the hysteresis of the given kind.
         selection = replace(selection, now=selection.base)
-    extended, missing = extension or (model, [named.name for named in selection.named])
-    outcomes = _outcomes(runs, _runs(extended, selection.now) if extension else runs, selection.now)
-    floor = _floor(selection.now)
-    found = judged(selection, floor, before, given, outcomes, missing, driven_alike(records, axis))
-    return found, extended
+    extension = extension or _Extension(model, [named.name for named in selection.named], runs)
+    outcomes = _outcomes(runs, extension.runs, selection.now)
+    floor, alike = _floor(selection.now), driven_alike(records, axis)
+    found = judged(selection, floor, before, given, outcomes, extension.left_out, alike)
+    return found, extension.model
 
 
-def _extension(model: AxisModel, selection: Selection, given: Given, source: str) -> tuple[AxisModel, list[str]] | None:
-    """Return the refitted model, and the effects of the selection that it does without; None if nothing is to refit."""
+class _Extension(NamedTuple):
+    """Refitted model, the effects of the selection that it does without, and its free run on each record."""
+
+    model: AxisModel
+    left_out: list[str]
+    runs: Sequence[FreeRun]
+
+
+def _extension(model: AxisModel, selection: Selection, given: Given, source: str) -> _Extension | None:
+    """Return the extension of a model by the effects of a selection; None if nothing is to refit."""
     left_out = _ambiguous(selection)
     # If effects remain ambiguous, parameters that were fitted together with them are not reliable on other records.
     if not (given.changed or BIAS in selection.structures or (selection.named and not left_out)):
         return None
     final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
-    return _extended(model, final, _floor(selection.now), source), left_out
+    extended = _extended(model, final, _floor(selection.now), source)
+    return _Extension(extended, left_out, _runs(extended, selection.now))
 
 
 def _of_another_kind(selection: Selection) -> bool:
@@ -188,13 +198,12 @@ def _runs(model: AxisModel, now: Explanation) -> list[FreeRun]:
     ]
 
 
-def _not_as_judged(extended: AxisModel, runs: "Sequence[FreeRun]", selection: Selection) -> bool:
-    """Return whether the free run of an extended model shows another gain than the held-out error.
+def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection: Selection) -> bool:
+    """Return whether the free runs `after` of an extended model show another gain than the held-out error.
 
-    It may be worse than that of the given model, `runs`, on none of the records. Where the effects leave more than what
-    does not repeat, it also shows at least `GAIN_SHOWN` of their held-out gain.
+    They may be worse than those of the given model, `runs`, on none of the records. Where the effects leave more than
+    what does not repeat, they also show at least `GAIN_SHOWN` of their held-out gain.
     """
-    after = _runs(extended, selection.now)
     if any(one.rms > NO_WORSE * given.rms for one, given in zip(after, runs, strict=True)):
         return True
     shown = 1.0 - rms_of(after) / rms_of(runs)

@@ -131,7 +131,6 @@ class RecordVerification:
 
     def to_document(self) -> dict[str, Any]:
         """Return the figures as in ``msg_schemas/verification.schema.json``."""
-        both = self.moving is not None and self.standing is not None
         return {
             "source": self.error.name,
             "verdict": self.verdict,
@@ -143,8 +142,8 @@ class RecordVerification:
             "constant_m": self.constant,
             "rest_rms_m": self.rest.rms,
             "rest_maximum_m": self.rest.maximum,
-            "moving_rms_m": self.moving.rms if self.moving and both else None,
-            "standing_rms_m": self.standing.rms if self.standing and both else None,
+            "moving_rms_m": self.moving.rms if self.moving else None,
+            "standing_rms_m": self.standing.rms if self.standing else None,
             "limit_m": self.limit,
             "limit_of": "rms_m" if self.absolute else "rest_rms_m",
             "floor_rms_m": self.floor_rms,
@@ -397,8 +396,8 @@ def _free_run(
     return coupled
 
 
-def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None, start: float) -> _Run:
-    """Simulate an axis on a record from its initial state; samples before `start` (s) are not judged."""
+def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None, since: float) -> _Run:
+    """Simulate an axis on a record from its initial state; samples before `since` (s) are not judged."""
     found, begins_known = _matched(axis, t, samples, start_memory)
     simulated = replace(axis, start=found.start).simulate(t, samples.v)
     # The outliers that `identify` leaves out are no error of the model.
@@ -416,7 +415,7 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMe
         t=t,
         samples=samples,
         judged=judged,
-        samples_in_span=int(np.count_nonzero(t >= start)),
+        samples_in_span=int(np.count_nonzero(t >= since)),
         begins_known=begins_known,
         found=found,
         simulated=simulated + shift,

@@ -342,7 +342,7 @@ def inverse_path(
                     if scale > 0.0:
                         if way != 0.0:
                             rate[1] = engine.solved(scale, laws.rate[0], abs(way), 0.0)
-                            u = reached - (laws.rate[0] * rate[1] if way > 0.0 else -(laws.rate[0] * rate[1]))
+                            u = engine.followed(laws.rate[0], reached, v_0, rate[1])
                     else:
                         u = v_0 + (reached - rate_0)
                     rate[0], rate[4] = applied, np.nan

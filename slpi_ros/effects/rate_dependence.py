@@ -24,7 +24,7 @@ from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.rate_law import solved
+from slpi_ros.hysteresis.rate_law import followed, solved
 
 if TYPE_CHECKING:
     from slpi_ros.hysteresis.turning_points import Memory
@@ -224,9 +224,7 @@ class StreamingRateDependence(StreamingBase):
             way = x - self._u
             if way:
                 self._w = solved(scale, self._c, abs(way), self._w)
-                u = x - copysign(self._c * self._w, way)
-                # It follows without overshoot, whatever the rounding: a reversal would be remembered.
-                self._u = min(max(u, self._u), x) if way > 0.0 else max(min(u, self._u), x)
+                self._u = followed(self._c, x, self._u, self._w)
         else:
             # In no time the difference between the two voltages stays what it was.
             self._u += x - self._v

@@ -284,7 +284,7 @@ def moved(
     return True
 
 
-solved = compiled(rate_law.solved)
+solved, followed = compiled(rate_law.solved), compiled(rate_law.followed)
 
 
 @compiled
@@ -303,8 +303,7 @@ def felt(t: FloatArray, v: FloatArray, threshold: float, onset_rate: float, lead
                 # Extrapolated from the two samples before the last one: it is computed while that one is being solved.
                 guess = 3.0 * before - 2.0 * earlier
                 w, before, earlier = solved(scale, threshold, abs(way), guess), w, before
-                # It follows without overshoot, whatever the rounding: a reversal would be remembered.
-                u = min(max(v[k] - threshold * w, u), v[k]) if way > 0.0 else max(min(v[k] + threshold * w, u), v[k])
+                u = followed(threshold, v[k], u, w)
         elif k:
             # In no time the difference between the two voltages stays what it was.
             u += v[k] - v[k - 1]
@@ -420,7 +419,7 @@ def through_law(
                 way, u = v - u0, u0
                 if way != 0.0:
                     w = solved(scale, threshold, abs(way), 0.0)
-                    u = v - threshold * (w if way > 0.0 else -w)
+                    u = followed(threshold, v, u, w)
             else:
                 u = u0 + (v - before)
             if u != u0:

@@ -4,7 +4,8 @@ With ``w = asinh(d / (s0 dt))`` for the change ``d`` of the voltage ``u`` that t
 the law are ``a sinh(w) + b w = goal``, with a unique solution: the forward law with ``a = s0 dt`` and ``b = c``, the
 inverse on a straight piece of a branch with the reversible gain, relative to its slope, times ``c`` as ``b``.
 
-`slpi_ros.hysteresis.compiled` compiles `solved` too, and keeps the machine code until its own file changes.
+`slpi_ros.hysteresis.compiled` compiles `solved` and `followed`, too, and keeps the machine code until its own file
+changes.
 """
 
 from math import asinh, exp
@@ -44,3 +45,13 @@ def solved(a: float, b: float, goal: float, guess: float) -> float:
         if abs(step) <= CONVERGED:
             break
     return w
+
+
+def followed(threshold: float, v: float, u: float, w: float) -> float:
+    """Return the voltage that the hysteresis feels next, for the applied voltage `v`, the last one `u` (V), and `w`.
+
+    It follows without overshoot, whatever the rounding: a reversal would be remembered.
+    """
+    if v > u:
+        return min(max(v - threshold * w, u), v)
+    return max(min(v + threshold * w, u), v)

@@ -223,11 +223,12 @@ class StreamingInverse:
         `t` (s) and `y` (m) have shape (N,); `coupled` (m) is as the attribute. For a new stream only, whose state
         afterwards is not defined: long paths are evaluated by compiled code, equal to `step` but for rounding errors.
         """
-        limits, timeless = self.pace.limits, min(self.pace.limits.slew, self.pace.limits.acceleration) == inf
-        if timeless and not self._streaming:
+        limits = self.pace.limits
+        unlimited = limits.slew == limits.acceleration == inf
+        if unlimited and self.timeless:
             return self._run_hysteresis(y - coupled)
         v, held = np.empty(y.size), np.zeros(y.size, dtype=bool)
-        if timeless and (laws := self._laws()) is not None and worth_compiling(y.size):
+        if unlimited and (laws := self._laws()) is not None and worth_compiling(y.size):
             from slpi_ros.effects.paths import Laws, inverse_path
 
             h, dt, voltages = y - coupled, np.diff(t, prepend=t[:1]), (float(limits.lower), float(limits.upper))

@@ -131,12 +131,17 @@ def _diagnose_axis(
         selection = replace(selection, structures=(BIAS, *selection.structures))
     given = _given(model, runs, selection)
     source = ", ".join(part.source for part in evidence.parts)
-    extension = _extension(model, selection, given, source)
+    extension = _extension(model, selection, (), source) if selection.named else None
     if extension and (_of_another_kind(selection) or _not_as_judged(extension.runs, runs, selection)):
-        # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
-        selection = _without_causes(selection)
+        # What was judged on held-out blocks is not what all records together give: these causes do not explain them,
+        # whether they would become part of the model or not.
+        selection, extension = _without_causes(selection), None
         given = _given(model, runs, selection)
-        extension = _extension(model, selection, given, source)
+    left_out = _ambiguous(selection)
+    if left_out or not extension:
+        # If effects remain ambiguous, parameters that were fitted together with them are not reliable elsewhere.
+        needed = given.changed or BIAS in selection.structures
+        extension = _extension(model, selection, left_out, source) if needed else None
         if extension and _not_as_judged(extension.runs, runs, selection):
             extension = None
     if not (extension or selection.named):
@@ -153,16 +158,12 @@ class _Extension(NamedTuple):
     """Refitted model, the effects of the selection that it does without, and its free run on each record."""
 
     model: AxisModel
-    left_out: list[str]
+    left_out: Sequence[str]
     runs: Sequence[FreeRun]
 
 
-def _extension(model: AxisModel, selection: Selection, given: Given, source: str) -> _Extension | None:
-    """Return the extension of a model by the effects of a selection; None if nothing is to refit."""
-    left_out = _ambiguous(selection)
-    # If effects remain ambiguous, parameters that were fitted together with them are not reliable on other records.
-    if not (given.changed or BIAS in selection.structures or (selection.named and not left_out)):
-        return None
+def _extension(model: AxisModel, selection: Selection, left_out: Sequence[str], source: str) -> _Extension:
+    """Return the extension of a model by the effects of a selection but those `left_out`."""
     final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
     extended = _extended(model, final, _floor(selection.now), source)
     return _Extension(extended, left_out, _runs(extended, selection.now))

@@ -131,17 +131,16 @@ def _diagnose_axis(
         selection = replace(selection, structures=(BIAS, *selection.structures))
     given = _given(model, runs, selection)
     source = ", ".join(part.source for part in evidence.parts)
-    extension = _extension(model, selection, (), source) if selection.named else None
-    if extension and (_of_another_kind(selection) or _not_as_judged(extension.runs, runs, selection)):
-        # What was judged on held-out blocks is not what all records together give: these causes do not explain them,
-        # whether they would become part of the model or not.
-        selection, extension = _without_causes(selection), None
+    extension = _extension(model, selection, given, source)
+    tried = [extension] if extension else []
+    if _ambiguous(selection):
+        # Causes that the model will do without are judged alike, in an extension by all of them.
+        tried.append(_extended_by(model, selection, (), source))
+    if _of_another_kind(selection) or any(_not_as_judged(one.runs, runs, selection) for one in tried):
+        # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
+        selection = _without_causes(selection)
         given = _given(model, runs, selection)
-    left_out = _ambiguous(selection)
-    if left_out or not extension:
-        # If effects remain ambiguous, parameters that were fitted together with them are not reliable elsewhere.
-        needed = given.changed or BIAS in selection.structures
-        extension = _extension(model, selection, left_out, source) if needed else None
+        extension = _extension(model, selection, given, source)
         if extension and _not_as_judged(extension.runs, runs, selection):
             extension = None
     if not (extension or selection.named):
@@ -162,7 +161,16 @@ class _Extension(NamedTuple):
     runs: Sequence[FreeRun]
 
 
-def _extension(model: AxisModel, selection: Selection, left_out: Sequence[str], source: str) -> _Extension:
+def _extension(model: AxisModel, selection: Selection, given: Given, source: str) -> _Extension | None:
+    """Return the extension of a model by the effects of a selection; None if nothing is to refit."""
+    left_out = _ambiguous(selection)
+    # If effects remain ambiguous, parameters that were fitted together with them are not reliable on other records.
+    if not (given.changed or BIAS in selection.structures or (selection.named and not left_out)):
+        return None
+    return _extended_by(model, selection, left_out, source)
+
+
+def _extended_by(model: AxisModel, selection: Selection, left_out: Sequence[str], source: str) -> _Extension:
     """Return the extension of a model by the effects of a selection but those `left_out`."""
     final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
     extended = _extended(model, final, _floor(selection.now), source)

@@ -45,12 +45,16 @@ def settle(client: Client, points: int) -> dict[str, str]:
     _, values = client.report("the end", points_remaining=0, trajectories=1)
     given = points - int(values["points_skipped"])
     client.graph.spin_until(lambda: client.answered >= given, f"{given} points")
-    # Voltages between the points come too, and may come after the report.
+    quiet(client)
+    return values
+
+
+def quiet(client: Client) -> None:
+    """Wait until no voltage comes any more: those between the points come too, and may come after the report."""
     answered = -1
     while client.answered > answered:
         answered = client.answered
         client.graph.spin_for(0.5)
-    return values
 
 
 def sender(client: Client):
@@ -129,6 +133,7 @@ def test_cancel_replace_append_and_refuse(xy_file):
         assert 2 < int(values["points_remaining"]) < 500
         client.graph.spin_until(lambda: client.answers[-1][1] > 0, "the appended one")
         client.report(points_remaining=0)
+        quiet(client)
         assert client.answers[-1] == pytest.approx(library(np.array([[3e-6, 4e-6], [3e-6, 5e-6]]))[-1], abs=1e-8)
         # Replaced at once, and cancelled by an empty one.
         publisher.publish(trajectory(["x"], np.arange(2000) * 5 * MS, long))
@@ -138,8 +143,7 @@ def test_cancel_replace_append_and_refuse(xy_file):
         client.graph.spin_until(lambda: client.answers[-1][0] > client.answers[3][0] + 1.0, "the other path")
         publisher.publish(JointTrajectory())
         _, values = client.report(points_remaining=0, trajectories=13)
-        # Voltages may come after the report.
-        client.graph.spin_for(0.3)
+        quiet(client)
         held = client.answered
         assert client.ask(["x"], [4e-6])[0] == pytest.approx(client.answers[held - 1][0], abs=1e-8)
         assert client.answered == held + 1

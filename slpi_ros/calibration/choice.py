@@ -31,12 +31,9 @@ def next_drive(
     recorded: Sequence[tuple[str, Sequence[str]]],
     left: float,
 ) -> Choice | None:
-    """Return the drive with the largest promise per second, or None if none is worth its time.
-
-    The promise of a drive is the share of the mean square error of an axis that it may explain. One axis moves in each,
-    so that the others need not be diagnosed on it; only coupling takes them all. `found` is the diagnosis of all
-    records so far, `recorded` are name and axes of each drive, and `left` is the time for drives (s).
-    """
+    """Return the drive with the largest promise per second; None if none is worth its time or fits into `left` (s)."""
+    # The promise of a drive is the share of the mean square error of an axis that it may explain. One axis moves in
+    # each, so that the others need not be diagnosed on it; only coupling takes them all.
     best, chosen = 0.0, None
     for axis in settings.axes:
         for drive, promise, why in _promises(found[axis] if found else None):

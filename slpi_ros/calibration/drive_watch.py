@@ -108,26 +108,21 @@ class _Relation:
 
 
 class DriveWatch:
-    """Hold the states of a stage against the voltages of a drive.
+    """Hold the states of a stage against the voltages of a drive. Times: steady clock, ns."""
 
-    Nothing is known of the stage when a run begins. What its first moves show, the slope with its sign, the noise and
-    the displacements at each voltage, bounds the rest of the run: a displacement has to be near those seen at the same
-    voltage before (by 35 % of their range, so that hysteresis, creep and drift fit in), and to follow the voltage.
-
-    All times are nanoseconds on the steady clock. Of the time between two calls at most 0.05 s count: a process that
-    was held up does not take what it has not read yet for silence.
-
-    `timeout` (s) is the longest time without a valid state, and that the reported voltages may be late; `simulated`
-    tells whether stamps are of a simulated clock, which is coarse. `fault` says what the first fault is, with axis,
-    value and limit; "" while there is none.
-    """
+    # Nothing is known of the stage when a run begins. What its first moves show, the slope with its sign, the noise and
+    # the displacements at each voltage, bounds the rest of the run: a displacement has to be near those seen at the
+    # same voltage before (by 35 % of their range, so that hysteresis, creep and drift fit in), and to follow the
+    # voltage. Of the time between two calls at most 0.05 s count: a process that was held up does not take what it has
+    # not read yet for silence. `timeout` (s) is the longest time without a valid state, and that the reported voltages
+    # may be late.
 
     def __init__(
         self, axes: Sequence[str], limits: Sequence[Limits], timeout: float, *, simulated: bool = False
     ) -> None:
         self._axes, self._limits, self._timeout = tuple(axes), tuple(limits), timeout
         self._jump = JUMP_SIMULATED if simulated else JUMP
-        self.fault = ""
+        self.fault = ""  # the first fault, with axis, value and limit
         self._relations = [_Relation(each) for each in limits]
         self._amplifiers = [Amplifier(each.upper - each.lower) for each in limits]
         for amplifier in self._amplifiers:
@@ -189,10 +184,7 @@ class DriveWatch:
         return ""
 
     def state(self, stamp_ns: int, clock_ns: int, v: Sequence[float], y: Sequence[float], now_ns: int) -> bool:
-        """Take a state with reported voltages `v` (V) and displacements `y` (m); return whether it is valid.
-
-        `clock_ns` is the clock of the node when the state arrives; NaN stands for an axis that the state does not name.
-        """
+        """Take a state with reported voltages (V) and displacements (m), NaN: not named; return whether it is valid."""
         self._attend(now_ns)
         self._refused = self.refusal(v, y)
         for amplifier, voltage in zip(self._amplifiers, v, strict=True):
@@ -380,19 +372,14 @@ class DriveWatch:
 
 
 def _slope(v: FloatArray, y: FloatArray, sign: float) -> tuple[float, float]:
-    """Return slope times sign (m/V) of displacements (N,), m, over voltages (N,), V, and its standard error.
-
-    The largest one counts over delays of the displacement by up to `SHIFTED` of the readings.
-    """
+    """Return slope times sign (m/V) of displacements (m) over voltages (V), largest over delays, and standard error."""
     slopes = [(sign * slope, error) for slope, error in _slopes(v, y)]
     return max(slopes, key=lambda each: each[0], default=(0.0, inf))
 
 
 def _surest_slope(v: FloatArray, y: FloatArray) -> tuple[float, float, float]:
-    """Return size (m/V), standard error and sign of the slope that is largest in its standard errors, over the delays.
-
-    At the beginning of a motion a wrong delay can make a slope many times too large.
-    """
+    """Return size (m/V), standard error and sign of the slope that is largest in standard errors, over the delays."""
+    # At the beginning of a motion a wrong delay can make a slope many times too large.
     slope, error = max(_slopes(v, y), key=lambda each: abs(each[0]) / max(each[1], TINY), default=(0.0, inf))
     return abs(slope), error, float(np.sign(slope))
 

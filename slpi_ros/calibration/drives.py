@@ -34,11 +34,7 @@ FIRST_STAMP = SECOND_NS
 
 
 def exciting(settings: CalibrationSettings, drive: str, duration: float, axes: Sequence[str], seed: int) -> Drive:
-    """Return a `drive` of `slpi_ros.excitation.drives.DRIVES` that excites some axes, while the others rest.
-
-    `duration` (s) is that of the whole drive, which the moving `axes` share; longer if the slew limit requires it. The
-    result has the voltages of all axes of the settings.
-    """
+    """Return a `drive` of `DRIVES`, of at least `duration` (s), in which some axes move and the others rest."""
     places = [settings.axes.index(axis) for axis in axes]
     limits = [settings.limits[place] for place in places]
 
@@ -85,11 +81,8 @@ def checking(settings: CalibrationSettings) -> Drive:
 
 
 def compensated(settings: CalibrationSettings, model: StageModel, seed: int) -> tuple[Drive, dict[str, FloatArray]]:
-    """Return a drive along a random path through the compensator, after a sweep that makes the memory known.
-
-    The compensator uses `model`; `seed` is that of the path. Return also the desired displacement (m) of each axis at
-    the samples of the drive, shape (N,): NaN in the sweep before and the return after the path.
-    """
+    """Return a drive along a random path through the compensator, after a sweep that makes the memory known."""
+    # Also the desired displacement (m) of each axis, shape (N,): NaN in the sweep before and the return after the path.
     sweep = exciting(settings, SWEEP, _sweep_seconds(settings), settings.axes, seed)
     swept = np.column_stack(list(sweep.voltage.values()))
     controller = Controller(settings.axes, settings.limits, period=1.0 / settings.rate)

@@ -29,13 +29,7 @@ class OtherLimitsError(RecordError):
 def require_kept(
     record: Record, drive: Drive, settings: CalibrationSettings, before: Record | None, *, fitted: bool
 ) -> None:
-    """Check a kept record before anything is computed from it.
-
-    `drive` is what this calibration would have driven instead, and `before` its first record, of the same stage, None
-    if this is the first; if `fitted`, a model is fitted to the record, so that its quality matters. RecordError if it
-    is of other limits, of another stage, or of a quality that allows no fit; the message names the record, what is
-    wrong, and what to do.
-    """
+    """Check a kept record of `drive` against the first one (`before`), and its quality if a model is `fitted`."""
     with naming(record):
         lasts, whole = float(np.ptp(record.time_ns)) * 1e-9, float(drive.t[-1])
         if lasts < LEAST_LENGTH * whole:

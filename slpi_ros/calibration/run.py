@@ -1,8 +1,4 @@
-"""A whole calibration, from top to bottom: check, record, identify, verify, diagnose, choose the next drive, again.
-
-`calibrate` is given a function that drives the stage and returns the record; it knows neither ROS nor files. Given the
-same records it takes the same decisions, so a calibration that was interrupted goes on where its records end.
-"""
+"""A whole calibration, from top to bottom: check, record, identify, verify, diagnose, choose the next drive, again."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -39,44 +35,33 @@ MOST_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Recording:
-    """What the stage did during one drive, which may have been `kept` by an earlier run.
-
-    `desired` (m, shape (N,)) is at the samples of the record, NaN where there was none; empty without compensator.
-    """
+    """What the stage did during one drive, which may have been `kept` by an earlier run."""
 
     record: Record
-    desired: Mapping[str, FloatArray]
+    desired: Mapping[str, FloatArray]  # m, (N,), NaN where there was none; empty without compensator
     kept: bool = False
 
 
 @dataclass(frozen=True)
 class Request:
-    """A drive to be recorded, by a `name` that is unique within a calibration.
-
-    `desired` (m, shape (N,)) is at the samples of the drive; empty without compensator.
-    """
+    """A drive to be recorded, by a `name` that is unique within a calibration."""
 
     name: str
     drive: Drive
-    desired: Mapping[str, FloatArray]
+    desired: Mapping[str, FloatArray]  # m, (N,), at the samples of the drive; empty without compensator
 
 
 @dataclass(frozen=True)
 class TrackingError:
-    """Error of the compensated stage on one path, measured - desired without its median.
+    """Error (m) of the compensated stage on one path, measured - desired without its median."""
 
-    `mean`, `rms`, `maximum` (m): of the magnitude. `offset` (m): median that was removed. `stroke` (m): displacement
-    range of the model. `goal` (m): largest mean error that meets the target. `t` (s, from the first stamp of the
-    record), `desired` (m) and `error` (m, without the offset), shape (N,) each: at the samples along the path.
-    """
-
-    mean: float
+    mean: float  # of the magnitude
     rms: float
     maximum: float
-    offset: float
-    stroke: float
-    goal: float
-    t: FloatArray
+    offset: float  # the median that was removed
+    stroke: float  # displacement range of the model
+    goal: float  # largest mean error that meets the target
+    t: FloatArray  # s, from the first stamp of the record
     desired: FloatArray
     error: FloatArray
 
@@ -88,33 +73,25 @@ class TrackingError:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of a calibration: what it was done for (`why`) and what it showed (`finding`).
+    """One step of a calibration: what it was done for (`why`) and what it showed (`finding`)."""
 
-    `name` is that of the record or of the computation, `seconds` the duration of the drive, 0 for a computation.
-    `errors` are those of a verification, else None.
-    """
-
-    name: str
-    seconds: float
+    name: str  # of the record or of the computation
+    seconds: float  # of the drive, 0 for a computation
     why: str
     finding: str = ""
-    errors: Mapping[str, TrackingError] | None = None
+    errors: Mapping[str, TrackingError] | None = None  # of a verification
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a calibration: the model with the lowest verified error, and these `errors`.
-
-    `diagnosis` is the last one, of all records before the last verification. `why` says in one line why the target is
-    met or not, and why the calibration ended.
-    """
+    """Result of a calibration: the model with the lowest verified error, and these `errors`."""
 
     settings: CalibrationSettings
     model: StageModel
     errors: Mapping[str, TrackingError]
-    diagnosis: Diagnosis
+    diagnosis: Diagnosis  # the last one, of all records before the last verification
     steps: tuple[Step, ...]
-    why: str
+    why: str  # the target is met or not, and why the calibration ended
 
     @property
     def met(self) -> bool:
@@ -129,16 +106,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a calibration: the present step, and its number from 1.
-
-    `seconds_left` is the time left for drives, `error` (m) the largest verified mean error so far, None before the
-    first.
-    """
+    """Progress of a calibration: the present step, and its number from 1."""
 
     doing: str
     step: int
-    seconds_left: float
-    error: float | None
+    seconds_left: float  # for drives
+    error: float | None  # m, the largest verified mean error so far
 
 
 Recorder = Callable[[Request], Recording]
@@ -147,11 +120,9 @@ Recorder = Callable[[Request], Recording]
 def calibrate(
     settings: CalibrationSettings, record: Recorder, report: Callable[[Progress], None] = lambda progress: None
 ) -> Outcome:
-    """Calibrate a stage by itself; SlpiError if it does not follow the voltages, or the records allow no model.
-
-    `record` drives the stage and returns what it did; an exception ends the calibration. `report` is called at the
-    beginning of each step.
-    """
+    """Calibrate a stage by itself; SlpiError if it does not follow the voltages, or the records allow no model."""
+    # `record` drives the stage and returns what it did; an exception ends the calibration. Given the same records it
+    # takes the same decisions, so a calibration that was interrupted goes on where its records end.
     return _Calibration(settings, record, report).run()
 
 
@@ -309,10 +280,8 @@ def _diagnosed(records: Sequence[Record], model: StageModel) -> Diagnosis:
 
 
 def _from_first_move(record: Record, axis: str) -> Record:
-    """Return the record from shortly before the first move of an axis on.
-
-    A long rest before tells nothing of the hysteresis, but keeps the initial history open while other axes couple in.
-    """
+    """Return the record from shortly before the first move of an axis on."""
+    # A long rest before tells nothing of the hysteresis, but keeps the initial history open while other axes couple in.
     v = record.voltage[axis]
     first = int(np.flatnonzero(np.abs(v - v[0]) > 0.0)[0])
     begin = max(int(np.searchsorted(record.t, record.t[first] - REST_BEFORE)), 0)
@@ -360,11 +329,7 @@ def _follows(axis: str, drive: Drive, record: Record) -> str:
 
 
 def tracking_error(recording: Recording, axis: str, model: StageModel, goal: float) -> TrackingError:
-    """Return the error of an axis along the path of a recording, which has desired displacements.
-
-    What the `model` that the compensator used knows of the sensor is taken out of the readings. `goal` (m) is the
-    largest mean error that meets the target. RecordError if there are no readings along the path.
-    """
+    """Return the error along the path of a recording, without known errors of the sensor; `goal`: mean (m) to meet."""
     record, desired = recording.record, recording.desired[axis]
     error = model.axis(axis).correct(record.t, record.displacement[axis]) - desired
     along = np.isfinite(error)
@@ -389,13 +354,10 @@ def tracking_error(recording: Recording, axis: str, model: StageModel, goal: flo
 def aligned(
     record: Record, sent_ns: NDArray[np.int64], commands: Mapping[str, FloatArray], desired: Mapping[str, FloatArray]
 ) -> Recording:
-    """Return a recording whose desired displacements belong to the applied voltages.
-
-    Commands take some time to the stage and readings some time back. The delay between commanded and applied voltages
-    is removed, so that only what the stage itself does is left. `sent_ns` (ns, shape (M,)) are the stamps of the
-    commands, on the clock of the record; `commands` (V) and `desired` (m, NaN where there was none) have the shape
-    (M,).
-    """
+    """Return a recording whose desired displacements belong to the applied voltages."""
+    # Commands take some time to the stage and readings some time back. The delay between commanded and applied voltages
+    # is removed, so that only what the stage itself does is left. `sent_ns` (M,) are stamps on the clock of the record;
+    # `commands` (V) and `desired` (m, NaN where there was none) have the shape (M,).
     if not desired:
         return Recording(record, {})
     t = (record.time_ns - sent_ns[0]) * 1e-9

@@ -12,23 +12,16 @@ CALIBRATION, EFFECT, CHECK, VERIFICATION = 40.0, 25.0, 1.5, 20.0
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """What a calibration may do and what it shall reach.
-
-    Tuples are in the order of the voltages; `rest` is the voltage (V) of each axis before and after every drive. `rate`
-    is in samples per second, `budget` (s) is the largest sum of the durations of all drives, and `seed` is that of
-    their random parts. `target` (m) is the largest mean error on a path not used for the model; 0: `floors` times the
-    repeatability floor. UsageError if a value is invalid, or the budget is too short for a calibration drive and a
-    verification.
-    """
+    """What a calibration may do and what it shall reach; tuples in the order of the voltages."""
 
     axes: tuple[str, ...]
     limits: tuple[Limits, ...]
-    rest: tuple[float, ...]
-    rate: float
-    budget: float
-    target: float = 0.0
+    rest: tuple[float, ...]  # V, before and after every drive
+    rate: float  # samples per second
+    budget: float  # s, the largest sum of the durations of all drives
+    target: float = 0.0  # m, mean error on a path not used for the model; 0: `floors` times the repeatability floor
     floors: float = 3.0
-    seed: int = 0
+    seed: int = 0  # of the random parts of the drives
 
     def __post_init__(self) -> None:
         """Validate the settings."""

@@ -57,19 +57,13 @@ class Calibration:
 
 
 class Amplifier:
-    """Reports of the voltage of one axis: where it starts, and whether somebody else moves it.
-
-    All times are nanoseconds on the steady clock. `span` (V) is the voltage range of the node; `calibration` is the
-    relation of reports to voltages that was found, at first that of equal ones. `foreign` says how the reports
-    contradict the voltages that were output, "" while they agree; an output voltage may still be reported for the time
-    `window_ns`.
-    """
+    """Reports of the voltage of one axis: where it starts, whether somebody else moves it. Times: steady clock, ns."""
 
     def __init__(self, span: float) -> None:
-        self.span = span
-        self.calibration = Calibration()
-        self.foreign = ""
-        self.window_ns = BAND_NS
+        self.span = span  # V, of the node
+        self.calibration = Calibration()  # the relation of reports to voltages that was found
+        self.foreign = ""  # how the reports contradict the voltages that were output; "" while they agree
+        self.window_ns = BAND_NS  # for this time an output voltage may still be reported
         # Reports (ns, V); output voltages as pieces (number, lowest, highest); time, output and report (ns, V, V).
         self._reports: deque[tuple[int, float]] = deque(maxlen=64)
         self._pieces: deque[tuple[int, float, float]] = deque()
@@ -165,10 +159,7 @@ class Amplifier:
     # Where it is
 
     def found(self, now_ns: int, since_ns: int) -> float | None:
-        """Return the voltage (V) at which the axis starts; None if more reports are needed.
-
-        `since_ns` is the time since which reports are awaited.
-        """
+        """Return the voltage (V) at which the axis starts, by reports since `since_ns`; None if more are needed."""
         recent = [v for t, v in list(self._reports)[-MOST_REPORTS:] if now_ns - t <= REPORT_AGE_NS]
         if len(recent) >= REPORTS:
             return self.calibration.voltage(median(recent))
@@ -239,10 +230,8 @@ class Amplifier:
         )
 
     def _explained(self) -> tuple[Calibration | None, bool]:
-        """Return a constant gain or offset that explains all reports so far, and whether they have followed a motion.
-
-        The reports may be late by up to the window. Gain and offset at once are none: any two voltages lie on a line.
-        """
+        """Return a constant gain or offset that explains all reports, and whether they have followed a motion."""
+        # The reports may be late by up to the window. Gain and offset at once are none: any two voltages lie on a line.
         times, given, reported = np.array(self._pairs).T
         best: tuple[float, float, Calibration, bool] | None = None
         for late in np.arange(0.0, self.window_ns, PIECE_NS):

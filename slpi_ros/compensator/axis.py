@@ -34,25 +34,12 @@ REST_SHARE, REST_NS, RESTING_NS = 1e-5, SECOND_NS // 10, SECOND_NS
 
 
 class Axis:
-    """Inverse hysteresis compensation, with optional feedback, of one axis.
+    """Inverse hysteresis compensation, with optional feedback, of one axis. Times: steady clock, ns."""
 
-    All times are nanoseconds on the steady clock of the process unless stated otherwise. A loaded model cannot relax
-    the `limits`; `place` is the index of the axis in the voltage command, and `period` the output period (s).
+    # A loaded model cannot relax the limits. The memory of the feedforward `stream` follows the setpoint, not the
+    # corrected voltage, so that sensor noise causes no reversals.
 
-    The feedforward `stream` is available once a model is loaded. Its memory follows the setpoint, not the corrected
-    voltage, so that sensor noise causes no reversals. `output` is the last place before publishing: the present
-    voltage, and where it may go next; `amplifier` is what is reported of the voltage. `driven` tells whether a model
-    has ever been loaded; before that, the voltage is unknown. `ramp` is an active motion without desired displacements.
-    `held` and `slewing` tell whether the last sample is held at a voltage limit, or slew limited. `start_memory` is the
-    assumed initial history; None after the first output voltage or when the memory was restored. `tracking` has the
-    statistics of measured - desired displacement, and `fault` is the fault of the sensor for which the feedback was
-    switched off.
-
-    `given_ns` is the time of the last sample or step, `due_ns` that of the next `tick`, None if nothing follows, and
-    `point_ns` the deadline of the last sample on the trajectory clock, None if it was not a trajectory point.
-    """
-
-    stream: StreamingInverse
+    stream: StreamingInverse  # feedforward; available once a model is loaded
     _applied: StreamingInverse
     _residuals: ResidualWindow
     _sensor: StreamingSensor
@@ -62,18 +49,18 @@ class Axis:
     ) -> None:
         self.name, self.place, self.limits = name, place, limits
         self.stamps = Stamps()
-        self.output = RateLimiter(limits, period, limits.clip(0.0))
-        self.amplifier = Amplifier(limits.upper - limits.lower)
+        self.output = RateLimiter(limits, period, limits.clip(0.0))  # the voltage, and where it may go
+        self.amplifier = Amplifier(limits.upper - limits.lower)  # what is reported of the voltage
         self.model: AxisModel | None = None
         self.confidence = MemoryConfidence()
-        self.held = self.slewing = self.driven = False
-        self.ramp: Ramp | Brake | None = None
-        self.start_memory: StartMemory | None = None
-        self.given_ns = 0
-        self.due_ns: int | None = None
-        self.point_ns: int | None = None
-        self.tracking = TrackingStatistics()
-        self.fault: Fault | None = None
+        self.held = self.slewing = self.driven = False  # at a voltage limit; slew limited; ever had a model
+        self.ramp: Ramp | Brake | None = None  # an active motion without desired displacements
+        self.start_memory: StartMemory | None = None  # assumed; None once output, or if restored
+        self.given_ns = 0  # of the last sample or step
+        self.due_ns: int | None = None  # of the next `tick`; None if nothing follows
+        self.point_ns: int | None = None  # deadline of the last trajectory point on its clock, None if it was none
+        self.tracking = TrackingStatistics()  # measured - desired displacement
+        self.fault: Fault | None = None  # for which the feedback was switched off
         self._loop_settings = loop_settings
         self._feedback: Feedback | None = None
         self._sensor_watch = SensorWatch(1.0)
@@ -102,11 +89,7 @@ class Axis:
 
     @property
     def feedback_state(self) -> str:
-        """State of the feedback.
-
-        "off", "on", "saturated" at the correction limit, "holding" if the last sample had no recent measurement, or
-        "fault" if it was switched off because of the sensor.
-        """
+        """One of "off", "on", "saturated", "holding" (no recent measurement) or "fault" (of the sensor)."""
         if not self._loop_settings.enabled:
             return "off"
         if self.fault:
@@ -140,12 +123,7 @@ class Axis:
     def prepare(
         self, model: AxisModel, reversal_voltages: Sequence[float] | None = None, start_memory: StartMemory = "end"
     ) -> StreamingInverse:
-        """Return the streaming inverse of a new model, for `use`.
-
-        The `reversal_voltages` (V) to replay are oldest first, then the present one; default: those of this axis.
-        `start_memory` is the initial history of an axis without known reversals. SlpiError if the model cannot be used
-        within the limits, see `take_over`, or at the present voltage.
-        """
+        """Return the streaming inverse of a new model, see `take_over`; default: the reversals of this axis (V)."""
         if reversal_voltages is None:
             reversal_voltages = turning_voltages(self.stream.memory) if self.driven else ()
             if self.driven:
@@ -193,17 +171,11 @@ class Axis:
             self._restart_feedback()
 
     def check_limits(self, limits: Limits) -> Limits:
-        """Return new limits, restricted to the identified voltages of the model.
-
-        UsageError if the model was identified entirely outside the limits.
-        """
+        """Return new limits, restricted to the identified voltages of the model; UsageError if it has none there."""
         return limits.within(self.model.voltage_range) if self.model else limits
 
     def use_limits(self, limits: Limits, period: float) -> None:
-        """Replace limits and output period (s); hysteresis memory and voltage are unchanged.
-
-        UsageError as in `check_limits`; the old limits remain in force.
-        """
+        """Replace limits and output period (s), or raise as `check_limits`; memory and voltage are unchanged."""
         allowed = self.check_limits(limits)
         self.limits = limits
         self.amplifier.span = limits.upper - limits.lower
@@ -246,20 +218,15 @@ class Axis:
     # Samples
 
     def check(self, y: float, kind: str = "desired") -> None:
-        """Reject a displacement (m; `kind` "desired" or "measured") that is not finite or far outside the model range.
-
-        RejectedError with the cause `not_finite` or `out_of_range`.
-        """
+        """Reject a displacement (m; "desired" or "measured") that is not finite or far outside the model range."""
         low, high = self.stream.accepted
         if not low <= y <= high:
             raise implausible(y, (low, high), kind)
 
     def update(self, ahead: float | None, y: float, now_ns: int) -> float:
-        """Return the voltage (V) for the desired displacement `y` (m), `ahead` (s) after the last sample.
-
-        `ahead` is the time by the stamps, of which the ticks since the last sample have used up a part: a sample that
-        is not later counts as one output period later. None: the time on the steady clock since the last step.
-        """
+        """Return the voltage (V) for the desired displacement `y` (m), `ahead` (s) after the last sample."""
+        # By the stamps, of which the ticks since the last sample have used up a part: a sample that is not later counts
+        # as one output period later. None: the time on the steady clock since the last step.
         if ahead is None:
             dt = max((now_ns - self.given_ns) * 1e-9, 0.0)
         else:
@@ -310,10 +277,7 @@ class Axis:
         return self._holding
 
     def tick(self, now_ns: int) -> bool:
-        """Do what is due without a sample: a step of a ramp, what the limits held back, or a hold.
-
-        Return whether the voltage, or its rate, has changed.
-        """
+        """Make a step of a ramp, of what the limits held back, or a hold; return whether voltage or rate changed."""
         before, rate = self.voltage, self.output.rate
         if self.ramp:
             self.step_ramp(now_ns)
@@ -391,12 +355,7 @@ class Axis:
         return dt
 
     def measure(self, displacement: float, now_ns: int, fresh: bool = True) -> None:
-        """Store a measured displacement (m).
-
-        What the model knows of the sensor is taken out first; all that follows refers to the displacement of the stage.
-        `fresh` tells whether the stamp is that of the present; others do not count for the initial history.
-        RejectedError as in `check`; the measurement is not used.
-        """
+        """Store a displacement (m) without the sensor's known errors; only those stamped now choose the history."""
         if not self.driven:
             return
         self.check(displacement, "measured")
@@ -423,11 +382,9 @@ class Axis:
             self.tracking.measure(x, desired)
 
     def choose_memory(self, now_ns: int) -> None:
-        """Choose the initial history that matches the first measurements; the voltage is unchanged.
-
-        The assumed one is kept unless another one matches better by more than the noise, and without enough recent
-        measurements that agree.
-        """
+        """Choose the initial history that matches the first measurements; the voltage is unchanged."""
+        # The assumed one is kept unless another one matches better by more than the noise, and without enough recent
+        # measurements that agree.
         recent = [y for t, y in self._first_readings if now_ns - t <= FIRST_AGE_NS]
         if not self.start_memory or len(recent) < FIRST_READINGS:
             return

@@ -1,14 +1,4 @@
-"""Compensation of all axes, independent of ROS: converts desired displacements into voltages.
-
-`Controller.update` validates a message as a whole and then moves every axis named in it. `Controller.advance` executes
-the samples of trajectories that are due, what the limits have held back, holds, ramps to the safe voltages, the reset
-of the hysteresis memory, and the deceleration of an axis to rest. `Controller.mode` is the operating mode of the stage.
-The first voltage starts from where the amplifiers are (`Controller.locate`), and their reports are held against what
-was output since (`Controller.report`).
-
-All times `now_ns` are nanoseconds on the steady clock of the process. All times `clock_ns` are nanoseconds on the
-trajectory clock, which is the steady clock or, in a simulation, the simulated clock.
-"""
+"""Compensation of all axes, independent of ROS. `now_ns`: steady clock; `clock_ns`: that, or the simulated one."""
 
 from array import array
 from collections.abc import Collection, Mapping, Sequence
@@ -56,17 +46,13 @@ class OperatingMode(Enum):
 
 
 class Controller:
-    """Inverse hysteresis compensation, with optional feedback, for all axes of a stage.
+    """Inverse hysteresis compensation, with optional feedback, for all axes of a stage; sequences in their order."""
 
-    Sequences are in the order of `axes`. A loaded model cannot relax the `limits`; a model with another `hardware_id`
-    is refused, "" accepts any. Without `loops`, feedback is disabled; `period` is the output period (s). The voltage of
-    each axis starts (`starts`) at `AUTO` (default), `MEASURED`, `SAVED`, or a voltage (V).
-
-    The output `voltages` (V), shape (axes,), are updated in place; an axis that a message does not name keeps its
-    voltage. `model` is None before the first one; `ownership` tells whether this controller may output voltages.
-    `too_fast` is what is said of the first point of the present trajectory that will be late, "" if none is known to
-    be.
-    """
+    # A loaded model cannot relax the limits; one with another `hardware_id` is refused, "" accepts any. Without
+    # `loops`, feedback is disabled. `update` validates a message as a whole and then moves every axis named in it;
+    # `advance` executes what is due without a message: trajectories, what the limits held back, holds, ramps, the reset
+    # of the memory. The first voltage starts from where the amplifiers are (`locate`), and their reports are held
+    # against what was output (`report`).
 
     def __init__(
         self,
@@ -81,10 +67,10 @@ class Controller:
         self.names = list(axes)
         loops = loops or [OPEN_LOOP] * len(self.names)
         self.axes = [Axis(name, place, limits[place], loops[place], period) for place, name in enumerate(self.names)]
-        self.ownership = Ownership(self.axes, starts)
+        self.ownership = Ownership(self.axes, starts)  # whether voltages may be output
         self._checks: list[PaceCheck] = []
-        self.too_fast = ""
-        self.voltages = array("d", [0.0] * len(self.axes))
+        self.too_fast = ""  # the first point of the trajectory that will be late; "" if none is known
+        self.voltages = array("d", [0.0] * len(self.axes))  # V, updated in place
         self.mode = OperatingMode.UNCONFIGURED
         self.counts = Counts()
         self.model: StageModel | None = None
@@ -143,13 +129,9 @@ class Controller:
         start_memory: StartMemory = "end",
         last_voltages: Mapping[str, float] | None = None,
     ) -> None:
-        """Replace the model in use; the voltages are unchanged.
-
-        Only with the first model are used: `saved`, the hysteresis state saved at the last shutdown, and
-        `last_voltages` (V), the last output voltages of axes whose saved state belongs to another model. `start_memory`
-        is the initial history of an axis without saved state, see `AxisModel.initial`. SlpiError if the model is of
-        another stage, lacks an axis or cannot be used within the limits; the old model is kept.
-        """
+        """Replace the model in use, or raise and keep the old one; the voltages are unchanged."""
+        # Only the first model uses what was saved; `last_voltages` (V) are of axes whose saved state is of another
+        # model.
         if self._hardware_id and model.hardware_id and model.hardware_id != self._hardware_id:
             raise UsageError(
                 f"the model has hardware id '{model.hardware_id}', this stage has '{self._hardware_id}'; "
@@ -178,10 +160,7 @@ class Controller:
     # Where the amplifiers are
 
     def report(self, names: Sequence[str], voltages: Sequence[float], now_ns: int) -> bool:
-        """Take the voltages (V) that the amplifiers report at `now_ns` (ns); names of other joints are ignored.
-
-        Return whether the reports now show that somebody else moves an axis: nothing is output until `arm`.
-        """
+        """Take the voltages (V) that amplifiers report; return whether somebody now moves an axis, until `arm`."""
         for name, voltage in zip(names, voltages, strict=False):
             axis = self._by_name.get(name)
             if axis:
@@ -205,10 +184,8 @@ class Controller:
             self._read_voltages()
 
     def arm(self, now_ns: int, steady_ns: int = STEADY_NS) -> str:
-        """Continue from where somebody else has moved the stage; return the reason if that is not possible, else "".
-
-        The steady voltage that the amplifiers report counts as the last output and enters the memory as one move.
-        """
+        """Continue from where somebody else has moved the stage; return the reason if that is not possible, else ""."""
+        # The steady voltage that the amplifiers report counts as the last output and enters the memory as one move.
         if self.ownership.armed:
             return ""
         why = self.ownership.arm(now_ns, steady_ns)
@@ -243,11 +220,7 @@ class Controller:
             axis.check_limits(new)
 
     def use_limits(self, limits: Sequence[Limits], now_ns: int, period: float = PERIOD) -> None:
-        """Replace the voltage limits of all axes and the output period (s); memory and voltages are unchanged.
-
-        A voltage outside the new limits goes to the nearest one at the slew limit. UsageError if the model was
-        identified entirely outside the new limits.
-        """
+        """Replace voltage limits and output period (s), or raise; a voltage outside goes inside at the slew limit."""
         self.check_limits(limits)
         for axis, new in zip(self.axes, limits, strict=True):
             axis.use_limits(new, period)
@@ -276,13 +249,8 @@ class Controller:
     def update(
         self, stamp_ns: int, names: Sequence[str], displacements: Sequence[float], now_ns: int, arrival_ns: int = 0
     ) -> bool:
-        """Move the named axes to their desired displacements (m) and update `voltages`.
-
-        Return whether an axis cannot reach its desired displacement and is held at a voltage limit. `arrival_ns`, on
-        the clock of the stamps, is used instead of a `stamp_ns` of 0 (no stamp), and is required then or if
-        `needs_arrival`. RejectedError if the message is rejected as a whole; the rejection is counted and no axis has
-        moved.
-        """
+        """Move the named axes to their displacements (m), or none; return whether one is held at a voltage limit."""
+        # `arrival_ns`, on the clock of the stamps, is used instead of a `stamp_ns` of 0, or if `needs_arrival`.
         counts = self.counts
         counts.received += 1
         try:
@@ -311,11 +279,7 @@ class Controller:
         return held
 
     def measure(self, names: Sequence[str], displacements: Sequence[float], now_ns: int, fresh: bool = True) -> None:
-        """Store measured displacements (m) at `now_ns` (ns); names of other joints are ignored.
-
-        `fresh` tells whether the stamp is that of the present. RejectedError if a displacement is not finite or out of
-        range; it is counted but not used, the other axes are processed.
-        """
+        """Store measured displacements (m), `fresh`: stamped now; a bad one is counted, raised after the others."""
         rejected: RejectedError | None = None
         for name, y in zip(names, displacements, strict=False):
             axis = self._by_name.get(name)
@@ -419,12 +383,8 @@ class Controller:
         now_ns: int,
         clock_ns: int,
     ) -> None:
-        """Start a trajectory at once, or when its first point is due; an empty one cancels the current trajectory.
-
-        For K `names`, `time_from_start_ns` has shape (N,) and `positions` (m) shape (N, K); `start_ns` is on the
-        trajectory clock, 0 starts at once. RejectedError if the trajectory is not valid; the rejection is counted and
-        the current trajectory continues.
-        """
+        """Start a trajectory, or raise and keep the current one; times (N,), positions (N, K) in m; empty: cancel."""
+        # `start_ns` is on the trajectory clock; 0 starts at once.
         self.counts.trajectories += 1
         try:
             if not len(time_from_start_ns):  # type: ignore[arg-type]
@@ -552,10 +512,7 @@ class Controller:
             self.mode = OperatingMode.STREAMING
 
     def ramp(self, voltages: Sequence[float], rate: float, now_ns: int) -> None:
-        """Start a ramp to `voltages` (V, one per axis, clipped to the limits) at `rate` (V/s).
-
-        RejectedError if the present voltages are not known, or somebody else moves the stage.
-        """
+        """Start a ramp to `voltages` (V, one per axis, clipped to the limits) at `rate` (V/s)."""
         self._begin_output(now_ns)
         self._start_ramps([Ramp([voltage], rate) for voltage in voltages], OperatingMode.RAMPING, now_ns)
 
@@ -567,12 +524,7 @@ class Controller:
         now_ns: int,
         spans: Sequence[tuple[float, float]] = (),
     ) -> None:
-        """Start the decaying voltage oscillation that resets the hysteresis memory of all axes.
-
-        `rate` is in V/s; `finals` are the final voltages (V) of all axes, clipped to the limits, and `spans` the lowest
-        and highest voltage (V) of the oscillation of each axis, by default the limits. RejectedError if the present
-        voltages are not known, or somebody else moves the stage.
-        """
+        """Start the decaying oscillation that resets the memory, to `finals` (V), within `spans` (V; the limits)."""
         self._begin_output(now_ns)
         ramps = []
         for final, limits in zip(finals, self.reset_limits(spans), strict=True):
@@ -593,10 +545,8 @@ class Controller:
         ]
 
     def watch(self, safety: Safety, now_ns: int) -> bool:
-        """Check the command watchdog: on expiry, hold or ramp to the safe voltages; return whether the state changed.
-
-        A trajectory counts as a command until its last point. The watchdog is suspended during a reset of the memory.
-        """
+        """Check the command watchdog: on expiry, hold or ramp to safe voltages; return whether the state changed."""
+        # A trajectory counts as a command until its last point. The watchdog is suspended during a reset of the memory.
         waiting = self.mode in (OperatingMode.STREAMING, OperatingMode.RAMPING)
         before = self.watchdog.safe_voltages
         news = self.watchdog.update(safety, now_ns, waiting)

@@ -16,17 +16,12 @@ ENOUGH = 50
 
 @dataclass(frozen=True)
 class PidGains:
-    """PID gains, for a stage whose displacement increases with its voltage.
+    """PID gains, for a stage whose displacement increases with its voltage."""
 
-    The gains are in V/m, V/(m s) and V s/m; UsageError if one is negative or not finite. The `derivative` acts on the
-    measured displacement only, not on the setpoint. `derivative_filter` (s) is the time constant of the low-pass filter
-    on the derivative; 0 disables it.
-    """
-
-    proportional: float
-    integral: float = 0.0
-    derivative: float = 0.0
-    derivative_filter: float = 0.0
+    proportional: float  # V/m
+    integral: float = 0.0  # V/(m s)
+    derivative: float = 0.0  # V s/m; on the measured displacement only, not on the setpoint
+    derivative_filter: float = 0.0  # s, time constant of its low-pass filter; 0: none
 
     def __post_init__(self) -> None:
         """Refuse negative and non-finite gains."""
@@ -37,28 +32,17 @@ class PidGains:
 
 
 class Feedback:
-    """Feedforward plus PID of one axis: ``v = correct(t, desired, measured, feedforward)``; initially disabled.
+    """Feedforward plus PID of one axis: ``v = correct(t, desired, measured, feedforward)``; initially disabled."""
 
-    Enabling, disabling and retuning are bumpless: an offset cancels the step of the correction and then decays with the
-    time constant `release_time`, so that the error at the moment of enabling is corrected gradually, but completely.
-
-    Windup is avoided by conditional integration: the integral grows only as far as the voltage can follow. Unlike
-    back-calculation, this keeps the integral while the voltage is slew limited on the way to a distant feedforward.
-
-    `step` calls `correct` with the last measurement stored by `measure`, or `hold` if that was used before or is too
-    old. The error refers to the setpoint at the time of the measurement, not to the present setpoint, and for a sensor
-    with a known delay or lag to the setpoint as that sensor would tell it, see `slpi_ros.model.sensor.Sensed`.
-
-    The `limits` of the total voltage may be replaced at any time; a voltage outside new limits returns within the slew
-    and acceleration limits. `voltage` (V) is that of the axis at the start. `release_time` (s) is the time constant of
-    the decay of the offset, and of the correction after disabling; inf keeps both. Intervals between samples longer
-    than `longest_gap` (s) count as this long in the integration and in the decay. `correction_limit` (V) is the largest
-    correction in each direction. UsageError if `voltage` is not finite, or a time is not positive.
-
-    `pace` is the rate limiter of the total voltage; alone, in the time of the samples, of which at most `MAX_DT`
-    counts. A compensator gives it that of its output, on the steady clock. `acting` tells whether a measurement within
-    the timeout corrected the last `step`.
-    """
+    # Enabling, disabling and retuning are bumpless: an offset cancels the step of the correction and then decays with
+    # the time constant `release_time` (s; inf: never), so that the error at the moment of enabling is corrected
+    # completely.
+    #
+    # Windup is avoided by conditional integration: the integral grows only as far as the voltage can follow. Unlike
+    # back-calculation, this keeps the integral while the voltage is slew limited on the way to a distant feedforward.
+    #
+    # The error refers to the setpoint at the time of the measurement, not to the present one, and for a sensor with a
+    # known delay or lag to the setpoint as that sensor would tell it, see `slpi_ros.model.sensor.Sensed`.
 
     def __init__(
         self,
@@ -76,12 +60,12 @@ class Feedback:
             raise UsageError(f"release_time is {release_time} s; give a positive value")
         if not 0.0 < longest_gap < inf:
             raise UsageError(f"longest_gap is {longest_gap} s; give a positive, finite value")
-        self.pace = RateLimiter(limits, MAX_DT / 2, voltage)
-        self.acting = False
-        self.correction_limit = correction_limit
+        self.pace = RateLimiter(limits, MAX_DT / 2, voltage)  # a compensator sets that of its output
+        self.acting = False  # whether a recent measurement corrected the last `step`
+        self.correction_limit = correction_limit  # V, in each direction
         self._gains = gains
         self._release_time = release_time
-        self._longest_gap = longest_gap
+        self._longest_gap = longest_gap  # s; longer intervals count as this long
         self._enabled = False
         self._taking_over = False
         self._t = -inf
@@ -148,10 +132,7 @@ class Feedback:
         self._taking_over = self._enabled
 
     def retune(self, gains: PidGains) -> None:
-        """Replace the gains without a voltage step.
-
-        UsageError if the gains give no finite voltage; the previous gains remain in use.
-        """
+        """Replace the gains without a voltage step, or raise and keep them if they give no finite voltage."""
         before, after = (self._direct(each, self._error, self._rate) for each in (self._gains, gains))
         offset = self._offset + (before - after)
         if not isfinite(offset):
@@ -161,13 +142,8 @@ class Feedback:
     def correct(
         self, t: float, desired: float, measured: float, feedforward: float, now_ns: int | None = None
     ) -> float:
-        """Return the voltage (V) for a sample with a measurement, within the voltage, slew and acceleration limits.
-
-        The time `t` (s) is not before the last one, `desired` and `measured` are in metres, and `feedforward` (V) is
-        the voltage of the inverse model for `desired`; `now_ns` is the time on the clock of `pace`, by default `t`.
-        UsageError if time runs backwards, or a value is not finite; the state is unchanged, and `hold` may be called
-        instead.
-        """
+        """Return the voltage (V) for desired and measured displacement (m), within all limits, or raise unchanged."""
+        # `t` (s) is not before the last one; `now_ns` is on the clock of `pace`, by default `t`.
         now_ns = self._check(t, feedforward, now_ns)
         elapsed = t - self._measured_at
         error, rate = desired - measured, self._next_rate(elapsed, measured)
@@ -189,28 +165,17 @@ class Feedback:
         return self.voltage
 
     def hold(self, t: float, feedforward: float, now_ns: int | None = None) -> float:
-        """Return the voltage (V) for a sample without measurement: the correction is kept, or decays if disabled.
-
-        UsageError if time `t` (s) runs backwards, or a value is not finite; the state is unchanged.
-        """
+        """Return the voltage (V) without measurement, or raise unchanged: the correction is kept, or decays."""
         now_ns = self._check(t, feedforward, now_ns)
         self._output(t, feedforward, self._without_measurement(t), now_ns)
         return self.voltage
 
     def measure(self, displacement: float, now_ns: int, desired: float | None = None) -> None:
-        """Store a measured displacement (m) received at `now_ns` (ns, monotonic) for the next `step`.
-
-        `desired` (m) is the setpoint that it refers to, as the sensor would tell it; default: that of the last `step`.
-        """
+        """Store a displacement (m), and the setpoint it refers to as the sensor would tell it; default: the last."""
         self._latest = displacement, now_ns, self._desired if desired is None else desired
 
     def step(self, dt: float, desired: float, feedforward: float, now_ns: int, timeout: float) -> float:
-        """Return the voltage (V) for a sample, corrected by the last measurement if it is recent enough.
-
-        `dt` (s) is the time since the last sample; `desired` is in metres, `feedforward` in volts, and `now_ns` on the
-        clock of `measure` and of `pace`. Measurements older than `timeout` (s) are ignored; the correction is then
-        held.
-        """
+        """Return the voltage (V), corrected by the last measurement unless it is used or older than `timeout` (s)."""
         t = self._t + dt if self._t > -inf else 0.0
         latest, self._latest = self._latest, None
         if latest is not None:
@@ -300,12 +265,10 @@ class Drift:
 
 
 class ResidualWindow:
-    """Residuals measured - model of the last `WINDOW` measurements.
+    """Residuals (m) measured - model of the last `WINDOW` measurements."""
 
-    Because the stage responds with a delay, the residual is the signed distance of a measurement from the interval
-    between the model displacements of the last two samples; at rest it is measured - model. `expected` is the model
-    displacement at the start (m).
-    """
+    # Because the stage responds with a delay, the residual is the signed distance of a measurement from the interval
+    # between the model displacements of the last two samples; at rest it is measured - model.
 
     __slots__ = ("_before", "_expected", "_next", "_residuals", "_samples")
 
@@ -329,10 +292,7 @@ class ResidualWindow:
         self._samples = min(self._samples + 1, WINDOW)
 
     def forget(self, expected: float) -> None:
-        """Discard all residuals because the model or its hysteresis state has changed.
-
-        `expected` (m) is the present displacement of the model.
-        """
+        """Discard all residuals: the model or its state has changed, its displacement is now `expected` (m)."""
         self._samples = self._next = 0
         self._before = self._expected = expected
 
@@ -347,13 +307,9 @@ class ResidualWindow:
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """Settings of the feedback of one axis.
+    """Settings of the feedback of one axis."""
 
-    If not `enabled`, measurements are used for the diagnostics only. Measurements older than `timeout` (s) are ignored;
-    `correction_limit` (V) is the largest correction.
-    """
-
-    enabled: bool
+    enabled: bool  # if not, measurements are used for the diagnostics only
     gains: PidGains
-    timeout: float
-    correction_limit: float = inf
+    timeout: float  # s, the age from which measurements are ignored
+    correction_limit: float = inf  # V

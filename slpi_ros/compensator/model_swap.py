@@ -15,14 +15,9 @@ from slpi_ros.model.streaming import TOLERATED_SHARE, StreamingInverse
 def take_over(
     axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = (), start_memory: StartMemory = "end"
 ) -> StreamingInverse:
-    """Return the streaming inverse of a new model, with its memory in the present hysteresis state of the axis.
-
-    `limits` are those of the node; the inverse is further limited to the identified voltages. The `reversal_voltages`
-    (V), oldest first, followed by the present voltage, are replayed on the initial history "start". If they are empty,
-    the reversals are unknown, and the initial history is `start_memory`, see `AxisModel.initial`. SlpiError if the
-    model is not causal, was identified entirely outside the limits or far from the present voltage, or its inverse
-    gives a voltage outside the limits.
-    """
+    """Return the streaming inverse of a new model, with its memory in the present hysteresis state of the axis."""
+    # The `reversal_voltages` (V), oldest first, then the present one, are replayed on the initial history "start";
+    # without them the initial history is `start_memory`, see `AxisModel.initial`.
     if not axis.causal:
         raise UsageError(
             f"kind '{axis.kind}' needs the complete path in advance, but the compensator works sample by sample; "
@@ -70,10 +65,7 @@ def replay(memory: Memory, voltages: Sequence[float]) -> None:
 
 
 def check_inverse(axis: AxisModel, allowed: Limits) -> None:
-    """Check the inverse at both ends of the accepted displacements, starting from both voltage limits.
-
-    SlpiError if a displacement has no voltage within the limits.
-    """
+    """Check that both ends of the accepted displacements have voltages within the limits, from either limit."""
     low, high = axis.displacement_range
     margin = TOLERATED_SHARE * (high - low) * (1.0 - 1e-9)
     stream = StreamingInverse(
@@ -87,10 +79,7 @@ def check_inverse(axis: AxisModel, allowed: Limits) -> None:
 
 
 def require_near(present: float, allowed: Limits) -> None:
-    """Refuse a model if the present voltage (V) is far outside its identified range: it would extrapolate.
-
-    UsageError if `present` is outside `allowed` by more than `TOLERATED_SHARE` of its span.
-    """
+    """Refuse a model if the present voltage (V) is far outside its identified range: it would extrapolate."""
     margin = TOLERATED_SHARE * (allowed.upper - allowed.lower)
     if not allowed.lower - margin <= present <= allowed.upper + margin:
         raise UsageError(

@@ -14,20 +14,14 @@ BEYOND = 2.0
 
 
 class Ownership:
-    """Whether voltages may be output: the amplifiers are where they are known to be, and nobody else moves them.
-
-    All times are nanoseconds on the steady clock. The voltage of each axis starts (`starts`) at `AUTO`, `MEASURED`,
-    `SAVED`, or a voltage (V); empty: `AUTO`. `reporting` tells whether ``stage_state`` has a publisher, `started`
-    whether a voltage has been output since the activation. `obstacle` is cause of rejection and reason if no voltage
-    may be output, else None; `notes` say by axis what is not certain about the voltage at the start, "" if nothing.
-    """
+    """Whether voltages may be output: the amplifiers are where they are known to be, and nobody else moves them."""
 
     def __init__(self, axes: Sequence[Axis], starts: Sequence[str | float] = ()) -> None:
-        self.reporting = self.started = False
-        self.obstacle: tuple[str, str] | None = None
-        self.notes: dict[str, str] = {}
+        self.reporting = self.started = False  # ``stage_state`` has a publisher; a voltage was output
+        self.obstacle: tuple[str, str] | None = None  # cause and reason why no voltage may be output
+        self.notes: dict[str, str] = {}  # by axis: what is not certain about the voltage at the start
         self._axes = axes
-        self._starts = list(starts) or [AUTO] * len(axes)
+        self._starts = list(starts) or [AUTO] * len(axes)  # `AUTO`, `MEASURED`, `SAVED`, or volts
         self._since_ns, self._ever = 0, False
 
     @property
@@ -90,10 +84,7 @@ class Ownership:
         )
 
     def begin_output(self, now_ns: int) -> None:
-        """Find the voltages at the start once more, and take them to be those of the amplifiers.
-
-        RejectedError if they are not known, or somebody else moves the stage.
-        """
+        """Find the voltages at the start once more, and take them to be those of the amplifiers, or reject."""
         if not self.started and self.armed:
             self.locate(now_ns)
         if self.obstacle:

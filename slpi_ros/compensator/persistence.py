@@ -24,23 +24,15 @@ TOLERATED_SHARE = 0.01
 
 @dataclass(frozen=True)
 class MemoryConfidence:
-    """Confidence in the hysteresis memory of an axis: `ASSUMED`, `RESETTING`, `KNOWN` or `RESTORED`.
-
-    `doubt` is the reason for the state `ASSUMED`, "" if the only reason is that the memory has not been verified;
-    `spanned` are the lowest and highest voltage (V) of the reset. If `contradicted`, a measured displacement
-    contradicts every initial history of the model.
-    """
+    """Confidence in the hysteresis memory of an axis: `ASSUMED`, `RESETTING`, `KNOWN` or `RESTORED`."""
 
     state: str = ASSUMED
-    doubt: str = ""
-    spanned: tuple[float, float] = (0.0, 0.0)
-    contradicted: bool = False
+    doubt: str = ""  # why `ASSUMED`; "" if only because it has not been verified
+    spanned: tuple[float, float] = (0.0, 0.0)  # V, of the reset
+    contradicted: bool = False  # by a measured displacement, for every initial history of the model
 
     def over(self, identified: tuple[float, float]) -> "MemoryConfidence":
-        """Return the confidence for a model identified on the voltage range `identified` (V).
-
-        The state becomes `ASSUMED` if the reset did not cover this range: reversals outside its span are not erased.
-        """
+        """Return the confidence on a voltage range (V): a reset does not erase reversals outside its span."""
         (low, high), (lowest, highest) = self.spanned, identified
         margin = TOLERATED_SHARE * (highest - lowest)
         if self.state not in (KNOWN, RESTORED) or (low <= lowest + margin and highest - margin <= high):
@@ -58,15 +50,11 @@ VOLTAGE_BYTES, CHECKSUM_BYTES = 8, 4
 
 
 class LastVoltages:
-    """Store the voltages of every command in a file; one write takes about two microseconds.
+    """Store the voltages of every command in the file `path`.last; one write takes about two microseconds."""
 
-    Two entries with checksums are written alternately, so one of them is intact after a crash of the process. The data
-    is not flushed to the disk: it survives the end of the process, but may be lost at a power failure.
-
-    The voltages go to `path`.last, which is truncated, for the file `path` of the saved memory. `mark` is the
-    identifier (32 bits) of the saved memory that the entries belong to, and may be changed at any time. ModelError if
-    the file cannot be written.
-    """
+    # Two entries with checksums are written alternately, so one of them is intact after a crash of the process. The
+    # data is not flushed to the disk: it survives the end of the process, but may be lost at a power failure. `mark` is
+    # the identifier (32 bits) of the saved memory that the entries belong to, and may be changed at any time.
 
     def __init__(self, path: str | os.PathLike[str], mark: int) -> None:
         self._path, self.mark, self._number = _beside(path), mark, 0
@@ -81,10 +69,7 @@ class LastVoltages:
             raise ModelError(f"{self._path}: cannot be written: no regular file; choose another path")
 
     def note(self, voltages: bytes) -> None:
-        """Write the voltages (V) of all axes, each as a double in native byte order.
-
-        ModelError if the file cannot be written.
-        """
+        """Write the voltages (V) of all axes, each as a double in native byte order."""
         self._number = number = self._number + 1
         record = HEAD.pack(self.mark, number) + voltages
         try:
@@ -123,16 +108,11 @@ CRASHED = "restored from before a crash: the last voltage is correct, the latest
 
 @dataclass(frozen=True)
 class SavedAxis:
-    """Saved hysteresis state of one axis.
+    """Saved hysteresis state of one axis."""
 
-    `reversal_voltages` (V), at least one, are those of the remembered reversals, oldest first, followed by the last
-    voltage. `certain` tells whether the memory was known (reset or restored) when it was saved; `doubt` is the reason
-    why the saved state may be incomplete, "" if none, and is not written to the file.
-    """
-
-    reversal_voltages: tuple[float, ...]
-    certain: bool
-    doubt: str = ""
+    reversal_voltages: tuple[float, ...]  # V, at least one: oldest first, then the last voltage
+    certain: bool  # whether the memory was reset or restored when it was saved
+    doubt: str = ""  # why the saved state may be incomplete; not written to the file
 
     def confidence(self, identified: tuple[float, float]) -> MemoryConfidence:
         """Return the confidence in the restored memory for a model identified on the voltage range `identified` (V)."""
@@ -148,13 +128,10 @@ class SavedAxis:
 
 @dataclass(frozen=True)
 class SavedMemory:
-    """Saved hysteresis state of all axes of a stage; `model` is the `model_id` of the model that it belongs to.
+    """Saved hysteresis state of all axes of a stage."""
 
-    `complete` tells whether the node was shut down cleanly after saving; if False (crash), reversals may be missing.
-    """
-
-    model: str
-    complete: bool
+    model: str  # `model_id` of the model that it belongs to
+    complete: bool  # False after a crash: reversals may be missing
     axes: Mapping[str, SavedAxis]
 
     def require_fit(self, model: StageModel, names: Sequence[str]) -> None:
@@ -177,10 +154,7 @@ def model_id(model: StageModel) -> str:
 
 
 def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
-    """Write a saved memory atomically; return its identifier for `LastVoltages`.
-
-    ModelError if the file cannot be written.
-    """
+    """Write a saved memory atomically; return its identifier for `LastVoltages`."""
     document = {
         "schema": SCHEMA,
         "model": memory.model,
@@ -197,10 +171,7 @@ def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
 
 
 def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
-    """Read a saved memory, updated with the last voltages after a crash; None if the file does not exist.
-
-    ModelError if the file cannot be read or is not a valid document.
-    """
+    """Read a saved memory, updated with the last voltages after a crash; None if the file does not exist."""
     try:
         text = read_input(path, MEMORY_BYTES).decode()
         document = json.loads(text, parse_constant=_refuse)
@@ -225,23 +196,16 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
 
 
 class MemoryFile:
-    """Save and restore the hysteresis memory of a stage, including the voltages output since the last save.
-
-    The voltages go to `path`.last; with an empty `path` all methods do nothing. `last_voltages` (V) are those by axis
-    that `find` has read, also where the rest of the file was not usable.
-    """
+    """Save and restore the memory of a stage, with the voltages since the last save; an empty `path`: nothing."""
 
     def __init__(self, path: str) -> None:
         self._path = path
-        self.last_voltages: dict[str, float] = {}
+        self.last_voltages: dict[str, float] = {}  # V by axis, as found, also if nothing else was usable
         self._saved: SavedMemory | None = None
         self._last: LastVoltages | None = None
 
     def find(self, model: StageModel, names: Sequence[str]) -> Mapping[str, SavedAxis] | None:
-        """Return the saved hysteresis state of each axis, or None if no file exists.
-
-        ModelError if the file cannot be read, or does not match `model` or the axes `names`.
-        """
+        """Return the saved state of each axis, None without file; ModelError if it is not of `model` and `names`."""
         saved = load_memory(self._path) if self._path else None
         if saved is None:
             return None
@@ -250,10 +214,7 @@ class MemoryFile:
         return saved.axes
 
     def save(self, model: StageModel | None, axes: Mapping[str, SavedAxis], complete: bool) -> None:
-        """Write the state of `axes` if it has changed; `complete` means that no further voltage is output afterwards.
-
-        ModelError if the file cannot be written, or is another document.
-        """
+        """Write the state of `axes` if it has changed; `complete`: no further voltage is output afterwards."""
         if not self._path or model is None:
             return
         memory = SavedMemory(model_id(model), complete, axes)
@@ -278,10 +239,7 @@ class MemoryFile:
             self._last = LastVoltages(self._path, mark)
 
     def note(self, voltages: bytes) -> None:
-        """Store the voltages just output (V, native doubles), for recovery after a crash; called for each command.
-
-        ModelError if the file cannot be written.
-        """
+        """Store the voltages just output (V, native doubles), for recovery after a crash; called for each command."""
         if self._last:
             self._last.note(voltages)
 

@@ -15,29 +15,21 @@ PLANNED_SHARE = 0.8
 
 @dataclass(frozen=True)
 class Safety:
-    """Reaction to a command timeout and to deactivation.
+    """Reaction to a command timeout and to deactivation: hold the voltages, or ramp to the safe ones."""
 
-    A `command_timeout` (s) of 0 disables the watchdog. With `ramps_on_timeout` and `ramps_on_deactivate` the axes ramp
-    to the safe `voltages` (V, one per axis) at `rate` (V/s), otherwise the voltages are held.
-    """
-
-    command_timeout: float
+    command_timeout: float  # s; 0 disables the watchdog
     ramps_on_timeout: bool
     ramps_on_deactivate: bool
-    voltages: tuple[float, ...]
-    rate: float
+    voltages: tuple[float, ...]  # V, one per axis
+    rate: float  # V/s
 
 
 class Ramp:
-    """Voltage ramp through a sequence of target voltages, each reached before the next one is approached.
-
-    The `goals` are in volts. `rate` (V/s) is the maximum rate of change, further limited to `PLANNED_SHARE` of the slew
-    limit; inf: at the slew limit. UsageError if the rate is not positive, or a target voltage is not finite.
-    """
+    """Voltage ramp through a sequence of target voltages, each reached before the next one is approached."""
 
     def __init__(self, goals: Iterable[float], rate: float) -> None:
-        self._goals = list(goals)[::-1]
-        self._rate = rate
+        self._goals = list(goals)[::-1]  # V
+        self._rate = rate  # V/s, at most `PLANNED_SHARE` of the slew limit
         if not rate > 0.0 or not all(-inf < goal < inf for goal in self._goals):
             raise UsageError(f"a ramp at {rate} V/s through {self._goals[::-1]} V; give a positive rate, finite goals")
 

@@ -32,11 +32,7 @@ class Fault:
 
 
 class SensorWatch:
-    """Hold the readings of a sensor against the displacement of the model for the voltages that were output.
-
-    All times are nanoseconds on the steady clock. `span` (m) is the displacement range of the model, and `noise` (m)
-    the rms noise of the sensor in the record of the model.
-    """
+    """Hold the readings of a sensor against the model's displacement for the output voltages; m, steady clock in ns."""
 
     def __init__(self, span: float, noise: float = 0.0) -> None:
         self.span, self.noise = span, noise

@@ -10,24 +10,15 @@ from slpi_ros.compensator.validation import CAUSES, MEASURED_CAUSES
 
 @dataclass
 class Counts:
-    """Message counters of a compensator.
+    """Message counters of a compensator."""
 
-    `received` and `accepted` count messages with desired displacements. Of the accepted messages, `held_at_limit`
-    counts those for which an axis was held at a voltage limit, `slew_limited` those for which the slew or acceleration
-    limit kept an axis from its setpoint, `gaps` those stamped more than `time_jump` after the previous message, and
-    `time_jumps` those stamped earlier than the previous message because the clock had been set back. `excursions`
-    counts how often an axis began to be held at a voltage limit. `by_cause` and `measured_by_cause` count rejected
-    messages and rejected measured displacements. `trajectories` counts those received, and `points_held` and
-    `points_slewing` count trajectory points that were held at a voltage limit, or slew limited.
-    """
-
-    received: int = 0
+    received: int = 0  # messages with desired displacements
     accepted: int = 0
-    held_at_limit: int = 0
-    slew_limited: int = 0
-    excursions: int = 0
-    gaps: int = 0
-    time_jumps: int = 0
+    held_at_limit: int = 0  # of the accepted: an axis was held at a voltage limit
+    slew_limited: int = 0  # of the accepted: slew or acceleration kept an axis from its setpoint
+    excursions: int = 0  # how often an axis began to be held at a voltage limit
+    gaps: int = 0  # stamped more than `time_jump` after the previous message
+    time_jumps: int = 0  # stamped before the previous message: the clock had been set back
     by_cause: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CAUSES, 0))
     measured_by_cause: dict[str, int] = field(default_factory=lambda: dict.fromkeys(MEASURED_CAUSES, 0))
     trajectories: int = 0
@@ -56,14 +47,10 @@ WINDOW = 8192
 
 @dataclass(frozen=True)
 class TimingReport:
-    """Timing of the messages since the last `Timing.restart`, at most of the last `WINDOW` messages.
+    """Timing of the messages since the last `Timing.restart`, at most of the last `WINDOW` messages."""
 
-    `jitter` (s) is the standard deviation of the time between messages; `latency` (s) is the time from arrival of a
-    message to the published voltages: median, 99th percentile, maximum.
-    """
-
-    jitter: float
-    latency: tuple[float, float, float]
+    jitter: float  # s, standard deviation of the time between messages
+    latency: tuple[float, float, float]  # s from arrival to output: median, 99th percentile, maximum
 
 
 class Timing:
@@ -110,25 +97,18 @@ class TrackingReport:
 
 
 class TrackingStatistics:
-    """Collect the tracking error, measured - desired, of one axis.
-
-    `desired` (m) is the present setpoint, None while the axis does not follow desired displacements; `fresh` tells
-    whether there was a measurement since the last report.
-    """
+    """Collect the tracking error (m), measured - desired, of one axis."""
 
     __slots__ = ("_count", "_errors", "desired", "fresh")
 
     def __init__(self) -> None:
-        self.desired: float | None = None
-        self.fresh = False
+        self.desired: float | None = None  # m; None while the axis follows none
+        self.fresh = False  # measured since the last report
         self._errors = array("d", bytes(8 * TRACKED))
         self._count = 0
 
     def measure(self, displacement: float, desired: float | None = None) -> None:
-        """Store the error of a measured displacement (m) if there is a setpoint.
-
-        `desired` (m) is the setpoint that it refers to; default: the present one.
-        """
+        """Store the error of a displacement (m) from the setpoint it refers to (m), by default the present one."""
         if self.desired is not None:
             self._errors[self._count % TRACKED] = displacement - (self.desired if desired is None else desired)
             self._count += 1

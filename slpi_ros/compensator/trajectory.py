@@ -1,11 +1,4 @@
-"""Trajectories: validated as a whole on arrival, then output at the output rate.
-
-The displacement is interpolated linearly between the points, and from the present displacement to the first point
-(in joint_trajectory_controller: interpolation without velocities). Each point is reached at its time, if the limits
-allow it; `PaceCheck` finds the first point that will be late.
-
-A `delay` in the model of an axis advances the deadlines of its points by that time.
-"""
+"""Trajectories: validated as a whole on arrival, then output at the output rate, linear between points."""
 
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
@@ -32,18 +25,13 @@ BLOCK = 256
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Desired displacements of some axes at given times, validated by `Trajectory.of`.
-
-    For K `names`, `time_from_start_ns`, shape (N,), is strictly increasing, N >= 1, and `positions` (m) has shape
-    (N, K). A `start_ns` of 0 starts at once; it may be negative on a clock that counts from the start of the machine.
-    `cut` is the number of earlier points discarded because their time had passed.
-    """
+    """Desired displacements of some axes at given times, validated by `Trajectory.of`."""
 
     names: tuple[str, ...]
-    time_from_start_ns: TimeArray
-    positions: FloatArray
-    start_ns: int
-    cut: int = 0
+    time_from_start_ns: TimeArray  # (N,), strictly increasing
+    positions: FloatArray  # m, (N, names)
+    start_ns: int  # 0: at once; may be negative if the clock counts from the start of the machine
+    cut: int = 0  # earlier points discarded because their time had passed
 
     @classmethod
     def of(
@@ -55,11 +43,7 @@ class Trajectory:
         *,
         axes: Sequence[str],
     ) -> "Trajectory":
-        """Return a validated trajectory; arrays are not copied.
-
-        `names` is a subset of `axes`, the names of all axes, in any order. RejectedError if names, shapes, times or
-        positions are not valid; the message names the first invalid point.
-        """
+        """Return a validated trajectory of some of the `axes`, in any order; arrays are not copied."""
         require_names(names, axes)
         times, places = _as_array(time_from_start_ns), _as_array(positions, np.float64)
         if not times.size:
@@ -89,10 +73,7 @@ class Trajectory:
                 raise RejectedError(rejection.OUT_OF_RANGE, what)
 
     def useful_at(self, now_ns: int) -> "Trajectory":
-        """Return the trajectory without the points before `now_ns` (ns), or with all points if `start_ns` is 0.
-
-        RejectedError if all points are in the past.
-        """
+        """Return the trajectory without the points before `now_ns` (ns), or with all points if `start_ns` is 0."""
         first = int(np.searchsorted(self.time_from_start_ns, now_ns - self.start_ns)) if self.start_ns else 0
         if first == len(self):
             ago = (now_ns - self.start_ns - int(self.time_from_start_ns[-1])) / SECOND_NS
@@ -128,25 +109,18 @@ def _check_times(times: NDArray[Any], start_ns: int) -> None:
 
 
 class Point(NamedTuple):
-    """The sample of a trajectory to output now: `displacements` (m) of the axes `names`, due at `deadline_ns`.
-
-    If not `between`, it is a point of the trajectory, else it is interpolated.
-    """
+    """The sample of a trajectory to output now."""
 
     names: tuple[str, ...]
-    displacements: list[float]
+    displacements: list[float]  # m, of the axes `names`
     deadline_ns: int
-    between: bool = False
+    between: bool = False  # interpolated, not a point of the trajectory
 
 
 class _Track:
-    """Points of one trajectory for all axes with the same delay, executed in order.
+    """Points (m, (N, names)) of one trajectory for all axes with the same delay, executed in order from `first`."""
 
-    For K `names`, `positions` (m) has shape (N, K) and `deadlines_ns` shape (N,). `first` is the index of the first
-    point to execute, and `begin_ns` the time at which the way to it begins; `place` is as in `TrajectoryExecutor`.
-    `counted` tells whether `TrajectoryExecutor.remaining` counts the points: only one track of each trajectory is
-    counted.
-    """
+    # Only one track of each trajectory is `counted` by `TrajectoryExecutor.remaining`.
 
     def __init__(
         self,
@@ -234,22 +208,17 @@ class _Track:
 
 
 class TrajectoryExecutor:
-    """Return the samples of trajectories at absolute deadlines: a late call does not delay the following ones.
+    """Return the samples of trajectories at absolute deadlines: a late call does not delay the following ones."""
 
-    Points that are further apart than the output period are interpolated. A new trajectory replaces the current points
-    as in joint_trajectory_controller: at once, or, if it starts in the future, from its start on. Any number of
-    trajectories may be pending.
-
-    All times are nanoseconds on the same clock, which the caller chooses.
-
-    `period` is the output period (s). `place` returns the present displacement (m) of an axis, from which the first
-    point is approached; by default an axis stays until the first point. `skipped` counts the points skipped so far
-    because a later point was already due.
-    """
+    # Points that are further apart than the output period are interpolated. A new trajectory replaces the current
+    # points as in joint_trajectory_controller: at once, or, if it starts in the future, from its start on. Any number
+    # of trajectories may be pending. All times are nanoseconds on the same clock, which the caller chooses. `place`
+    # returns the present displacement (m) of an axis, from which the first point is approached; by default an axis
+    # stays until then.
 
     def __init__(self, period: float = PERIOD, place: Callable[[str], float] | None = None) -> None:
         self.period, self._place = period, place
-        self.skipped = 0
+        self.skipped = 0  # points, because a later one was already due
         self._tracks: list[_Track] = []
 
     @property
@@ -289,12 +258,9 @@ class TrajectoryExecutor:
         return any(track.begun for track in self._tracks)
 
     def start(self, trajectory: Trajectory, now_ns: int, delays: Mapping[str, float] | None = None) -> None:
-        """Start a trajectory at once, or when its first point is due.
-
-        `delays` (s), 0 by default, are those of each axis, by which its deadlines are advanced; of the points with
-        deadlines in the past only the last one is executed. RejectedError if all points are in the past; the current
-        trajectory continues.
-        """
+        """Start a trajectory at once, or when its first point is due; RejectedError if all points are in the past."""
+        # `delays` (s) advance the deadlines of an axis; of the points with deadlines in the past the last one is
+        # executed.
         useful = trajectory.useful_at(now_ns)
         due = useful.time_from_start_ns + (trajectory.start_ns or now_ns)
         shifts = {name: round((delays or {}).get(name, 0.0) * SECOND_NS) for name in useful.names}
@@ -319,10 +285,8 @@ class TrajectoryExecutor:
         self._tracks = []
 
     def due(self, now_ns: int) -> Point | None:
-        """Return the latest point that is due and not yet returned, or None; to be called until it returns None.
-
-        Earlier points of the same track are skipped. Every track is returned separately, as it may move other axes.
-        """
+        """Return the latest point that is due and not yet returned, or None; to be called until it returns None."""
+        # Earlier points of the same track are skipped. Every track is returned separately, as it may move other axes.
         if not self._tracks:
             return None
         track = self._tracks[0] if len(self._tracks) == 1 else min(self._tracks, key=lambda each: each.next_ns)
@@ -340,12 +304,7 @@ CHECKED_FIRST, CHECKED_LATER = 500, 50
 
 
 class PaceCheck:
-    """Find the first point of a trajectory that the slew limit makes late; the stage is not moved.
-
-    `stream`, in the state at the begin of the trajectory, is copied; `wait` (s) is the time from the present to the
-    start of the trajectory. A point counts as late if it is late by more than the output `period` (s). `done` tells
-    whether all points have been looked at, or a late one was found.
-    """
+    """Find the first point that the slew limit makes late by more than a `period` (s), `wait` (s) before the start."""
 
     def __init__(self, axis: str, stream: StreamingInverse, trajectory: Trajectory, wait: float, period: float) -> None:
         self._axis, self._period = axis, period
@@ -354,7 +313,7 @@ class PaceCheck:
         self._stream, limits = stream.copy(), stream.limits
         self._slew, self._voltage, self._last_ns = limits.slew, stream.voltage, -round(max(wait, 0.0) * SECOND_NS)
         self._stream.pace = RateLimiter(Limits(limits.lower, limits.upper), period, stream.voltage)
-        self.done = not np.isfinite(self._slew)
+        self.done = not np.isfinite(self._slew)  # all points looked at, or a late one found
 
     def look(self, points: int) -> str:
         """Look at the next points; return what is said of the first late one, "" if there is none among them."""

@@ -1,8 +1,4 @@
-"""Validation of axis names, displacements and time stamps in messages.
-
-Every message is accepted as a whole, or rejected as a whole with a `RejectedError` that states the cause; a rejected
-message moves no axis.
-"""
+"""Validation of axis names, displacements and stamps: a message is accepted as a whole, or moves no axis."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -44,10 +40,7 @@ class RejectedError(SlpiError):
 
 
 def require_names(names: Sequence[str], axes: Collection[str]) -> None:
-    """Reject an empty list of axis names, duplicates, and names that are not in `axes`.
-
-    RejectedError with the cause `empty`, `duplicate_axis` or `unknown_axis`.
-    """
+    """Reject an empty list of axis names, duplicates, and names that are not in `axes`."""
     if not names:
         raise RejectedError(EMPTY, "the message names no axis; name the axes to move")
     if len(set(names)) != len(names):
@@ -66,22 +59,17 @@ def implausible(y: float, accepted: tuple[float, float], kind: str) -> RejectedE
 
 @dataclass(frozen=True)
 class TimestampRules:
-    """Rules for message time stamps.
+    """Rules for message time stamps."""
 
-    `jump` (s) is the largest backward step of a late stamp; a larger one means a clock set back, a larger forward step
-    a gap. Messages stamped longer ago than `max_age` (s) are rejected as stale; 0 disables the check.
-    """
-
-    jump: float = 1.0
-    max_age: float = 0.0
+    jump: float = 1.0  # s, the largest step back of a late stamp; beyond it the clock was set back, or forward a gap
+    max_age: float = 0.0  # s, beyond which messages are stale; 0 disables the check
 
 
 class Stamps:
-    """Check the order of the sample time stamps of one axis and compute elapsed times.
+    """Check the order of the sample time stamps of one axis and compute elapsed times."""
 
-    A stamp that is older than the last one by at most `jump_ns` is late. If it is older by more than this, the clock
-    was set back, and the elapsed time restarts.
-    """
+    # A stamp that is older than the last one by at most `jump_ns` is late. If it is older by more than this, the clock
+    # was set back, and the elapsed time restarts.
 
     __slots__ = ("_last_ns", "_restarted", "jump_ns")
 
@@ -92,10 +80,7 @@ class Stamps:
         self._restarted = False
 
     def check(self, stamp_ns: int) -> None:
-        """Reject a stamp (ns) that is not newer than the last one, unless the clock was set back.
-
-        RejectedError with the cause `duplicate` or `time_backwards`.
-        """
+        """Reject a stamp (ns) that is not newer than the last one, unless the clock was set back."""
         last = self._last_ns
         if last is None or stamp_ns > last or stamp_ns < last - self.jump_ns:
             return
@@ -105,10 +90,8 @@ class Stamps:
         raise RejectedError(TIME_BACKWARDS, f"time runs {back} backwards; send samples in order")
 
     def accept(self, stamp_ns: int) -> float | None:
-        """Store a stamp (ns) accepted by `check`; return the time (s) since the last stamp.
-
-        It is 0 for the first stamp, negative if the clock was set back, None for the first one after `restart`.
-        """
+        """Store a stamp (ns) accepted by `check`; return the time (s) since the last stamp."""
+        # It is 0 for the first stamp, negative if the clock was set back, None for the first one after `restart`.
         last, self._last_ns = self._last_ns, stamp_ns
         if self._restarted:
             self._restarted = False

@@ -4,20 +4,15 @@ from slpi_ros.compensator.ramps import Safety
 
 
 class CommandWatchdog:
-    """Detect that no command has arrived within the command timeout.
-
-    `commanded` tells whether a command has been executed since the activation; before the first command, a timeout
-    moves no axis. `expired` tells whether the timeout had elapsed at the last call of `update`. `safe_voltages` (V, one
-    per axis) are the targets of the ramp started at expiry; None if the voltages are held.
-    """
+    """Detect that no command has arrived within the command timeout."""
 
     def __init__(self) -> None:
         self.start(0)
 
     def start(self, now_ns: int) -> None:
         """Restart the timeout at `now_ns` (ns) and clear all flags."""
-        self.commanded = self.expired = False
-        self.safe_voltages: tuple[float, ...] | None = None
+        self.commanded = self.expired = False  # since activation, before which no axis moves; at the last `update`
+        self.safe_voltages: tuple[float, ...] | None = None  # V, ends of the ramp at expiry; None: held
         self._heard_ns = now_ns
 
     def feed(self, now_ns: int) -> None:
@@ -26,10 +21,7 @@ class CommandWatchdog:
         self.expired, self.safe_voltages = False, None
 
     def update(self, safety: Safety, now_ns: int, waiting: bool) -> bool:
-        """Update `expired`; return True at expiry, and again if the reaction in `safety` changes afterwards.
-
-        If not `waiting`, no commands are expected and the watchdog does not expire.
-        """
+        """Update `expired`, only if `waiting`; return True at expiry, and if the reaction changes afterwards."""
         before = self.expired, self.safe_voltages
         self.expired = waiting and 0.0 < safety.command_timeout < self.silence(now_ns)
         moves = self.expired and self.commanded and safety.ramps_on_timeout

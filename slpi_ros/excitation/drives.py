@@ -62,17 +62,10 @@ def excite(
     seed: int = 0,
     drive: str = CALIBRATION,
 ) -> Drive:
-    """Return the voltage signals for the identification of a stage.
-
-    The axes move one after the other and share the duration: the cross coupling, which would resemble hysteresis during
-    simultaneous motion, appears on the axes at rest.
-
-    `axes` are in the order of their motion. `voltage_min` and `voltage_max` (V), `slew_limit` (V/s) and `start` (V) are
-    one value, or one for each axis. `slew_limit` is the largest rate of change, 0 for no limit; `start` is the rest
-    voltage before and after the motion, by default `voltage_min`. `duration` (s) is the time of the last sample, `rate`
-    is in hertz, and the same `seed` gives the same drive. `drive` is one of `DRIVES`: ``calibration``, ``sweep``, or
-    the name of the effect to be identified. UsageError if a value is invalid, or the duration is too short.
-    """
+    """Return the voltages (V), for `duration` (s) at `rate` (Hz), of one of `DRIVES` that identify a stage."""
+    # The axes move one after the other and share the duration: the cross coupling, which would resemble hysteresis
+    # during simultaneous motion, appears on the axes at rest. Voltages (V) and `slew_limit` (V/s; 0: none) are one
+    # value, or one for each axis; `start` is the rest voltage before and after the motion, by default `voltage_min`.
     _check(axes, drive)
     lows, highs, slews = (
         _each(name, given, axes)
@@ -170,10 +163,9 @@ def _why(drive: str) -> str:
 
 
 class Playback:
-    """Playback of a drive sample by sample, within its limits; with `repeat` it restarts at the end until stopped.
+    """Playback of a drive sample by sample, within its limits; with `repeat` it restarts at the end until stopped."""
 
-    After `stop` it is `stopping` while the axes return to their rest voltages.
-    """
+    # After `stop` it is `stopping` while the axes return to their rest voltages.
 
     def __init__(self, drive: Drive, *, repeat: bool = False) -> None:
         self.drive, self.stopping = drive, False

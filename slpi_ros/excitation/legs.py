@@ -29,10 +29,7 @@ class Leg:
 
 @dataclass(frozen=True)
 class DriveSpec:
-    """Voltage limits (V), time of the last sample (s), sampling rate (Hz) and slew limit (V/s; 0: none) of one axis.
-
-    UsageError if a value is invalid.
-    """
+    """Voltage limits (V), time of the last sample (s), sampling rate (Hz) and slew limit (V/s; 0: none) of one axis."""
 
     low: float
     high: float
@@ -107,11 +104,8 @@ class Path:
         return np.array(fewest, dtype=np.int64)
 
     def voltages(self, spec: DriveSpec) -> FloatArray:
-        """Return the voltages (V) along all legs, shape (spec.steps + 1,); every reversal coincides with a sample.
-
-        The time beyond the shortest durations is distributed in proportion to desired minus shortest duration.
-        UsageError if the duration is too short for the legs at this slew limit and rate.
-        """
+        """Return the voltages (V) along all legs, shape (spec.steps + 1,); every reversal coincides with a sample."""
+        # The time beyond the shortest durations is distributed in proportion to desired minus shortest duration.
         fewest = self.fewest_steps(spec)
         spare = spec.steps - int(fewest.sum())
         if spare < 0:

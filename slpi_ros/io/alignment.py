@@ -23,20 +23,13 @@ _AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class Signals:
-    """Decoded messages of one topic.
+    """Decoded messages of one topic; (N,) each."""
 
-    `logged` (ns), ascending, are the recording times and `stamp` (ns) the header stamps, shape (N,) each; `stamp` is
-    None if no message is stamped. `frame_id` is the first one that is not empty. `fields` holds the columns, shape
-    (N,), by name for each of the fields ``position``, ``effort``, ``data`` or ``vector``, in the order of their first
-    occurrence; NaN where a message does not contain the column. `named` tells whether the message type gives names to
-    the columns; otherwise they are ``0``, ``1``, ...
-    """
-
-    logged: NDArray[np.int64]
-    stamp: NDArray[np.int64] | None
-    frame_id: str
-    fields: Mapping[str, Mapping[str, FloatArray]]
-    named: bool
+    logged: NDArray[np.int64]  # ns, ascending: recording times
+    stamp: NDArray[np.int64] | None  # ns, of the headers; None if no message is stamped
+    frame_id: str  # the first that is not empty
+    fields: Mapping[str, Mapping[str, FloatArray]]  # ``position``, ``effort``, ``data`` or ``vector``; NaN: not given
+    named: bool  # the message type names the columns, otherwise they are ``0``, ``1``, ...
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -85,12 +78,7 @@ class _Series:
 
 
 def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axes: Sequence[str], path: Path) -> Record:
-    """Combine the signals of two topics into a record.
-
-    `axes` are the axes to read, by name, or in the order of columns without names; empty for all. `path` is that of the
-    bag, for messages. RecordError if a topic has no signal, the topics do not overlap in time, or their axes do not
-    match.
-    """
+    """Combine the signals of two topics into a record of `axes`, by name, or in the order of columns; empty for all."""
     where = f"{path}: voltage on '{topics.voltage}', displacement on '{topics.displacement}'"
     v_columns = _filled(voltage, ("effort", "position", "data", "vector"), where)
     d_columns = _filled(displacement, ("position", "data", "vector"), where)
@@ -113,12 +101,7 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
 
 
 def held_at(desired: Signals, record: Record, where: str) -> dict[str, FloatArray]:
-    """Return displacements (m), shape (N,), each held until the next message, at the samples of a record.
-
-    `desired` are messages with desired displacements, `where` is the bag and the topic in error messages. The result
-    has the axes of the record that the messages contain; NaN before the first message. RecordError if topic and record
-    do not overlap in time, or the columns do not match the axes of the record.
-    """
+    """Return displacements (m), (N,), each held until the next message, at the samples of a record; NaN before."""
     time = desired.logged if desired.stamp is None else desired.stamp
     if not _overlap(time, record.time_ns):
         raise RecordError(f"{where}: at no time were it and {record.source} both recorded; record them with one clock")

@@ -1,8 +1,5 @@
-"""Reading of records from bags: rosbag2 folders or single files, mcap or sqlite3, compressed or not.
-
-Only this module and ``bag_writer`` import rosbags; rosbags exceptions do not propagate beyond them. rosbags locates
-the files and topics of a bag; blocks of messages with equal layout are decoded at once.
-"""
+"""Reading of records from bags: rosbag2 folders or single files, mcap or sqlite3, compressed or not."""
+# Only this module and ``bag_writer`` import rosbags; rosbags exceptions do not propagate beyond them.
 
 import os
 from collections import Counter
@@ -98,12 +95,8 @@ def _stage_of(record: Record) -> str:
 
 
 def read_desired(path: _Path, record: Record, topic: str | None = None) -> dict[str, NDArray[np.float64]] | None:
-    """Read the desired displacement (m) of each axis, shape (N,), at the samples of a record of the same bag.
-
-    Each message is held until the next one; NaN before the first one. The topic is of one of the `MESSAGE_TYPES`, by
-    default ``desired_displacement``; None if `topic` is not given and the bag has no message on that one. RecordError
-    if the bag cannot be read, or the times or axes of the topic do not match those of the record.
-    """
+    """Read the desired displacement (m) of each axis at the samples of a record of the same bag, held, NaN before."""
+    # By default of ``desired_displacement``; None if `topic` is not given and the bag has no message on that one.
     path = Path(path)
     with _Bag(locate(path), path) as bag:
         if topic is None and not bag.holds(DESIRED):
@@ -192,11 +185,7 @@ def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tupl
 
 
 def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int = 0) -> Signals | None:
-    """Decode the messages of a topic, None if there is none; blocks of messages with equal layout are decoded at once.
-
-    `msgtype` is one of the `MESSAGE_TYPES`, `expected` the approximate total number of messages. Each block is released
-    after decoding.
-    """
+    """Decode the messages of a topic, None if there is none; blocks are released after decoding."""
     columns, frame_id = _Columns(expected), ""
     for block in blocks:
         frame, part = _decode(block, msgtype)

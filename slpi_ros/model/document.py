@@ -81,10 +81,7 @@ def _update(document: dict[str, Any], source: str) -> None:
 
 
 def model_from(document: dict[str, Any], source: str) -> StageModel:
-    """Build a model from a document that follows its schema, of any version, which is updated in place.
-
-    ModelError, which begins with `source`, if the numbers are inconsistent.
-    """
+    """Build a model from a document of any version, updated in place; ModelError, which begins with `source`."""
     _update(document, source)
     try:
         axes = {name: _axis_from(axis) for name, axis in document["axes"].items()}

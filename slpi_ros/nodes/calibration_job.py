@@ -25,16 +25,12 @@ STATE, PATH = "stage_state", "verification_path"
 
 @dataclass(frozen=True)
 class Wanted:
-    """A drive to be recorded in the bag `name`.
-
-    `t` (s) has the shape (N,), `voltage` (V) the shape (N, axes), and so has the `desired` displacement (m), or (N, 0)
-    if there is none.
-    """
+    """A drive to be recorded in the bag `name`."""
 
     name: str
-    t: FloatArray
-    voltage: FloatArray
-    desired: FloatArray
+    t: FloatArray  # s, (N,)
+    voltage: FloatArray  # V, (N, axes)
+    desired: FloatArray  # m, (N, axes), or (N, 0) if there is none
 
 
 @dataclass(frozen=True)

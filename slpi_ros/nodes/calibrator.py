@@ -1,8 +1,4 @@
-"""Node ``calibrator``: calibrates a stage by itself, from an unknown stage to a verified model with causes.
-
-The decisions are those of `slpi_ros.calibration.run.calibrate`, which computes in a process of its own. This node
-drives the stage through `slpi_ros.nodes.guarded_drive`: whatever goes wrong during a drive ends in a ramp back to rest.
-"""
+"""Node ``calibrator``: drives an unknown stage and carries out what `slpi_ros.calibration.run` decides."""
 
 import math
 import sys
@@ -161,13 +157,6 @@ class Calibrator(Node):
     Nothing is moved while stage_state is missing or another node publishes voltages. If stage_state reports what the
     voltages cannot have caused (`slpi_ros.calibration.drive_watch`), another publisher appears or a bag cannot be
     written, the voltages return to rest within the limits. An interrupted drive is kept as ``interrupted_NAME``.
-
-    Raises
-    ------
-    UsageError
-        If a parameter is not valid.
-    RecordError
-        If the folder cannot be used.
     """
 
     def __init__(self) -> None:

@@ -1,9 +1,4 @@
-"""Node ``compensator``: converts desired displacements into voltages.
-
-The node is an adapter: it decodes messages, calls the `Controller`, and publishes voltages and diagnostics. Motion
-without messages (trajectory points, ramps, the reset of the memory) is executed by `Compensator.meet_deadline`, which
-`slpi_ros.nodes.common.run` calls at the next deadline of the controller.
-"""
+"""Node ``compensator``: an adapter that decodes messages, calls the `Controller`, and publishes what it returns."""
 
 import math
 import sys
@@ -83,13 +78,6 @@ class Compensator(LifecycleNode):
     ``stage_model``, publishes ``voltage_command``, ``tracking_error`` and ``/diagnostics``, provides the services
     ``~/reset_memory`` and ``~/arm``.
     Message types, units and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
-
-    Raises
-    ------
-    UsageError
-        If the parameters are not valid.
-    ModelError
-        If ``model_file`` is not a valid model for these axes and limits.
     """
 
     def __init__(self) -> None:
@@ -553,11 +541,9 @@ class Compensator(LifecycleNode):
     # Models
 
     def _on_model(self, message: String) -> None:
-        """Load the model of a message in the background; the previous model is used until then.
-
-        Validating a document takes as long as processing many commands, so it runs in another thread. The validation is
-        canceled when a newer document arrives.
-        """
+        """Load the model of a message in the background; the previous model is used until then."""
+        # Validating a document takes as long as processing many commands, so it runs in another thread. The validation
+        # is canceled when a newer document arrives.
         self._stop_reading()
         try:
             self._reading = Reading(message.data, self._model_topic)
@@ -712,10 +698,8 @@ class Compensator(LifecycleNode):
 
 
 def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayLike]:
-    """Return stamp (ns), names, times (ns) and positions of a serialized JointTrajectory.
-
-    An unreadable message gives no names; positions of different lengths are returned as such. Both are then rejected.
-    """
+    """Return stamp (ns), names, times (ns) and positions of a serialized JointTrajectory."""
+    # An unreadable message gives no names; positions of different lengths are returned as such. Both are then rejected.
     if arrays := decode_trajectory(data):
         return arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.positions
     try:

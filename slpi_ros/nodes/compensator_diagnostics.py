@@ -17,23 +17,15 @@ Problem = tuple[bool, bytes, str]
 
 
 class Reporter:
-    """Collect and publish the diagnostics of the compensator.
-
-    `finalized` tells whether the node has been shut down. `timing` is the latency of messages, `lateness` the deadline
-    error of trajectory points. `last_rejection` and `model_error` are the reasons for the last rejected message and
-    model; `model_error` is "" after a newer model was accepted. `model_id` is the fingerprint of the model in use.
-    `lost` counts the messages that the middleware has lost, `worked_off` those of a backlog that were answered in one
-    go, and `largest_backlog` is the most of them; `age` (s) is that of the last answered command by its stamp, None
-    without a stamp.
-    """
+    """Collect and publish the diagnostics of the compensator."""
 
     def __init__(self, node: Node, controller: Controller) -> None:
-        self.finalized = False
-        self.timing, self.lateness = Timing(), Timing()
-        self.last_rejection = self.model_error = self.model_id = ""
+        self.finalized = False  # the node has been shut down
+        self.timing, self.lateness = Timing(), Timing()  # latency of messages; deadline error of trajectory points
+        self.last_rejection = self.model_error = self.model_id = ""  # reasons; fingerprint
         self.models_refused = 0
-        self.lost = self.worked_off = self.largest_backlog = 0
-        self.age: float | None = None
+        self.lost = self.worked_off = self.largest_backlog = 0  # messages: by the middleware, of a backlog
+        self.age: float | None = None  # s, of the last answered command by its stamp
         self._controller = controller
         self._diagnostics = Diagnostics(node, "compensator")
         self.start_window()

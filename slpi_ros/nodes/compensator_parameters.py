@@ -186,28 +186,20 @@ DECLARATIONS = (
 
 @dataclass(frozen=True)
 class CompensatorSettings:
-    """Validated settings of the compensator; tuples hold one value for each axis.
+    """Validated settings of the compensator; tuples hold one value for each axis."""
 
-    `values` holds all parameters by name, validated; a parameter that may differ between axes is a tuple. `starts` are
-    the start voltages, `reset_spans` the lowest and highest voltage (V) of the reset, and `period` is the output period
-    (s).
-    """
-
-    values: Mapping[str, Any]
+    values: Mapping[str, Any]  # all parameters by name; a tuple where axes may differ
     limits: tuple[Limits, ...]
     starts: tuple[str | float, ...]
-    reset_spans: tuple[tuple[float, float], ...]
-    period: float
+    reset_spans: tuple[tuple[float, float], ...]  # lowest and highest voltage (V) of the reset
+    period: float  # s, of the output
     time: TimestampRules
     safety: Safety
     loops: tuple[LoopSettings, ...]
 
     @classmethod
     def of(cls, given: Values) -> "CompensatorSettings":
-        """Return the settings from a mapping of parameter names to values.
-
-        UsageError if a value, or a combination of values, is not valid.
-        """
+        """Return the settings from a mapping of parameter names to values."""
         axes, values = given["axes"], validated(DECLARATIONS, given)
         if values["desired_type"] == "Float64" and len(axes) > 1:
             raise UsageError(

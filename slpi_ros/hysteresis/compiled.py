@@ -1,7 +1,4 @@
-"""Compiled (Numba) version of the engine in `turning_points` for whole paths; its results are bit-identical.
-
-Importing Numba takes about 0.5 s: import this module only where a long path is evaluated.
-"""
+"""Compiled (Numba) engine of `turning_points` for whole paths, bit-identical; its import takes about 0.5 s."""
 
 from collections.abc import Callable
 from math import asinh, inf, sinh
@@ -19,12 +16,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """Return a function that is compiled by Numba at its first call, or the function itself where Numba is missing.
-
-    The machine code is cached beside the source, or in ``NUMBA_CACHE_DIR`` or the user's cache folder; if none of these
-    is writable, every process compiles the function. Only changes of the function's own file invalidate the cache:
-    compiled functions that call each other must be in one file.
-    """
+    """Return a function that is compiled by Numba at its first call, or the function itself where Numba is missing."""
+    # The machine code is cached beside the source, or in ``NUMBA_CACHE_DIR`` or the user's cache folder; if none of
+    # these is writable, every process compiles the function. Only changes of the function's own file invalidate the
+    # cache: compiled functions that call each other must be in one file.
     njit = compilation.compiler()
     if njit is None:
         return function
@@ -223,10 +218,7 @@ def along(
     ends: FloatArray,
     knots: FloatArray,
 ) -> bool:
-    """Move a memory on its present straight piece; return whether neither its end, a loop closure nor a limit is met.
-
-    Arguments as in `moved`.
-    """
+    """Move a memory on its present straight piece; return whether no end, loop closure or limit is met."""
     s, i, other = float(at[0]), at[2], 1 - coordinate
     if i == 0 or not s * (target - point[coordinate]) > 0.0 or not s * (target - ends[coordinate, 1]) < 0.0:
         return False
@@ -257,13 +249,11 @@ def moved(
     first: FloatArray,
     branches: Branches,
 ) -> bool:
-    """Move a memory to a voltage (V; `coordinate` 0) or displacement (m; 1); return False if it cannot be reached.
-
-    It does what `Memory.forward` and `Memory.inverse` do. `at`, shape (4,), is modified in place: direction, depth of
-    the stack, index of the knot after the present point (0: `ends` and `knots` are not those of the present branch),
-    and 1 once the branch or its piece may have changed. The others are as in `through`; `point` may lie outside the
-    limits.
-    """
+    """Move a memory to a voltage (V; `coordinate` 0) or displacement (m; 1); return False if it cannot be reached."""
+    # It does what `Memory.forward` and `Memory.inverse` do. `at`, shape (4,), is modified in place: direction, depth of
+    # the stack, index of the knot after the present point (0: `ends` and `knots` are not those of the present branch),
+    # and 1 once the branch or its piece may have changed. The others are as in `through`; `point` may lie outside the
+    # limits.
     one, out, walk = np.empty(1), np.empty(1), np.empty((3, 0), dtype=np.int64)
     ways = 1 if coordinate == 0 or lower <= point[0] <= upper else 2
     for way in range(ways):
@@ -289,11 +279,8 @@ solved, followed = compiled(rate_law.solved), compiled(rate_law.followed)
 
 @compiled
 def felt(t: FloatArray, v: FloatArray, threshold: float, onset_rate: float, lead: float) -> FloatArray:
-    """Return the voltage that the hysteresis feels, shape (N,), volts, by the law of `slpi_ros.hysteresis.rate_law`.
-
-    `t` (s) and the applied voltage `v` (V) have the shape (N,). `threshold` (V) and `onset_rate` (V/s) are those of the
-    law; `lead` (V) is the difference of the two voltages, applied minus felt, at the first sample.
-    """
+    """Return the voltage that the hysteresis feels, (N,), V, by `rate_law`, for threshold (V) and onset rate (V/s)."""
+    # `lead` (V) is the difference of the two voltages, applied minus felt, at the first sample.
     felt_voltage, w, before, earlier = np.empty_like(v), 0.0, 0.0, 0.0
     u = v[0] - lead if v.size else 0.0
     for k in range(v.size):

@@ -22,19 +22,12 @@ Row = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class LoopFamily:
-    """An Everett function on a voltage grid, and the curve of the first rise.
+    """An Everett function on a voltage grid, and the curve of the first rise; ModelError if not strictly increasing."""
 
-    `grid` (V, shape (n,), n >= 2) holds the vertices, strictly increasing. ``everett[i, j] = E(grid[i], grid[j])`` (m,
-    shape (n, n)) for ``j < i`` is strictly increasing with ``i`` and strictly decreasing with ``j``; it is zero on the
-    diagonal and not used above. `rise` (m, shape (n,)) is the displacement of the first rise at the vertices, strictly
-    increasing; a constant offset has no effect. `edge_gain` (m/V), positive, is the slope of the first rise outside the
-    grid and of branches beyond it. ModelError if the shapes are inconsistent or a branch is not strictly increasing.
-    """
-
-    grid: FloatArray
-    everett: FloatArray
-    rise: FloatArray
-    edge_gain: float
+    grid: FloatArray  # V, (n,), n >= 2: vertices, strictly increasing
+    everett: FloatArray  # m, (n, n): ``E(grid[i], grid[j])`` for ``j < i``, 0 on the diagonal, unused above
+    rise: FloatArray  # m, (n,): first rise at the vertices, strictly increasing; an offset has no effect
+    edge_gain: float  # m/V, slope of the first rise outside the grid and of branches beyond it
     symmetric_rest: bool = field(default=False, init=False)
     branches: Branches = field(init=False, repr=False)
 
@@ -77,12 +70,10 @@ class LoopFamily:
         return np.array([np.append(u, u[-1] + END), np.append(f, f[-1] + END * self.edge_gain)])
 
     def branch(self, direction: int, v_turn: float) -> Curve:
-        """Return the branch that starts at `v_turn` (V): an interpolated row or column of the Everett function.
-
-        Beyond the grid the displacement between two reversals depends only on their distance, as in the classical PI
-        model, and the branches equal those at the end of the grid. A fall from far above, which erases the memory, has
-        the slope `edge_gain` down to the grid, and then follows the branch from the grid's upper end.
-        """
+        """Return the branch that starts at `v_turn` (V): an interpolated row or column of the Everett function."""
+        # Beyond the grid the displacement between two reversals depends only on their distance, as in the classical PI
+        # model, and the branches equal those at the end of the grid. A fall from far above, which erases the memory,
+        # has the slope `edge_gain` down to the grid, and then follows the branch from the grid's upper end.
         return self.branches.curve(direction, v_turn)
 
     def first_rise(self, v_rest: float) -> Curve:

@@ -48,11 +48,9 @@ def rising_envelope(u: ArrayLike, thresholds: ArrayLike) -> FloatArray:
 
 
 def falling_envelope(u: ArrayLike, thresholds: ArrayLike, amplitude: float) -> FloatArray:
-    """Return the falling envelope (V), the inner minimum of Eq. 2, limited from below by the rising envelope.
-
-    Its slope is 1 below ``u = -5 r``, 1.2 up to ``0.5 V_p + 1.5 r``, 0.8 up to ``V_p + 8 r``, and 1 beyond. `u`, above
-    `MultiSlope.origin`, `thresholds`, and `amplitude` are in volts; the first two are broadcast against each other.
-    """
+    """Return the falling envelope (V), the inner minimum of Eq. 2, limited from below by the rising envelope."""
+    # Its slope is 1 below ``u = -5 r``, 1.2 up to ``0.5 V_p + 1.5 r``, 0.8 up to ``V_p + 8 r``, and 1 beyond. `u` (V,
+    # above `MultiSlope.origin`) and `thresholds` (V) are broadcast against each other.
     u, r = np.asarray(u, dtype=np.float64), np.asarray(thresholds, dtype=np.float64)
     gentle = GENTLE * u + AMPLITUDE_SHARE * amplitude + THRESHOLD_SHARE * r
     return np.maximum(rising_envelope(u, r), np.minimum(STEEP * u, gentle))
@@ -60,23 +58,18 @@ def falling_envelope(u: ArrayLike, thresholds: ArrayLike, amplitude: float) -> F
 
 @dataclass(frozen=True)
 class MultiSlope:
-    """A weighted sum of the operators of Eq. 2, ``y = sum_k w_k f_k``.
+    """A weighted sum of the operators of Eq. 2, ``y = sum_k w_k f_k``."""
 
-    The operators start at the low end, as after a fall from far above. A memory without previous motion is valid for
-    voltages at or above its rest voltage, a primed one for all voltages.
+    # The operators start at the low end, as after a fall from far above. A memory without previous motion is valid for
+    # voltages at or above its rest voltage, a primed one for all voltages.
+    #
+    # There is no linear term: a branch is flat from its reversal until the first operator moves, except at the ends of
+    # the range. The inverse exists for every displacement, but its voltage jumps across the flat part.
 
-    There is no linear term: a branch is flat from its reversal until the first operator moves, except at the ends of
-    the range. The inverse exists for every displacement, but its voltage jumps across the flat part.
-
-    `origin` (V) is the lowest voltage of the range, at which ``u = 0``, and `amplitude` (V) the highest one relative to
-    it, ``V_p``. `thresholds` (V, shape (n,)) are ``0 <= r_1 < r_2 < ...``; `weights` (m/V, shape (n,)) are
-    non-negative, with at least one positive. ModelError if they are inconsistent.
-    """
-
-    origin: float
-    amplitude: float
-    thresholds: FloatArray
-    weights: FloatArray
+    origin: float  # V, lowest of the range, where ``u = 0``
+    amplitude: float  # V, highest of the range, relative to the origin, ``V_p``
+    thresholds: FloatArray  # V, (n,), ``0 <= r_1 < r_2 < ...``
+    weights: FloatArray  # m/V, (n,), non-negative, at least one positive
     symmetric_rest: bool = field(default=False, init=False)
     branches: Branches = field(init=False, repr=False)
     _r: FloatArray = field(init=False, repr=False)
@@ -140,10 +133,8 @@ class MultiSlope:
 
 
 def _curve(u: FloatArray, changes: FloatArray) -> Curve:
-    """Return the curve whose slope changes at the distances `u`, shape (n,), volts, by `changes`, shape (n,), m/V.
-
-    `slpi_ros.hysteresis.compiled.composed` computes the same, with the same rounding.
-    """
+    """Return the curve whose slope changes at the distances `u`, shape (n,), volts, by `changes`, shape (n,), m/V."""
+    # `slpi_ros.hysteresis.compiled.composed` computes the same, with the same rounding.
     order = np.argsort(u, kind="stable")
     u, slopes = np.append(0.0, u[order]), np.append(0.0, np.cumsum(changes[order]))
     u = np.append(u, u[-1] + END)
@@ -151,11 +142,8 @@ def _curve(u: FloatArray, changes: FloatArray) -> Curve:
 
 
 def cycles(x: FloatArray, back: float) -> list[tuple[int, int]]:
-    """Divide a path, shape (N,), N >= 1, into cycles that end at the lowest sample of each section at or below `back`.
-
-    Each cycle is given by its first and last sample; the last one is the first sample of the next cycle. The parts
-    before the first and after the last of these samples also count as cycles.
-    """
+    """Divide a path (N,) into cycles (first and last sample), at the lowest sample of each section below `back`."""
+    # The last sample of a cycle is the first of the next. The parts before the first and after the last count, too.
     low = np.concatenate([[False], x <= back, [False]])
     stretches = np.flatnonzero(low[1:] != low[:-1]).reshape(-1, 2)
     lowest = [start + int(np.argmin(x[start:stop])) for start, stop in stretches.tolist()]
@@ -164,16 +152,11 @@ def cycles(x: FloatArray, back: float) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class AmplitudeScaled:
-    """An MPI model scaled by the peak displacement ``X_p`` as a piecewise linear function of the amplitude.
+    """An MPI model scaled by the peak displacement ``X_p`` as a piecewise linear function of the amplitude."""
 
-    `base` is the model of the amplitude ``base.amplitude``. `peak_displacements` (m, shape (m,)) are ``X_p`` at the
-    amplitudes `peak_voltages` (V, shape (m,), m >= 1), relative to ``base.origin``; both are positive and strictly
-    increasing, else ModelError.
-    """
-
-    base: MultiSlope
-    peak_voltages: FloatArray
-    peak_displacements: FloatArray
+    base: MultiSlope  # of the amplitude ``base.amplitude``
+    peak_voltages: FloatArray  # V, (m,), relative to ``base.origin``, positive, strictly increasing
+    peak_displacements: FloatArray  # m, (m,), ``X_p``, positive, strictly increasing
 
     def __post_init__(self) -> None:
         """Validate the peaks."""
@@ -201,23 +184,18 @@ class AmplitudeScaled:
 
 @dataclass(frozen=True)
 class KnownPath:
-    """The SMPI model for paths known in advance: the amplitude of a cycle is known only at its peak.
+    """The SMPI model for paths known in advance: the amplitude of a cycle is known only at its peak."""
 
-    A cycle starts at the low end, at the end point of the previous cycle. Every call starts from the initial point,
-    `start_voltage` (V) and `start_displacement` (m). A voltage path is divided into cycles where it returns to the
-    origin, a displacement path where it returns to the displacement at the origin, with the same relative tolerance;
-    both divisions agree except close to the tolerance.
-    """
+    # A cycle starts at the low end, at the end point of the previous cycle. Every call starts from the initial point. A
+    # voltage path is divided into cycles where it returns to the origin, a displacement path where it returns to the
+    # displacement at the origin, with the same relative tolerance; both divisions agree except close to the tolerance.
 
     model: AmplitudeScaled
     start_voltage: float
     start_displacement: float
 
     def forward_array(self, v: FloatArray) -> FloatArray:
-        """Return the displacements, shape (N,), metres, for the voltages `v`, shape (N,), volts.
-
-        UsageError if a voltage is not finite or out of range.
-        """
+        """Return the displacements, shape (N,), metres, for the voltages `v`, shape (N,), volts."""
         v = np.asarray(v, dtype=np.float64)
         require_finite(v)
         if v.size and np.max(np.abs(v)) > FAR:
@@ -232,10 +210,7 @@ class KnownPath:
         return y
 
     def inverse_array(self, y: FloatArray, lower: float = -inf, upper: float = inf) -> FloatArray:
-        """Return the voltages, shape (N,), volts, within `lower` and `upper` (V), for the displacements `y`, metres.
-
-        UsageError if a displacement is not finite or cannot be reached by the model.
-        """
+        """Return the voltages, shape (N,), volts, within `lower` and `upper` (V), for the displacements `y`, metres."""
         y = np.asarray(y, dtype=np.float64)
         require_finite(y)
         model, v = self.model, np.empty_like(y)

@@ -1,7 +1,4 @@
-"""The play operator and the classical Prandtl-Ishlinskii (PI) model, whose branches all have the same shape.
-
-SLPI paper, Eq. 1 (play operator), Eq. 8 (PI model), Eq. 10-12 (analytic inverse, as corrected in the documentation).
-"""
+"""The play operator (SLPI paper, Eq. 1) and the classical Prandtl-Ishlinskii (PI) model (Eq. 8, inverse Eq. 10-12)."""
 
 from dataclasses import dataclass, field
 
@@ -14,16 +11,13 @@ from slpi_ros.hysteresis.shapes import END, Branches, Curve
 
 @dataclass(frozen=True)
 class PrandtlIshlinskii:
-    """A weighted sum of play operators, ``P[v] = sum_i w_i p_i[v]``; the one with threshold 0 is the linear term.
+    """A weighted sum of play operators, ``P[v] = sum_i w_i p_i[v]``; the one with threshold 0 is the linear term."""
 
-    At rest every operator is in the middle of its play and moves after ``r_i``. In a primed memory it is at the end of
-    its play, as after a long fall, and moves up after ``2 r_i``. `thresholds` (V, shape (n,)) are
-    ``0 <= r_1 < r_2 < ...``. ModelError if they and the `weights` (m/V, shape (n,)) are inconsistent, or a cumulative
-    sum of the weights is negative.
-    """
+    # At rest every operator is in the middle of its play and moves after ``r_i``. In a primed memory it is at the end
+    # of its play, as after a long fall, and moves up after ``2 r_i``.
 
-    thresholds: FloatArray
-    weights: FloatArray
+    thresholds: FloatArray  # V, (n,), ``0 <= r_1 < r_2 < ...``
+    weights: FloatArray  # m/V, (n,); no cumulative sum is negative
     symmetric_rest: bool = field(default=True, init=False)
     branches: Branches = field(init=False, repr=False)
     _branch: Curve = field(init=False, repr=False)
@@ -61,12 +55,10 @@ class PrandtlIshlinskii:
         return self._first
 
     def inverse(self) -> "PrandtlIshlinskii":
-        """Return the analytic inverse, a PI model from displacement (m) to voltage (V).
-
-        ``r'_i = sum_{j<=i} w_j (r_i - r_j)``, ``w'_1 = 1 / w_1`` and ``w'_i = -w_i / (W_{i-1} W_i)``, where ``W_i`` is
-        the sum of the first i weights (Eq. 12, the linear weight being that of threshold 0). It is valid for a memory
-        without previous motion; for a primed one use `Memory.inverse`. ModelError if the model is not invertible.
-        """
+        """Return the analytic inverse, a PI model from displacement (m) to voltage (V), or raise."""
+        # ``r'_i = sum_{j<=i} w_j (r_i - r_j)``, ``w'_1 = 1 / w_1`` and ``w'_i = -w_i / (W_{i-1} W_i)``, where ``W_i``
+        # is the sum of the first i weights (Eq. 12, the linear weight being that of threshold 0). It is valid for a
+        # memory without previous motion; for a primed one use `Memory.inverse`.
         if not self.invertible:
             raise ModelError("PI: no inverse without a threshold 0 of positive weight; add a linear term")
         r, w = self.thresholds, self.weights

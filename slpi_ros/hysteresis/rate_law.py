@@ -17,10 +17,7 @@ MOST, TOO_FAR, LARGEST = 100, 1.5, 30.0
 
 
 def solved(a: float, b: float, goal: float, guess: float) -> float:
-    """Return ``w`` of ``a sinh(w) + b w = goal`` by Chebyshev's method; `a`, `b`, `goal`: 0 or more, `a` or `b` more.
-
-    `guess` is a first value, extrapolated from the last samples; any number is valid.
-    """
+    """Return ``w`` of ``a sinh(w) + b w = goal``, all >= 0, not a = b = 0, by Chebyshev's method from any `guess`."""
     if b == 0.0:
         return asinh(goal / a)
     if a == 0.0:
@@ -48,10 +45,8 @@ def solved(a: float, b: float, goal: float, guess: float) -> float:
 
 
 def followed(threshold: float, v: float, u: float, w: float) -> float:
-    """Return the voltage that the hysteresis feels next, for the applied voltage `v`, the last one `u` (V), and `w`.
-
-    It follows without overshoot, whatever the rounding: a reversal would be remembered.
-    """
+    """Return the voltage that the hysteresis feels next, for the applied voltage `v`, the last one `u` (V), and `w`."""
+    # It follows without overshoot, whatever the rounding: a reversal would be remembered.
     if v > u:
         return min(max(v - threshold * w, u), v)
     return max(min(v + threshold * w, u), v)

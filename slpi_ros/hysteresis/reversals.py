@@ -12,13 +12,11 @@ IntArray = NDArray[np.int64]
 
 
 def reversals(x: FloatArray, dead_band: float = 0.0) -> IntArray:
-    """Return the samples at which a signal `x`, shape (N,), reverses, ascending and with its ends, shape (M,).
-
-    Reversals of at most `dead_band` (unit of `x`) are ignored: from one sample to the next, `x` changes by more than
-    that, alternately up and down. A flat extremum gives its last sample. Without a dead band the ends are the first and
-    the last sample; with one, the extrema before the first and after the last change larger than the dead band. A
-    constant signal gives only sample 0.
-    """
+    """Return the samples at which a signal `x`, shape (N,), reverses, ascending and with its ends, shape (M,)."""
+    # Reversals of at most `dead_band` (unit of `x`) are ignored: from one sample to the next, `x` changes by more than
+    # that, alternately up and down. A flat extremum gives its last sample. Without a dead band the ends are the first
+    # and the last sample; with one, the extrema before the first and after the last change larger than the dead band. A
+    # constant signal gives only sample 0.
     if not x.size:
         return np.empty(0, dtype=np.int64)
     candidates = np.append(0, _run_ends(x)[1:])
@@ -43,11 +41,8 @@ def reversals(x: FloatArray, dead_band: float = 0.0) -> IntArray:
 
 
 def monotone_runs(x: FloatArray) -> list[tuple[int, int]]:
-    """Divide `x`, shape (N,), into monotone runs ``start:stop``.
-
-    The first sample and the equal samples after it form a run of their own; later equal neighbours belong to the
-    preceding run.
-    """
+    """Divide `x`, (N,), into monotone runs ``start:stop``; the first sample and its equals are a run of their own."""
+    # Later equal neighbours belong to the preceding run.
     return list(pairwise([0, *(_run_ends(x) + 1).tolist()])) if x.size else []
 
 

@@ -14,10 +14,9 @@ END = 4 * FAR
 
 
 class Curve(NamedTuple):
-    """A branch shape ``F`` as knots (V, m), increasing from ``u[0] = f[0] = 0``; the last lies `END` beyond the others.
+    """A branch shape ``F`` as knots (V, m), increasing from ``u[0] = f[0] = 0``; the last `END` beyond the others."""
 
-    The knots are stored as lists for a fast scalar search and as an array, shape (2, k).
-    """
+    # The knots are stored as lists for a fast scalar search and as an array, shape (2, k).
 
     u: list[float]
     f: list[float]
@@ -31,23 +30,17 @@ class Curve(NamedTuple):
 
 
 class Branches(NamedTuple):
-    """All branches of a shape as arrays, for the compiled engine; first index 0 rising, 1 falling.
+    """All branches of a shape as arrays, for the compiled engine; index 0 rising, 1 falling (voltages negated)."""
 
-    Voltages of the falling branches are negated. A branch is interpolated between vertices or composed of operators.
+    # A branch is interpolated between vertices or composed of operators. Row k of `knots`, `change` and `last` is for
+    # branches that start above vertex k - 1, up to vertex k.
 
-    `vertices` (V, shape (2, n)) ascend; row k of the other arrays is for branches that start above vertex k - 1, up to
-    vertex k. `knots` (V and m, shape (2, n + 1, 2, m)) are those of the branch that starts at vertex k, `change` (same
-    shape) their derivative with respect to the distance (V) of the start below vertex k, and `last` (shape (2, n + 1))
-    the index of the last one. `operators`, shape (2, k), are the thresholds (V) and weights (m/V) of a `MultiSlope`
-    model, `scale` its origin and amplitude (V).
-    """
-
-    vertices: FloatArray = np.empty((2, 0))
-    knots: FloatArray = np.empty((2, 0, 2, 0))
-    change: FloatArray = np.empty((2, 0, 2, 0))
-    last: NDArray[np.int64] = np.empty((2, 0), dtype=np.int64)
-    operators: FloatArray = np.empty((2, 0))
-    scale: tuple[float, float] = (0.0, 0.0)
+    vertices: FloatArray = np.empty((2, 0))  # V, (2, n), ascending
+    knots: FloatArray = np.empty((2, 0, 2, 0))  # V and m, (2, n + 1, 2, m), from vertex k
+    change: FloatArray = np.empty((2, 0, 2, 0))  # their derivative with respect to the start's distance (V) below k
+    last: NDArray[np.int64] = np.empty((2, 0), dtype=np.int64)  # (2, n + 1), index of the last knot
+    operators: FloatArray = np.empty((2, 0))  # (2, k): thresholds (V), weights (m/V) of `MultiSlope`
+    scale: tuple[float, float] = (0.0, 0.0)  # V, its origin and amplitude
 
     @classmethod
     def interpolated(cls, vertices: FloatArray, rows: Sequence[Sequence[tuple[FloatArray, FloatArray]]]) -> "Branches":
@@ -74,10 +67,8 @@ class Shape(Protocol):
 
     @property
     def symmetric_rest(self) -> bool:
-        """Whether the first loop closes at the mirror image of its reversal about the rest point (symmetric rest).
-
-        If not, the rest point is the low end of all loops: a rise after a fall from rest closes at the rest point.
-        """
+        """Whether the first loop closes at the mirror image of its reversal about the rest point (symmetric rest)."""
+        # If not, the rest point is the low end of all loops: a rise after a fall from rest closes at the rest point.
 
     @property
     def branches(self) -> Branches:

@@ -37,23 +37,15 @@ class UnidentifiedLoopWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Loop:
-    """One separated loop.
+    """One separated loop."""
 
-    `level` is 0 for the outer loop, else one more than that of the loop that contains the vertex, whose index is
-    `below` (0 for the outer loop). `vertex` is the sample at which the loop starts, and `direction` that of the first
-    move from there: +1 rising, -1 falling. `samples`, shape (m,), are those of this loop without its inner loops, in
-    order; a vertex belongs to the loop that contains it, except for that of the outer loop, sample 0. `joined`, shape
-    (n,), are the samples of this loop that are vertices of separated inner loops. `closed` is whether the voltage
-    returned to the vertex; the outer loop is open by definition.
-    """
-
-    level: int
-    vertex: int
-    direction: int
-    samples: IntArray
-    joined: IntArray
-    closed: bool
-    below: int
+    level: int  # 0: outer loop, else one more than that of the loop `below`
+    vertex: int  # sample at which the loop starts
+    direction: int  # of the first move from there: 1 rising, -1 falling
+    samples: IntArray  # (m,), without inner loops; a vertex belongs to the loop that contains it
+    joined: IntArray  # (n,), samples of this loop that are vertices of separated inner loops
+    closed: bool  # the voltage returned to the vertex; the outer loop is open by definition
+    below: int  # index of the loop that contains the vertex; 0 for the outer loop
 
     @property
     def path(self) -> IntArray:
@@ -64,21 +56,14 @@ class Loop:
 
 @dataclass(frozen=True)
 class Separation:
-    """A record separated into loops, ``NewData(k) = [k, v, d, tr, lv, sp]`` (Eq. 4); arrays of shape (N,).
+    """A record separated into loops, ``NewData(k) = [k, v, d, tr, lv, sp]`` (Eq. 4); arrays of shape (N,)."""
 
-    `voltage` (V) is without the reversals within the dead band; `displacement` is in metres. `phase` (``tr``) is +1
-    boost (rising) or -1 back (falling); a reversal belongs to the phase that it starts. `level` (``lv``) is the number
-    of suspected vertices at that time. It is one higher for loops in the back phase of the outer loop than in its boost
-    phase; `Loop.level` is the nesting depth instead. `vertex` (``sp``) is 0 none, 1 suspected, 2 true vertex. `loops`
-    holds the outer loop first, then the others in the order of their vertices.
-    """
-
-    voltage: FloatArray
-    displacement: FloatArray
-    phase: IntArray
-    level: IntArray
-    vertex: IntArray
-    loops: tuple[Loop, ...]
+    voltage: FloatArray  # V, without the reversals within the dead band
+    displacement: FloatArray  # m
+    phase: IntArray  # ``tr``: 1 boost (rising), -1 back; a reversal belongs to the phase that it starts
+    level: IntArray  # ``lv``: suspected vertices, one more in the back phase of the outer loop
+    vertex: IntArray  # ``sp``: 0 none, 1 suspected, 2 true vertex
+    loops: tuple[Loop, ...]  # the outer one, then in the order of their vertices
 
     def table(self) -> FloatArray:
         """Return ``[k, v, d, tr, lv, sp]``, shape (N, 6), as floats."""
@@ -88,13 +73,9 @@ class Separation:
 
 
 def separate(voltage: FloatArray, displacement: FloatArray | None = None, *, dead_band: float = 0.0) -> Separation:
-    """Separate a record into single loops.
-
-    `voltage` (V, shape (N,)) starts at rest at the vertex of the outer loop; for a desired path, pass the desired
-    displacement instead. `displacement` (m, shape (N,)) is stored in the result without being used. Reversals of at
-    most `dead_band` (V) are treated as measurement noise. RecordError if there is no sample, or the lengths differ;
-    UsageError if a voltage is not finite.
-    """
+    """Separate a record (V, (N,)) that starts at rest at the vertex of the outer loop into single loops."""
+    # For a desired path, pass the desired displacement as voltage. `displacement` (m, (N,)) is stored in the result
+    # without being used. Reversals of at most `dead_band` (V) are treated as measurement noise.
     v = np.asarray(voltage, dtype=np.float64)
     d = np.zeros_like(v) if displacement is None else np.asarray(displacement, dtype=np.float64)
     if v.ndim != 1 or v.shape != d.shape or not v.size:
@@ -112,10 +93,8 @@ def separate(voltage: FloatArray, displacement: FloatArray | None = None, *, dea
 def _judge(
     v: FloatArray, phase: IntArray, level: IntArray, vertex: IntArray
 ) -> tuple[list[tuple[int, int]], list[int]]:
-    """Find the closed loops, as pairs of vertex and closing sample, and the remaining suspected vertices.
-
-    The columns `phase`, `level` and `vertex` of the `Separation` are written in place.
-    """
+    """Find the closed loops, as pairs of vertex and closing sample, and the remaining suspected vertices."""
+    # The columns `phase`, `level` and `vertex` of the `Separation` are written in place.
     suspects: list[int] = []
     closed: list[tuple[int, int]] = []
     now = 1
@@ -170,24 +149,22 @@ def _loops(closed: list[tuple[int, int]], suspects: list[int], falls_first: bool
 
 @dataclass(frozen=True)
 class SingleLoop:
-    """One identified loop; pairs are in volts and metres.
+    """One identified loop; pairs are in volts and metres."""
 
-    `level` and `direction` are as in `Loop`. `vertex` is the start of the loop, and `span` the distance from there to
-    its farthest point, both positive. `offset` is the distance of the vertex from the model of the containing loop, in
-    voltage at the same displacement and in displacement at the same voltage: every loop keeps its measured position, so
-    that errors do not propagate. The coordinates of `model` are zero at the vertex and increase along the loop.
-
-    With a `run_in` (V) of None the play operators start at rest, as published; an inner loop then misses its vertex by
-    ``sum w_i r_i``. With 0 they start primed and move after ``2 r``, as after a reversal; the loop closes. If positive,
-    they are primed this far below the vertex and driven up to it, for an outer loop with an initial history.
-    """
+    # `offset` is in voltage at the same displacement and in displacement at the same voltage: every loop keeps its
+    # measured position, so that errors do not propagate.
+    #
+    # With a `run_in` (V) of None the play operators start at rest, as published; an inner loop then misses its vertex
+    # by ``sum w_i r_i``. With 0 they start primed and move after ``2 r``, as after a reversal; the loop closes. If
+    # positive, they are primed this far below the vertex and driven up to it, for an outer loop with an initial
+    # history.
 
     level: int
     direction: int
-    vertex: tuple[float, float]
-    span: tuple[float, float]
-    offset: tuple[float, float]
-    model: PrandtlIshlinskii
+    vertex: tuple[float, float]  # start of the loop
+    span: tuple[float, float]  # distance from there to its farthest point, positive
+    offset: tuple[float, float]  # distance of the vertex from the model of the containing loop
+    model: PrandtlIshlinskii  # its coordinates are zero at the vertex and increase along the loop
     run_in: float | None
 
     def memory(self) -> Memory:
@@ -207,14 +184,10 @@ def at_vertex(model: PrandtlIshlinskii, run_in: float | None) -> Memory:
 
 @dataclass(frozen=True)
 class SeparatedLoops:
-    """The identified loops of an axis, at least one of level 0.
-
-    Reversals of at most `dead_band` (V) are treated as measurement noise. ModelError if there is no outer loop, or a
-    loop has no extent or no inverse.
-    """
+    """The identified loops of an axis, at least one of level 0."""
 
     loops: tuple[SingleLoop, ...]
-    dead_band: float = 0.0
+    dead_band: float = 0.0  # V; smaller reversals are measurement noise
 
     def __post_init__(self) -> None:
         """Validate the loops."""
@@ -242,11 +215,8 @@ class SeparatedLoops:
         return max(loop.span for loop in self.loops if loop.level == 0)
 
     def nearest(self, level: int, direction: int, vertex: float, span: float, coordinate: int) -> SingleLoop:
-        """Return the identified loop nearest to a loop of a path.
-
-        `vertex` and `span` are in volts (`coordinate` 0) or metres (`coordinate` 1). A `level` or `direction` that
-        differs adds half the outer loop's span to the distance.
-        """
+        """Return the identified loop nearest to a loop of a path; vertex and span in V (`coordinate` 0) or m (1)."""
+        # A `level` or `direction` that differs adds half the outer loop's span to the distance.
         scale = self.outer_span[coordinate]
 
         def distance(loop: SingleLoop) -> float:
@@ -272,17 +242,11 @@ class KnownPath:
         self._start = start
 
     def forward_array(self, v: FloatArray) -> FloatArray:
-        """Return the displacements, shape (N,), metres, along the voltages `v`, shape (N,), volts.
-
-        UnidentifiedLoopWarning if the path contains loops that were not identified.
-        """
+        """Return displacements (m, (N,)) along voltages (V); UnidentifiedLoopWarning: a loop was not identified."""
         return self._through(v, 0)
 
     def inverse_array(self, y: FloatArray, lower: float = -np.inf, upper: float = np.inf) -> FloatArray:
-        """Return the voltages, shape (N,), volts, for the displacements `y`, shape (N,), metres, within limits (V).
-
-        UnidentifiedLoopWarning if the path contains loops that were not identified.
-        """
+        """Return the voltages (V, (N,)) within limits for displacements (m), with the warning of `forward_array`."""
         return np.clip(self._through(y, 1), lower, upper)
 
     def _through(self, x: FloatArray, coordinate: int) -> FloatArray:

@@ -45,11 +45,9 @@ class MemoryState:
 
 
 class Memory:
-    """Reversal memory of one axis, driven by voltage (`forward`) or by displacement (`inverse`).
+    """Reversal memory of one axis, driven by voltage (`forward`) or by displacement (`inverse`)."""
 
-    `rest_voltage` (V) and `rest_displacement` (m) are the initial point. If `primed`, it was reached by a long fall,
-    which erased the memory, else there was no previous motion.
-    """
+    # The initial point was reached, if `primed`, by a long fall, which erased the memory, else without previous motion.
 
     __slots__ = (
         *("_shape", "_rest", "_far", "_turns", "_turn_curves", "_direction", "_v", "_y"),
@@ -130,10 +128,7 @@ class Memory:
         self._enter_branch(older)
 
     def _enter_branch(self, known: Curve | None = None) -> None:
-        """Set the branch from the last reversal in the current direction, and its closing point.
-
-        `known` is the cached curve of this branch, if available.
-        """
+        """Set the branch from the last reversal, of a cached curve if `known`, and its closing point."""
         s, shape = self._direction, self._shape
         v_turns, y_turns = self._turns
         if v_turns:
@@ -159,10 +154,7 @@ class Memory:
         return (v_rest, y_rest) if s > 0 else (-inf, -inf)
 
     def forward(self, v: float) -> float:
-        """Move to the voltage `v` (V) and return the displacement (m).
-
-        UsageError if `v` is not finite or out of range; the memory is unchanged.
-        """
+        """Move to the voltage `v` (V) and return the displacement (m), or raise unchanged."""
         s = self._direction
         u = s * (v - self._v0)
         if not (s * (v - self._v) > 0.0 and u < self._reach_u):
@@ -183,11 +175,8 @@ class Memory:
         return y
 
     def inverse(self, y: float, lower: float = -inf, upper: float = inf) -> float:
-        """Move to the displacement `y` (m), or as near as `lower` and `upper` (V) allow; return that voltage (V).
-
-        The memory follows the returned voltage: for an unreachable displacement it stays at the limit. UsageError if
-        `y` is not finite or out of range; the memory is unchanged.
-        """
+        """Move to the displacement `y` (m), or as near as limits (V) allow; return the voltage, or raise unchanged."""
+        # The memory follows the returned voltage: for an unreachable displacement it stays at the limit.
         s = self._direction
         f = s * (y - self._y0)
         if not (s * (y - self._y) > 0.0 and f < self._reach_f):
@@ -221,13 +210,11 @@ class Memory:
     def inverse_of_law(
         self, y: float, gain: float, threshold: float, scale: float, lower: float, upper: float, guess: float
     ) -> float:
-        """Move to the voltage ``u`` at which displacement plus ``gain w`` is `y` (m), and return ``w``.
-
-        Here ``w = asinh(d / scale)`` for the change ``d`` (V) of ``u``; see `slpi_ros.hysteresis.rate_law`. The applied
-        voltage ``u + threshold w`` stays within `lower` and `upper` (V): where they hold it back, ``u`` follows it by
-        the law. `gain` is in metres, `threshold` and `scale`, more than 0, in volts; `guess` is a first value of the
-        magnitude of ``w``. UsageError if `y` is not finite or out of range; the memory is unchanged.
-        """
+        """Move to the voltage ``u`` at which displacement plus ``gain w`` is `y` (m); return ``w`` or raise."""
+        # Here ``w = asinh(d / scale)`` for the change ``d`` (V) of ``u``; see `slpi_ros.hysteresis.rate_law`. The
+        # applied voltage ``u + threshold w`` stays within `lower` and `upper` (V): where they hold it back, ``u``
+        # follows it by the law. `gain` is in metres, `threshold` and `scale`, more than 0, in volts; `guess` is of the
+        # magnitude of ``w``.
         if not abs(y - self._rest[1]) < self._far[1]:
             raise UsageError(f"displacement {y} m is out of range; leave such samples out")
         start, s = self._v, 1 if y > self._y else -1
@@ -284,10 +271,7 @@ class Memory:
         return self._through(v, 0, -inf, inf)
 
     def inverse_array(self, y: FloatArray, lower: float = -inf, upper: float = inf) -> FloatArray:
-        """Move through the displacements `y`, shape (N,), metres; return the voltages, shape (N,), volts.
-
-        `lower` and `upper` (V) limit the voltage as in `inverse`.
-        """
+        """Move through the displacements `y`, (N,), m; return the voltages, (N,), V, limited as in `inverse`."""
         return self._through(y, 1, lower, upper)
 
     def _through(self, x: FloatArray, coordinate: int, lower: float, upper: float) -> FloatArray:
@@ -336,10 +320,8 @@ class Memory:
     def inverse_of_law_array(
         self, dt: FloatArray, h: FloatArray, law: FloatArray, limits: tuple[float, float]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the voltages (V) before a rate law, and the displacements (m) that they reach, shape (N,) each.
-
-        `slpi_ros.hysteresis.compiled.through_law` describes the arguments. The memory itself does not move.
-        """
+        """Return the voltages (V) before a rate law, and the displacements (m) that they reach, shape (N,) each."""
+        # `slpi_ros.hysteresis.compiled.through_law` describes the arguments. The memory itself does not move.
         from slpi_ros.hysteresis.compiled import through_law
 
         v, reached = np.empty_like(h), np.empty_like(h)

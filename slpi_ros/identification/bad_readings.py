@@ -1,7 +1,4 @@
-"""Detection of wrong sensor readings: repeated values, outliers, and stale, early, late and mixed readings.
-
-All tests take the voltage into account: a displacement may rest or reverse where the voltage does.
-"""
+"""Wrong sensor readings: repeated, outlying, stale, early, late and mixed ones; a rest of the voltage explains one."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -79,12 +76,9 @@ class Repeats:
 
 
 def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: float) -> Repeats:
-    """Return the runs of equal displacement readings that indicate a frozen sensor.
-
-    Either the voltage changed so much that the displacement must have moved, or a run of this length is improbable
-    given the noise. Displacement `y` (m) and voltage `v` (V) have shape (N,); `gain` (m/V) is the mean gain of the
-    stage, and `noise_rms` and `step` (m) are the noise and the resolution of the displacement.
-    """
+    """Return the runs of equal displacements (m) that indicate a frozen sensor; noise (rms) and resolution in m."""
+    # Either the voltage changed so much that the displacement must have moved, or a run of this length is improbable
+    # given the noise.
     repeats = Repeats.within(y)
     moved = repeats.spans(v)
     due = LEAST_GAIN * gain * moved > 3.0 * step + 6.0 * noise_rms
@@ -96,10 +90,7 @@ def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: fl
 
 
 def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return repeated readings, in runs of three or more, of a displacement `y` (m) with noise above its resolution.
-
-    If the noise is below the resolution, repeats are expected and none is returned. `v` (V) is the voltage.
-    """
+    """Return repeated displacements (m), in runs of three or more; none if the noise is below the resolution."""
     repeats = Repeats.within(y)
     if not np.any(repeats.length > 2):
         return np.empty(0, np.int64)
@@ -117,10 +108,8 @@ def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
 
 
 def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repeats:
-    """Return the runs of equal voltage readings during which the displacement moves and after which the voltage jumps.
-
-    Parameters as for `frozen`. A hold after a voltage jump is excluded: there the displacement still follows the jump.
-    """
+    """Return the runs of equal voltages (V) in which the displacement (m) moves and after which the voltage jumps."""
+    # A hold after a voltage jump is excluded: there the displacement still follows the jump.
     repeats = Repeats.within(v)
     moved = repeats.spans(y) / gain
     last = repeats.first + repeats.length - 1
@@ -131,11 +120,9 @@ def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repe
 
 
 def far_outliers(v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices of large outliers in `v` (V) and `y` (m), shape (N,), that the other signal does not explain.
-
-    Unlike `lone_outliers`, this needs no noise estimate, which such large outliers would distort. Readings where both
-    signals are suddenly 0 are outliers of both: a lost message, and no motion that the other signal explains.
-    """
+    """Return the indices of large outliers in `v` (V) and `y` (m), (N,), that the other signal does not explain."""
+    # Unlike `lone_outliers`, this needs no noise estimate, which such large outliers would distort. Readings where both
+    # signals are suddenly 0 are outliers of both: a lost message, and no motion that the other signal explains.
     found = np.zeros((2, v.size), dtype=bool)
     zero = (v == 0.0) & (y == 0.0)
     for _ in range(_PASSES):
@@ -190,12 +177,8 @@ def _running_median(x: FloatArray) -> FloatArray:
 
 
 def outliers_by_model(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
-    """Return the indices of displacement readings with a sudden deviation from a model that no reversal explains.
-
-    This includes groups of outliers and outliers at kinks, which cannot be distinguished from motion without a model.
-    `path` is the displacement of the model (m), `y` the measured displacement (m) and `v` the voltage (V), shape (N,)
-    each.
-    """
+    """Return the indices of displacements (m) that deviate suddenly from a model's (m), which no reversal explains."""
+    # This includes groups of outliers and outliers at kinks, which cannot be distinguished from motion without a model.
     kept = np.arange(y.size)
     for _ in range(_PASSES):
         # Neighbouring outliers mask each other.
@@ -259,12 +242,8 @@ def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:
 def lone_of(
     t: FloatArray, v: FloatArray, y: FloatArray, at_kinks: bool = True
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices of the isolated outliers of a voltage and of a displacement.
-
-    An outlier of both signals at the same sample is attributed to the voltage, which the displacement follows. Times
-    `t` (s), voltage `v` (V) and displacement `y` (m) have shape (N,), and neither signal is constant. `at_kinks`
-    applies to the displacement, as in `lone_outliers`.
-    """
+    """Return the indices of the isolated outliers of a voltage (V) and of a displacement (m), neither constant."""
+    # An outlier of both signals at the same sample is attributed to the voltage, which the displacement follows.
     gain, noise_v, noise_y = spread(y) / spread(v), noise(v, t), noise(y, v, t)
     if noise_y < ROUND_OFF * spread(y):
         # Without noise, the usual distance from the neighbours, by curvature or by digits, stands in its place.
@@ -278,11 +257,8 @@ def lone_of(
 def lone_outliers(
     y: FloatArray, v: FloatArray, gain: float, noise_y: float, noise_v: float, at_kinks: bool = True
 ) -> NDArray[np.int64]:
-    """Return the readings that deviate from a line through their four neighbours although the voltage does not.
-
-    Return indices into displacement `y` (m) and voltage `v` (V), shape (N,); `noise_y` and `noise_v` are their rms
-    noise, and `gain` is in m/V. `at_kinks` includes readings that a kink in the displacement plus noise could explain.
-    """
+    """Return the readings that deviate from a line through their four neighbours although the voltage does not."""
+    # `at_kinks` includes readings that a kink in the displacement plus noise (rms, m and V) could explain.
     if not noise_y:
         return np.empty(0, np.int64)
     deviations = -float(ndtri(0.5 * FALSE_ALARMS / y.size)) * noise_y
@@ -306,11 +282,9 @@ def lone_outliers(
 def _outliers_at_start(
     y: FloatArray, v: FloatArray, gain: float, limit: float, follows: bool = True
 ) -> NDArray[np.int64]:
-    """Return which of the first two readings deviate from a line through the next five although the voltage does not.
-
-    `y`, `v` and `gain` as for `lone_outliers`; `limit` (m) is the largest deviation of a reading from the mean of four
-    others by noise. If `follows`, one signal may jump at the start and the other follow later.
-    """
+    """Return which of the first two readings deviate from a line through the next five, but not the voltage."""
+    # `limit` (m) is the largest deviation of a reading from the mean of four others by noise. If `follows`, one signal
+    # may jump at the start and the other follow later.
     at, inner = np.arange(2), np.arange(2, 7)
     off = np.abs(y[at] - np.polyval(np.polyfit(inner, y[inner], 1), at))
     near = np.arange(_WINDOW)
@@ -361,10 +335,8 @@ def _off_neighbours(x: FloatArray) -> FloatArray:
 
 
 def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArray[np.int64]:
-    """Return the outliers that are equal, within the noise, to one of the preceding readings.
-
-    If outliers match later readings almost as often, the matches are coincidental and none is returned.
-    """
+    """Return the outliers that are equal, within the noise, to one of the preceding readings."""
+    # If outliers match later readings almost as often, the matches are coincidental and none is returned.
     near = 3.0 * np.sqrt(2.0) * noise_rms
     reach = np.arange(1, _EARLIER + 1)
     earlier, later = (
@@ -389,24 +361,18 @@ _MIXED_MOST = 1.3
 
 
 class Mixed(NamedTuple):
-    """Readings of a displacement that are early, late or a mixture of two neighbouring values.
+    """Readings of a displacement that are early, late or a mixture of two neighbouring values."""
 
-    `readings`, shape (M,), are their indices; `judged` is the number of readings tested, which are those not next to a
-    reversal. `side` is 1 if they are mixed with the next reading, -1 if with the preceding one, 0 if none were found.
-    """
-
-    readings: NDArray[np.int64]
-    judged: int
-    side: int
+    readings: NDArray[np.int64]  # indices
+    judged: int  # number of readings tested: those not next to a reversal
+    side: int  # 1: mixed with the next reading, -1: with the preceding one, 0: none found
 
 
 def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
-    """Find the readings of a displacement `y` (m) that are early, late or a mixture of two neighbouring values.
-
-    Such a reading lies between its true value and that of a neighbour: a data link has delivered an old value or parts
-    of two values. Unlike noise and outliers, all deviate towards the next reading, or all towards the preceding one.
-    The voltage `v` (V) and `y` have shape (N,).
-    """
+    """Find the readings of a displacement (m, (N,)) that are early, late or a mixture of two neighbouring values."""
+    # Such a reading lies between its true value and that of a neighbour: a data link has delivered an old value or
+    # parts of two values. Unlike noise and outliers, all deviate towards the next reading, or all towards the preceding
+    # one.
     off, way = _beside_lines(y[:ENOUGH], v[:ENOUGH])
     clear = np.abs(way) * _MIXED_NOISE > median_rms(off[way != 0.0]) if way.any() else way != 0.0
     count = int(np.count_nonzero(clear))
@@ -427,11 +393,7 @@ def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
 
 
 def mixed_by_model(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> NDArray[np.int64]:
-    """Return the mixed readings among the `fitted` ones by comparison with a model, including those near reversals.
-
-    `path` and `y` are the displacement of the model and the measured one (m), shape (N,); `fitted` is a mask of shape
-    (N,), and `side` is as in `Mixed`.
-    """
+    """Return the mixed ones of the `fitted` readings, also near reversals, by the displacement of a model (m, (N,))."""
     at = np.flatnonzero(fitted)
     off = (y - path)[at]
     # The error of the model itself is similar in neighbouring readings.
@@ -450,10 +412,7 @@ def _mixed(off: FloatArray, way: FloatArray, least: float) -> NDArray[np.int64]:
 
 
 def _beside_lines(y: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the deviation of each reading from a line through its neighbours, and its step, both (N,), metres.
-
-    The step is the displacement from one reading to the next. Both are 0 where the voltage is not monotone.
-    """
+    """Return deviations (m) of readings from lines through their neighbours, and steps (m), (N,); 0 at turns."""
     width = 2 * _BESIDE + 1
     off, way = np.zeros(y.size), np.zeros(y.size)
     if y.size < 2 * width:

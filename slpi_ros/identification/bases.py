@@ -131,12 +131,10 @@ class SurfaceBasis:
 
     @cached_property
     def roughness(self) -> sp.csr_array:
-        """Rows of the roughness penalty, shape (r, size + 1).
-
-        Third differences along branches penalise uneven loops; second differences along the diagonal penalise uneven
-        change of the loops from vertex to vertex (zero for the classical PI model); the first rise is penalised for
-        curvature and for deviation from the rise that starts at the low end.
-        """
+        """Rows of the roughness penalty, shape (r, size + 1)."""
+        # Third differences along branches penalise uneven loops; second differences along the diagonal penalise uneven
+        # change of the loops from vertex to vertex (zero for the classical PI model); the first rise is penalised for
+        # curvature and for deviation from the rise that starts at the low end.
         n, column, rise = self.grid.size, self._column, self._rise_columns
         i, j = np.tril_indices(n, -1)
         scale = n / REFERENCE_VERTICES

@@ -1,8 +1,4 @@
-"""Held-out error of a model by cross-validation, overall and by loop level, voltage region and speed.
-
-For comparison, the report includes the held-out error of the classical PI model on the same blocks, and the
-repeatability floor of the record, a lower bound for the error of any model.
-"""
+"""Held-out error of a model and of the classical PI model by cross-validation, overall and by class of samples."""
 
 import warnings
 from collections.abc import Iterator, Sequence
@@ -40,17 +36,13 @@ _SPEED_REACH = 2
 
 @dataclass(frozen=True)
 class Slice:
-    """Held-out errors (m) of one class of samples.
-
-    `rms` and `maximum` (absolute) are of the model; `classical_rms` is of the classical PI model, NaN where it could
-    not be fitted.
-    """
+    """Held-out errors (m) of one class of samples."""
 
     name: str
     samples: int
     rms: float
-    maximum: float
-    classical_rms: float
+    maximum: float  # absolute
+    classical_rms: float  # of the classical PI model, NaN where it could not be fitted
 
     def line(self) -> str:
         """Return the errors as a line of the table, in nanometres."""
@@ -60,25 +52,19 @@ class Slice:
 
 @dataclass(frozen=True)
 class CrossValidationReport:
-    """Held-out errors of a model, free-run, in total and by class.
-
-    `floor` is the repeatability floor of the record, for several records the median of their floors. The slices are by
-    nesting level of the loop (0 is the outer loop), by voltage region in ascending order, and by the magnitude of dv/dt
-    in ascending order from rest. The arrays hold the held-out samples, shape (M,): time from the first stamp of each
-    record (s), voltage (V), and the errors (m, model minus measured) of the model and of the `classical` PI model.
-    """
+    """Held-out errors of a model, free-run, in total and by class; the arrays hold the held-out samples, (M,)."""
 
     axis: str
     kind: str
-    floor: Floor
+    floor: Floor  # of the record, or the median of several
     overall: Slice
-    by_level: tuple[Slice, ...]
-    by_region: tuple[Slice, ...]
-    by_speed: tuple[Slice, ...]
-    t: FloatArray
-    v: FloatArray
-    error: FloatArray
-    classical: FloatArray
+    by_level: tuple[Slice, ...]  # by nesting of the loop, 0 is the outer one
+    by_region: tuple[Slice, ...]  # by voltage, ascending
+    by_speed: tuple[Slice, ...]  # by the magnitude of dv/dt, ascending from rest
+    t: FloatArray  # s, from the first stamp of each record
+    v: FloatArray  # V
+    error: FloatArray  # m, model minus measured
+    classical: FloatArray  # m, of the classical PI model
 
     def lines(self) -> list[str]:
         """Return the held-out errors as a text table, in nanometres."""
@@ -110,11 +96,7 @@ def cross_validate(
     stop: float | None = None,
     loops_at_rest: bool = False,
 ) -> CrossValidationReport:
-    """Cross-validate a kind of model on a thinned record: fit all folds but one, evaluate the error on that fold.
-
-    Several records are fitted together; `kind`, `start`, `stop` and `loops_at_rest` are as for `slpi_ros.identify`.
-    SlpiError if the record does not allow a fit.
-    """
+    """Cross-validate a kind of model on thinned records: fit all folds but one, evaluate the error on that fold."""
     records = [record] if isinstance(record, Record) else list(record)
     fit = fit_of(kind, loops_at_rest=loops_at_rest)
     parts = [_Part.of(one, axis, start, stop, SAMPLES // len(records)) for one in records]

@@ -21,17 +21,12 @@ from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, trace
 
 @dataclass(frozen=True)
 class Walk:
-    """Hysteresis branch of each sample of a voltage `v` (V); all arrays have shape (N,).
+    """Hysteresis branch of each sample of a voltage; all arrays have shape (N,)."""
 
-    `origin` is the sample at which the branch started, or `AT_REST` or `LONG_FALL`; `direction` is +1 for rising, -1
-    for falling, 0 for samples before the first motion. `first` is the index of the first sample of the record to which
-    the sample belongs.
-    """
-
-    v: FloatArray
-    origin: NDArray[np.int64]
-    direction: NDArray[np.int64]
-    first: NDArray[np.int64]
+    v: FloatArray  # V
+    origin: NDArray[np.int64]  # the sample at which the branch started, or `AT_REST` or `LONG_FALL`
+    direction: NDArray[np.int64]  # 1: rising, -1: falling, 0: before the first motion
+    first: NDArray[np.int64]  # the first sample of the record
 
     @classmethod
     def along(cls, v: FloatArray, *, symmetric_rest: bool, primed: bool) -> "Walk":
@@ -78,14 +73,10 @@ class Walk:
 
 @dataclass(frozen=True)
 class Design:
-    """Design matrix of the linear prediction: one column per parameter, then each record's displacement at rest.
+    """Design matrix of the linear prediction: one column per parameter, then each record's displacement at rest."""
 
-    `local`, shape (N, p), holds the increments along the branch of each sample; `turns` are the samples at which
-    branches start (reversals), in ascending order.
-    """
-
-    local: sp.csr_array
-    turns: NDArray[np.int64]
+    local: sp.csr_array  # (N, p): increments along the branch of each sample
+    turns: NDArray[np.int64]  # reversals, samples at which branches start, ascending
     walk: Walk
 
     @cached_property

@@ -24,15 +24,11 @@ _SMALLEST_TURN, _LARGEST_DEAD_BAND = 0.005, 0.1
 
 @dataclass(frozen=True)
 class Runs:
-    """Monotone runs of the voltage between reversals.
+    """Monotone runs of the voltage between reversals."""
 
-    `ends`, shape (M + 1,), are the samples at which the runs begin and end, as from `reversals`; `swing` (V, signed)
-    and `duration` (s) of the runs have shape (M,).
-    """
-
-    ends: IntArray
-    swing: FloatArray
-    duration: FloatArray
+    ends: IntArray  # (M + 1,), samples at which the runs begin and end, as from `reversals`
+    swing: FloatArray  # V, signed, (M,)
+    duration: FloatArray  # s, (M,)
 
     @classmethod
     def of(cls, t: FloatArray, v: FloatArray, dead_band: float) -> "Runs":
@@ -47,10 +43,7 @@ class Runs:
 
     @property
     def speeds(self) -> tuple[float, ...]:
-        """Distinct speeds (V/s) of runs with similar voltage change, in ascending order.
-
-        Of all voltage changes, the one with the largest number of distinct speeds is used.
-        """
+        """Distinct speeds (V/s), ascending, of the runs with that voltage change which has the most of them."""
         timed = (self.duration > 0.0) & (self.swing != 0.0)
         swing, speed = np.abs(self.swing[timed]), np.abs(self.swing[timed]) / self.duration[timed]
         best: tuple[float, ...] = ()
@@ -103,10 +96,7 @@ def hold_band(v: FloatArray, noise: float, digit: float) -> float:
 
 
 def resting(t: FloatArray, v: FloatArray, band: float) -> tuple[IntArray, IntArray]:
-    """Find the holds: 0.5 s or more in which the voltage `v`, shape (N,), at times `t` (s) varies by up to `band` (V).
-
-    Return the samples ``start:stop`` of each hold, as two arrays of shape (H,).
-    """
+    """Return the samples ``start:stop`` (two arrays) of holds: 0.5 s or more with `v` within a `band` (V)."""
     period = float(np.median(np.diff(t)))
     width = max(5, round(_SHORTEST_HOLD / period)) if period > 0.0 else 5
     if width >= v.size:

@@ -1,8 +1,4 @@
-"""Free run of a model on a record, whose initial state is unknown as the stage has moved before the first sample.
-
-`choose_start` chooses the initial state for a fit, `free_run` the one from which a model predicts a record best, and
-`match` compares a model with a record by the samples whose prediction does not depend on the initial state.
-"""
+"""Free run of a model on a record, whose initial state is unknown as the stage has moved before the first sample."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -41,10 +37,7 @@ class Fit(Protocol):
 
 
 def histories(samples: Samples) -> list[tuple[float, ...]]:
-    """Return the candidate initial histories: none (rest), a long fall, a long rise, a decaying oscillation.
-
-    Each is a tuple of voltages (V) as in `slpi_ros.model.axis_model.Start`.
-    """
+    """Return the candidate initial histories (V): none (rest), a long fall, a long rise, a decaying oscillation."""
     v0, low, high = float(samples.v[0]), float(samples.v.min()), float(samples.v.max())
     shrink = 1.0 - np.arange(1, MIDDLE_LOOPS) / MIDDLE_LOOPS
     decay = np.column_stack([v0 + (high - v0) * shrink, v0 - (v0 - low) * shrink])
@@ -54,13 +47,10 @@ def histories(samples: Samples) -> list[tuple[float, ...]]:
 
 @dataclass(frozen=True)
 class InitialHistory:
-    """Initial `history` (V) that a fit assumes for a record, as in `slpi_ros.model.axis_model.Start`.
-
-    `only_wiped`: samples before the reset of the hysteresis state are excluded, because no history explains them.
-    """
+    """Initial `history` (V) that a fit assumes for a record, as in `slpi_ros.model.axis_model.Start`."""
 
     history: tuple[float, ...]
-    only_wiped: bool
+    only_wiped: bool  # samples before the reset of the state are excluded: no history explains them
 
     def of(self, samples: Samples) -> Samples:
         """Return the samples to be fitted, preceded by the voltages of the initial history."""
@@ -68,10 +58,7 @@ class InitialHistory:
 
 
 def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> InitialHistory:
-    """Choose the initial history with the lowest error of the fits that `pose` makes to samples without one.
-
-    Samples before the reset of the hysteresis state are excluded if no history explains them.
-    """
+    """Choose the initial history with the lowest error of the fits that `pose` makes to samples without one."""
     wiped = samples.fitted & samples.wiped
     enough = np.count_nonzero(wiped) >= FEWEST and samples.mostly_wiped
     candidates = histories(samples)
@@ -132,13 +119,10 @@ AS_WELL = 1.1
 
 @dataclass(frozen=True)
 class FreeRun:
-    """Free run of a model on a record from the initial state with the lowest error, its `rms` (m) without the mean.
+    """Free run of a model on a record from the initial state with the lowest error."""
 
-    `offsets`: smallest and largest offset (m), median of measured - model, over all possible initial states.
-    """
-
-    rms: float
-    offsets: tuple[float, float]
+    rms: float  # m, without the mean
+    offsets: tuple[float, float]  # m, extremes over all possible initial states of the median of measured - model
 
     @property
     def offset(self) -> float:
@@ -163,11 +147,9 @@ def free_run(
     others: Mapping[str, FloatArray],
     of_record: bool,
 ) -> FreeRun:
-    """Return the best free run of a model from the initial states `starts` over a record, shape (N,), s, V and m.
-
-    The error is that of the samples `used`, the offset that of the samples `known`, to which the initial state only
-    adds a constant. `others` and `of_record` as in `AxisModel.simulate`.
-    """
+    """Return the best free run of a model from the initial states `starts` over a record, shape (N,), s, V and m."""
+    # The error is that of the samples `used`, the offset that of the samples `known`, to which the initial state only
+    # adds a constant.
     errors = [y - replace(axis, start=start).simulate(t, v, others, of_record=of_record) for start in starts]
     spread = [float(np.std(error[known])) for error in errors]
     as_well = [error for error, own in zip(errors, spread, strict=True) if own <= AS_WELL * min(spread)]
@@ -181,10 +163,8 @@ def rms_of(runs: Sequence[FreeRun]) -> float:
 
 
 def likely_starts(axis: AxisModel, v: float, *others: tuple[float, ...]) -> list[Start]:
-    """Return the initial states at the voltage `v` (V) for the usual histories and `others`.
-
-    Their displacements are such that after a sweep over the whole range all are alike.
-    """
+    """Return the initial states at the voltage `v` (V) for the usual histories and `others`."""
+    # Their displacements are such that after a sweep over the whole range all are alike.
     if not axis.causal:
         return [axis.start]
     low, high = axis.voltage_range
@@ -216,32 +196,20 @@ LEVELS = 201
 
 @dataclass(frozen=True)
 class Match:
-    """Comparison of a model with a record of unknown initial history.
+    """Comparison of a model with a record of unknown initial history."""
 
-    `start` is the initial state with the lowest error, at the first voltage of the hysteresis; its displacement
-    includes the offset of the record. `offset` (m) is the zero of the record minus that of the model, and
-    `offset_uncertainty` (m) half the range due to the unknown initial history plus `BEYOND_CHANCE` standard deviations.
-    `gain_change` is the relative change of the loop height, `width_change` that of the loop width in addition;
-    `gain_uncertainty` and `width_uncertainty` are their standard deviations. `rms` (m) is the error of the model on the
-    `known` samples, without the offset, and `rms_explained` (m) what remains of it after fitting changes of gain and
-    width, a lag and a linear drift. `known_from` is the first sample after which the initial history affects only the
-    offset; N if there is none. `known`, shape (N,), marks the fitted samples, without outliers, of stretches between
-    two new extremes of the voltage that are long enough for a comparison, see `match`. `residual` (m), shape (N,), is
-    model minus measured, free-run from `start`; NaN where not fitted.
-    """
-
-    start: Start
-    offset: float
-    offset_uncertainty: float
-    gain_change: float
-    gain_uncertainty: float
-    width_change: float
-    width_uncertainty: float
-    rms: float
-    rms_explained: float
-    known_from: int
-    known: NDArray[np.bool_]
-    residual: FloatArray
+    start: Start  # with the lowest error; its displacement includes the offset of the record
+    offset: float  # m, zero of the record minus that of the model
+    offset_uncertainty: float  # m, half the range of unknown histories plus `BEYOND_CHANCE` standard deviations
+    gain_change: float  # relative, of the loop height
+    gain_uncertainty: float  # standard deviation
+    width_change: float  # relative, of the loop width in addition
+    width_uncertainty: float  # standard deviation
+    rms: float  # m, of the `known` samples, without the offset
+    rms_explained: float  # m, after a fit of gain, width, lag and linear drift
+    known_from: int  # first sample after which the history affects only the offset; N: none
+    known: NDArray[np.bool_]  # (N,), fitted, no outliers, in stretches long enough for a comparison
+    residual: FloatArray  # m, (N,), model minus measured, free-run from `start`; NaN where not fitted
 
     @property
     def gain_changed(self) -> bool:
@@ -260,13 +228,10 @@ class Match:
 
 
 def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None, start: Start | None = None) -> Match:
-    """Compare a model, from voltage to displacement of the stage, with a record of unknown initial state.
-
-    While the voltage stays within the range visited so far, the unknown initial state adds only a constant, so the
-    samples of such a stretch can be compared with each other. Once both ends of the model's voltage range have been
-    visited, the offset is known as well. `t`, shape (N,), seconds, is needed only with effects. `start` is the initial
-    state where it is known.
-    """
+    """Compare a model, from voltage to displacement of the stage, with a record of unknown initial state."""
+    # While the voltage stays within the range visited so far, the unknown initial state adds only a constant, so the
+    # samples of such a stretch can be compared with each other. Once both ends of the model's voltage range have been
+    # visited, the offset is known as well. `t` (s, (N,)) is needed only with effects.
     time = np.arange(float(samples.v.size)) if t is None else t
     starts = [start] if start else _possible_starts(axis, float(samples.v[0]))
     predictions = [replace(axis, start=one).simulate(time, samples.v) for one in starts]
@@ -305,10 +270,8 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None, start:
 
 
 def starts_at_end(axis: AxisModel, v: float) -> list[Start]:
-    """Return the states at an end of the model's voltage range if `v` (V) is one, else none.
-
-    There a stage has lost its memory of the range, unless it has never moved, as before the record of the model.
-    """
+    """Return the states at an end of the model's voltage range if `v` (V) is one, else none."""
+    # There a stage has lost its memory of the range, unless it has never moved, as before the record of the model.
     low, high = axis.voltage_range
     near = AT_END * (high - low)
     if not axis.causal or low + near < v < high - near:
@@ -336,11 +299,9 @@ def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
 
 
 def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> NDArray[np.int64]:
-    """Return the stretch number of each sample, shape (N,); in a stretch the initial history adds only a constant.
-
-    The voltage `v` (V) and the range `apart` (m) of the predicted displacements over all candidate histories have shape
-    (N,). Changes of `apart` below `tolerance` (m) are ignored.
-    """
+    """Return the stretch number of each sample, shape (N,); in a stretch the initial history adds only a constant."""
+    # `apart` (m, (N,)) is the range of the displacements over all candidate histories; changes below `tolerance` (m)
+    # are ignored.
     extends = np.zeros(v.size, dtype=bool)
     for extreme in (np.maximum.accumulate(v), np.minimum.accumulate(v)):
         extends[1:] |= extreme[1:] != extreme[:-1]
@@ -415,11 +376,8 @@ def _changes(
 
 
 def _solved(matrices: FloatArray, vectors: FloatArray, own_error: float, count: int) -> tuple[FloatArray, FloatArray]:
-    """Solve the sum of the normal equations of all parts; return the solution and its standard deviations (jackknife).
-
-    `matrices`, shape (PARTS, c, c), and `vectors`, shape (PARTS, c), are those of each part, of `count` samples in all,
-    for columns with a mean square of 1. `own_error` (m) is the held-out error of the model.
-    """
+    """Solve the sum of the normal equations of all parts; return solution and standard deviations (jackknife)."""
+    # Columns have a mean square of 1; `own_error` (m) is the held-out error of the model.
     ridge = 1e-9 * count * np.eye(matrices.shape[1])
     matrix, vector = matrices.sum(axis=0) + ridge, vectors.sum(axis=0)
     whole = np.linalg.solve(matrix, vector)

@@ -23,20 +23,15 @@ from slpi_ros.model.axis_model import Start
 
 @dataclass(frozen=True)
 class Fitted:
-    """Fitted hysteresis model, the initial state of each record (`starts`) and the errors.
-
-    `y` and `errors` (m, model minus measured, free-run) hold the fitted samples; `voltage_range` (V) is theirs.
-    `held_out` (m, model minus measured, free-run), shape (N,), is the held-out error of every sample, NaN for samples
-    that are in every fit. `covered` is the share, 0..1, of the model's parameters or loops that the samples determine.
-    """
+    """Fitted hysteresis model, the initial state of each record, and the errors (m, model minus measured, free-run)."""
 
     hysteresis: Hysteresis
     starts: tuple[Start, ...]
-    y: FloatArray
-    voltage_range: tuple[float, float]
+    y: FloatArray  # m, fitted samples
+    voltage_range: tuple[float, float]  # V, of the fitted samples
     errors: FloatArray
-    held_out: FloatArray
-    covered: float
+    held_out: FloatArray  # of every sample, (N,); NaN for those in every fit
+    covered: float  # share of the parameters or loops that the samples determine
 
     @property
     def held_out_rms(self) -> float:
@@ -58,12 +53,8 @@ def solve_qp(
     *,
     least_iterations: int = CHECKED_EVERY,
 ) -> FloatArray:
-    """Return the x, shape (p,), that minimises ``x' M x / 2 - b' x`` subject to ``C x >= bound``.
-
-    M is the positive definite `matrix`, shape (p, p), b the `vector`, and C the `constraints`, shape (m, p).
-    `least_iterations` is also the interval of the convergence checks; IdentificationError if the solver does not
-    converge.
-    """
+    """Return the x, (p,), that minimises ``x' M x / 2 - b' x`` subject to ``C x >= bound``; M positive definite."""
+    # `least_iterations` is also the interval of the convergence checks; IdentificationError if it does not converge.
     free = solve_free(matrix, vector)
     if np.all(constraints @ free >= bound):
         return free
@@ -104,20 +95,16 @@ RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class Problem:
-    """Least-squares problem of the fit of one basis to one or several records.
-
-    `y` is in units of `scale` (m), shape (N,); `weights` are zero for samples that are not fitted; `judged` marks the
-    samples that can be held out; `rough` is the roughness matrix, shape (p, p); `gain` is the mean gain (m/V).
-    """
+    """Least-squares problem of the fit of one basis to one or several records."""
 
     basis: Basis
     design: Design
-    y: FloatArray
-    weights: FloatArray
-    judged: NDArray[np.bool_]
-    rough: FloatArray
-    scale: float
-    gain: float
+    y: FloatArray  # in units of `scale`, (N,)
+    weights: FloatArray  # 0: not fitted
+    judged: NDArray[np.bool_]  # can be held out
+    rough: FloatArray  # roughness matrix, (p, p)
+    scale: float  # m
+    gain: float  # m/V, mean
 
     @classmethod
     def pose(cls, samples: Sequence[Samples], basis: Basis) -> "Problem":
@@ -195,10 +182,8 @@ class Problem:
         return problem
 
     def folds(self) -> list[NDArray[np.int64]]:
-        """Return the sample indices of each fold.
-
-        The first rise is part of every fit: it occurs only once in a record, so no other part can predict it.
-        """
+        """Return the sample indices of each fold."""
+        # The first rise is part of every fit: it occurs only once in a record, so no other part can predict it.
         return blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise)
 
     def held_out_errors(self, smoothness: float) -> FloatArray:
@@ -217,10 +202,7 @@ class Problem:
         return np.array([self._score(each) for each in smoothness])
 
     def smoothness_near(self, present: float, among: Sequence[float]) -> float:
-        """Return a local minimum of the held-out error over the roughness weights `among`, in ascending order.
-
-        The search starts at the value `present`.
-        """
+        """Return a local minimum of the held-out error over ascending roughness weights, searched from `present`."""
         score = cache(lambda k: self._score(among[k]))
         best, k = among.index(present), -1
         while best != k:
@@ -259,11 +241,8 @@ def blocked_folds(allowed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
 def held_out_errors(
     samples: Samples, allowed: NDArray[np.bool_], predict: Callable[[NDArray[np.bool_]], FloatArray]
 ) -> FloatArray:
-    """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit.
-
-    `allowed` is the mask of samples that may be held out; `predict` takes the mask of samples to be fitted, and returns
-    the displacement of all (m). All have shape (N,).
-    """
+    """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit."""
+    # `predict` takes the mask of samples to be fitted, and returns the displacement of all (m).
     errors = np.full(samples.v.size, np.nan)
     for fold, chosen in enumerate(blocked_folds(allowed), 1):
         report_progress(f"cross-validation, fold {fold} of {FOLDS}")

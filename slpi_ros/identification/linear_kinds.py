@@ -64,12 +64,8 @@ def fit_linear(
     *,
     share: float = 1.0,
 ) -> Fitted:
-    """Fit the basis and roughness weight with the lowest held-out error.
-
-    `bases` are the candidates, the simplest first, `smoothness` the candidate roughness weights, and `share`, 0..1, a
-    factor on `SELECTION_SAMPLES` and `FIT_SAMPLES`. IdentificationError if the samples do not determine the model;
-    InitialHistoryWarning if the first samples of a record do not agree with the rest.
-    """
+    """Fit the basis, the simplest first, and the roughness weight with the lowest held-out error."""
+    # `share`, 0..1, is a factor on `SELECTION_SAMPLES` and `FIT_SAMPLES`.
     chosen = choose(samples, bases, smoothness, share=share)
     warn_of_rest(samples, chosen.beginnings)
     fitted = [

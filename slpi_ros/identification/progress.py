@@ -1,7 +1,4 @@
-"""Progress messages of long computations.
-
-Computations call `report_progress`; a listener set by `listening` receives the messages through a context variable.
-"""
+"""Progress messages of long computations: `report_progress` tells the listener that `listening` has set."""
 
 import time
 from collections.abc import Callable, Iterator

@@ -60,20 +60,14 @@ def fit_at_rest(samples: Sequence[Samples]) -> Fitted:
 
 
 def default_thresholds(span: float) -> FloatArray:
-    """Return the paper's thresholds 0, 5, ..., 45 V (Tables 2 to 5), shape (10,), volts.
-
-    These suit an outer loop of 100 V. For a `span` (V) below 50 or above 200, the thresholds are 0, 5, ..., 45 % of
-    the span.
-    """
+    """Return the paper's thresholds 0, 5, ..., 45 V (Tables 2 to 5), shape (10,), volts."""
+    # These suit an outer loop of 100 V. For a `span` (V) below 50 or above 200, they are 0, 5, ..., 45 % of the span.
     spacing = SPACING if 10 <= span / SPACING <= 40 else span / 20
     return spacing * np.arange(OPERATORS, dtype=np.float64)
 
 
 def voltage_dead_band(v: FloatArray) -> float:
-    """Return the dead band (V) for the noise of a measured voltage, shape (N,), volts.
-
-    Noise is estimated from third differences; that of a commanded voltage is nearly zero.
-    """
+    """Return the dead band (V) for the noise of a measured voltage, shape (N,), volts; nearly 0 for a commanded one."""
     if v.size < FEWEST:
         return 0.0
     # Third differences of white noise are sqrt(20) as large as the noise.
@@ -116,12 +110,8 @@ def _predict(loops: SeparatedLoops, offset: float, v: FloatArray) -> FloatArray:
 def fit_loops(
     samples: Samples, fitted: NDArray[np.bool_], *, at_rest: bool, thresholds: FloatArray | None = None
 ) -> tuple[SeparatedLoops, float]:
-    """Fit a PI model to each separated loop of a record; return the loops and the displacement at rest (m).
-
-    `fitted` is the mask of the samples to be fitted, shape (N,). Play operators start in their state after a reversal
-    or, as published, `at_rest`; their `thresholds` (V), shape (n,), are those of `default_thresholds` by default.
-    IdentificationError if the outer loop has too few samples.
-    """
+    """Fit a PI model to each separated loop of a record; return the loops and the displacement at rest (m)."""
+    # Play operators start in their state after a reversal or, as published, `at_rest`.
     dead_band = voltage_dead_band(samples.v)
     separation = separate(samples.v, dead_band=dead_band)
     samples = replace(samples, v=separation.voltage)
@@ -158,16 +148,12 @@ def _run_ins(level: int, thresholds: FloatArray, at_rest: bool) -> list[float | 
 
 
 class Plays(NamedTuple):
-    """Play operators fitted to one loop, with the rms error (m).
+    """Play operators fitted to one loop."""
 
-    `weights` (m/V) have shape (n,), `start` is the displacement at the vertex (m), and `run_in` (V) is the initial
-    state of the operators, as in `SingleLoop`.
-    """
-
-    weights: FloatArray
-    start: float
-    run_in: float | None
-    rms: float
+    weights: FloatArray  # m/V, (n,)
+    start: float  # m, at the vertex
+    run_in: float | None  # V, initial state of the operators, as in `SingleLoop`
+    rms: float  # m
 
 
 def fit_plays(
@@ -180,13 +166,9 @@ def fit_plays(
     through_zero: bool,
     iterations: int,
 ) -> Plays:
-    """Fit a PI model (Eq. 8) by a quadratic program: least squares, no weight negative, the first one positive.
-
-    `drive` (V) and `y` (m), shape (m,), are relative to the vertex of the loop; `used` is the mask of the samples to be
-    fitted, and `thresholds` (V) have shape (n,). `run_in` (V) is the initial state of the operators, as in
-    `SingleLoop`. If `through_zero`, the displacement at the vertex is 0, otherwise it is a parameter of the fit;
-    `iterations` is the minimum number, see `least_iterations`.
-    """
+    """Fit a PI model (Eq. 8) by a quadratic program: least squares, no weight negative, the first one positive."""
+    # `drive` (V) and `y` (m), shape (m,), are relative to the vertex of the loop. If `through_zero`, the displacement
+    # there is 0, otherwise it is a parameter of the fit; `iterations` is the minimum number, see `least_iterations`.
     plays = [at_vertex(play(r), run_in).forward_array(drive)[used] for r in thresholds.tolist()]
     design = np.column_stack(plays if through_zero else [*plays, np.ones(np.count_nonzero(used))])
     scale = float(np.ptp(y[used])) or 1.0
@@ -293,13 +275,10 @@ class MultiSlopeBasis(OperatorWeights):
 
 
 def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return amplitude (V) and peak displacement (m) of each cycle of a record, shape (c,), in chronological order.
-
-    A cycle starts at a voltage within 1 % of the range above the lowest voltage, and rises above that band. It is
-    omitted if its displacement is unknown at its start, or at all voltages within 1 % of the range below its peak.
-    Amplitudes are relative to the lowest voltage of the record, peaks to the start of the cycle. `v` (V) and `y` (m,
-    not finite where unknown) have shape (N,).
-    """
+    """Return amplitude (V) and peak displacement (m) of each cycle of a record, shape (c,), in chronological order."""
+    # A cycle starts at a voltage within 1 % of the range above the lowest voltage, and rises above that band. It is
+    # omitted if its displacement is unknown at its start, or at all voltages within 1 % of the range below its peak.
+    # Amplitudes are relative to the lowest voltage of the record, peaks to the start of the cycle.
     if not v.size:
         return np.empty(0), np.empty(0)
     origin, near = v.min(), BACK * np.ptp(v)
@@ -314,11 +293,7 @@ def cycle_peaks(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return amplitudes (V) and mean peak displacements (m) of cycles, for the simplified multi-slope PI model (SMPI).
-
-    Both have shape (m,), the amplitudes in ascending order; `v` (V) and `y` (m, not finite where unknown) have shape
-    (N,). IdentificationError if the record contains no cycle, or the peaks do not rise with the amplitude.
-    """
+    """Return ascending amplitudes (V) and mean peak displacements (m) of cycles, for the simplified model (SMPI)."""
     amplitudes, peaks = cycle_peaks(v, y)
     if not amplitudes.size:
         raise IdentificationError("no cycle starts at the lowest voltage; drive up and back from there, per amplitude")
@@ -343,12 +318,9 @@ def peak_line(v: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class PeakFrequency:
-    """Peak displacement as a function of excitation frequency, ``X_p = a f^b`` (MPI paper, Eq. 1).
+    """Peak displacement as a function of excitation frequency, ``X_p = a f^b`` (MPI paper, Eq. 1)."""
 
-    `a` (m) is the peak displacement at 1 Hz; `b` is negative if the peak decreases with frequency.
-    """
-
-    a: float
+    a: float  # m, at 1 Hz
     b: float
 
     def __call__(self, frequency: ArrayLike) -> FloatArray:
@@ -357,10 +329,7 @@ class PeakFrequency:
 
 
 def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
-    """Fit ``X_p = a f^b`` to peak displacements (m) at frequencies (Hz), shape (n,) each, by nonlinear least squares.
-
-    IdentificationError if fewer than two frequencies differ, or a value is not positive and finite.
-    """
+    """Fit ``X_p = a f^b`` to peak displacements (m) at frequencies (Hz), (n,) each, by nonlinear least squares."""
     f, x = np.asarray(frequency, dtype=np.float64), np.asarray(peak, dtype=np.float64)
     if f.ndim != 1 or f.shape != x.shape or np.unique(f).size < 2:
         raise IdentificationError(
@@ -380,11 +349,7 @@ def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
 
 
 def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
-    """Fit the simplified multi-slope PI model (SMPI) to one record, given as a sequence of one element.
-
-    UsageError if several records are given; IdentificationError if too few samples belong to cycles of the largest
-    amplitude.
-    """
+    """Fit the simplified multi-slope PI model (SMPI) to one record, given as a sequence of one element."""
     samples = only_one(records, "smpi")
     largest = in_largest_cycles(samples.v)
     count = int(np.count_nonzero(samples.fitted & largest))

@@ -25,51 +25,36 @@ _CATCHES_UP = 51
 
 @dataclass(frozen=True)
 class ClockQuality:
-    """Quality of the time stamps of a record; times in seconds.
-
-    `period` is the median sampling period, and `jitter` the standard deviation of the time steps, without those at
-    missing samples, which `lost` counts. `gaps` counts the steps of more than five periods, and `unseen` those of them
-    within which the voltage moved, so that reversals may be missing; `longest_gap` is the longest step. `duplicates`
-    counts the samples with the same stamp as the preceding one.
-    """
+    """Quality of the time stamps of a record; times in seconds."""
 
     samples: int
     duration: float
-    period: float
-    jitter: float
-    lost: int
-    gaps: int
+    period: float  # median
+    jitter: float  # standard deviation of the time steps, without those at missing samples
+    lost: int  # missing samples
+    gaps: int  # steps of more than five periods
     longest_gap: float
-    duplicates: int
-    unseen: int
+    duplicates: int  # samples with the stamp of the preceding one
+    unseen: int  # gaps within which the voltage moved: reversals may be missing
 
 
 @dataclass(frozen=True)
 class SignalQuality:
-    """Quality of the readings of a voltage (V) or a displacement (m).
-
-    `noise` is the rms from reading to reading, `digit` the resolution (0 if none was found), `missing` the number of
-    NaN. `stuck` counts repeated readings in runs of three or more while the other signal moves, `longest_stuck` is the
-    length of the longest run, and `clipped` counts the stuck readings at the lowest or the highest value. `stale`
-    counts single readings that repeat an earlier one while the other signal moves, and `spikes` other single outliers.
-    `mixed` counts readings that are early, late or a mixture of two neighbouring values, `mixed_share` is their share
-    of the readings tested, which are those not next to a reversal, and `mixed_size` their typical largest error: half
-    of the change between their neighbours.
-    """
+    """Quality of the readings of a voltage (V) or a displacement (m)."""
 
     low: float
     high: float
-    noise: float
-    digit: float
-    missing: int
-    stuck: int
+    noise: float  # rms, from reading to reading
+    digit: float  # resolution; 0: none found
+    missing: int  # NaN
+    stuck: int  # repeated readings in runs of three or more while the other signal moves
     longest_stuck: int
-    clipped: int
-    stale: int
-    spikes: int
-    mixed: int = 0
-    mixed_share: float = 0.0
-    mixed_size: float = 0.0
+    clipped: int  # stuck readings at the lowest or the highest value
+    stale: int  # single readings that repeat an earlier one while the other signal moves
+    spikes: int  # other single outliers
+    mixed: int = 0  # early, late or a mixture of two neighbouring values
+    mixed_share: float = 0.0  # of those tested, which are not next to a reversal
+    mixed_size: float = 0.0  # typical largest error: half the change between the neighbours
 
     @property
     def range(self) -> float:
@@ -79,39 +64,28 @@ class SignalQuality:
 
 @dataclass(frozen=True)
 class DriveQuality:
-    """Properties of the excitation voltage.
+    """Properties of the excitation voltage."""
 
-    `turns` is the number of reversals, `samples_per_run` the median number of samples between them, and `covered` the
-    share, 0..1, of all pairs of last reversal voltage and present voltage that were visited. `speeds` (V/s) are those
-    of runs with about equal voltage change, as in `slpi_ros.identification.drive.Runs`, and `speed_range` (V/s) those
-    of the slowest and the fastest run; `holds` are durations (s). If `begins_at_end`, the record begins at an end of
-    its voltage range, so that the initial history is known. By the time `wiped` (s) both ends have been visited, which
-    resets the hysteresis state; None if never.
-    """
-
-    turns: int
-    covered: float
-    samples_per_run: float
-    speeds: tuple[float, ...]
-    speed_range: tuple[float, float]
-    holds: tuple[float, ...]
-    begins_at_end: bool
-    wiped: float | None
+    turns: int  # reversals
+    covered: float  # share of all pairs of last reversal voltage and present voltage that were visited
+    samples_per_run: float  # median, between reversals
+    speeds: tuple[float, ...]  # V/s, of runs with about equal voltage change, as in `Runs`
+    speed_range: tuple[float, float]  # V/s, of the slowest and the fastest run
+    holds: tuple[float, ...]  # s
+    begins_at_end: bool  # at an end of its voltage range: the initial history is known
+    wiped: float | None  # s, by when both ends were visited, which resets the hysteresis state
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of the record of one axis; `findings` describes it in sentences.
-
-    `notes` are remarks on how the record was made.
-    """
+    """Quality of the record of one axis; `findings` describes it in sentences."""
 
     axis: str
     clock: ClockQuality
     voltage: SignalQuality
     displacement: SignalQuality
     drive: DriveQuality
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # how the record was made
 
 
 def assess(record: Record, axis: str, *, start: float | None = None, stop: float | None = None) -> Quality:
@@ -217,10 +191,8 @@ def _clock(t: FloatArray, v: FloatArray, still: float) -> ClockQuality:
 
 
 def _missing(steps: FloatArray) -> int:
-    """Return the number of missing samples, from the steps between stamps in sampling periods, shape (N - 1,).
-
-    Only a lasting delay counts: if a late stamp is followed by shorter steps, no sample is missing.
-    """
+    """Return the number of missing samples, from the steps between stamps in sampling periods, shape (N - 1,)."""
+    # Only a lasting delay counts: if a late stamp is followed by shorter steps, no sample is missing.
     behind = np.cumsum(np.maximum(steps, 0.0) - 1.0)
     stays = minimum_filter1d(behind, _CATCHES_UP, origin=-((_CATCHES_UP - 1) // 2), mode="nearest")
     rises = np.rint(np.diff(stays, prepend=0.0))

@@ -46,23 +46,15 @@ EXCESS_SHARE = 0.01
 
 @dataclass(frozen=True)
 class AxisChange:
-    """Changes of one axis by an update.
+    """Changes of one axis by an update; errors (m, rms) on the new record, free-run, without the constant offset."""
 
-    `error_before` and `error_after` are the rms errors (m) on the new record, free-run, of the old and of the new
-    model, each with the best-fitting initial history and without the constant offset from the record; `repeatability`
-    (m) is the held-out error of the old model, or the noise of the sensor if larger. If `drifted`, gain, width or shape
-    of the loops has changed: initial history, offset, lag and slow drift cannot explain the error of the old model.
-    `gain` is the relative change of the height of the outermost loop, `largest` (m) the largest change of a branch;
-    `match` compares the old model with the new record: offset, changes of gain and width, and their uncertainties.
-    """
-
-    error_before: float
-    error_after: float
-    repeatability: float
-    drifted: bool
-    gain: float
-    largest: float
-    match: Match
+    error_before: float  # of the old model
+    error_after: float  # of the new model
+    repeatability: float  # held-out error of the old model, or the noise of the sensor if larger
+    drifted: bool  # gain, width or shape of the loops has changed: nothing else explains the old model's error
+    gain: float  # relative change of the height of the outermost loop
+    largest: float  # m, change of a branch
+    match: Match  # of the old model with the new record
 
 
 def refit(
@@ -223,11 +215,7 @@ def _within(samples: Samples, low: float, high: float) -> Samples:
 
 
 def require_own(error: float, fitted_anew: float, span: float) -> None:
-    """Raise IdentificationError if a model does not belong to the stage of a record.
-
-    `error` and `fitted_anew` (m) are the rms errors on the record, of the model and of a model fitted to this record;
-    `span` (m) is the displacement range.
-    """
+    """Raise IdentificationError if the rms errors (m) of a model and of a refit show that it is of another stage."""
     if error > FOREIGN_SHARE * span and error > FOREIGN_TIMES * fitted_anew:
         raise IdentificationError(
             f"this model does not belong to this bag: its error is {error * 1e6:.4g} µm rms of {span * 1e6:.4g} µm, "
@@ -255,10 +243,8 @@ def basis_of(axis: AxisModel) -> tuple[Basis, FloatArray]:
 
 
 def _solved(problem: Problem, x_old: FloatArray, gain_spread: float = 0.0, shape_spread: float = 0.0) -> FloatArray:
-    """Return the parameters and the displacement at rest of a fit with prior `x_old`, in units of the problem's scale.
-
-    If `shape_spread` is zero, `x_old` is kept and only the displacement at rest is fitted.
-    """
+    """Return parameters and displacement at rest of a fit with prior `x_old`, in units of the problem's scale."""
+    # If `shape_spread` is zero, `x_old` is kept and only the displacement at rest is fitted.
     matrix, vector = problem.design.normal_equations(problem.y, problem.weights)
     size = x_old.size
     if not shape_spread:

@@ -30,24 +30,17 @@ NO_NOISE = 1e-9
 
 @dataclass(frozen=True)
 class Floor:
-    """Repeatability floor of a record: rms of the differences between repetitions, per reading (m).
+    """Repeatability floor of a record."""
 
-    `source` names the data from which it was estimated, with numbers.
-    """
-
-    rms: float
-    source: str
+    rms: float  # m, of the differences between repetitions, per reading
+    source: str  # the data from which it was estimated, with numbers
 
 
 def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray | None = None) -> Floor:
-    """Estimate the repeatability floor of a record: noise and all other differences between repetitions of a motion.
-
-    Estimated from repeated moves between the same reversals if there are enough; else from holds; else from the
-    sample-to-sample noise. Slow and smooth differences (drift, creep) do not count. Neither do outliers. Time `t` (s),
-    voltage `v` (V), displacement `y` (m, NaN where unknown) and `residual` (m) have shape (N,). The residual of a model
-    replaces `y` in the estimate, so that drift and hum described by the model do not count. RecordError if there are
-    fewer than 5 samples.
-    """
+    """Estimate the repeatability floor of a record: noise and all other differences between repetitions of a motion."""
+    # Estimated from repeated moves between the same reversals if there are enough; else from holds; else from the
+    # sample-to-sample noise. Slow and smooth differences (drift, creep) do not count. Neither do outliers. The residual
+    # of a model (m) replaces `y` (m, NaN where unknown), so that drift and hum described by the model do not count.
     signal = y if residual is None else residual
     usable = np.isfinite(v) & np.isfinite(signal)
     t, v, y, signal = t[usable], v[usable], y[usable], signal[usable]
@@ -84,11 +77,9 @@ def robust_rms(x: FloatArray) -> float:
 
 
 def _repeats(t: FloatArray, v: FloatArray, signal: FloatArray) -> Iterator[FloatArray]:
-    """Yield the difference of each repeated move from its earlier repetition (m), scaled to the noise of one reading.
-
-    Between two reversals the stage follows one branch until the enclosing loop closes; motion before the previous
-    reversal has no influence.
-    """
+    """Yield the difference (m) of each repeated move from its earlier repetition, scaled to noise of one reading."""
+    # Between two reversals the stage follows one branch until the enclosing loop closes; motion before the previous
+    # reversal has no influence.
     span = float(np.ptp(v))
     ends = reversals(v, smallest_turn(v, noise(v, t)))
     # For each move: voltage of the reversal before its start, of its start and of its end.

@@ -38,21 +38,17 @@ NEAR_END = 0.02
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples of one axis, in time order, with a finite voltage.
+    """Samples of one axis, in time order, with a finite voltage; arrays have shape (N,)."""
 
-    The voltage `v` (V, measurement noise removed) includes samples that are not fitted, the displacement `y` (m) is
-    finite where the mask `fitted` is set; all have shape (N,). The first `history` samples form an assumed initial
-    history, and before them the voltage falls from far above, which erases the hysteresis memory; 0: the axis starts at
-    rest. `mixed` samples are not fitted because their displacement belongs to a neighbouring sample or is a mixture
-    with it, and `side` is that of the neighbour, as in `slpi_ros.identification.bad_readings.Mixed`.
-    """
+    # The first `history` samples form an assumed initial history, and before them the voltage falls from far above,
+    # which erases the hysteresis memory; 0: the axis starts at rest.
 
-    v: FloatArray
-    y: FloatArray
+    v: FloatArray  # V, measurement noise removed, also where not fitted
+    y: FloatArray  # m, finite where fitted
     fitted: NDArray[np.bool_]
     history: int = 0
-    mixed: int = 0
-    side: int = 0
+    mixed: int = 0  # samples not fitted because they are mixed, see `bad_readings.Mixed`
+    side: int = 0  # of the neighbour that they are mixed with
 
     @property
     def primed(self) -> bool:
@@ -75,10 +71,8 @@ class Samples:
         return replace(self, fitted=self.fitted & chosen)
 
     def without_mixed(self, path: FloatArray) -> "Samples":
-        """Exclude mixed readings from the fit, using the displacement of a model, `path`, shape (N,), metres.
-
-        This includes readings next to a reversal, which `select_samples` cannot test without a model.
-        """
+        """Exclude mixed readings from the fit, using the displacement of a model, `path`, shape (N,), metres."""
+        # This includes readings next to a reversal, which `select_samples` cannot test without a model.
         if not self.side:
             return self
         fitted, mixed = self.fitted.copy(), mixed_by_model(path, self.y, self.fitted, self.side)
@@ -86,10 +80,8 @@ class Samples:
         return replace(self, fitted=fitted, mixed=self.mixed + mixed.size)
 
     def without_outliers(self, path: FloatArray) -> "Samples":
-        """Exclude outliers from the fit, using the displacement of a model, `path`, shape (N,), metres.
-
-        Samples with mixed readings are returned unchanged, because outliers cannot be distinguished from these.
-        """
+        """Exclude outliers from the fit, using the displacement of a model, `path`, shape (N,), metres."""
+        # Samples with mixed readings are returned unchanged, because outliers cannot be distinguished from these.
         if self.side:
             return self
         at = np.flatnonzero(self.fitted)
@@ -152,20 +144,13 @@ class Samples:
 
     @property
     def judged(self) -> NDArray[np.bool_]:
-        """Mask of the samples that can be held out, shape (N,).
-
-        Samples before the reset of the hysteresis state depend on the initial history and cannot be predicted; they are
-        excluded if `mostly_wiped`.
-        """
+        """Mask of the samples that can be held out, (N,)."""
+        # Those before the reset of the hysteresis state depend on the initial history: not if `mostly_wiped`.
         return self.fitted & self.wiped if self.mostly_wiped else self.fitted
 
 
 def select_samples(record: Record, axis: str, start: float | None, stop: float | None) -> Samples:
-    """Select the samples of one axis for a fit, ``start <= t < stop`` (s), preceded by all earlier voltages.
-
-    UsageError if the record has no such axis; RecordError if the samples are too few or unordered, or a signal is
-    constant, implausibly large or of the wrong sign; IdentificationError if the voltage has no reversal.
-    """
+    """Select the samples of one axis for a fit, ``start <= t < stop`` (s), preceded by all earlier voltages."""
     record.require_axis(axis)
     _require_order(record)
     # Stamps are ordered, so the selection is a slice and long records are not copied.
@@ -184,11 +169,9 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
 def select_thinned(
     record: Record, axis: str, start: float | None, stop: float | None, most: int
 ) -> tuple[Samples, NDArray[np.int64]]:
-    """Return what `thinned` returns for the samples of `select_samples`, and their indices in the record.
-
-    A record longer than `WINDOW` is examined in windows, which need little memory: noise, resolution and outliers are
-    those of each window. Errors as in `select_samples`.
-    """
+    """Return what `thinned` returns for the samples of `select_samples`, and their indices in the record."""
+    # A record longer than `WINDOW` is examined in windows, which need little memory: noise, resolution and outliers are
+    # those of each window.
     if len(record) <= WINDOW:
         samples = select_samples(record, axis, start, stop)
         kept = samples.thinning(most)
@@ -231,10 +214,8 @@ def select_thinned(
 
 
 def windows(v: FloatArray, first: int, until: int) -> Iterator[tuple[int, int]]:
-    """Yield the bounds of windows of a voltage (V), shape (N,), from `first` to `until`, each with enough of its range.
-
-    The memory of a mapped voltage is released after each window.
-    """
+    """Yield the bounds of windows of a voltage (V, (N,)), from `first` to `until`, each with enough of its range."""
+    # The memory of a mapped voltage is released after each window.
     low, high = np.inf, -np.inf
     for (part,) in each_block(v[first:until]):
         finite = part[np.isfinite(part)]
@@ -266,12 +247,9 @@ def _require_enough(record: Record, axis: str, count: int, start: float | None, 
 
 
 def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> Samples:
-    """Return samples with a finite voltage without outliers, stuck and mixed readings, and noise of the voltage.
-
-    Times `t` (s), `v` (V), `y` (m) and the mask `fitted` have shape (N,); the mask has at least `FEWEST` samples and is
-    modified in place. `where` names the record in the error of signals without motion; "" for a part of a record, which
-    is not tested.
-    """
+    """Return samples with a finite voltage without outliers, stuck and mixed readings, and noise of the voltage."""
+    # The mask `fitted` has at least `FEWEST` samples and is modified in place. `where` names the record in the error of
+    # signals without motion; "" for a part of a record, which is not tested.
     if not fitted.all():
         y = np.where(fitted, y, 0.0)
     # Outliers of the voltage must not count as reversals or extend the range.

@@ -13,30 +13,22 @@ from slpi_ros.hysteresis.reversals import without_small_reversals
 
 @dataclass(frozen=True)
 class ErrorMetrics:
-    """Error metrics of a model against a measurement, or of a measurement against a setpoint.
+    """Error metrics (m) of a model against a measurement, or of a measurement against a setpoint."""
 
-    The "mean square error" of the MPI paper is `root_mean_square` throughout: Tables 2 and 4, 0.1201 µm (feedforward)
-    and 0.2949 µm (feedforward and PID). Its unit is µm, and it exceeds the mean absolute error, as an rms must. A mean
-    square cannot exceed the product of maximum and mean absolute error, but the values in Table 2 from 20 to 100 V, in
-    Table 4 at 20 and 40 V, and 0.1201 do. The value at 120 V matches R² = 0.9996 (Table 3) only as an rms.
-
-    Errors are in metres, `mean` is that of the absolute errors, `mean_square` is in square metres; `r_squared` is
-    ``R² = 1 - SSE / SST``, MPI paper, Eq. 3.
-    """
+    # The "mean square error" of the MPI paper is `root_mean_square` throughout: Tables 2 and 4, 0.1201 µm (feedforward)
+    # and 0.2949 µm (feedforward and PID). Its unit is µm, and it exceeds the mean absolute error, as an rms must. A
+    # mean square cannot exceed the product of maximum and mean absolute error, but the values in Table 2 from 20 to 100
+    # V, in Table 4 at 20 and 40 V, and 0.1201 do. The value at 120 V matches R² = 0.9996 (Table 3) only as an rms.
 
     maximum: float
-    mean: float
+    mean: float  # of the absolute errors
     root_mean_square: float
-    mean_square: float
-    r_squared: float
+    mean_square: float  # m²
+    r_squared: float  # ``R² = 1 - SSE / SST``, MPI paper, Eq. 3
 
 
 def error_metrics(measured: ArrayLike, model: ArrayLike) -> ErrorMetrics:
-    """Compute the error metrics of a model against a measurement, or of a measurement against a setpoint.
-
-    Both have shape (N,), metres; R² is relative to the variation of `measured`. UsageError if the two are not equally
-    long, not finite, or `measured` does not vary.
-    """
+    """Compute the errors of a model against a measurement, or of a measurement against a setpoint, (N,), metres."""
     y, y_model = np.asarray(measured, dtype=np.float64), np.asarray(model, dtype=np.float64)
     if y.ndim != 1 or y.shape != y_model.shape or y.size == 0:
         raise UsageError(f"error metrics: {y.shape} measured and {y_model.shape} modelled values; give as many of each")
@@ -63,10 +55,8 @@ FEWEST = 100
 
 
 def digit(x: FloatArray) -> float:
-    """Return the resolution of readings `x`, shape (N,), in their unit; 0 if they are continuous.
-
-    The resolution is the largest step of which (nearly) all small differences between sorted readings are multiples.
-    """
+    """Return the resolution of readings `x`, shape (N,), in their unit; 0 if they are continuous."""
+    # The resolution is the largest step of which (nearly) all small differences between sorted readings are multiples.
     differences = np.diff(np.unique(x[:: max(1, x.size // ENOUGH)]))
     if differences.size < 5:
         return 0.0
@@ -90,13 +80,10 @@ def median_rms(deviation: FloatArray) -> float:
 
 
 def noise(x: FloatArray, *drivers: FloatArray) -> float:
-    """Return the robust rms of the noise from reading to reading, in the unit of `x`, shape (N,), N >= 5.
-
-    The smallest of several estimates: deviations from a line or a cubic through the neighbours, and from a line over
-    each of the `drivers`, which allows for uneven sampling. Curvature of the signal increases each estimate; medians
-    reduce this effect. Noise correlated over several samples is not detected. The `drivers`, shape (N,) each, are
-    signals that the readings follow: time, or a voltage.
-    """
+    """Return the robust rms of the noise from reading to reading, in the unit of `x`, shape (N,), N >= 5."""
+    # The smallest of several estimates: deviations from a line or a cubic through the neighbours, and from a line over
+    # each of the `drivers`, signals that the readings follow, which allows for uneven sampling. Curvature of the signal
+    # increases each estimate; medians reduce this effect. Noise correlated over several samples is not detected.
     every = max(1, x.size // ENOUGH)
     far_before, before, own, after, far_after = (x[first : x.size - 4 + first : every] for first in range(5))
     line = 0.5 * (before + after) - own
@@ -125,10 +112,7 @@ _DEAD_BAND = 2.0
 
 
 def voltage_noise(t: FloatArray, v: FloatArray) -> float:
-    """Return the noise (V rms) of a measured voltage, shape (N,), volts; 0 for a commanded voltage.
-
-    Noise is estimated from high-order differences, which suppress smooth signals.
-    """
+    """Return the noise (V rms) of a measured voltage, shape (N,), volts, by high-order differences; 0 if commanded."""
     if v.size <= max(_ORDERS):
         return 0.0
     part = v[:ENOUGH]
@@ -148,11 +132,9 @@ def _central_binomial(order: int) -> float:
 
 
 def without_noise(t: FloatArray, v: FloatArray) -> FloatArray:
-    """Return a voltage, shape (N,), volts, with measurement noise removed; a commanded voltage is unchanged.
-
-    Each reading is replaced by a parabola over the largest window that fits within the noise. Remaining reversals
-    within the noise are flattened.
-    """
+    """Return a voltage, shape (N,), volts, with measurement noise removed; a commanded voltage is unchanged."""
+    # Each reading is replaced by a parabola over the largest window that fits within the noise. Remaining reversals
+    # within the noise are flattened.
     # SciPy's signal package takes a second to load, and most commands do not need it.
     from scipy.signal import savgol_filter
 

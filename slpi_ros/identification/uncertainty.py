@@ -29,26 +29,20 @@ _CURVE_POINTS = 101
 
 @dataclass(frozen=True)
 class CurveUncertainty:
-    """Uncertainty of a model's curves due to the errors of the record.
+    """Uncertainty of a model's curves due to the errors of the record; standard deviations in metres."""
 
-    Computed from a thinned record, and therefore an upper bound for long records. The uncertainty of regions that no
-    sample visits is not included: there the roughness penalty determines the curves.
-
-    `rising` and `falling` (m) are the branches of the outermost loop at the voltages `v` (V), relative to the
-    displacement at its low end, `rising_std` and `falling_std` (m) their standard deviations, shape (n,) each. `rms`
-    and `maximum` (m) are the rms and the largest standard deviation of the displacement predicted for the record's
-    samples; `resamples` is the number of bootstrap fits.
-    """
+    # Computed from a thinned record, and therefore an upper bound for long records. The uncertainty of regions that no
+    # sample visits is not included: there the roughness penalty determines the curves.
 
     axis: str
     kind: str
-    resamples: int
-    v: FloatArray
-    rising: FloatArray
-    falling: FloatArray
+    resamples: int  # bootstrap fits
+    v: FloatArray  # V, (n,)
+    rising: FloatArray  # m, (n,), branch of the outermost loop from its low end
+    falling: FloatArray  # m, (n,), from the low end, too
     rising_std: FloatArray
     falling_std: FloatArray
-    rms: float
+    rms: float  # of the displacement predicted for the record's samples
     maximum: float
 
     def line(self) -> str:
@@ -69,11 +63,7 @@ def curve_uncertainty(
     stop: float | None = None,
     resamples: int = RESAMPLES,
 ) -> CurveUncertainty:
-    """Estimate the uncertainty of a model's curves by bootstrap fits to a thinned record.
-
-    Several records are fitted together; `axis`, `kind`, `start` and `stop` are as for `slpi_ros.identify`. UsageError
-    for a kind other than ``slpi`` and ``pi``; SlpiError if the record does not allow a fit.
-    """
+    """Estimate the uncertainty of the curves of a model (slpi or pi) by bootstrap fits to thinned records."""
     require_known_uncertainty(kind)
     records = [record] if isinstance(record, Record) else list(record)
     samples = [select_thinned(part, axis, start, stop, SAMPLES // len(records))[0] for part in records]

@@ -11,10 +11,7 @@ from slpi_ros.errors import SlpiError
 
 @contextmanager
 def all_or_nothing(path: str | os.PathLike[str], failure: type[SlpiError] = SlpiError) -> Iterator[TextIO]:
-    """Open a UTF-8 text file for writing; it replaces `path` only if the ``with`` block ends without an error.
-
-    An error of the type `failure` is raised if the file cannot be written.
-    """
+    """Open a UTF-8 text file that replaces `path` only if the ``with`` block ends without an error, else `failure`."""
     if not str(path) or not is_replaceable(Path(path)):
         raise failure(f"'{path}': cannot be written: no regular file; choose another place")
     # What a link leads to is replaced, not the link.
@@ -67,10 +64,7 @@ def output_folder(path: str | os.PathLike[str], *names: str) -> Iterator[Path]:
 
 
 def make_folder(path: str | os.PathLike[str], *names: str) -> None:
-    """Create a folder and its parents if missing, and check that files with these `names` can be written there.
-
-    SlpiError if the folder cannot be created or written to, or contains a folder with one of these names.
-    """
+    """Create a folder and its parents if missing, and check that files with these `names` can be written there."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
         reason = "" if os.access(path, os.W_OK) else "it is write-protected"

@@ -155,10 +155,8 @@ def _require_small(packed: BinaryIO, file: Path) -> None:
 
 
 def _require_whole(file: Path, header: bytes) -> None:
-    """Raise EOFError if an SQLite file is truncated (SQLite would read zeros) or its write-ahead log is not empty.
-
-    LimitError if it has a view: a query instead of data, which may not end.
-    """
+    """Raise EOFError if an SQLite file is truncated (SQLite would read zeros) or its write-ahead log is not empty."""
+    # LimitError if it has a view: a query instead of data, which may not end.
     journal = file.with_name(f"{file.name}-wal")
     if journal.exists() and journal.stat().st_size:
         raise EOFError(f"messages still in {journal.name}: `sqlite3 {file} 'PRAGMA wal_checkpoint'` moves them")
@@ -191,11 +189,7 @@ def one_line(error: Exception) -> str:
 
 
 def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str], source: Path) -> str:
-    """Resolve a full topic name, or its last parts if they are unambiguous, to the full name of a topic in the bag.
-
-    `topics` maps full names to types, `msgtypes` are the accepted types, and `source` is the path of the bag, for
-    messages. RecordError if no topic or several topics match, or the type is not accepted.
-    """
+    """Resolve a topic name, or its last parts if unambiguous, among full names by type, to one of the `msgtypes`."""
     contents = ", ".join(f"{name} ({topics[name]})" for name in sorted(topics)) or "no topics"
     wanted = absolute_name(topic)
     found = [name for name in topics if absolute_name(name) == wanted]
@@ -219,15 +213,13 @@ def absolute_name(topic: str) -> str:
 
 
 class BagWatch:
-    """Watch a folder for newly completed bags; bags still being written are ignored.
+    """Watch a folder for newly completed bags; bags still being written are ignored."""
 
-    A rosbag2 folder is complete when it contains ``metadata.yaml``, which its writer adds last; a single mcap file when
-    it ends with the magic bytes of a complete file. Single sqlite3 files are ignored, as they have no such mark.
-
-    Bags that are complete from the beginning are not reported, except the newest one. An incomplete bag that has not
-    grown for `patience` (s) counts as abandoned; `abandoned` are those found at the last `poll`, sorted by name, which
-    are still watched. UsageError if the folder does not exist.
-    """
+    # A rosbag2 folder is complete when it contains ``metadata.yaml``, which its writer adds last; a single mcap file
+    # when it ends with the magic bytes of a complete file. Single sqlite3 files are ignored, as they have no such mark.
+    #
+    # Bags that are complete from the beginning are not reported, except the newest one. An incomplete bag that has not
+    # grown for `patience` (s) counts as abandoned, but is still watched.
 
     def __init__(self, folder: str | os.PathLike[str], patience: float = PATIENCE) -> None:
         self.folder, self.patience = Path(folder), patience

@@ -31,13 +31,10 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 @dataclass(frozen=True)
 class MessageBlock:
-    """Block of consecutive serialised messages of one topic; `logged` (ns), shape (n,), is their recording time.
+    """Block of consecutive serialised messages of one topic."""
 
-    `messages` are an array, shape (n, L), if all have the same length L, else a list of length n.
-    """
-
-    logged: NDArray[np.int64]
-    messages: ByteArray | list[bytes]
+    logged: NDArray[np.int64]  # ns, (n,), recording times
+    messages: ByteArray | list[bytes]  # (n, L) if all have the same length L
 
     @classmethod
     def of(cls, logged: Sequence[int], messages: Sequence[bytes]) -> "MessageBlock":
@@ -79,10 +76,7 @@ def _unpacked(messages: Iterable[bytes]) -> Iterator[bytes]:
 
 
 def decompressed(data: bytes, compression: str, most: int) -> bytes:
-    """Decompress data of an MCAP or rosbag2 file to at most `most` bytes; `compression` is "", "zstd" or "lz4".
-
-    ValueError if `compression` has another value, LimitError if there are more bytes, EOFError if the data are cut off.
-    """
+    """Decompress ("", "zstd", "lz4") to at most `most` bytes, else LimitError; EOFError if the data are cut off."""
     unpacked = b""
     while data:
         if compression == "":
@@ -131,10 +125,7 @@ _HEAD_IN_LENGTH = _MESSAGE_HEAD.itemsize - _RECORD.size
 
 
 def read_mcap(path: Path, topic: str) -> Iterator[MessageBlock]:
-    """Yield the messages of a topic, given by its full name, in the order in which they were written.
-
-    The file must be complete; an exception of any type is raised if it is damaged.
-    """
+    """Yield the messages of a topic, by its full name, as written, from a complete file; any exception if damaged."""
     with open_input(path, BAG_BYTES) as file:
         yield from _McapFile(file, topic).blocks()
 
@@ -311,11 +302,8 @@ def _rows(data: ByteArray, starts: NDArray[np.int64], length: int) -> ByteArray:
 
 
 def read_sqlite(storage: Any, topic: str) -> Iterator[MessageBlock]:
-    """Yield the messages of a topic, given by its full name, in the order in which they were recorded.
-
-    `storage` is the ``rosbags.rosbag2.storage_sqlite3.Sqlite3Reader`` of the open file; an exception of any type is
-    raised if the file is damaged.
-    """
+    """Yield the messages of a topic, by its full name, as recorded; any exception if the file is damaged."""
+    # `storage` is the ``rosbags.rosbag2.storage_sqlite3.Sqlite3Reader`` of the open file.
     connections = [connection for connection in storage.connections if connection.topic == topic]
     messages = _bounded(storage, connections) if connections else iter(())
     while block := list(islice(messages, BLOCK)):

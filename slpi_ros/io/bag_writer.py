@@ -1,7 +1,4 @@
-"""Atomic writing of rosbag2 folders, mcap or sqlite3.
-
-No rosbags exception leaves this module.
-"""
+"""Atomic writing of rosbag2 folders, mcap or sqlite3; no rosbags exception leaves this module."""
 
 import os
 import shutil
@@ -28,17 +25,11 @@ _WRITE_ERRORS = (OSError, sqlite3.Error, WriterError)
 
 
 class BagWriter:
-    """Write a rosbag2 folder; a context manager.
+    """Write a rosbag2 folder; a context manager, which an exception makes discard the bag."""
 
-    An incomplete bag is in ``.NAME.partial`` (`partial`) next to the final `path`, so a folder at the final path is
-    always a complete bag. An exception inside ``with`` discards the bag; without ``with``, call ``close`` or
-    ``discard``.
-
-    Missing parent folders are created. `storage` is "mcap" or "sqlite3". `topic`, of type ``sensor_msgs/JointState``,
-    is the one to which ``write`` writes by default; None if all topics are added with ``add_topic``. With `replace`, a
-    folder at this path is deleted once the new bag is complete. RecordError if the path exists and is not replaced, an
-    unfinished bag of the same name exists, or the bag cannot be written; UsageError if `storage` is another format.
-    """
+    # An incomplete bag is in ``.NAME.partial`` next to the final `path`, so a folder at the final path is always a
+    # complete bag. ``write`` writes to `topic` by default, of type ``sensor_msgs/JointState``; None if all are added
+    # with ``add_topic``. With `replace`, a folder at this path is deleted once the new bag is complete.
 
     def __init__(
         self,
@@ -74,11 +65,7 @@ class BagWriter:
             self.add_topic(topic)
 
     def add_topic(self, topic: str, msgtype: str = JOINT_STATE) -> None:
-        """Add a topic to the bag; a missing leading slash is added.
-
-        `msgtype` is written like ``sensor_msgs/msg/JointState``, from a package that is part of ROS 2 Jazzy.
-        RecordError if its definition is not known, or the bag cannot be written.
-        """
+        """Add a topic of a type of ROS 2 Jazzy, like ``sensor_msgs/msg/JointState``; a missing slash is added."""
         name = absolute_name(topic)
         try:
             self._connections[name] = self._writer.add_connection(name, msgtype, typestore=typestore())
@@ -90,10 +77,7 @@ class BagWriter:
             raise self._failure(error) from error
 
     def write(self, stamp_ns: int, message: bytes, topic: str | None = None) -> None:
-        """Write a serialised message, CDR data with encapsulation header, with its log time (ns).
-
-        `topic` is one of the bag, by default that given to the constructor.
-        """
+        """Write a serialised message, CDR data with encapsulation header, with its log time (ns)."""
         name = absolute_name(topic or self._topic or "")
         if name not in self._connections:
             raise UsageError(f"{self.path}: topic '{name}' was not announced; call add_topic first")
@@ -104,10 +88,7 @@ class BagWriter:
         self.message_count += 1
 
     def close(self) -> None:
-        """Complete the bag and move it to its final path.
-
-        RecordError if the bag cannot be written; the data written so far remain in the partial folder.
-        """
+        """Complete the bag and move it to its final path; if it cannot be written, the partial folder remains."""
         try:
             self._writer.close()
             before = self.partial / f"{self.path.name}.replaced"
@@ -157,11 +138,7 @@ def write_bag(
     topic: str = "/stage_state",
     replace: bool = False,
 ) -> None:
-    """Write a record as a new rosbag2 folder that `slpi_ros.read_bag` reads back without loss.
-
-    `storage` is "mcap" or "sqlite3"; the hardware id becomes the ``frame_id`` of the messages. RecordError if the path
-    exists, unless `replace` is given, or the bag cannot be written.
-    """
+    """Write a record as a new rosbag2 folder that `slpi_ros.read_bag` reads back without loss, id as ``frame_id``."""
     displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
     voltage = np.column_stack([record.voltage[axis] for axis in record.axes])
     messages = encode_joint_states(record.time_ns, displacement, voltage, record.axes, record.hardware_id)

@@ -28,23 +28,15 @@ _DTYPES = {"i": "i4", "I": "u4"}
 
 @dataclass(frozen=True)
 class CdrLayout:
-    """Offsets of the numbers in messages of one layout.
+    """Offsets of the numbers in messages of one layout."""
 
-    `template`, shape (M,), is one message of this layout. `fixed`, shape (M,), is True for bytes that are the same in
-    all messages of this layout; False for numbers, and for padding bytes, which are undefined. `fields` holds the NumPy
-    type and the offset of each named field.
-    """
-
-    template: ByteArray
-    fixed: NDArray[np.bool_]
-    fields: Mapping[str, tuple[Any, int]]
+    template: ByteArray  # (M,), one message of this layout
+    fixed: NDArray[np.bool_]  # (M,), bytes that all messages share: neither numbers nor padding
+    fields: Mapping[str, tuple[Any, int]]  # NumPy type and offset by name
 
     def decode(self, rows: ByteArray) -> NDArray[np.void] | None:
-        """Return the fields of all messages, shape (N,), a view of `rows`; None if one of them has another layout.
-
-        `rows`, shape (N, L), are the serialised messages; bytes after the end of the message are ignored, as some
-        writers append undefined bytes.
-        """
+        """Return the fields of all messages (N, L), shape (N,), a view; None if one of them has another layout."""
+        # Bytes after the end of the message are ignored, as some writers append undefined bytes.
         if rows.shape[1] < self.template.size or not self._alike(rows):
             return None
         return rows.view(self.dtype(rows.shape[1]))[:, 0]
@@ -83,12 +75,7 @@ def _words(begin: int, end: int) -> Iterator[tuple[int, int]]:
 
 
 class CdrReader:
-    """Reader of one serialised message, value by value, which also determines its layout.
-
-    `data` include the encapsulation header. `order` is the byte order, as a format character of the module ``struct``,
-    and `at` the offset of the next byte to read. struct.error if the data are not plain CDR; methods raise it if the
-    message is truncated.
-    """
+    """Reader of one serialised message, value by value, which also determines its layout; struct.error if truncated."""
 
     def __init__(self, data: bytes) -> None:
         order = BYTE_ORDERS.get(data[:2])

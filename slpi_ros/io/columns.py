@@ -11,19 +11,13 @@ from slpi_ros.io.input_limits import MOST_AXES
 
 @dataclass(frozen=True, eq=False)
 class ColumnQuantity:
-    """A physical quantity that a column can hold.
+    """A physical quantity that a column can hold."""
 
-    `name` is that in messages, and of the option that selects its columns. `default` is the unit if neither the column
-    name nor an option gives one, and `units` are the known units with their values in SI units. `prefixes` are the
-    beginnings of the names of its columns, `others` the units that are recognized in a column name but are not valid
-    for this quantity, both in lower case.
-    """
-
-    name: str
-    default: str
-    units: Mapping[str, float]
-    prefixes: tuple[str, ...]
-    others: frozenset[str]
+    name: str  # in messages, and of the option that selects its columns
+    default: str  # unit if neither the column name nor an option gives one
+    units: Mapping[str, float]  # SI values
+    prefixes: tuple[str, ...]  # beginnings of the names of its columns, lower case
+    others: frozenset[str]  # units that are recognized in a column name but not valid, lower case
 
     def unit(self, text: str) -> str:
         """Return the known unit that a text denotes, or ""; case matters only where it changes the meaning."""
@@ -91,27 +85,19 @@ _PARTS = re.compile(r"[^\s_.,-]+")
 
 @dataclass(frozen=True)
 class Column:
-    """Column of a table, with the axis and unit from its name.
-
-    `axis` is the part of the name that is neither quantity nor unit, ``x`` if there is none. `scale` is the value of
-    the unit in SI units. `assumed` tells whether neither the name nor an option gives the unit.
-    """
+    """Column of a table, with the axis and unit from its name."""
 
     name: str
-    axis: str
+    axis: str  # the part of the name that is neither quantity nor unit; x if there is none
     unit: str
-    scale: float
-    assumed: bool
+    scale: float  # SI value of the unit
+    assumed: bool  # neither the name nor an option gives the unit
 
 
 def parse_column(
     name: str, quantity: ColumnQuantity, *, given_unit: str | None = None, source: str = "table"
 ) -> Column:
-    """Parse the name of a column; units as in ``x_nm``, ``x (nm)``, ``x [nm]``, ``x in nm``, ``x / nm``.
-
-    `given_unit` is that of an option, for a name without a unit; `source` is the name of the table, for messages.
-    RecordError if the name contains an unknown unit, UsageError if the units of the name and the option differ.
-    """
+    """Parse the name of a column; unit as in ``x_nm``, ``x (nm)``, ``x [nm]``, ``x in nm``, ``x / nm``, or given."""
     stem, written = _split(name, quantity)
     unit = quantity.unit(written)
     if written and not unit:
@@ -232,12 +218,7 @@ class ColumnChoice:
 
 
 def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) -> ColumnChoice:
-    """Choose the columns of a record among the `names` of all columns of the table, by option, else by name.
-
-    `source` is the name of the table, for messages. RecordError if a column is missing, the numbers of columns do not
-    match, or a name contains an unknown unit; UsageError if an option is invalid, contradicts a name, or gives one
-    column two roles.
-    """
+    """Choose the columns of a record among the `names` of all columns of the table, by option, else by name."""
     given_unit = options.displacement_unit
     if given_unit is not None and not DISPLACEMENT.unit(given_unit):
         raise UsageError(f"no displacement unit '{given_unit}'; choose {', '.join(DISPLACEMENT.units)}")

@@ -60,11 +60,7 @@ def most_unpacked(packed: int) -> int:
 
 
 def open_input(path: str | os.PathLike[str], most: int) -> BinaryIO:
-    """Open a regular file of at most `most` bytes for reading.
-
-    LimitError if it is a device, pipe or socket, or larger; OSError if it cannot be opened, or is a folder; ValueError
-    if no file can have this name.
-    """
+    """Open a regular file of at most `most` bytes, else LimitError; ValueError if no file has such a name."""
     # A device is not even opened; the second check is of what has been opened, should the name have changed hands.
     _require(os.stat(path), most)
     file = open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")  # noqa: SIM115

@@ -50,17 +50,12 @@ def _read_vector(reader: CdrReader) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class MessageType:
-    """Rules for decoding one message type.
+    """Rules for decoding one message type."""
 
-    `stamped` tells whether the message begins with a header, `named` whether the columns have names, such as joint
-    names; otherwise they are numbered. `fields` are those that contain the numbers. `read` reads everything after the
-    header and returns the name of each column.
-    """
-
-    stamped: bool
-    named: bool
-    fields: tuple[str, ...]
-    read: Callable[[CdrReader], tuple[str, ...]]
+    stamped: bool  # begins with a header
+    named: bool  # columns have names, such as joint names; otherwise they are numbered
+    fields: tuple[str, ...]  # that contain the numbers
+    read: Callable[[CdrReader], tuple[str, ...]]  # everything after the header; returns the names of the columns
 
 
 MESSAGE_TYPES = {
@@ -73,19 +68,13 @@ MESSAGE_TYPES = {
 
 @dataclass(frozen=True)
 class Message:
-    """Decoded message.
+    """Decoded message."""
 
-    `stamp_ns` (ns) and `frame_id` are those of the header; 0 and "" if there is no header. `names`, length K, are those
-    of the columns. `values` are arrays of shape (n,) by field: ``position`` (m), ``effort`` (V), ``data`` or
-    ``vector``; an array with n < K lacks the last columns. `layout` is that of all messages with the same strings and
-    array lengths.
-    """
-
-    stamp_ns: int
+    stamp_ns: int  # 0 without header
     frame_id: str
-    names: tuple[str, ...]
-    values: Mapping[str, NDArray[np.float64]]
-    layout: CdrLayout
+    names: tuple[str, ...]  # of the columns, K
+    values: Mapping[str, NDArray[np.float64]]  # by field; n < K: without the last columns
+    layout: CdrLayout  # of all messages with the same strings and lengths
 
     def is_regular(self) -> bool:
         """Return whether there are names, all different, and every field has one number for each name."""
@@ -94,11 +83,7 @@ class Message:
 
 
 def read_message(data: bytes, msgtype: str) -> Message:
-    """Decode a serialised message of one of the `MESSAGE_TYPES`.
-
-    struct.error or UnicodeDecodeError if the data are not a valid message of this type, LimitError if the message has
-    more columns than a stage has axes.
-    """
+    """Decode a serialised message of one of the `MESSAGE_TYPES`; struct.error or UnicodeDecodeError if not valid."""
     kind, reader = MESSAGE_TYPES[msgtype], CdrReader(data)
     stamp_ns, frame_id = 0, ""
     if kind.stamped:
@@ -115,11 +100,7 @@ def encode_joint_states(
     names: tuple[str, ...],
     frame_id: str = "",
 ) -> list[bytes]:
-    """Return one serialised message for each header stamp (ns), shape (N,).
-
-    `position` (m) and `effort`, the applied voltages (V), have the shape (N, K), `names` of the joints the length K.
-    RecordError if there is no name, or a stamp does not fit into a header (before 1970 or after 2038).
-    """
+    """Return one serialised message for each header stamp (ns), shape (N,); positions (m) and voltages (V), (N, K)."""
     if not names:
         raise RecordError("a stage_state message needs at least one axis name")
     unfit = (stamp_ns < 0) | (stamp_ns >= _STAMP_END)
@@ -188,23 +169,17 @@ SMALLEST_POINT = 24
 
 @dataclass(frozen=True)
 class TrajectoryArrays:
-    """Decoded JointTrajectory; `start_ns` (ns) is the header stamp.
+    """Decoded JointTrajectory."""
 
-    `time_from_start_ns` (ns), shape (N,), is the time of each point from the start, and `positions` (m), shape (N, K),
-    are those of the joints at each point; `names` of the joints have the length K.
-    """
-
-    start_ns: int
+    start_ns: int  # header stamp
     names: tuple[str, ...]
-    time_from_start_ns: NDArray[np.int64]
-    positions: NDArray[np.float64]
+    time_from_start_ns: NDArray[np.int64]  # (N,)
+    positions: NDArray[np.float64]  # m, (N, names)
 
 
 def decode_trajectory(data: bytes) -> TrajectoryArrays | None:
-    """Decode a serialised JointTrajectory; return None if its points differ in layout or the message is invalid.
-
-    Points of equal layout are decoded as one array, which is much faster than point by point.
-    """
+    """Decode a serialised JointTrajectory; return None if its points differ in layout or the message is invalid."""
+    # Points of equal layout are decoded as one array, which is much faster than point by point.
     try:
         return _decode(data)
     except (struct.error, UnicodeDecodeError, IndexError, ValueError, TypeError, MemoryError, LimitError):

@@ -31,21 +31,14 @@ _ASK = "give another output, or --overwrite to replace it"
 
 
 def allow_document(path: _Path, kind: str, *, overwrite: bool = False) -> list[str]:
-    """Check that a document may be written to a file; return remarks on what it replaces that slpi did not write.
-
-    The file may be missing, empty, or a document of the same `kind`, the middle part of the schema id, for example
-    ``"model"``; with `overwrite`, also any other regular file. UsageError if it is no such document, or lies in a
-    recording. SlpiError if no file can be written there: it is a folder or a device, or its folder is missing or
-    write-protected.
-    """
+    """Check that a document may be written to a file; return remarks on what it replaces that slpi did not write."""
+    # The file may be missing, empty, or a document of the same `kind`, the middle part of the schema id; with
+    # `overwrite`, also any other regular file.
     return _allow_file(Path(path), f"no {kind} document of slpi", overwrite, is_own=_kind(_ends(path)[0]) == kind)
 
 
 def allow_table(path: _Path, header: str, *, overwrite: bool = False) -> list[str]:
-    """Check that a table may be written to a file: like `allow_document`, for a CSV file with the first line `header`.
-
-    `header` are the names of the columns, without the end of the line; a table with this very header may be replaced.
-    """
+    """Check that a table may be written: like `allow_document`, for a CSV file with the first line `header`."""
     first = _ends(path)[0].split(b"\n", 1)[0]
     return _allow_file(Path(path), f"no table with the columns {header}", overwrite, is_own=first == header.encode())
 
@@ -53,14 +46,10 @@ def allow_table(path: _Path, header: str, *, overwrite: bool = False) -> list[st
 def allow_folder(
     path: _Path, *names: str, tables: Mapping[str, str] | None = None, overwrite: bool = False
 ) -> list[str]:
-    """Check that files may be written into a folder; return remarks, as `allow_document` does.
-
-    The folder may be missing, be without anything but empty files, or hold a document or a page of slpi. `names` are
-    the documents and pages that will be written into it, `tables` the tables with the names of their columns; those
-    that exist must be slpi's as well. With `overwrite`, the folder and these files may be any others. UsageError if the
-    folder or one of the files is not slpi's, or the folder is a recording or lies in one; SlpiError if the folder
-    cannot be read, or holds a folder with one of these names.
-    """
+    """Check that files may be written into a folder; return remarks, as `allow_document` does."""
+    # The folder may be missing, be without anything but empty files, or hold a document or a page of slpi. Of `names`,
+    # the documents and pages to be written, and `tables` with their columns, those that exist must be slpi's as well.
+    # With `overwrite`, the folder and these files may be any others.
     folder = Path(path)
     with _told(folder):
         _refuse_recording(folder, folder)
@@ -85,11 +74,7 @@ def allow_folder(
 
 
 def allow_bag(path: _Path, *, overwrite: bool = False) -> list[str]:
-    """Check that a bag may be written as a folder; a recording is replaced only when asked to.
-
-    At `path` there may be nothing or, with `overwrite`, a rosbag2 folder with nothing else in it; UsageError otherwise.
-    Remarks are returned as by `allow_document`.
-    """
+    """Check that a bag may be written as a folder: nothing is there or, with `overwrite`, only a rosbag2 folder."""
     bag = Path(path)
     _refuse_recording(bag, Path(os.path.realpath(bag)).parent)
     if not os.path.lexists(bag):

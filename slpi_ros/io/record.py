@@ -24,10 +24,7 @@ _OWN: WeakSet[mmap.mmap] = WeakSet()
 
 
 def new_column(size: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return an uninitialised column of a record, shape (size,); a long one is mapped from an unnamed temporary file.
-
-    Without room for such a file the column is kept in memory.
-    """
+    """Return an uninitialised column of a record; a long one is mapped from a temporary file if there is room."""
     if size * dtype.itemsize >= MAPPED_FROM:
         try:
             with tempfile.TemporaryFile() as file:
@@ -151,11 +148,7 @@ class Record:
 
 
 def common_stage(records: Sequence[Record], hardware_id: str = "") -> str:
-    """Return the hardware id of the stage that all records, and optionally a model, belong to; "" if unknown.
-
-    `hardware_id` is that of the model, "" if unknown; records and models without an id may belong to any stage.
-    UsageError if there is no record, or there are several hardware ids.
-    """
+    """Return the hardware id of the stage of all records and a model, "" if unknown; UsageError if several."""
     if not records:
         raise UsageError("no record given; give at least one")
     stages = {hardware_id: "the model"} if hardware_id else {}

@@ -28,11 +28,7 @@ def load_schema(name: str) -> dict[str, Any]:
 
 
 def validate(document: object, name: str, source: str) -> None:
-    """Check a document, as returned by ``json.loads``, against the schema `name`, for example ``"model"``.
-
-    `source` is the origin of the document, for messages. ModelError if the document does not conform to the schema; the
-    message names the location and the reason.
-    """
+    """Check a document, as from ``json.loads``, against the schema `name`; `source` is named in the ModelError."""
     axes = document.get("axes") if isinstance(document, dict) else None
     if isinstance(axes, dict):
         # The validator would take minutes to tell what is wrong with each of a million axes.
@@ -58,10 +54,7 @@ def validate(document: object, name: str, source: str) -> None:
 
 
 def format_document(document: Mapping[str, Any], name: str) -> str:
-    """Return the JSON text of a new document of the kind `name`.
-
-    ModelError if the document does not conform to its schema, ValueError if a value is not finite.
-    """
+    """Return the JSON text of a new document of the kind `name`; ModelError if it does not conform to its schema."""
     validate(document, name, f"the new {name}")
     return json.dumps(document, allow_nan=False, indent=1)
 

@@ -47,16 +47,12 @@ _MAT_NUMERIC, _MAT_COMPLEX = range(6, 16), 0x800
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Table in a text file.
-
-    `body` is the text below the line of column names, and `header_line` the number of that line. If the `separator` of
-    the cells is not a comma, numbers may have a decimal comma. `path` is that of the file, for messages.
-    """
+    """Table in a text file."""
 
     path: Path
     columns: tuple[str, ...]
-    body: str
-    separator: str = ","
+    body: str  # text below the line of column names
+    separator: str = ","  # if not a comma, numbers may have a decimal comma
     header_line: int = 1
 
     def listing(self) -> str:
@@ -64,10 +60,7 @@ class CsvTable:
         return joined(self.columns)
 
     def read(self, wanted: Sequence[str]) -> dict[str, FloatArray]:
-        """Return the wanted columns as numbers, each of shape (N,), N >= 2; an empty cell is NaN.
-
-        RecordError if a column is missing or not unique, a cell is not a number, or there are fewer than two rows.
-        """
+        """Return the wanted columns as numbers, each of shape (N,), N >= 2; an empty cell is NaN."""
         for column in wanted:
             if self.columns.count(column) != 1:
                 problem = "two columns" if column in self.columns else "no column"
@@ -138,10 +131,7 @@ class CsvTable:
             ) from error
 
     def require(self, good: NDArray[np.bool_], column: str, values: FloatArray, rule: str) -> None:
-        """Raise RecordError for the first of the values, shape (N,), one for each row, that is not `good`, shape (N,).
-
-        `rule` is the requirement for the values of this column, for the message.
-        """
+        """Raise RecordError, with the `rule`, for the first of the values (N,) that is not `good`."""
         if not good.all():
             row = int(np.argmin(good))
             line, _ = next(islice(self._lines(), row, None))
@@ -149,10 +139,7 @@ class CsvTable:
 
 
 def load_csv(path: Path) -> CsvTable:
-    """Read the text and the column names of a table; encoding, separator and header line are detected.
-
-    RecordError if the file cannot be read, or is not a table with column names above its numbers.
-    """
+    """Read the text and the column names of a table; encoding, separator and header line are detected."""
     text = _text(path)
     try:
         lines = _first_lines(text)
@@ -219,10 +206,8 @@ def _first_lines(text: str) -> list[_Line]:
 
 
 def _header(lines: Sequence[_Line], separator: str) -> _Header | None:
-    """Return the header: the line of names directly above a line of as many numbers; if several, the widest one.
-
-    If that line contains units only, the names are in the line above it. None if there is no such line.
-    """
+    """Return the header: the line of names directly above a line of as many numbers; if several, the widest one."""
+    # If that line contains units only, the names are in the line above it.
     rows = [_cells(line.text, separator) for line in lines]
     tops = [at for at in range(len(rows) - 1) if _are_names(rows[at]) and _are_numbers(rows[at + 1], rows[at])]
     if not tops:
@@ -281,24 +266,17 @@ _NUMERIC = {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("",
 
 @dataclass(frozen=True)
 class MatTable:
-    """Vectors in a MATLAB file; a matrix is split into vectors along its longer side.
-
-    `columns` are ``name`` for a vector; ``name(:,1)``, ``name(:,2)``, ... or ``name(1,:)``, ... for a matrix. `path` is
-    that of the file, for messages.
-    """
+    """Vectors in a MATLAB file; a matrix is split into vectors along its longer side."""
 
     path: Path
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # ``name`` of a vector; ``name(:,1)``, .. or ``name(1,:)``, .. of a matrix
 
     def listing(self) -> str:
         """Return the names of the columns for a message."""
         return joined(self.columns)
 
     def read(self, wanted: Sequence[str]) -> dict[str, FloatArray]:
-        """Return the wanted columns, each of shape (N,), N >= 2.
-
-        RecordError if a column is missing, the columns differ in length, have fewer than two values, or are complex.
-        """
+        """Return the wanted columns, each of shape (N,), N >= 2."""
         for column in wanted:
             if column not in self.columns:
                 raise RecordError(f"{self.path}: no numeric array '{column}'; there is {self.listing()}")
@@ -323,10 +301,7 @@ class MatTable:
 
 
 def load_mat(path: Path) -> MatTable:
-    """Find the numeric vectors and matrices in a MATLAB file.
-
-    RecordError if the file cannot be read, is of MATLAB v7.3, or holds no numeric vector.
-    """
+    """Find the numeric vectors and matrices in a MATLAB file."""
     columns: list[str] = []
     others = []
     for name, shape, kind in _joined(path):
@@ -361,12 +336,9 @@ def _joined(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
 
 
 def _require_small(file: BinaryIO) -> None:
-    """Raise an error if SciPy must not read a MATLAB file.
-
-    From version 5 on it is a header of 128 bytes and elements: type, size and data, each as a whole compressed or not
-    (https://www.mathworks.com/help/pdf_doc/matlab/matfile_format.pdf). LimitError if it unpacks to more than any
-    record, or has too many variables; ValueError if a part of a numeric matrix has a wrong type.
-    """
+    """Raise LimitError if a MATLAB file is too large for a record; ValueError if a numeric matrix has a wrong type."""
+    # From version 5 on it is a header of 128 bytes and elements: type, size and data, each as a whole compressed or not
+    # (https://www.mathworks.com/help/pdf_doc/matlab/matfile_format.pdf).
     size = file.seek(0, 2)
     left = min(ARRAY_BYTES, most_unpacked(size))
     file.seek(124)
@@ -399,11 +371,10 @@ def _require_small(file: BinaryIO) -> None:
 
 
 class _Matrix:
-    """Check the parts of a numeric matrix in a MATLAB file: SciPy ends the process at some wrong types.
+    """Check the parts of a numeric matrix in a MATLAB file: SciPy ends the process at some wrong types."""
 
-    A matrix is a sequence of words of 8 bytes: its own type, then type and content of its flags, shape, name, real and
-    imaginary data. The content of a short part is in the word of its type.
-    """
+    # A matrix is a sequence of words of 8 bytes: its own type, then type and content of its flags, shape, name, real
+    # and imaginary data. The content of a short part is in the word of its type.
 
     def __init__(self, order: str) -> None:
         self._order = order

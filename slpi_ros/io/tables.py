@@ -30,36 +30,24 @@ def import_table(
     displacement_unit: str | None = None,
     axes: Sequence[str] = (),
 ) -> Record:
-    """Import measured data (V, m) from a table, identifying columns and units by name or option.
-
-    The table is a text file with a line of column names above the numbers, separated by comma, semicolon or tab; with
-    semicolon or tab, decimal commas are allowed. Or it is a MATLAB file (``.mat``, up to version 7), whose numeric
-    vectors are the columns. A column name may contain a unit, as in ``time_ms``, ``Voltage (mV)``, ``x [nm]`` or
-    ``displacement in nm``; upper and lower case matter only where they change the meaning. Default units are seconds,
-    volts and micrometres; `displacement_unit` ("um", "m", "mm", "nm" or "pm") is that of displacement columns whose
-    names contain none.
-
-    The default of `time` is ``time_s``, else the first column with a unit whose name begins with "time" or is ``t``,
-    else the first column whose name begins with "time". `voltage` is one column for all axes or one for each
-    displacement column, by default those whose names begin with "voltage" or contain a unit of voltage. `displacement`
-    is one column for each axis, by default those whose names begin with "displacement", else with "position", else
-    ``<axis>_m`` (or another unit) if there is ``<axis>_V``, else x, y and z with a unit. `axes` are by default taken
-    from the names of the displacement columns, ``x`` if they contain none.
-
-    Empty cells and ``nan`` become NaN. If the first time is negative, all times are shifted such that the record begins
-    at 0. RecordError if the file, a column, its unit or a value is invalid; UsageError if an option is invalid,
-    contradicts the name of a column, or gives one column two roles.
-    """
+    """Import measured data (V, m) from a table, identifying columns and units by name or option."""
+    # The table is a text file with a line of column names above the numbers, separated by comma, semicolon or tab; with
+    # semicolon or tab, decimal commas are allowed. Or it is a MATLAB file (``.mat``, up to version 7), whose numeric
+    # vectors are the columns. A column name may contain a unit; without, units are seconds, volts and
+    # `displacement_unit`, by default micrometres. Empty cells and ``nan`` become NaN. If the first time is negative,
+    # all times are shifted such that the record begins at 0.
+    #
+    # By default `time` is ``time_s``, else the first column with a unit whose name begins with "time" or is ``t``, else
+    # the first one whose name begins with "time"; `voltage`, one column for all axes or one for each, those whose names
+    # begin with "voltage" or contain a unit of voltage; `displacement`, one column for each axis, those whose names
+    # begin with "displacement", else "position", else ``<axis>_m`` (or another unit) if there is ``<axis>_V``, else x,
+    # y and z with a unit; `axes` are from the names of the displacement columns, ``x`` if they contain none.
     options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
     return import_with_summary(path, options)[0]
 
 
 def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) -> tuple[Record, tuple[str, ...]]:
-    """Import a table as `import_table` does, with a summary of the columns; `options` are its other parameters.
-
-    The summary is one line for each axis with columns, units and ranges, preceded by a line on time if its unit was
-    assumed.
-    """
+    """Import a table as `import_table` does, with a summary: a line on the time if assumed, and one for each axis."""
     path = Path(path)
     table = load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
     choice = choose_columns(table.columns, options, str(path))
@@ -97,12 +85,8 @@ def _column_summary(column: Column, values: FloatArray, unit: str) -> str:
 
 
 def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Read times (s) and finite values (V or m) by axis, shape (N,) each, from a table of the command line.
-
-    The table has the columns ``time_s`` and ``<axis>_<suffix>`` in any order, with the unit "V" or "m" as `suffix`;
-    other columns are ignored, and the axes are in the order of the columns. RecordError if a value is missing or not
-    finite, or time runs backwards; the message names line, column and value.
-    """
+    """Read times (s) and finite values (V or m) by axis, shape (N,) each, from a table of the command line."""
+    # The columns are ``time_s`` and ``<axis>_<suffix>``, "V" or "m", in any order; others are ignored.
     table = load_csv(Path(path))
     ending = _ending(suffix)
     columns = {n.removesuffix(ending): n for n in table.columns if n.endswith(ending) and n != ending}
@@ -124,12 +108,7 @@ def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, d
 
 
 def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[str, FloatArray], suffix: str) -> None:
-    """Write a table that ``read_table`` reads back: time to the nanosecond, values to the last bit.
-
-    The times `t` (s) and the column of each axis (V or m) have the shape (N,); the unit "V" or "m" is the `suffix`. The
-    file is written atomically; an existing file is replaced. RecordError if the lengths differ or the file cannot be
-    written.
-    """
+    """Write a table that ``read_table`` reads back: time to the nanosecond, values to the last bit; atomically."""
     path = Path(path)
     for axis, values in columns.items():
         if len(values) != len(t):

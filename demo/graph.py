@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -59,10 +60,23 @@ class Operator(Node):
         self._answers: list[tuple[float, float]] = []
         self.state = JointState()
         self.create_subscription(JointState, "stage_state", self._keep, QOS)
+        self._reports: list[dict[str, str]] = []
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._hear, QOS)
 
     def _keep(self, state: JointState) -> None:
         self.state = state
         self._answers.append((state.effort[0], state.position[0]))
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            self._reports += [values] if "held_at_limit" in values else []
+
+    def held_at_limit(self) -> int:
+        """Return how many displacements the compensator has held at a voltage limit so far."""
+        before = len(self._reports)
+        self.wait_until("a report of the compensator", lambda: len(self._reports) > before)
+        return int(self._reports[-1]["held_at_limit"])
 
     def wait_until(self, what: str, condition: Callable[[], bool], timeout: float = 30.0) -> None:
         """Wait for the graph to be ready."""
@@ -103,6 +117,8 @@ class Operator(Node):
             time.sleep(max(0.0, start + k / rate - time.monotonic()))
             # On a busy machine the path is followed more slowly, but no sample is lost.
             self.wait_until(f"the answer to sample {k - AHEAD}", lambda k=k: len(self._answers) >= k - AHEAD)
+            # More answers than messages: on a busy machine the compensator has held a displacement meanwhile.
+            del self._answers[k:]
             publish(message)
         self.wait_until(f"the answer to all of {len(messages)} samples", lambda: len(self._answers) >= len(messages))
         return np.array(self._answers[: len(messages)])

@@ -28,12 +28,15 @@ class Run:
     t : ndarray, shape (N,), seconds
     desired, displacement : ndarray, shape (N,), metres
         Desired and measured displacement.
+    held : float
+        Share of the samples that were out of reach and held at a voltage limit; default 0.
     """
 
     name: str
     t: FloatArray
     desired: FloatArray
     displacement: FloatArray
+    held: float = 0.0
 
     @property
     def error(self) -> FloatArray:

@@ -90,7 +90,8 @@ def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y
         # To the begin of the path without a jump, from where the reset has left the stage.
         at = float(stage.state.position[0])
         approach = at + (y[0] - at) * (1 - np.cos(np.linspace(0.0, np.pi, int(RATE)))) / 2
-        return plots.Run(name, t, y, stage.follow([*approach.tolist(), *y.tolist()], RATE)[-y.size :, 1])
+        measured = stage.follow([*approach.tolist(), *y.tolist()], RATE)[-y.size :, 1]
+        return plots.Run(name, t, y, measured, stage.held_at_limit() / y.size)
 
 
 def compared(seed: int, models: Mapping[str, Path], stroke: tuple[float, float], duration: float) -> list[plots.Run]:
@@ -145,6 +146,17 @@ def write_page(
     path.with_name("tracking.png").write_bytes(png(plots.picture(runs)))
 
 
+def out_of_reach(runs: Sequence[plots.Run]) -> str:
+    """Return a sentence about the samples that no voltage reaches, which no model can follow; "" if none."""
+    held = [f"{run.name} {run.held:.1%}" for run in runs if run.held]
+    if not held:
+        return ""
+    return (
+        f" A part of the path was out of reach on this day, held at a voltage limit: {', '.join(held)} of the samples. "
+        "The errors there, and the maximum, say nothing of the model."
+    )
+
+
 def hidden_and_found(seed: int, model: slpi_ros.StageModel) -> str:
     """Return a sentence about the effects of the stage, and those in the model."""
     hidden = Stage.hidden(("x",), seed, NOISE, rate=RATE, voltage_max=V_MAX).effects["x"]
@@ -175,7 +187,7 @@ def main() -> int:
         low, high = model.axes["x"].displacement_range
         print(f"following a new path of {options.path:g} s, {1 + len(models)} times", flush=True)
         runs = compared(seed, models, (low, high), options.path)
-    rows, told = table_of(runs, high - low), hidden_and_found(seed, model)
+    rows, told = table_of(runs, high - low), hidden_and_found(seed, model) + out_of_reach(runs)
     page = options.output / "report.html"
     write_page(page, seed, rows, runs, told, model)
     print()

@@ -201,6 +201,11 @@ def test_unreachable_displacements_are_held_and_told(folder, tmp_path):
     write_table(tmp_path / "desired.csv", t, {"x": desired}, "m")
     done = slpi("compensate", folder / "pi.json", tmp_path / "desired.csv", "-o", tmp_path / "v.csv")
     assert done.returncode == 0 and "axis 'x'" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert f"to {1.1 * top * 1e6:.4g} µm" in done.stderr and "µm/s" not in done.stderr
+    # A hundred times as fast.
+    write_table(tmp_path / "desired.csv", t / 100, {"x": 0.8 * desired}, "m")
+    done = slpi("compensate", folder / "pi.json", tmp_path / "desired.csv", "-o", tmp_path / "v.csv")
+    assert done.returncode == 0 and "µm/s, the record" in done.stderr
     _, v = read_table(tmp_path / "v.csv", "V")
     assert v["x"].max() <= 100.0
 

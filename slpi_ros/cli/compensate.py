@@ -36,6 +36,7 @@ def _run(options: Namespace) -> Result:
 
     from slpi_ros.io.outputs import allow_table
     from slpi_ros.io.tables import read_table, table_header, write_table
+    from slpi_ros.model.coverage import path_beyond
     from slpi_ros.model.document import load_model
     from slpi_ros.model.limits import MAX_DT, Limits
     from slpi_ros.model.stage_model import check_time, held_message
@@ -55,8 +56,9 @@ def _run(options: Namespace) -> Result:
     except SlpiError as error:
         raise type(error)(f"{options.table}, {error}") from None
     for axis, (_, held) in answers.items():
-        if held.any():
-            options.remarks.append(f"axis '{axis}': {held_message(held)}")
+        told = [held_message(held)] if held.any() else []
+        told += [beyond] if (beyond := path_beyond(model.axes[axis], t, known[axis])) else []
+        options.remarks += [f"axis '{axis}': {'; '.join(told)}"] if told else []
     write_table(options.output, t, {axis: v for axis, (v, _) in answers.items()}, "V")
     lines = [describe_start(model, answers, options.start_memory)]
     document: dict[str, Any] = {"table": options.output, "samples": t.size, "axes": {}}

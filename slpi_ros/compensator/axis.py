@@ -9,6 +9,7 @@ from statistics import median
 from slpi_ros.compensator.amplifier import BAND_NS, Amplifier
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
 from slpi_ros.compensator.model_swap import continue_from, require_near, take_over, turning_voltages, voltage_history
+from slpi_ros.compensator.path_watch import PathWatch
 from slpi_ros.compensator.persistence import RESETTING, MemoryConfidence
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
@@ -60,6 +61,7 @@ class Axis:
         self.due_ns: int | None = None  # of the next `tick`; None if nothing follows
         self.point_ns: int | None = None  # deadline of the last trajectory point on its clock, None if it was none
         self.tracking = TrackingStatistics()  # measured - desired displacement
+        self.path = PathWatch()  # desired displacements against the record of the model
         self.fault: Fault | None = None  # for which the feedback was switched off
         self._loop_settings = loop_settings
         self._feedback: Feedback | None = None
@@ -139,6 +141,7 @@ class Axis:
             self.output.start(stream.voltage)
         planned = self.stream.pace if self._feedback and not self.ramp else self.output
         self.model, self.stream, self.driven = model, stream, True
+        self.path = PathWatch(model)
         stream.pace = planned
         self._set_limits(allowed)
         self.confidence = self.confidence.over(model.hysteresis_range)
@@ -236,6 +239,7 @@ class Axis:
         self._ticked = 0.0
         self._arrivals = (*self._arrivals[-3:], now_ns)
         self.tracking.desired = y
+        self.path.sample(dt, y)
         v = self._sample(dt, y, now_ns)
         self._follow_later(now_ns)
         return v

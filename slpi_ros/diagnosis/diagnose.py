@@ -24,6 +24,7 @@ from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.repeatability_floor import Floor, floor_of
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import ABOVE_FLOOR, AxisModel, Start
+from slpi_ros.model.coverage import fastest
 from slpi_ros.model.sensor import IDEAL, corrected
 from slpi_ros.model.stage_model import StageModel
 
@@ -415,6 +416,7 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
             floor_rms=floor.rms,
             samples=y.size,
             source=source,
+            fastest=max(fastest(part.t[part.used], part.v[part.used]) for part in evidence.parts),
         ),
     )
     return replace(extended, end=extended.at_rest(now.u, float(evidence.v[-1])))

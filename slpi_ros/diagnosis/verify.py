@@ -24,13 +24,13 @@ from slpi_ros.identification.cross_validation import (
     loop_levels,
     region_classes,
     speed_classes,
-    speeds,
 )
 from slpi_ros.identification.free_run import AS_WELL, Match, match, starts_at_end
 from slpi_ros.identification.repeatability_floor import floor_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import RESOLUTION, START_MEMORIES, AxisModel, StartMemory
+from slpi_ros.model.coverage import rates, record_beyond
 from slpi_ros.model.stage_model import StageModel
 
 IntArray = NDArray[np.int64]
@@ -64,7 +64,8 @@ class RecordVerification:
     None if the initial state is estimated and all are. `moving` and `standing` are absolute errors where both
     occur. `floor_rms` (m) is the repeatability of the record, estimated from `floor_source`. `zero_moved`: the
     offset exceeds its uncertainty. `gain` and `width` are relative changes of the loops' height, and of their width
-    in addition. `outside` counts voltages outside the range of the identification. `t`, `v`, `measured`, `model`,
+    in addition. `outside` counts voltages outside the range of the identification, and `beyond` says where the record
+    is faster or wider than that of the identification, "" if nowhere. `t`, `v`, `measured`, `model`,
     (N,), s, V and m: the record, and the displacement of the model with the constant; `judged`: mask of the judged
     samples. `tracking` is None if the desired displacement is not known. `corrected` says what was taken out of the
     readings, as known of the sensor.
@@ -90,6 +91,7 @@ class RecordVerification:
     width: float
     match: Match
     outside: int
+    beyond: str
     t: FloatArray
     v: FloatArray
     measured: FloatArray
@@ -501,6 +503,7 @@ def _judge(
         width=found.width_change,
         match=found,
         outside=int(np.count_nonzero((samples.v < low - margin) | (samples.v > high + margin))),
+        beyond=record_beyond(axis, run.t, samples.v),
         t=run.t,
         v=samples.v,
         measured=np.where(samples.fitted, samples.y, np.nan),
@@ -527,7 +530,7 @@ def _summary(records: Sequence[RecordVerification], resolution: float) -> AxisVe
         for signals in (
             [one.v for one in records],
             [loop_levels(one.t, one.v) for one in records],
-            [speeds(one.t, one.v) for one in records],
+            [rates(one.t, one.v) for one in records],
         )
     )
 

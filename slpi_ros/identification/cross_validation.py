@@ -19,6 +19,7 @@ from slpi_ros.identification.repeatability_floor import Floor, floor_of
 from slpi_ros.identification.samples import Samples, select_thinned
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
+from slpi_ros.model.coverage import rates
 
 IntArray = NDArray[np.int64]
 
@@ -30,8 +31,6 @@ DEEPEST, REGIONS = 3, 5
 # Below this share of the 95th percentile of the speed the stage counts as at rest; below this ratio speeds are equal.
 _REST, _ONE_SPEED = 0.02, 1.5
 _SPEED_CLASSES = 3
-# Samples before and after the current one between which the speed is computed.
-_SPEED_REACH = 2
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def cross_validate(
     left_out = np.isfinite(error)
     error, classical = error[left_out], classical[left_out]
     level = np.concatenate([loop_levels(part.t, part.samples.v) for part in parts])[left_out]
-    speed = np.concatenate([speeds(part.t, part.samples.v) for part in parts])[left_out]
+    speed = np.concatenate([rates(part.t, part.samples.v) for part in parts])[left_out]
     t = np.concatenate([part.t for part in parts])[left_out]
     v = np.concatenate([part.samples.v for part in parts])[left_out]
 
@@ -158,14 +157,6 @@ def loop_levels(t: FloatArray, v: FloatArray) -> IntArray:
     for loop in separate(v, dead_band=smallest_turn(v, noise(v, t))).loops:
         level[loop.samples] = loop.level
     return level
-
-
-def speeds(t: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the magnitude of dv/dt (V/s), shape (N,), from central differences over a few samples."""
-    at = np.arange(v.size)
-    before, after = np.maximum(at - _SPEED_REACH, 0), np.minimum(at + _SPEED_REACH, v.size - 1)
-    seconds = t[after] - t[before]
-    return np.divide(np.abs(v[after] - v[before]), seconds, out=np.zeros(v.size), where=seconds > 0.0)
 
 
 def level_classes(level: IntArray) -> Iterator[tuple[str, Mask]]:

@@ -14,8 +14,9 @@ from slpi_ros.identification.linear_kinds import FIT_SAMPLES, fit_family, fit_mu
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import fit_amplitude_scaled, fit_at_rest, fit_primed
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_thinned
-from slpi_ros.io.record import Record, common_stage
+from slpi_ros.io.record import Record, common_stage, release
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.coverage import fastest
 from slpi_ros.model.sensor import Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
 
@@ -86,7 +87,13 @@ def identify(
     models = {}
     for axis in axes or records[0].axes:
         report_progress(f"axis {axis}: identification")
-        samples = [select_thinned(part, axis, start, stop, FIT_SAMPLES)[0] for part in records]
+        selected = [select_thinned(part, axis, start, stop, FIT_SAMPLES) for part in records]
+        samples = [part for part, _ in selected]
+        rates = []
+        for part, (one, at) in zip(records, selected, strict=True):
+            stamps = part.time_ns[at[one.fitted]]
+            rates.append(fastest((stamps - stamps[0]) * 1e-9, one.v[one.fitted]))
+            release(part.time_ns)
         try:
             # The matrices are small: one thread is fastest.
             with threadpool_limits(1):
@@ -108,7 +115,8 @@ def identify(
                     if stop is not None:
                         whole, _ = select_thinned(records[last], axis, None, None, FIT_SAMPLES)
                     model = replace(model, end=replace(model, start=fitted.starts[last]).after(whole.v))
-                models[axis] = replace(model, sensor=sensor)
+                quality = replace(model.quality, fastest=max(rates))
+                models[axis] = replace(model, sensor=sensor, quality=quality)
         except SlpiError as error:
             raise type(error)(f"{source}: axis '{axis}': {error}") from None
     return StageModel(models, hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))

@@ -26,6 +26,7 @@ from slpi_ros.identification.linear_kinds import FIT_SAMPLES
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.coverage import fastest
 from slpi_ros.model.stage_model import StageModel
 
 # Standard deviations of the prior, for the gain (relative) and for the smooth deviation of each parameter (share of the
@@ -109,7 +110,10 @@ def refit(
             with threadpool_limits(1):
                 old = model.axes[name]
                 new, changes[name] = _refit_axis(old.hysteresis_only, samples, record.source)
-            new = replace(new, effects=lasting(old.effects), sensor=old.sensor)
+            t = record.t[np.isfinite(record.voltage[name])][: samples.v.size]
+            rate = max(old.quality.fastest or 0.0, fastest(t[samples.fitted], samples.v[samples.fitted]))
+            quality = replace(new.quality, fastest=rate)
+            new = replace(new, effects=lasting(old.effects), sensor=old.sensor, quality=quality)
             if new.end:
                 v = applied.voltage[name]
                 last = float(v[np.isfinite(v)][samples.v.size - 1])

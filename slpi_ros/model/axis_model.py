@@ -60,7 +60,8 @@ class FitQuality:
 
     `rms` and `maximum` (m) are errors of the fitted samples, `held_out_rms` (m) is the held-out error, from
     cross-validation, and `floor_rms` (m) the repeatability floor, estimated from the record. `covered` is the share of
-    the cells of the Everett function that the record visited, 0..1.
+    the cells of the Everett function that the record visited, 0..1. `fastest` (V/s) is its fastest rate, see
+    `slpi_ros.model.coverage`; None (default): unknown, as in older documents.
     """
 
     rms: float
@@ -70,6 +71,7 @@ class FitQuality:
     samples: int
     covered: float
     source: str
+    fastest: float | None = None
 
 
 @dataclass(frozen=True)

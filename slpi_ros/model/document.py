@@ -3,7 +3,7 @@
 import json
 import os
 import textwrap
-from dataclasses import asdict, astuple
+from dataclasses import asdict
 from math import isfinite
 from typing import Any
 
@@ -18,8 +18,8 @@ from slpi_ros.model.sensor import Sensor
 from slpi_ros.model.stage_model import StageModel
 
 SCHEMA, EARLIER = "slpi_ros/model/2", "slpi_ros/model/1"
-# Names of the fields of `FitQuality`, in order.
-QUALITY = ("rms_m", "maximum_m", "held_out_rms_m", "floor_rms_m", "samples", "covered", "source")
+# Names of the fields of `FitQuality`, in order; the last one is optional.
+QUALITY = ("rms_m", "maximum_m", "held_out_rms_m", "floor_rms_m", "samples", "covered", "source", "fastest_V_per_s")
 
 
 def load_model(path: str | os.PathLike[str]) -> StageModel:
@@ -126,7 +126,7 @@ def _axis_from(axis: dict[str, Any]) -> AxisModel:
         end=_start_from(axis["end"]) if "end" in axis else None,
         voltage_range=ranges["voltage_range_V"],
         displacement_range=ranges["displacement_range_m"],
-        quality=FitQuality(*(axis["quality"][key] for key in QUALITY)),
+        quality=FitQuality(*(axis["quality"].get(key) for key in QUALITY)),
         effects=tuple(map(registry.from_document, axis.get("effects", []))),
         sensor=Sensor(**axis.get("sensor", {})),
     )
@@ -143,6 +143,7 @@ def _start_document(start: Start) -> dict[str, Any]:
 
 
 def _axis_document(axis: AxisModel) -> dict[str, Any]:
+    quality = dict(zip(QUALITY, asdict(axis.quality).values(), strict=True))
     return {
         "kind": axis.kind,
         "voltage_range_V": list(axis.voltage_range),
@@ -152,5 +153,5 @@ def _axis_document(axis: AxisModel) -> dict[str, Any]:
         "hysteresis": kinds.to_document(axis.hysteresis),
         "effects": [registry.to_document(effect) for effect in axis.effects],
         **({"sensor": asdict(axis.sensor)} if axis.sensor else {}),
-        "quality": dict(zip(QUALITY, astuple(axis.quality), strict=True)),
+        "quality": {key: value for key, value in quality.items() if value is not None},
     }

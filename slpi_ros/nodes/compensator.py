@@ -23,6 +23,7 @@ from trajectory_msgs.msg import JointTrajectory
 from slpi_ros.compensator.amplifier import Calibration
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
+from slpi_ros.compensator.path_watch import PathWatch
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis, model_id
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import ModelError, SlpiError, shown
@@ -106,6 +107,7 @@ class Compensator(LifecycleNode):
         self._doubts: dict[str, str] = {}
         self._noted: set[str] = set()
         self._calibrations: dict[str, Calibration] = {}
+        self._beyond: dict[str, PathWatch] = {}
         # The age of one command for each report: reading the clock takes as long as compensating an axis.
         self._measures_age = True
         self._state_topic = self.resolve_topic_name("stage_state")
@@ -384,6 +386,17 @@ class Compensator(LifecycleNode):
                     "(effort): a matter of calibration, it is not followed"
                 )
 
+    def _tell_beyond(self) -> None:
+        """Log once for each model that a path is faster than its record."""
+        for axis in self._controller.axes:
+            if axis.path is not self._beyond.get(axis.name) and axis.path.beyond:
+                self._beyond[axis.name] = axis.path
+                self.get_logger().warning(
+                    f"axis '{axis.name}': {axis.path.beyond}; errors may be larger than told, record at that rate "
+                    "(slpi excite --for-path)"
+                )
+                self._report_at_least(WARN)
+
     def _tell_doubts(self) -> None:
         """Log once what has become doubtful about the memory of an axis."""
         for axis in self._controller.axes:
@@ -437,9 +450,9 @@ class Compensator(LifecycleNode):
         self._report_at_least(WARN)
         if self._controller.counts.excursions > self._excursions:
             self._excursions = self._controller.counts.excursions
-            out = [axis.name for axis in self._controller.axes if axis.held]
+            out = [f"axis {axis.name}{_reach(axis)}" for axis in self._controller.axes if axis.held]
             self.get_logger().warning(
-                f"desired displacement out of reach, held at a voltage limit: axis {', '.join(out)}; "
+                f"desired displacement out of reach, held at a voltage limit: {', '.join(out)}; "
                 "send displacements within the identified range"
             )
 
@@ -503,6 +516,7 @@ class Compensator(LifecycleNode):
         self._locate()
         self._tell_notes()
         self._tell_calibrations()
+        self._tell_beyond()
         if controller.watch(self._settings.safety, now_ns):
             self._report()
         for axis, fault in controller.watch_sensors(values["feedback_fault_time"], now_ns):
@@ -695,6 +709,15 @@ class Compensator(LifecycleNode):
             self._memory_file.save(controller.model, axes, complete)
         except SlpiError as error:
             self.get_logger().error(str(error), throttle_duration_sec=FILE_LOG_PERIOD)
+
+
+def _reach(axis: Axis) -> str:
+    """Return the desired displacement of an axis beside the identified range as text."""
+    desired, model = axis.tracking.desired, axis.model
+    if desired is None or model is None:
+        return ""
+    low, high = model.displacement_range
+    return f" at {desired * 1e6:.5g} of {low * 1e6:.5g} to {high * 1e6:.5g} µm"
 
 
 def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayLike]:

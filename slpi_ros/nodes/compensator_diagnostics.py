@@ -51,6 +51,7 @@ class Reporter:
         """Start a new reporting period."""
         self._window, self._window_start = self._controller.counts.copy(), time.perf_counter()
         self._lost_before = self.lost
+        self._beyond_before = {axis.name for axis in self._controller.axes if axis.path.beyond}
         self.timing.restart()
         self.lateness.restart()
 
@@ -177,6 +178,8 @@ class Reporter:
         yield silence != "", WARN, silence
         if ready:
             for axis in self._controller.axes:
+                beyond = axis.path.beyond
+                yield beyond != "" and axis.name not in self._beyond_before, WARN, f"axis '{axis.name}': {beyond}"
                 yield from _axis_problems(axis, settings.values["drift_alarm"], counts.accepted > window.accepted)
 
 
@@ -192,6 +195,7 @@ def _axis_values(axis: Axis) -> dict[str, object]:
         "voltage_V": f"{axis.voltage:.4f}",
         "memory": axis.confidence.state,
         "memory_doubt": axis.confidence.doubt,
+        "beyond_record": axis.path.beyond,
         "covered": f"{quality.covered:.3f}" if quality else "",
         "held_out_rms_nm": f"{quality.held_out_rms * 1e9:.2f}" if quality else "",
         "feedback": axis.feedback_state,

@@ -10,6 +10,7 @@ from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops
 from slpi_ros.model.axis_model import ABOVE_FLOOR, RESOLUTION, AxisModel, StartMemory
+from slpi_ros.model.coverage import fastest_displacement
 from slpi_ros.model.stage_model import StageModel
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def describe_axis(axis: AxisModel, *, details: bool = True) -> list[str]:
     ]
     return [
         f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {_parts(axis.hysteresis)}",
-        f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} µm "
+        f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} µm{_rate(axis)} "
         f"({quality.covered:.0%} model covered)",
         f"held-out error: {nm(quality.held_out_rms)} rms; sensor noise {nm(quality.floor_rms)} rms",
         *(more if details else ()),
@@ -95,6 +96,11 @@ def describe_axis(axis: AxisModel, *, details: bool = True) -> list[str]:
         *(() if axis.effects else ("effects: none",)),
         *((f"sensor: {axis.sensor.describe()}, known and taken out of its readings",) if axis.sensor else ()),
     ]
+
+
+def _rate(axis: AxisModel) -> str:
+    rate = fastest_displacement(axis)
+    return "" if rate is None else f", at up to {axis.quality.fastest:.3g} V/s or {rate * 1e6:.3g} µm/s"
 
 
 def describe_start(model: StageModel, axes: Iterable[str], start_memory: StartMemory) -> str:

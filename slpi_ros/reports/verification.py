@@ -173,8 +173,8 @@ def _notes(record: RecordVerification) -> list[str]:
         notes.append(f"the zero has moved by {_um(record.offset)} µm")
     if not record.passed:
         notes.append(f"relative to the model, gain {record.gain:+.2%}, loop width {record.width:+.2%}")
-    if record.outside:
-        notes.append(f"{record.outside} voltages lie outside the identified range, where the model extrapolates")
+    if record.beyond:
+        notes.append(f"{record.beyond}: the model extrapolates there")
     return notes
 
 

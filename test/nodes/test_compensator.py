@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from std_msgs.msg import Float64, Float64MultiArray, String  # noqa: E402
 
 from slpi_ros.compensator.validation import CAUSES  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
-from slpi_ros.model.stage_model import HeldAtLimitWarning  # noqa: E402
+from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings(f"ignore::{HeldAtLimitWarning.__module__}.{HeldAtLimitWarning.__name__}")
 
@@ -62,6 +63,30 @@ def test_every_sample_is_answered_in_order_as_the_library_answers(xy_file, execu
     assert status.hardware_id == values["model.hardware_id"] == "stage under test"
     assert values["model.created"] == "2026-01-02T03:04:05+00:00"
     assert (values["model.kind"], values["memory"]) == ("slpi, slpi", "assumed")
+
+
+def test_a_path_that_is_faster_than_the_record_is_told_once(tmp_path):
+    axis = stage_model().axes["x"]
+    stroke = np.ptp(axis.displacement_range) * 1e6
+    axis = replace(axis, quality=replace(axis.quality, fastest=50.0))
+    save_model(StageModel({"x": axis}), tmp_path / "x.json")
+    # At the rate of the record, then at six times that.
+    way = np.concatenate([np.arange(100) * 2.5e-3 * stroke, np.arange(30) * 15e-3 * stroke])[:, None] * 1e-6
+    with compensator(model_file=str(tmp_path / "x.json")) as client:
+        client.connect()
+        client.follow(["x"], way[:100])
+        _, values = client.report(accepted=100)
+        assert values["x.beyond_record"] == ""
+        client.follow(["x"], way[100:], START_NS + 10**9)
+        _, values = client.report(accepted=130)
+        reports = len(client.reports)
+        client.graph.spin_until(lambda: len(client.reports) > reports + 3, "later reports")
+        told = values["x.beyond_record"]
+        assert f"{3 * stroke:.3g} µm/s" in told and f"{0.5 * stroke:.3g} µm/s" in told
+        said = [told in status.message for status in client.graph.statuses("/compensator: compensator")]
+        assert any(said) and not any(said[-2:])
+        client.node.stop()
+        assert client.node.stderr.count(told) == 1
 
 
 NAN, INF = math.nan, math.inf

@@ -236,6 +236,10 @@ class EffectBase(Protocol):
         """Return new parameters, by name, within bounds that concern several of them."""
         return changed
 
+    def anchored(self, rest: float) -> Self:
+        """Return the effect with the displacement `rest` (m) as its origin, if it needs one and has none."""
+        return self
+
     def streaming(self) -> Any:
         """Return the `StreamingEffect` or `StreamingAround`; None if it is not compensated sample by sample."""
         return

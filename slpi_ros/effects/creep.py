@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import inf
 from typing import Any, ClassVar
 
 import numpy as np
@@ -54,7 +55,8 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class Creep(EffectBase):
     """Parallel first-order relaxations, ``y = h + sum_k g_k z_k`` with ``tau_k dz_k/dt = (h - h_0) - z_k``.
 
-    ``h_0`` is the displacement at the start, where all relaxations are in equilibrium.
+    ``h_0``, the `origin`, is the displacement to which creep adds nothing; in a fit, where there is none, the first one
+    of each record. At the start all relaxations are in equilibrium.
     """
 
     name: ClassVar[str] = "creep"
@@ -80,6 +82,9 @@ class Creep(EffectBase):
     gains: tuple[float, ...] = parameter(
         "", "shares g_k of the motion that follow with each", -0.9, 11, count=(1, 100), fit=Fit("linear", 1e-5, 0.0)
     )
+    origin: float = parameter(
+        "m", "displacement h_0 to which creep adds nothing; null: that at the start", -1e3, 1e3, default=inf, none=True
+    )
     # Only `apply` includes the creep after it; streaming starts at equilibrium.
     initial: float = parameter("m", "step of the displacement just before the record", -1e3, 1e3, default=0.0)
     uncertainty: Mapping[str, float] = field(default_factory=dict)
@@ -104,6 +109,8 @@ class Creep(EffectBase):
 
         crept = relaxed(moved, np.array(self.gains), np.array(self._holds(grid.dt)))
         crept, step = grid.off(crept), around.step(signal)
+        if self.origin < inf and signal.size:
+            crept += sum(self.gains) * (float(signal[0]) - step - self.origin)
         if step or self.initial:
             for gain, tau in zip(self.gains, self.time_constants, strict=True):
                 crept += gain * (step - (step + self.initial) * np.exp(-around.since / tau))
@@ -193,9 +200,13 @@ class Creep(EffectBase):
         span = f"{fast:.3g} s" if slow == fast else f"{fast:.3g} to {slow:.3g} s"
         return f"after a move the stage creeps on by {sum(self.gains) * 100:.3g} % of it, with time constants of {span}"
 
-    def laws(self) -> Mapping[str, FloatArray]:
-        """Return time constants (s) and gains for the compiled inverse."""
-        return {"relaxations": np.array([self.time_constants, self.gains])}
+    def laws(self) -> Mapping[str, Any]:
+        """Return time constants (s), gains and origin (m) for the compiled inverse."""
+        return {"relaxations": np.array([self.time_constants, self.gains]), "rest_of_creep": self.origin}
+
+    def anchored(self, rest: float) -> "Creep":
+        """Return the creep with the origin `rest` (m) unless it has one."""
+        return self if self.origin < inf else replace(self, origin=rest)
 
     def streaming(self) -> "StreamingCreep":
         """Return the streaming creep."""
@@ -215,7 +226,9 @@ class StreamingCreep(StreamingBase):
 
     def start(self, x: float) -> None:
         """Initialise to equilibrium at `x` (m)."""
-        self._origin, self._input, self._states = x, 0.0, [0.0] * len(self._creep.gains)
+        self._origin = self._creep.anchored(x).origin
+        self._input = x - self._origin
+        self._states = [self._input] * len(self._creep.gains)
 
     def forward(self, dt: float, x: float) -> float:
         """Advance by `dt` (s) to the displacement `x` (m) and return the displacement with creep (m)."""
@@ -241,10 +254,9 @@ class StreamingCreep(StreamingBase):
 
         Relaxations with a time constant that `other` also has continue from its state; all others start in equilibrium.
         """
-        moved = other._input
+        self.start(x)
         known = dict(zip(other._creep.time_constants, other._states, strict=True))
-        self._origin, self._input = x - moved, moved
-        self._states = [known.get(tau, moved) for tau in self._creep.time_constants]
+        self._states = [self._input + known.get(tau, other._input) - other._input for tau in self._creep.time_constants]
 
     def snapshot(self) -> tuple[float, ...]:
         """Return origin, last motion from the origin, and states of the relaxations (m)."""

@@ -21,15 +21,17 @@ class Laws(NamedTuple):
     """Parameters of the effects of an axis, each as its method `laws` returns them; without the effect: empty or 0.
 
     `lag` is in seconds. `rate`, shape (0,) or (3,), holds threshold (V), onset rate (V/s) and reversible gain (m/V),
-    and `relaxations`, shape (2, K), time constants (s) and gains of the creep. `modes`, shape (M, 4), holds 0, angular
-    frequency (rad/s), damping and gain of each mode of a resonance, `rest` the share of the motion beside the modes,
-    and `factors`, shape (F, 8), the factors of the inverse of the resonance, see `Exact.law` and `Unringing.law`.
-    `gain`, shape (2,), holds origin (m) and factor of the sensitivity.
+    and `relaxations`, shape (2, K), time constants (s) and gains of the creep around its origin `rest_of_creep` (m),
+    inf for the displacement at the start. `modes`, shape (M, 4), holds 0, angular frequency (rad/s), damping and gain
+    of each mode of a resonance, `rest` the share of the motion beside the modes, and `factors`, shape (F, 8), the
+    factors of the inverse of the resonance, see `Exact.law` and `Unringing.law`. `gain`, shape (2,), holds origin (m)
+    and factor of the sensitivity.
     """
 
     lag: float = 0.0
     rate: FloatArray = np.empty(0)
     relaxations: FloatArray = np.empty((2, 0))
+    rest_of_creep: float = np.inf
     modes: FloatArray = np.empty((0, 4))
     rest: float = 1.0
     factors: FloatArray = np.empty((0, 8))
@@ -270,6 +272,10 @@ def inverse_path(
     creep = np.zeros((k + 1, 7))
     creep[:k, TAU], creep[:k, GAIN] = laws.relaxations[0], laws.relaxations[1]
     creep[k, ORIGIN], creep[k, STEP] = x, -1.0
+    if laws.rest_of_creep < np.inf:
+        creep[k, ORIGIN], creep[k, INPUT] = laws.rest_of_creep, x - laws.rest_of_creep
+        creep[:k, STATE] = creep[k, INPUT]
+        x += laws.relaxations[1].sum() * creep[k, INPUT]
     modes, factors, rest_share = np.zeros((m, WIDTH)), np.zeros((f, WIDTH)), laws.rest
     modes[:, :4], factors[:, :8] = laws.modes, laws.factors
     modes[:, MOVED : MOVED + 2] = factors[:, MOVED : MOVED + 2] = x

@@ -108,7 +108,8 @@ class AxisModel:
     sensor: Sensor = IDEAL
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "effects", in_order(self.effects))
+        rest = self.start.displacement
+        object.__setattr__(self, "effects", tuple(effect.anchored(rest) for effect in in_order(self.effects)))
 
     @property
     def causal(self) -> bool:

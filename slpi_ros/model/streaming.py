@@ -88,8 +88,10 @@ class StreamingInverse:
             streaming.start(memory.voltage)
         if self._around:
             self._around.start(memory.voltage)
+        y = memory.displacement
         for streaming in self._behind.values():
-            streaming.start(memory.displacement)
+            streaming.start(y)
+            y = streaming.forward(0.0, y)
         self._command = self.goal = memory.voltage
         self.desired = memory.displacement
         # Shortfall of the last sample: of the hysteresis or the voltage (m or V), and of the axis as a whole (m).
@@ -343,9 +345,11 @@ class StreamingInverse:
         # The command is set without elapsed time.
         self.memory.forward(self._reaching(0.0, before.voltage))
         self.desired = self._inside
+        y = self.desired
         for name, streaming in self._behind.items():
             if name in before._behind:
-                streaming.resume(before._behind[name], self.memory.displacement)
+                streaming.resume(before._behind[name], y)
+            y = streaming.forward(0.0, y)
         self._follow(0.0)
 
     def copy(self) -> "StreamingInverse":
@@ -401,6 +405,7 @@ class StreamingInverse:
         """Return the voltage (V) that the hysteresis feels for a command `v` (V), `dt` (s) later."""
         for streaming in self._before.values():
             v = streaming.forward(dt, v)
+        v = min(max(v, self._clipped[0]), self._clipped[1])
         return self._around.forward(dt, v) if self._around else v
 
     def _follow(self, dt: float) -> None:

@@ -284,3 +284,22 @@ def test_a_stage_without_coupling_is_its_axes():
         for now, wish in zip(T[:500].tolist(), y[:500].tolist(), strict=True):
             assert stream.step(now, {"x": wish, "y": wish})["x"] == alone.step(now, wish)
     assert FAMILY_CASE.rest[1] == 2e-6
+
+
+@pytest.mark.parametrize("effects", [(CREEP,), (CREEP, MODE, SENSITIVE)], ids=ids)
+def test_where_a_stage_rests_does_not_depend_on_where_its_stream_begins(effects):
+    """Creep is counted from the rest of the model: after a minute at one voltage the stage is where `simulate` says."""
+    axis, t = with_effects(*effects), np.append(T, T[-1] + 60.0)
+    v = np.append(np.interp(T, [0.0, 1.0, 2.0, 3.0], [X.start.voltage, 110.0, 10.0, 70.0]), 70.0)
+    ended = replace(axis, end=axis.after(v))
+    assert abs(ended.end.displacement - axis.start.displacement) > 0.3 * SPAN
+    stream = ended.stream()
+    assert stream.uncoupled_displacement == pytest.approx(axis.simulate(t, v)[-1], abs=1e-5 * SPAN)
+    # The same document, read again, and another start of the same record.
+    assert replace(ended, start=ended.end).stream().uncoupled_displacement == stream.uncoupled_displacement
+
+
+def test_a_voltage_beyond_the_saturation_moves_nothing():
+    one, other = (with_effects(Saturation(upper=80.0)).stream() for _ in range(2))
+    assert one.drive(100.0, DT) == other.drive(80.0, DT)
+    assert one.drive(50.0, DT) == other.drive(50.0, DT)

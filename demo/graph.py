@@ -9,6 +9,7 @@ from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -23,8 +24,6 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 FloatArray = NDArray[np.float64]
-# Samples sent but not yet answered: fewer than the compensator's queue holds.
-AHEAD = 50
 QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 EXECUTABLES = (
     Path(__file__).resolve().parents[1] / os.environ.get("SLPI_INSTALL", "install") / "slpi_ros" / "lib" / "slpi_ros"
@@ -78,13 +77,13 @@ class Operator(Node):
         self.wait_until("a report of the compensator", lambda: len(self._reports) > before)
         return int(self._reports[-1]["held_at_limit"])
 
-    def wait_until(self, what: str, condition: Callable[[], bool], timeout: float = 30.0) -> None:
+    def wait_until(self, what: str, condition: Callable[[], bool], timeout: float = 30.0, poll: float = 0.02) -> None:
         """Wait for the graph to be ready."""
         end = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > end:
                 raise SystemExit(f"demo: {what} did not happen within {timeout:g} s")
-            time.sleep(0.02)
+            time.sleep(poll)
 
     def reset(self, compensator: str) -> None:
         """Let a compensator sweep the stage, so that the memory is known."""
@@ -101,27 +100,28 @@ class Operator(Node):
 
     def follow(self, displacements: Sequence[float], rate: float) -> FloatArray:
         """Wish for displacements (m) one after the other; return as `drive` does."""
-        # The times at which the samples are meant: those at which they are sent are less even.
-        begin = self.get_clock().now()
-        messages = []
-        for k, y in enumerate(displacements):
-            message = JointState(name=["x"], position=[y])
-            message.header.stamp = (begin + Duration(seconds=k / rate)).to_msg()
-            messages.append(message)
-        return self._send(messages, self.desired.publish, rate)
+        return self._send([JointState(name=["x"], position=[y]) for y in displacements], self.desired.publish, rate)
 
-    def _send(self, messages: Sequence[object], publish: Callable[[object], None], rate: float) -> FloatArray:
-        self._answers = []
-        start = time.monotonic()
+    def _send(self, messages: Sequence[Any], publish: Callable[[Any], None], rate: float) -> FloatArray:
+        """Return the last answer to each message: while the compensator holds or slews there are several."""
+        kept = []
+        due, begin = time.monotonic(), self.get_clock().now() - Duration(seconds=time.monotonic())
         for k, message in enumerate(messages):
-            time.sleep(max(0.0, start + k / rate - time.monotonic()))
-            # On a busy machine the path is followed more slowly, but no sample is lost.
-            self.wait_until(f"the answer to sample {k - AHEAD}", lambda k=k: len(self._answers) >= k - AHEAD)
-            # More answers than messages: on a busy machine the compensator has held a displacement meanwhile.
-            del self._answers[k:]
+            time.sleep(max(0.0, due - time.monotonic()))
+            if k:
+                self.wait_until(f"the answer to sample {k - 1}", lambda: bool(self._answers), poll=1e-3)
+                kept.append(self._answers[-1])
+            # On a busy machine the path is followed more slowly, and its stamps say so.
+            now = time.monotonic()
+            due = now if now > due + 1.0 / rate else due
+            if isinstance(message, JointState):
+                # The time at which it is meant: those at which messages are sent are less even.
+                message.header.stamp = (begin + Duration(seconds=due)).to_msg()
+            self._answers.clear()
             publish(message)
-        self.wait_until(f"the answer to all of {len(messages)} samples", lambda: len(self._answers) >= len(messages))
-        return np.array(self._answers[: len(messages)])
+            due += 1.0 / rate
+        self.wait_until("the last answer", lambda: bool(self._answers))
+        return np.array([*kept, self._answers[-1]])
 
 
 @contextmanager

@@ -31,11 +31,9 @@ _LONGEST_REASON = 200
 
 
 def shown(text: object, most: int = LONGEST_SHOWN) -> str:
-    """Return a text as one line for a terminal, a log or a page.
-
-    Names of axes, stages, columns, topics and files come from strangers: control characters, which could command a
-    terminal, are escaped, and a long text loses its middle, so that the remedy at the end of a message stays.
-    """
+    """Return a text as one line for a terminal, a log or a page."""
+    # Names of axes, stages, columns, topics and files come from strangers: control characters, which could command a
+    # terminal, are escaped, and a long text loses its middle, so that the remedy at the end of a message stays.
     line = _cut(str(text), most)
     if line.isprintable():
         return line

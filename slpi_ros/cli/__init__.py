@@ -1,11 +1,8 @@
 # PYTHON_ARGCOMPLETE_OK
-"""The command line ``slpi``, usable without a running ROS graph.
-
-Exit codes: 0 success, 1 the data do not allow the request, a verification failed or ``slpi doctor`` found a fault, 2
-wrong usage. Errors are reported on one line. A command prints its verdict first, then at most `MOST_LINES` lines (all
-with ``-v``), and last the command that follows; with ``--json`` it prints one JSON document instead. Each command is a
-module of this folder.
-"""
+"""The command line ``slpi``, usable without a running ROS graph; each command is a module of this folder."""
+# Exit codes: 0 success, 1 the data do not allow the request, a verification failed or ``slpi doctor`` found a fault, 2
+# wrong usage. Errors are reported on one line. A command prints its verdict first, then at most `MOST_LINES` lines (all
+# with ``-v``), and last the command that follows; with ``--json`` it prints one JSON document instead.
 
 import argparse
 import os
@@ -81,10 +78,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser of all commands; its result contains the name of the chosen command as ``command``.
-
-    With `command`, only the options of this command are added; default: of all commands.
-    """
+    """Return the parser of all commands, of which only `command` (default: all) has its options."""
     whole = _Parser(
         prog="slpi",
         description="Hysteresis models of piezo stages: identify, diagnose, compensate.",

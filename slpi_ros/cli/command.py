@@ -22,19 +22,14 @@ MOST_LINES = 10
 
 @dataclass(frozen=True)
 class Result:
-    """What a command has to say: its `lines`, the most important first, and its exit code, 0 if `passed`, else 1.
+    """What a command has to say."""
 
-    `document` holds the figures for ``--json``, in SI units: the text of a document, or what becomes one. `next` is the
-    command that follows, or what to do; `verdict` is the first line, "" (default): none. `details` are all lines,
-    printed instead of `lines` with ``-v``; default: `lines`.
-    """
-
-    lines: Sequence[str]
-    document: str | Mapping[str, Any]
-    next: str
-    verdict: str = ""
-    details: Sequence[str] | None = None
-    passed: bool = True
+    lines: Sequence[str]  # the most important first
+    document: str | Mapping[str, Any]  # for ``--json``, SI: its text, or what becomes one
+    next: str  # the command that follows, or what to do
+    verdict: str = ""  # the first line; "": none
+    details: Sequence[str] | None = None  # all lines, for ``-v``; default: `lines`
+    passed: bool = True  # exit code 0, else 1
 
     def show(self, *, as_document: bool, verbose: bool) -> None:
         """Print the result."""

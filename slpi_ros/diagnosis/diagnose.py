@@ -209,11 +209,9 @@ def _runs(model: AxisModel, now: Explanation) -> list[FreeRun]:
 
 
 def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection: Selection) -> bool:
-    """Return whether the free runs `after` of an extended model show another gain than the held-out error.
-
-    They may be worse than those of the given model, `runs`, on none of the records. Where the effects leave more than
-    what does not repeat, they also show at least `GAIN_SHOWN` of their held-out gain.
-    """
+    """Return whether the free runs `after` of an extended model show another gain than the held-out error."""
+    # They may be worse than those of the given model, `runs`, on none of the records. Where the effects leave more than
+    # what does not repeat, they also show at least `GAIN_SHOWN` of their held-out gain.
     if any(one.rms > NO_WORSE * given.rms for one, given in zip(after, runs, strict=True)):
         return True
     shown = 1.0 - rms_of(after) / rms_of(runs)
@@ -221,11 +219,9 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
 
 
 def _ambiguous(selection: Selection) -> list[str]:
-    """Return the effects that cannot be distinguished from others whose predictions on other records differ.
-
-    Held-out records can resolve this, except for dynamic effects at a single drive frequency. Effects that only shift
-    in time predict the same wherever they cannot be distinguished.
-    """
+    """Return the effects that cannot be distinguished from others whose predictions on other records differ."""
+    # Held-out records can resolve this, except for dynamic effects at a single drive frequency. Effects that only shift
+    # in time predict the same wherever they cannot be distinguished.
     alone = one_speed(selection.now.evidence)
     return [
         named.name
@@ -335,11 +331,9 @@ def _compared(bare: AxisModel, one: Explanation) -> Given:
 
 
 def _since(own: NDArray[np.bool_], one: Explanation) -> Given:
-    """Compare new records with those from which the given model was identified, the mask `own`, shape (records,).
-
-    The given model has absorbed the effects in its own records, which act differently in others. Therefore the
-    residuals of one joint fit to all records show whether the stage has changed in between.
-    """
+    """Compare new records with those from which the given model was identified, the mask `own`, shape (records,)."""
+    # The given model has absorbed the effects in its own records, which act differently in others. Therefore the
+    # residuals of one joint fit to all records show whether the stage has changed in between.
     found = []
     for part, rows in zip(one.evidence.parts, one.evidence.slices, strict=True):
         chosen = _known(part) & one.joint.predictable[rows]

@@ -62,17 +62,11 @@ BLOCKS = 40
 
 @dataclass(frozen=True)
 class Score:
-    """Held-out errors of a joint fit of hysteresis and columns.
+    """Held-out errors of a joint fit of hysteresis and columns."""
 
-    `losses`, shape (blocks,), m^2, are the mean square held-out errors of the blocks, and `gains`, shape (k,), those of
-    the columns, fitted to all samples. `records`, shape (records,), m^2, are the mean square errors of each record
-    without its offset, from a fit to the other records: NaN if these cover too little of it, empty if there is only one
-    record.
-    """
-
-    losses: FloatArray
-    gains: FloatArray
-    records: FloatArray
+    losses: FloatArray  # (blocks,), m^2, mean squares
+    gains: FloatArray  # (k,), of the columns, fitted to all samples
+    records: FloatArray  # (records,), m^2, without offset, fitted to the others; NaN: they cover too little; empty: one
 
     @property
     def rms(self) -> float:
@@ -86,11 +80,10 @@ class Score:
 
 
 class Joint:
-    """Normal equations of the hysteresis of one axis, to which columns of effects can be added.
+    """Normal equations of the hysteresis of one axis, to which columns of effects can be added."""
 
-    The voltage `u`, shape (N,), volts, drives the hysteresis. The mask `predictable` is reused from `like`, equations
-    of the same records.
-    """
+    # The voltage `u` (V, (N,)) drives the hysteresis. The mask `predictable` is reused from `like`, equations of the
+    # same records.
 
     def __init__(self, evidence: Evidence, u: FloatArray, like: "Joint | None" = None) -> None:
         if like and len(evidence.parts) > 1:
@@ -187,12 +180,10 @@ class Joint:
         return Columns(self, self.sampled(np.column_stack(signals)))
 
     def score(self, signals: Sequence["Columns"], *, positive: int = 0, starting: Sequence[int] = ()) -> Score:
-        """Return the held-out errors of a joint fit of hysteresis and all other columns to the very first column.
-
-        The gains of the last `positive` columns are non-negative. The columns `starting`, indices without counting the
-        first one, describe the state before a record; together with an offset, they are fitted to a held-out record
-        itself.
-        """
+        """Return the held-out errors of a joint fit of hysteresis and all other columns to the very first column."""
+        # The gains of the last `positive` columns are non-negative. The columns `starting`, indices without counting
+        # the first one, describe the state before a record; together with an offset, they are fitted to a held-out
+        # record itself.
         at = self.grouped(np.column_stack([one.at for one in signals]))
         projected = [np.column_stack(parts) for parts in zip(*(one.projected for one in signals), strict=True)]
         products = [own.T @ own for own in at]
@@ -220,10 +211,7 @@ class Joint:
 
 
 def _without_start(missed: FloatArray, began: FloatArray) -> float:
-    """Return the mean square of errors, shape (n,), after a fit of a constant and of columns, shape (n, k), to them.
-
-    NaN for fewer than `FEWEST_JUDGED` errors.
-    """
+    """Return the mean square of errors (n,) after a fit of a constant and of columns (n, k); NaN if too few."""
     if missed.size < FEWEST_JUDGED:
         return np.nan
     own = np.column_stack([np.ones(missed.size), began[:, began.any(axis=0)]])
@@ -282,11 +270,8 @@ class Columns:
         return left * self.joint.problem.scale**2
 
     def fit(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Fit hysteresis and columns to all samples of `y`, shape (N,), metres.
-
-        Return the hysteresis parameters, shape (p,), in units of the problem's scale, without the constraint of
-        monotone branches, and the gains, shape (k,).
-        """
+        """Fit hysteresis and columns to all samples of `y` (m, (N,)); return parameters (p,) and gains (k,)."""
+        # The parameters are in units of the problem's scale, without the constraint of monotone branches.
         own = self.joint.columns(y)
         solved = np.column_stack([own.solved, self.solved])
         cross = self.at.T @ own.at
@@ -301,11 +286,9 @@ def _missed(gains: FloatArray) -> FloatArray:
 
 
 def _gains(projected: FloatArray, products: FloatArray, solved: FloatArray, positive: int = 0) -> FloatArray:
-    """Return the gains, shape (k,), of the columns in a joint fit with the hysteresis to the first column.
-
-    `projected` is ``A'J``, `solved` the hysteresis parameters of the best fit to each column, shape (p, 1 + k) each,
-    and `products` is ``J'J``, shape (1 + k, 1 + k). The gains of the last `positive` columns are non-negative.
-    """
+    """Return the gains, shape (k,), of the columns in a joint fit with the hysteresis to the first column."""
+    # `projected` is ``A'J``, `solved` the hysteresis parameters of the best fit to each column, shape (p, 1 + k) each,
+    # and `products` is ``J'J``, shape (1 + k, 1 + k). The gains of the last `positive` columns are non-negative.
     if products.shape[0] == 1:
         return np.empty(0)
     left = products[1:] - projected[:, 1:].T @ solved
@@ -329,10 +312,8 @@ def _solved(factor: Factor, of: FloatArray) -> FloatArray:
 
 
 def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
-    """Return, for each record, the rows that are in every fit, followed by the rows of each fold.
-
-    The beginning of a record is never held out, because relaxation from before the record is visible only there.
-    """
+    """Return, for each record, the rows that are in every fit, followed by the rows of each fold."""
+    # The beginning of a record is never held out, because relaxation from before the record is visible only there.
     judged, groups = _judged(problem), []
     for rows in evidence.slices:
         fitted = evidence.rows[rows][problem.weights[evidence.rows[rows]] > 0]
@@ -356,13 +337,11 @@ def _judged(problem: Problem) -> NDArray[np.bool_]:
 def _predicted(
     own: Rows, known: NDArray[np.bool_], rest: FloatArray, factor: Factor, size: int, every: int
 ) -> NDArray[np.bool_]:
-    """Return the mask of the rows of a record, shape (n,), that the other records can predict.
-
-    The record has the rows `own`; to those where `known`, shape (n,), the initial history only adds a constant. `rest`,
-    shape (p, p), are the normal equations of the other records, and `factor` is their factor with the penalty; after
-    the first `size` parameters, of the hysteresis, follow the displacements at rest. The prediction variance is
-    computed at every `every`-th row.
-    """
+    """Return the mask of the rows of a record, shape (n,), that the other records can predict."""
+    # The record has the rows `own`; to those where `known`, shape (n,), the initial history only adds a constant.
+    # `rest`, shape (p, p), are the normal equations of the other records, and `factor` is their factor with the
+    # penalty; after the first `size` parameters, of the hysteresis, follow the displacements at rest. The prediction
+    # variance is computed at every `every`-th row.
     if not known.any():
         return known
     # Parameters on which only the preceding path depends add a constant to these samples.
@@ -394,14 +373,13 @@ def _sum(parts: Sequence[FloatArray]) -> FloatArray:
 
 
 class Explanation:
-    """Joint fit of the hysteresis and of effects, which are in the order of the signal chain.
+    """Joint fit of the hysteresis and of effects, which are in the order of the signal chain; signals (m, (N,))."""
 
-    The equations of `like`, a fit to the same evidence, are reused if the same voltage `u` (V) drives the hysteresis.
-    All signals have shape (N,): `h` (m) is the displacement of the hysteresis, `added` (m) the contribution of the
-    effects on the displacement and of the reversible path parallel to the hysteresis, and `settling` (m) the relaxation
-    in each record from moves before it, with the additional columns `beside` of the evidence. `began` (m) holds the
-    amplitudes of that relaxation, record by record, shape (k,), by effect name.
-    """
+    # The equations of `like`, a fit to the same evidence, are reused if the same voltage `u` (V) drives the hysteresis.
+    # `h` is the displacement of the hysteresis, `added` the contribution of the effects on the displacement and of the
+    # reversible path parallel to the hysteresis, and `settling` the relaxation in each record from moves before it,
+    # with the columns `beside` of the evidence. `began` (m, (k,)) holds its amplitudes, record by record, by effect
+    # name.
 
     joint: Joint
     h: FloatArray
@@ -602,10 +580,8 @@ class Explanation:
         return problem.basis.shape(x[: problem.basis.size + 1] * problem.scale, problem.gain), starts
 
     def with_uncertainty(self) -> list[Effect]:
-        """Return the effects with the standard deviations of their free parameters.
-
-        Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
-        """
+        """Return the effects with the standard deviations of their free parameters."""
+        # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
         if not self.effects:
             return []
         precision = self.joint.columns(self.tangents, self._before).precision

@@ -56,45 +56,30 @@ AT_LIMIT, AT_LIMIT_TIMES = 20, 5
 
 @dataclass(frozen=True)
 class Part:
-    """Data of one axis from one record, signals and masks of shape (N,).
-
-    `t` (s) begins at the first stamp, `v` (V) is as commanded or read, `y` (m) is the displacement. Samples that are
-    not `used` in the fit (outliers, drop-outs, samples before the hysteresis state is known) only drive the hysteresis
-    state. `seen` marks a valid displacement within the selected time, and `wiped` the samples after both ends of the
-    voltage range have been visited, which resets the hysteresis state: the initial `history`
-    (V, as in `slpi_ros.model.axis_model.Start`) only adds a constant to these. `others` (m) are the displacements of
-    the other axes relative to the start of the record, by name. `digit` (m) is the resolution of the sensor readings, 0
-    if they are continuous; `mixed` is the share of the readings that are early, late or a mixture of two neighbouring
-    values, which are not used.
-    """
+    """Data of one axis from one record, signals and masks of shape (N,)."""
 
     source: str
-    t: FloatArray
-    v: FloatArray
-    y: FloatArray
-    used: NDArray[np.bool_]
-    seen: NDArray[np.bool_]
-    wiped: NDArray[np.bool_]
-    history: tuple[float, ...]
-    others: Mapping[str, FloatArray]
-    digit: float
-    mixed: float = 0.0
+    t: FloatArray  # s, from the first stamp
+    v: FloatArray  # V, as commanded or read
+    y: FloatArray  # m
+    used: NDArray[np.bool_]  # in the fit; outliers, drop-outs and an unknown start only drive the hysteresis
+    seen: NDArray[np.bool_]  # valid displacement within the selected time
+    wiped: NDArray[np.bool_]  # both ends of the voltage range visited: `history` only adds a constant
+    history: tuple[float, ...]  # V, as in `slpi_ros.model.axis_model.Start`
+    others: Mapping[str, FloatArray]  # m, of the other axes from the start of the record
+    digit: float  # m, resolution of the readings, 0: continuous
+    mixed: float = 0.0  # share of readings, not used, that are early, late or a mixture of two
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Data of one axis for a joint fit; signals of shape (N,) are concatenated from all records.
-
-    `basis` is that of the hysteresis, and `smoothness` the weight of its roughness penalty. `beside`, shape (N, k),
-    metres, are additional columns of the joint fit, whose gains are free. With `older_moves`, creep may continue from
-    moves long before a record, in addition to one just before it.
-    """
+    """Data of one axis for a joint fit; signals of shape (N,) are concatenated from all records."""
 
     parts: tuple[Part, ...]
-    basis: Basis
-    smoothness: float
-    beside: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    older_moves: bool = False
+    basis: Basis  # of the hysteresis
+    smoothness: float  # weight of its roughness penalty
+    beside: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # m, (N, k), free gains
+    older_moves: bool = False  # creep may also continue from moves long before a record
 
     def __post_init__(self) -> None:
         """Give an empty `beside` the shape (N, 0)."""
@@ -197,10 +182,7 @@ def evidence_of(
     start: float | None = None,
     stop: float | None = None,
 ) -> Evidence:
-    """Return the data of one axis from records, with the hysteresis basis of `model` or, by default, of a loop family.
-
-    RecordError or IdentificationError if the records contain too little data; `start`, `stop` (s) as in `diagnose`.
-    """
+    """Return the data of one axis from records, with the hysteresis basis of `model`, by default a loop family."""
     read = [_readings(record, axis, start, stop) for record in records]
     _require_enough(read)
     basis = _basis(model, [samples for _, samples, _ in read])

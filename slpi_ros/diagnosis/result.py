@@ -72,18 +72,14 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class Traces:
-    """Signals of one axis for charts, shape (N,): time from the first stamp (s), voltage (V), and displacements (m).
+    """Signals of one axis for charts, (N,)."""
 
-    These are the measured one, that of the hysteresis without effects (`before`) and with them (`after`), and the
-    contribution of each effect by its name.
-    """
-
-    t: FloatArray
-    voltage: FloatArray
-    measured: FloatArray
-    before: FloatArray
-    after: FloatArray
-    contributions: Mapping[str, FloatArray] = field(default_factory=dict)
+    t: FloatArray  # s, from the first stamp
+    voltage: FloatArray  # V
+    measured: FloatArray  # m
+    before: FloatArray  # m, hysteresis without effects
+    after: FloatArray  # m, with effects
+    contributions: Mapping[str, FloatArray] = field(default_factory=dict)  # m, by effect
 
 
 @dataclass(frozen=True)
@@ -112,29 +108,23 @@ class RecordOutcome:
 
 @dataclass(frozen=True)
 class AxisDiagnosis:
-    """Diagnosis of the model of one axis.
+    """Diagnosis of the model of one axis."""
 
-    `verdict` is `NAMED`, `AMBIGUOUS`, `UNEXPLAINED` or `NOTHING_FOUND`, and `summary` the result in a few sentences.
-    `floor_rms` (m) is the repeatability floor, which no model can explain, estimated from `floor_source`. `given_rms`
-    (m) is the free-run rms error of the given model as it is, without the offset of each record. `before_rms` and
-    `after_rms` (m) are held-out, free-run rms errors of the refitted hysteresis without and with effects, on held-out
-    blocks or, if there are several records, on held-out records. `effects` begin with the largest gain,
-    `next_experiment` is the recommended next recording or other action, `traces` are the signals of the first record,
-    and `dropped` are effects that were found on some records but do not carry over to others.
-    """
+    # `before_rms` and `after_rms` are of the refitted hysteresis without and with effects, on held-out blocks or, if
+    # there are several records, on held-out records.
 
-    verdict: str
-    summary: str
-    floor_rms: float
+    verdict: str  # `NAMED`, `AMBIGUOUS`, `UNEXPLAINED` or `NOTHING_FOUND`
+    summary: str  # a few sentences
+    floor_rms: float  # m, repeatability, which no model can explain
     floor_source: str
-    given_rms: float
-    before_rms: float
-    after_rms: float
-    effects: tuple[NamedEffect, ...]
-    next_experiment: str | None
-    traces: Traces
+    given_rms: float  # m, free-run, of the given model as it is, without the offset of each record
+    before_rms: float  # m, held-out, free-run
+    after_rms: float  # m, held-out, free-run
+    effects: tuple[NamedEffect, ...]  # the largest gain first
+    next_experiment: str | None  # recommended next recording or other action
+    traces: Traces  # of the first record
     records: tuple[RecordOutcome, ...] = ()
-    dropped: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()  # found on some records, but do not carry over to others
     given: "Given | None" = None
 
     def to_document(self) -> dict[str, Any]:
@@ -184,25 +174,19 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Given:
-    """Comparison of the given model with the records.
+    """Comparison of the given model with the records; errors in metres (rms), free-run."""
 
-    `rms` (m) is the free-run rms error of the model as it is, without the offset of each record. `hysteresis_rms` and
-    `refitted_rms` (m) are those of its hysteresis and of a refitted one, on samples to which the initial history only
-    adds a constant; with the identified effects if the error is then lower. `gain` is the relative change of the gain
-    of the stage with respect to the model, and `gain_deviation` its standard deviation. `zero_moved` (m) is the largest
-    shift of the zero among the records, None if it is small or the initial history can explain it. `motion` (m) is the
-    range of the measured displacement. `own_rms` (m) is the rms error at the identification of the model, if the
-    diagnosed records are those of the identification, else 0.
-    """
+    # `hysteresis_rms` and `refitted_rms` are on samples to which the initial history only adds a constant; with the
+    # identified effects if the error is then lower.
 
-    rms: float
-    hysteresis_rms: float
-    refitted_rms: float
-    gain: float
-    gain_deviation: float
-    zero_moved: float | None
-    motion: float
-    own_rms: float
+    rms: float  # of the model as it is, without the offset of each record
+    hysteresis_rms: float  # of its hysteresis
+    refitted_rms: float  # of a refitted one
+    gain: float  # relative change of the gain of the stage
+    gain_deviation: float  # standard deviation
+    zero_moved: float | None  # m, largest among the records; None: small, or due to the initial history
+    motion: float  # m, range of the measured displacement
+    own_rms: float  # at the identification of the model, if these are its records, else 0
 
     @property
     def changed(self) -> bool:
@@ -223,11 +207,9 @@ def judged(
     left_out_of_model: Sequence[str],
     driven_alike: Sequence[str],
 ) -> AxisDiagnosis:
-    """Return the diagnosis of one axis; `before_rms` (m) is the held-out rms error without effects.
-
-    `floor` is the repeatability floor of the records. `left_out_of_model` are identified effects that the extended
-    model does not contain, and `driven_alike` other axes with the same drive as this one.
-    """
+    """Return the diagnosis of one axis; `before_rms` (m) is the held-out rms error without effects."""
+    # `left_out_of_model` are identified effects that the extended model does not contain, and `driven_alike` other axes
+    # with the same drive as this one.
     base, now = selection.base, selection.now
     effects = _named_effects(selection)
     verdict = _verdict(selection, effects, floor, left_out_of_model)

@@ -90,10 +90,8 @@ class Contender:
         return free(self.effect).size
 
     def refined(self, steps: int = STEPS) -> "Contender":
-        """Return the candidate after up to `steps` Gauss-Newton steps, unless these increase the held-out error.
-
-        Far from the best parameters the held-out error, of a fit that is linear in them, says nothing.
-        """
+        """Return the candidate after up to `steps` Gauss-Newton steps, unless these increase the held-out error."""
+        # Far from the best parameters the held-out error, of a fit that is linear in them, says nothing.
         better = Contender(self.name, self.explanation.refined(steps))
         if EFFECTS[self.name].companion() and better.explanation.objective < FAR_OFF * self.explanation.objective:
             return better
@@ -131,10 +129,8 @@ def held_out_error(score: Score, *, own: bool) -> float:
 
 
 def contenders(now: Explanation, names: Iterable[str] | None = None) -> list[Contender]:
-    """Return candidates for the named effects (default: all) that explain part of the residual, the best one first.
-
-    Of several records, significant effects precede all others, and among them those that are common to all records.
-    """
+    """Return candidates for the named effects (default: all) that explain part of the residual, the best one first."""
+    # Of several records, significant effects precede all others, and among them those that are common to all records.
     taken = {effect.name for effect in now.effects}
     screened = [best for name in names or EFFECTS if name not in taken for best in _screened(name, now)]
     error = now.held_out.rms
@@ -178,10 +174,8 @@ def _refined(tried: Sequence[Contender], before: Explanation, most: float) -> li
 
 
 def _screened(name: str, now: Explanation) -> list[tuple[Score, Effect]]:
-    """Return the held-out errors and the effect for the best form of each group of forms of the effect `name`.
-
-    Surplus parameters extrapolate poorly.
-    """
+    """Return the held-out errors and the effect for the best form of each group of forms of the effect `name`."""
+    # Surplus parameters extrapolate poorly.
     tried: dict[int, list[tuple[Score, Effect]]] = {}
     for form in _forms(name, now):
         if (scored := _scored(form, now)) and scored[1].in_phase(seen(now)):
@@ -231,11 +225,9 @@ def _scored(form: Candidate | Effect, now: Explanation) -> tuple[Score, Effect] 
 
 
 def chance_of_gain(before: Score, after: Score) -> float:
-    """Return the p-value of a reduction of the block losses, by a sign-flip test with random signs of each reduction.
-
-    The test is made with absolute and with logarithmic reductions, so that a single block with large errors does not
-    hide the others; the smaller p-value is returned.
-    """
+    """Return the p-value of a reduction of the block losses, by a sign-flip test with random signs of each."""
+    # The test is made with absolute and with logarithmic reductions, so that a single block with large errors does not
+    # hide the others; the smaller p-value is returned.
     signs = _signs(before.losses.size)
     gains = (before.losses - after.losses, np.log(np.maximum(before.losses, TINY) / np.maximum(after.losses, TINY)))
     return min(float((1 + np.count_nonzero(signs @ gain >= gain.sum())) / (1 + SURROGATES)) for gain in gains)
@@ -253,10 +245,7 @@ def gain(before: Score, after: Score) -> float:
 
 
 def carries_over(before: Score, after: Score) -> bool:
-    """Return whether a gain carries over to held-out records; True for one record.
-
-    It does if the error falls on each of them, or as required by `_carries_over_clearly`.
-    """
+    """Return whether the error falls on each held-out record, or `_carries_over_clearly`; True for one record."""
     ratio = _ratio_on_records(before, after)
     lower = ratio.size == 0 or float(ratio.max()) < 1.0
     return lower or _carries_over_clearly(before, after)
@@ -287,12 +276,10 @@ def counts(before: Score, after: Score, *, own: bool = True, least: float = LEAS
 
 
 def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) -> bool:
-    """Return whether the records do not distinguish another effect from the best one.
-
-    A single drive frequency cannot distinguish effects that depend on time from those that depend on rate; a better fit
-    then only means a more suitable loop shape. Delay and lag of a few sampling periods are alike, too. If there are
-    several records, the errors on held-out records also decide.
-    """
+    """Return whether the records do not distinguish another effect from the best one."""
+    # A single drive frequency cannot distinguish effects that depend on time from those that depend on rate; a better
+    # fit then only means a more suitable loop shape. Delay and lag of a few sampling periods are alike, too. If there
+    # are several records, the errors on held-out records also decide.
     explained, by_other = before.rms**2 - best.score.rms**2, before.rms**2 - other.score.rms**2
     one, two = EFFECTS[best.name], EFFECTS[other.name]
     if one.time_shift == "only" and two.contains_shift:
@@ -337,10 +324,8 @@ class Selection:
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
-    """Add effects as long as one has a significant gain, and remove those that later ones make unnecessary.
-
-    `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better.
-    """
+    """Add effects as long as one has a significant gain, and remove those that later ones make unnecessary."""
+    # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better.
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
@@ -423,11 +408,9 @@ def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
 
 
 def _without_needless(now: Explanation, names: Collection[str], *, restart: bool = True) -> Explanation:
-    """Return the fit without those of the named effects that the others make unnecessary.
-
-    An unnecessary effect, with `restart` (default) any effect, is first refitted from new initial parameters: its
-    parameters may compensate for another effect that was missing when it was found.
-    """
+    """Return the fit without those of the named effects that the others make unnecessary."""
+    # An unnecessary effect, with `restart` (default) any effect, is first refitted from new initial parameters: its
+    # parameters may compensate for another effect that was missing when it was found.
     for name in [effect.name for effect in now.effects if effect.name in names]:
         without = now.without(name)
         needed = counts(without.held_out, now.held_out, own=is_own(now.effect(name)))
@@ -442,10 +425,8 @@ def _without_needless(now: Explanation, names: Collection[str], *, restart: bool
 
 
 def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
-    """Return the fit in which rivals replace effects that are worse, or equivalent with more parameters.
-
-    An effect may have been selected before its rival only because a third one was missing at that time.
-    """
+    """Return the fit in which rivals replace effects that are worse, or equivalent with more parameters."""
+    # An effect may have been selected before its rival only because a third one was missing at that time.
     alone = one_speed(now.evidence)
     for name in [effect.name for effect in now.effects if effect.name in rivals]:
         rest, best = now.without(name), Contender(name, now)
@@ -522,10 +503,8 @@ def _in_its_place(
 
 
 def _do_not_close(now: Explanation) -> FloatArray:
-    """Return columns, shape (N, k), metres, for loops that do not close: Duhem operators, as in the Bouc-Wen model.
-
-    Each follows ``dz = dv - z |dv| / w`` with a memory length ``w`` (V), independent of the rate.
-    """
+    """Return columns, shape (N, k), metres, for loops that do not close: Duhem operators, as in the Bouc-Wen model."""
+    # Each follows ``dz = dv - z |dv| / w`` with a memory length ``w`` (V), independent of the rate.
     span = float(np.ptp(now.evidence.v))
     columns = [
         np.concatenate([_duhem(part.v, share * span) for part in now.evidence.parts]) for share in FORGETS_WITHIN

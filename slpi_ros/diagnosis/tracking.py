@@ -49,21 +49,15 @@ class ErrorPart:
 
 @dataclass(frozen=True)
 class Tracking:
-    """Tracking error of a compensated path of N samples, and its causes.
-
-    `shares`: share of each of `CAUSES` in the mean square of measured - desired; their sum is 1, a cause that
-    counteracts others is negative. `delay` (s): that of the displacement behind the desired one. `effects`: what a
-    diagnosis of the record identified. `t`, `desired`, (N,), s and m. `parts`: contribution of each cause, (N,), m,
-    with noise and effects in "model".
-    """
+    """Tracking error of a compensated path of N samples, and its causes."""
 
     error: ErrorPart
-    shares: Mapping[str, float]
-    delay: float
-    effects: tuple[str, ...]
-    t: FloatArray
-    desired: FloatArray
-    parts: Mapping[str, FloatArray]
+    shares: Mapping[str, float]  # of each of `CAUSES` in the mean square error; sum 1, negative: counteracts others
+    delay: float  # s, of the displacement behind the desired one
+    effects: tuple[str, ...]  # identified by a diagnosis of the record
+    t: FloatArray  # s, (N,)
+    desired: FloatArray  # m, (N,)
+    parts: Mapping[str, FloatArray]  # m, (N,), of each cause, with noise and effects in "model"
 
     @property
     def blame(self) -> str:

@@ -54,51 +54,36 @@ STANDS, STANDS_FOR, BOTH = 1e-3, 50, 0.05
 
 @dataclass(frozen=True)
 class RecordVerification:
-    """Verification of one axis on one record of N samples.
+    """Verification of one axis on one record of N samples; errors (m) are measured - model."""
 
-    `error` is the absolute error, measured - model, of the judged samples, named after the record; of it,
-    `constant` (m) is constant, and `rest` is the rest. `offset` (m) is the shift of the zero, without that of a
-    changed gain, and `offset_uncertainty` (m) what the unknown initial state and random errors can make of it.
-    `judged_error` (m, rms) is compared with `limit` (m): the absolute one if `absolute`, else the rest. `samples`
-    counts all samples of the part that was to be judged, and `known_from` (s) the time from which they are judged,
-    None if the initial state is estimated and all are. `moving` and `standing` are absolute errors where both
-    occur. `floor_rms` (m) is the repeatability of the record, estimated from `floor_source`. `zero_moved`: the
-    offset exceeds its uncertainty. `gain` and `width` are relative changes of the loops' height, and of their width
-    in addition. `outside` counts voltages outside the range of the identification, and `beyond` says where the record
-    is faster or wider than that of the identification, "" if nowhere. `t`, `v`, `measured`, `model`,
-    (N,), s, V and m: the record, and the displacement of the model with the constant; `judged`: mask of the judged
-    samples. `tracking` is None if the desired displacement is not known. `corrected` says what was taken out of the
-    readings, as known of the sensor.
-    """
-
-    error: ErrorPart
-    constant: float
-    rest: ErrorPart
-    offset: float
-    offset_uncertainty: float
-    limit: float
-    absolute: bool
-    samples: int
-    known_from: float | None
+    error: ErrorPart  # absolute, of the judged samples, named after the record
+    constant: float  # m, part of the error
+    rest: ErrorPart  # without the constant
+    offset: float  # m, shift of the zero, without that of a changed gain
+    offset_uncertainty: float  # m, from the unknown initial state and random errors
+    limit: float  # m, rms
+    absolute: bool  # the limit holds for the error, else for the rest
+    samples: int  # all of the part that was to be judged
+    known_from: float | None  # s, from when they are judged; None: estimated state, all are
     begins_known: bool
     history: tuple[float, ...]
-    moving: ErrorPart | None
+    moving: ErrorPart | None  # absolute error, where there is a standing one
     standing: ErrorPart | None
-    floor_rms: float
+    floor_rms: float  # m, repeatability of the record
     floor_source: str
-    zero_moved: bool
-    gain: float
-    width: float
+    zero_moved: bool  # the offset exceeds its uncertainty
+    gain: float  # relative change of the loops' height
+    width: float  # relative change of the loops' width, in addition
     match: Match
-    outside: int
-    beyond: str
-    t: FloatArray
-    v: FloatArray
-    measured: FloatArray
-    model: FloatArray
-    judged: Mask
-    tracking: Tracking | None = None
-    corrected: str = ""
+    outside: int  # voltages outside the range of the identification
+    beyond: str  # where the record is faster or wider than that of the identification
+    t: FloatArray  # s, (N,)
+    v: FloatArray  # V, (N,)
+    measured: FloatArray  # m, (N,)
+    model: FloatArray  # m, (N,), with the constant
+    judged: Mask  # (N,)
+    tracking: Tracking | None = None  # None: the desired displacement is not known
+    corrected: str = ""  # what was taken out of the readings, as known of the sensor
 
     @property
     def share(self) -> float:
@@ -112,10 +97,7 @@ class RecordVerification:
 
     @property
     def verdict(self) -> str:
-        """The verdict: `PASSED`, `FAILED`, or `UNPROVED` if too few samples are judged.
-
-        Also if the absolute error is to be judged, and the unknown initial state alone may be beyond the limit.
-        """
+        """`PASSED`, `FAILED`, or `UNPROVED`: too few samples are judged, or the state alone may exceed the limit."""
         hidden = self.absolute and not self.begins_known and self.offset_uncertainty > self.limit
         if self.share < LEAST or (hidden and self.rest.rms <= self.limit):
             return UNPROVED
@@ -164,20 +146,15 @@ class RecordVerification:
 
 @dataclass(frozen=True)
 class AxisVerification:
-    """Verification of one axis on all records.
+    """Verification of one axis on all records."""
 
-    `overall` and `rest` are the absolute error of all judged samples and that without the constant of each record;
-    `resolution` (m) is the held-out error of the model at its identification. `by_level`, `by_speed`, `by_region`: the
-    rest by nesting depth of the loop, magnitude of dv/dt, and voltage.
-    """
-
-    overall: ErrorPart
-    rest: ErrorPart
-    resolution: float
+    overall: ErrorPart  # absolute error of all judged samples
+    rest: ErrorPart  # without the constant of each record
+    resolution: float  # m, held-out error of the model at its identification
     records: tuple[RecordVerification, ...]
-    by_level: tuple[ErrorPart, ...]
-    by_speed: tuple[ErrorPart, ...]
-    by_region: tuple[ErrorPart, ...]
+    by_level: tuple[ErrorPart, ...]  # the rest by nesting depth of the loop
+    by_speed: tuple[ErrorPart, ...]  # by the magnitude of dv/dt
+    by_region: tuple[ErrorPart, ...]  # by voltage
 
     @property
     def verdict(self) -> str:
@@ -330,25 +307,19 @@ def verify(
 
 @dataclass(frozen=True)
 class _Run:
-    """Free run of one axis on a record, from the given, the known or the estimated initial state.
-
-    `simulated`, (N,), m, contains the constant error; `constant` (m) is that error, and `explained` (m) the part of
-    it that a change of gain makes, and a significant `offset`. `assumed` holds a simulation from each initial state
-    that a compensator may have assumed. `begins_known`: the initial state is known. `samples_in_span`: all samples
-    of the part that is to be judged.
-    """
+    """Free run of one axis on a record, from the given, the known or the estimated initial state."""
 
     t: FloatArray
     samples: Samples
     judged: Mask
-    samples_in_span: int
-    begins_known: bool
+    samples_in_span: int  # of the part that is to be judged
+    begins_known: bool  # the initial state is known
     found: Match
-    simulated: FloatArray
-    assumed: tuple[FloatArray, ...]
-    constant: float
+    simulated: FloatArray  # m, (N,), with the constant error
+    assumed: tuple[FloatArray, ...]  # from each initial state that a compensator may have assumed
+    constant: float  # m
     offset: float
-    explained: float
+    explained: float  # m, of the constant: by a change of gain and a significant offset
 
 
 def _free_run(
@@ -429,11 +400,9 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMe
 
 
 def _matched(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None) -> tuple[Match, bool]:
-    """Compare the model with a record; return also whether the initial state is known.
-
-    It is if it is given, or if the record begins at an end of the model's voltage range, unless the state there
-    explains the record worse than the samples to which any initial state only adds a constant.
-    """
+    """Compare the model with a record; return also whether the initial state is known."""
+    # It is if it is given, or if the record begins at an end of the model's voltage range, unless the state there
+    # explains the record worse than the samples to which any initial state only adds a constant.
     if start_memory:
         return match(axis, samples, t, axis.initial(start_memory)), True
     found = match(axis, samples, t)
@@ -446,10 +415,8 @@ def _matched(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: Sta
 
 
 def _judged(samples: Samples, found: Match) -> Mask:
-    """Return the mask, (N,), of the samples that are judged where the initial state is unknown.
-
-    Those to which it only adds a constant, unless they are few and the estimated one explains all others as well.
-    """
+    """Return the mask, (N,), of the samples that are judged where the initial state is unknown."""
+    # Those to which it only adds a constant, unless they are few and the estimated one explains all others as well.
     known = samples.fitted & (np.arange(samples.v.size) >= found.known_from)
     share = np.count_nonzero(known) / np.count_nonzero(samples.fitted)
     if share >= MOST_KNOWN or (share >= LEAST and _spread(found) > AS_WELL * _spread(found, found.known_from)):

@@ -184,10 +184,8 @@ class EffectBase(Protocol):
         return given, spread
 
     def plausible(self, view: "FitView") -> bool:
-        """Return whether the parameters are plausible, so that the effect does not imitate another cause.
-
-        Where others shift in time, too, a short shift may be the hold of commands between samples.
-        """
+        """Return whether the parameters are plausible, so that the effect does not imitate another cause."""
+        # Where others shift in time, too, a short shift may be the hold of commands between samples.
         others = any(other.time_shift != "none" and other.name != self.name for other in view.effects)
         return self.time_shift != "only" or not others or abs(self.slow_shift) > HELD * view.step
 
@@ -205,10 +203,7 @@ class EffectBase(Protocol):
         return None
 
     def starting(self, around: EffectContext, used: NDArray[np.bool_], *, older: bool = False) -> FloatArray:
-        """Return what is left of its state before each record, with `older` also of that long before.
-
-        Shape (N, k), metres, one column per unknown amplitude.
-        """
+        """Return what is left (m, (N, k)) of its state before each record, with `older` also of long before."""
         return np.empty((around.t.size, 0))
 
     def started(self, amplitudes: FloatArray, records: int) -> Self:

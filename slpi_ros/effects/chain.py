@@ -13,18 +13,13 @@ from slpi_ros.effects.registry import in_order
 
 @dataclass(frozen=True)
 class Chain:
-    """The effects of one axis, in the order in which they act.
+    """The effects of one axis, in the order in which they act."""
 
-    On the voltage (`before`), `around` the hysteresis, on the displacement of the axis itself (`own`); coupling to
-    other axes and the effects of the stage after it (`shared`); and between the displacement of the stage and the
-    reading those of sensor and record (`measured`), which no inverse for the stage contains.
-    """
-
-    before: tuple[Effect, ...]
-    around: AroundHysteresis | None
-    own: tuple[Effect, ...]
-    shared: tuple[Effect, ...]
-    measured: tuple[Effect, ...] = ()
+    before: tuple[Effect, ...]  # on the voltage
+    around: AroundHysteresis | None  # the hysteresis
+    own: tuple[Effect, ...]  # on the displacement of the axis itself
+    shared: tuple[Effect, ...]  # coupling to other axes, and what follows it
+    measured: tuple[Effect, ...] = ()  # of sensor and record, which no inverse for the stage contains
 
     @classmethod
     def of(cls, effects: tuple[Effect, ...]) -> "Chain":

@@ -53,11 +53,10 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class Creep(EffectBase):
-    """Parallel first-order relaxations, ``y = h + sum_k g_k z_k`` with ``tau_k dz_k/dt = (h - h_0) - z_k``.
+    """Parallel relaxations, ``y = h + sum_k g_k z_k``, ``tau_k dz_k/dt = (h - h_0) - z_k``, at first in equilibrium."""
 
-    ``h_0``, the `origin`, is the displacement to which creep adds nothing; in a fit, where there is none, the first one
-    of each record. At the start all relaxations are in equilibrium.
-    """
+    # ``h_0``, the `origin`, is the displacement to which creep adds nothing; in a fit, where there is none, the first
+    # one of each record.
 
     name: ClassVar[str] = "creep"
     acts_on: ClassVar[Signal] = "displacement"
@@ -250,10 +249,9 @@ class StreamingCreep(StreamingBase):
         return self._origin + (wanted - self._origin - self._crept()) / (1.0 + self._now)
 
     def resume(self, other: "StreamingCreep", x: float) -> None:
-        """Take over the state of another model's creep at the input `x` (m).
-
-        Relaxations with a time constant that `other` also has continue from its state; all others start in equilibrium.
-        """
+        """Take over the state of another model's creep at the input `x` (m)."""
+        # Relaxations with a time constant that `other` also has continue from its state; all others start in
+        # equilibrium.
         self.start(x)
         known = dict(zip(other._creep.time_constants, other._states, strict=True))
         self._states = [self._input + known.get(tau, other._input) - other._input for tau in self._creep.time_constants]
@@ -294,11 +292,9 @@ def _reduced(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[f
 def _settling(
     time_constants: Sequence[float], around: EffectContext, used: NDArray[np.bool_], *, older: bool = False
 ) -> FloatArray:
-    """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation.
-
-    The logarithmic law has a single column, for a move just before the record. With `older` there is a second one, for
-    a move one record duration before the record, of which only the slow part remains.
-    """
+    """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation."""
+    # The logarithmic law has a single column, for a move just before the record. With `older` there is a second one,
+    # for a move one record duration before the record, of which only the slow part remains.
     whole = []
     for own in range(max(len(around.records), 1)):
         for column in _settling_of(time_constants, around.split(around.t)[own], around.split(used)[own], older):

@@ -25,10 +25,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class CrossCoupling(EffectBase):
-    """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j relative to its start.
-
-    It needs the setpoints of all axes and is compensated by the stage model.
-    """
+    """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j; the stage model inverts it."""
 
     name: ClassVar[str] = "cross_coupling"
     acts_on: ClassVar[Signal] = "displacement"

@@ -29,10 +29,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class Delay(EffectBase):
-    """Transport delay, or offset between the stamps of voltage and displacement.
-
-    It is not compensated sample by sample, which needs future setpoints.
-    """
+    """Transport delay, or offset between the stamps of voltage and displacement; its inverse needs future setpoints."""
 
     name: ClassVar[str] = "delay"
     acts_on: ClassVar[Signal] = "voltage"

@@ -93,10 +93,7 @@ class Mode:
         return np.asarray(np.exp(-decay_rate * t) * (np.cos(rate * t) + decay_rate / rate * np.sin(rate * t)))
 
     def transfer(self, dt: float) -> tuple[FloatArray, FloatArray]:
-        """Return the discrete transfer function with step `dt` (s), numerator and denominator, shape (3,) each.
-
-        For an input linear between samples.
-        """
+        """Return the discrete transfer function with step `dt` (s) for an input linear between samples, (3,) each."""
         m11, m12, m21, m22 = mode_transition(self.omega, self.damping, dt)
         late = self.lag / dt
         # Response of position and velocity to the input at the start and at the end of a step.
@@ -142,14 +139,11 @@ class StreamingMode:
 
 @dataclass(frozen=True)
 class Uniform:
-    """A uniform `grid` (s), shape (M,), with step `dt` (s), that covers non-decreasing stamps `t` (s), shape (N,).
+    """A uniform grid that covers non-decreasing stamps; its points are the stamps if these are uniform."""
 
-    The grid points are the stamps if these are uniform; `dt` is 0 if all stamps are equal.
-    """
-
-    t: FloatArray
-    grid: FloatArray
-    dt: float
+    t: FloatArray  # s, (N,)
+    grid: FloatArray  # s, (M,)
+    dt: float  # s; 0 if all stamps are equal
 
     @classmethod
     def over(cls, t: FloatArray) -> "Uniform":

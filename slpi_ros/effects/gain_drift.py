@@ -38,12 +38,11 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class GainDrift(EffectBase):
-    """A time-dependent factor on the displacement, ``y = origin + (1 + g(t)) (x - origin)``.
+    """A time-dependent factor on the displacement, ``y = origin + (1 + g(t)) (x - origin)``."""
 
-    ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
-    record; after it the sensitivity stays at its last value, see `lasting`. The factor scales hysteresis, creep and
-    resonance, and acts before the cross coupling, so that other axes receive the scaled motion.
-    """
+    # ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
+    # record; after it the sensitivity stays at its last value, see `lasting`. The factor scales hysteresis, creep and
+    # resonance, and acts before the cross coupling, so that other axes receive the scaled motion.
 
     name: ClassVar[str] = "gain_drift"
     acts_on: ClassVar[Signal] = "displacement"
@@ -109,10 +108,8 @@ class GainDrift(EffectBase):
 
     @classmethod
     def fit(cls, left: ResidualView) -> Iterator[Candidate]:
-        """Yield a straight line, and piecewise linear curves with uniform knots and additional early knots.
-
-        Displacement shifts at the same knots are fitted with the gains; their ratio gives the origin.
-        """
+        """Yield a straight line, and piecewise linear curves with uniform knots and additional early knots."""
+        # Displacement shifts at the same knots are fitted with the gains; their ratio gives the origin.
         t, end = left.t - left.t[0], float(left.t[-1] - left.t[0])
         travel = np.cumsum(np.abs(np.diff(left.u, prepend=left.u[0])) * left.used)
         first = float(max(np.interp(2.0 * np.ptp(left.u), travel, t), t[left.used][:FEWEST][-1]))

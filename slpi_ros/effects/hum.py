@@ -51,10 +51,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Hum(EffectBase):
-    """Sinusoids in time, ``y = x + sum_k amplitude_k sin(2 pi frequency_k t + phase_k)``.
-
-    They are not compensated, as the phases are known only for the clock of the record.
-    """
+    """Sinusoids in time, ``y = x + sum_k amplitude_k sin(2 pi frequency_k t + phase_k)``, on the record's clock."""
 
     name: ClassVar[str] = "hum"
     acts_on: ClassVar[Signal] = "displacement"

@@ -1,8 +1,6 @@
-"""Compiled evaluation of whole paths through effects with a state that changes from sample to sample.
-
-`inverse_path` does at each sample what `slpi_ros.model.streaming.StreamingInverse.move` does, with the same rounding:
-changes of one are changes of both. The machine code is kept until this file changes, not those that it calls.
-"""
+"""Compiled evaluation of whole paths through effects with a state that changes from sample to sample."""
+# `inverse_path` does at each sample what `slpi_ros.model.streaming.StreamingInverse.move` does, with the same rounding:
+# changes of one are changes of both. The machine code is kept until this file changes, not those that it calls.
 
 from typing import NamedTuple
 
@@ -18,32 +16,21 @@ from slpi_ros.hysteresis.shapes import Branches
 
 
 class Laws(NamedTuple):
-    """Parameters of the effects of an axis, each as its method `laws` returns them; without the effect: empty or 0.
+    """Parameters of the effects of an axis, each as its method `laws` returns them; without the effect: empty or 0."""
 
-    `lag` is in seconds. `rate`, shape (0,) or (3,), holds threshold (V), onset rate (V/s) and reversible gain (m/V),
-    and `relaxations`, shape (2, K), time constants (s) and gains of the creep around its origin `rest_of_creep` (m),
-    inf for the displacement at the start. `modes`, shape (M, 4), holds 0, angular frequency (rad/s), damping and gain
-    of each mode of a resonance, `rest` the share of the motion beside the modes, and `factors`, shape (F, 8), the
-    factors of the inverse of the resonance, see `Exact.law` and `Unringing.law`. `gain`, shape (2,), holds origin (m)
-    and factor of the sensitivity.
-    """
-
-    lag: float = 0.0
-    rate: FloatArray = np.empty(0)
-    relaxations: FloatArray = np.empty((2, 0))
-    rest_of_creep: float = np.inf
-    modes: FloatArray = np.empty((0, 4))
-    rest: float = 1.0
-    factors: FloatArray = np.empty((0, 8))
-    gain: FloatArray = np.array([0.0, 1.0])
+    lag: float = 0.0  # s
+    rate: FloatArray = np.empty(0)  # (0,) or (3,): threshold (V), onset rate (V/s), reversible gain (m/V)
+    relaxations: FloatArray = np.empty((2, 0))  # (2, K): time constants (s) and gains of the creep
+    rest_of_creep: float = np.inf  # m, its origin; inf: the displacement at the start
+    modes: FloatArray = np.empty((0, 4))  # (M, 4): 0, angular frequency (rad/s), damping, gain
+    rest: float = 1.0  # share of the motion beside the modes
+    factors: FloatArray = np.empty((0, 8))  # (F, 8), of the inverse of the resonance, `Exact.law`, `Unringing.law`
+    gain: FloatArray = np.array([0.0, 1.0])  # (2,): origin (m) and factor of the sensitivity
 
 
 @compiled
 def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArray:
-    """Return the sum of first-order relaxations of a displacement, shape (N,), metres.
-
-    `gains` has shape (K,); `holds`, shape (K, 3), are coefficients as in `slpi_ros.effects.filters.Hold`.
-    """
+    """Return the sum of first-order relaxations (m, (N,)) with gains (K,) and `holds` (K, 3) as `filters.Hold`."""
     crept, before, states = np.empty_like(moved), 0.0, np.zeros(gains.size)
     for k in range(moved.size):
         total = 0.0

@@ -232,10 +232,7 @@ class StreamingRateDependence(StreamingBase):
         return self._u
 
     def inverse(self, dt: float, wanted: float, memory: "Memory", lower: float, upper: float) -> float:
-        """Return the voltage (V) for the displacement `wanted` (m) of hysteresis and reversible part, `dt` (s) later.
-
-        It is within `lower` and `upper` (V). The memory moves to the voltage that the hysteresis then feels.
-        """
+        """Return the voltage (V) within limits for a displacement (m), `dt` (s) later; the memory moves to ``u``."""
         scale = self._s0 * dt
         if scale > 0.0:
             before, earlier = self._before, self._earlier

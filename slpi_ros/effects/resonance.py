@@ -38,10 +38,9 @@ MOST_MODES, LEAST_REST = 10, 1e-9
 
 
 class Exact(StreamingMode):
-    """Inverse of a mode with a zero near it: the ratio of their polynomials, with static gain 1, as a filter.
+    """Inverse of a mode with a zero near it: the ratio of their polynomials, with static gain 1, as a filter."""
 
-    It is a weighted sum of input, position and velocity of the zero, a mode that the desired displacement drives.
-    """
+    # It is a weighted sum of input, position and velocity of the zero, a mode that the desired displacement drives.
 
     def __init__(self, mode: Mode, zero: Mode) -> None:
         super().__init__(zero)
@@ -65,11 +64,10 @@ class Exact(StreamingMode):
 
 
 class Unringing:
-    """Inverse of a mode as a finite impulse response, ``sum_k taps[k] y(t - k spacing)``.
+    """Inverse of a mode as a finite impulse response, ``sum_k taps[k] y(t - k spacing)``."""
 
-    The sum of the taps is 1. Two zeros are at the poles of the mode, and one more compensates the remaining delay but
-    `known` (s).
-    """
+    # The sum of the taps is 1. Two zeros are at the poles of the mode, and one more compensates the remaining delay but
+    # `known` (s).
 
     def __init__(self, mode: Mode, known: float) -> None:
         self._mode, self._late = mode, mode.lag - known
@@ -329,12 +327,10 @@ def _within(modes: Sequence[Mode]) -> tuple[Mode, ...]:
 
 
 def zeros(modes: Sequence[Mode], rest: float) -> list[Mode]:
-    """Return the pairs of zeros of a superposition as modes, in order of frequency; one less if `rest` is 0.
-
-    They are the modes of a stage that is held, ``y = 0``. With the forces ``sqrt(gain_k) w_k`` on the modes these are
-    the eigenvalues, but one that is 0, of a skew-symmetric matrix minus the damping: all are stable, and all oscillate,
-    as the modes do.
-    """
+    """Return the pairs of zeros of a superposition as modes, in order of frequency; one less if `rest` is 0."""
+    # They are the modes of a stage that is held, ``y = 0``. With the forces ``sqrt(gain_k) w_k`` on the modes these are
+    # the eigenvalues, but one that is 0, of a skew-symmetric matrix minus the damping: all are stable, and all
+    # oscillate, as the modes do.
     w, loss = np.array([mode.omega for mode in modes]), np.diag([mode.lag * mode.omega**2 for mode in modes])
     force = np.sqrt([mode.gain for mode in modes]) * w
     if rest > LEAST_REST:

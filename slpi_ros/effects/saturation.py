@@ -105,10 +105,8 @@ class Saturation(EffectBase):
 
 
 def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the steps away from the middle of the voltage range, which give no displacement beyond a clipping limit.
-
-    Mean voltage (V), change of voltage (V) and displacement (m) of each step, shape (M,) each.
-    """
+    """Return mean voltage (V), its change and displacement (m), (M,), of steps away from the middle of the range."""
+    # Beyond a clipping limit they give no displacement.
     low, high = float(v.min()), float(v.max())
     # Steps over several samples improve the signal-to-noise ratio.
     every = max(1, round((high - low) / BINS / 4 / max(float(np.mean(np.abs(np.diff(v)))), 1e-12)))

@@ -80,10 +80,8 @@ class SensorPeriodic(EffectBase):
         return bool(self.period > ROUNDING_PERIOD * view.rounding)
 
     def in_phase(self, view: FitView) -> bool:
-        """Return whether the phase is the same in all records.
-
-        If the zeros of the records differ, so may those of other records, and the phase there is unknown.
-        """
+        """Return whether the phase is the same in all records."""
+        # If the zeros of the records differ, so may those of other records, and the phase there is unknown.
         return float(np.ptp(view.zeros())) <= IN_PHASE * self.period
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:

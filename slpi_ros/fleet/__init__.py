@@ -1,7 +1,4 @@
-"""Calibration records of many stages, processed on a Dask cluster; see `slpi_ros.fleet.run`.
-
-The extra ``slpi_ros[fleet]`` installs what this package needs; it is imported at the first use of `run`.
-"""
+"""Calibration records of many stages, processed on a Dask cluster, of which ``slpi_ros[fleet]`` installs the parts."""
 
 from typing import TYPE_CHECKING, Any
 

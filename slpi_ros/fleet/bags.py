@@ -1,8 +1,6 @@
-"""What is done with one bag: examination, identification, comparison with the stage's model, search for causes.
-
-Each function depends on its arguments and the files that they name only, so that a repeated or moved task gives the
-same result. No function raises: what a bag does not allow is told in its rows.
-"""
+"""What is done with one bag: examination, identification, comparison with the stage's model, search for causes."""
+# Each function depends on its arguments and the files that they name only, so that a repeated or moved task gives the
+# same result. No function raises: what a bag does not allow is told in its rows.
 
 import hashlib
 import json
@@ -50,10 +48,7 @@ _LONGEST_PLAIN = 200
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the results: an axis of a bag, or a bag that cannot be used. None: unknown.
-
-    The columns are described in ``msg_schemas/README.md``.
-    """
+    """One row of the results, see ``msg_schemas/README.md``: an axis of a bag, or a bag that cannot be used."""
 
     bag: str
     stage: str = ""
@@ -97,21 +92,16 @@ class Row:
 
 @dataclass(frozen=True)
 class Examined:
-    """What is known of a bag without a model.
-
-    `stage`: its name in the list, else the bag's hardware id, else "". `date_ns` (ns): first stamp, Unix time; None if
-    the bag cannot be read. `axes`: those that can be used. `findings`: on the quality of the record, other than "ok".
-    `refused`: reason for each axis that cannot be used; axis "" if that is the whole bag. `seconds`: computing time.
-    """
+    """What is known of a bag without a model."""
 
     bag: Bag
-    stage: str
+    stage: str  # in the list, else the bag's hardware id, else ""
     hardware_id: str = ""
-    date_ns: int | None = None
-    axes: tuple[str, ...] = ()
-    findings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    refused: Mapping[str, str] = field(default_factory=dict)
-    seconds: float = 0.0
+    date_ns: int | None = None  # first stamp, Unix time; None: cannot be read
+    axes: tuple[str, ...] = ()  # that can be used
+    findings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # on the quality of the record, but "ok"
+    refused: Mapping[str, str] = field(default_factory=dict)  # reasons by axis; "": the whole bag
+    seconds: float = 0.0  # computing time
 
     def to_document(self) -> dict[str, Any]:
         """Return the examination as JSON values."""
@@ -175,10 +165,7 @@ def examine(bag: Bag, topic: str) -> Examined:
 
 
 def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
-    """Identify the reference model of a stage from a bag, and write it to the file `name` in the folder `output`.
-
-    The `model` of the result is `name`, or "" if no axis can be identified.
-    """
+    """Identify the reference model of a stage from a bag, and write it to the file `name` in the folder `output`."""
     began = time.process_time()
     rows, axes = [], {}
     try:
@@ -203,10 +190,7 @@ def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
 
 
 def compare(one: Examined, topic: str, output: str, reference: str, name: str) -> Judged:
-    """Verify the reference model of the stage on a bag, and refit it where it is beyond the limit.
-
-    `reference` and `name` are the paths of the reference model and of the refitted one within the folder `output`.
-    """
+    """Verify the stage's model `reference` on a bag, and write a refitted one, `name`, where it is beyond the limit."""
     began = time.process_time()
     try:
         with _quiet():
@@ -243,12 +227,9 @@ def explain(
     others: Mapping[str, str],
     diagnosed: bool,
 ) -> Judged:
-    """Explain the error of a bag that neither the reference model nor a changed gain, width or zero describes.
-
-    `rows` are from `identify_bag` or `compare`, and `others` the paths of the reference models of all other stages. If
-    `diagnosed`, a diagnosis names the causes if no other stage's model describes the record. The rest is as for
-    `compare`.
-    """
+    """Explain the error of a bag that neither the reference model nor a changed gain, width or zero describes."""
+    # `others` are the paths of the reference models of all other stages. If `diagnosed`, a diagnosis names the causes
+    # if none of these describes the record.
     began = time.process_time()
     told = []
     try:

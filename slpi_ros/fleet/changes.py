@@ -24,30 +24,21 @@ DRIFT, STEP = "drift", "step"
 
 @dataclass(frozen=True)
 class Change:
-    """A change of a series, a "step" or a "drift".
+    """A change of a series."""
 
-    `date_ns` is the Unix time of the first bag after a step, or at which a drift has become significant, and
-    `before_ns` that of the bag before it. `size` is the change by the step, or by the drift from the first to the last
-    bag, `uncertainty` its standard deviation, and `chance` the probability that noise alone shows such a change
-    anywhere in the series.
-    """
-
-    kind: str
-    date_ns: int
-    before_ns: int
-    size: float
-    uncertainty: float
-    chance: float
+    kind: str  # "step" or "drift"
+    date_ns: int  # Unix time of the first bag after a step, or of a significant drift
+    before_ns: int  # of the bag before
+    size: float  # by the step, or by the drift from the first to the last bag
+    uncertainty: float  # standard deviation
+    chance: float  # that noise alone shows such a change anywhere in the series
 
 
 def find_changes(date_ns: IntArray, values: FloatArray, deviations: FloatArray) -> list[Change]:
-    """Find the steps and the drift of a series, in order of time; none if there are fewer than `FEWEST` values.
-
-    The series is a constant, plus a linear drift, plus steps. The terms that reduce the sum of squares most are added
-    one after the other; then those are removed that noise may explain, with a correction for the number of possible
-    steps. Noise is estimated from the given deviations and from what the largest set of terms leaves. The Unix times
-    `date_ns` are increasing; `deviations` are the standard deviations of the `values`, all of shape (N,).
-    """
+    """Find the steps and the drift of a series, in order of time; none if there are fewer than `FEWEST` values."""
+    # The series is a constant, plus a linear drift, plus steps. The terms that reduce the sum of squares most are added
+    # one after the other; then those are removed that noise may explain, with a correction for the number of possible
+    # steps. Noise is estimated from the given standard deviations and from what the largest set of terms leaves.
     if values.size < FEWEST:
         return []
     date_ns, values, deviations = date_ns[-MOST:], values[-MOST:], deviations[-MOST:]

@@ -47,17 +47,14 @@ WRITE_PAUSE = 20.0
 
 @dataclass(frozen=True)
 class Task:
-    """A function with its arguments, and what is done with its result; `bag` is the bag that it processes.
+    """A function with its arguments, and what is done with its result."""
 
-    One that is `alone` shares a group with no other.
-    """
-
-    bag: Examined
+    bag: Examined  # that it processes
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
     finish: Callable[[Any], Iterable["Task"]]
     attempts: int = 0
-    alone: bool = False
+    alone: bool = False  # shares a group with no other
 
 
 def run(

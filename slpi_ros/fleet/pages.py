@@ -50,10 +50,7 @@ class Pages:
         self._written: dict[str, int] = {}
 
     def write(self, results: Results) -> None:
-        """Write ``fleet.json``, ``index.html`` and the pages of the stages with new rows.
-
-        SlpiError if a file cannot be written.
-        """
+        """Write ``fleet.json``, ``index.html`` and the pages of the stages with new rows."""
         rows, folder = results.state.rows(), results.folder
         stages = summarise(rows)
         with all_or_nothing(folder / DOCUMENT) as file:
@@ -70,10 +67,7 @@ class Pages:
 def report_fleet(
     sources: Sequence[str], output: str, *, as_document: bool = False, **options: Any
 ) -> tuple[list[str], bool]:
-    """Run `slpi_ros.fleet.run` with its `options`, write the pages, and summarise the results.
-
-    Return the summary, as sentences or as the text of ``fleet.json``, and whether any bag could be used.
-    """
+    """Run `slpi_ros.fleet.run`, write pages; return sentences or ``fleet.json``, and whether any bag was usable."""
     pages = Pages()
     rows: list[Row] = []
 

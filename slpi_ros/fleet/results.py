@@ -1,8 +1,6 @@
-"""The results of a fleet on disk: a journal of finished bags, and the table ``results.parquet`` made from it.
-
-The journal ``journal.jsonl`` is appended to, one line per finished step, and each line is complete or dropped when it
-is read again. So a run that was killed at any moment is continued from what it had finished.
-"""
+"""The results of a fleet on disk: a journal of finished bags, and the table ``results.parquet`` made from it."""
+# The journal ``journal.jsonl`` is appended to, one line per finished step, and each line is complete or dropped when it
+# is read again. So a run that was killed at any moment is continued from what it had finished.
 
 import fcntl
 import json
@@ -28,15 +26,11 @@ TABLE, JOURNAL, LOCK = "results.parquet", "journal.jsonl", ".lock"
 
 @dataclass
 class State:
-    """What is known of all bags.
+    """What is known of all bags."""
 
-    `examined` and `judged`, the rows of each bag that has been processed, are by path; `references` holds by stage the
-    path of the reference model, within the folder of the results.
-    """
-
-    examined: dict[str, Examined] = field(default_factory=dict)
-    judged: dict[str, Judged] = field(default_factory=dict)
-    references: dict[str, str] = field(default_factory=dict)
+    examined: dict[str, Examined] = field(default_factory=dict)  # by path
+    judged: dict[str, Judged] = field(default_factory=dict)  # by path
+    references: dict[str, str] = field(default_factory=dict)  # reference models, in the folder, by stage
 
     def rows(self) -> list[Row]:
         """Return the rows of all bags, by stage, axis, date and path."""
@@ -45,11 +39,9 @@ class State:
 
 
 class Results:
-    """The folder of the results, locked against other runs while it is open.
+    """The folder of the results, created if missing, locked against other runs while it is open."""
 
-    `folder` is created if missing. The rows depend on `options`; UsageError if the folder holds results of others.
-    SlpiError if the folder cannot be written, or another run writes into it.
-    """
+    # The rows depend on `options`; a folder with results of others is refused.
 
     def __init__(self, folder: str | os.PathLike[str], options: Mapping[str, Any]) -> None:
         self.folder, self.state = Path(os.path.realpath(folder)), State()

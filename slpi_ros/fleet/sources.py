@@ -19,26 +19,18 @@ _MCAP_END = b"\x89MCAP0\r\n"
 
 @dataclass(frozen=True)
 class Bag:
-    """A bag on disk, with the absolute `path` of its folder or file.
+    """A bag on disk; size and time of change tell a changed bag from a processed one, both 0 if there is none."""
 
-    `stage` is the name of the stage from a CSV list, "" if the bag's hardware id names it. `size` (bytes) and
-    `modified` (ns), the time of the last change of its files, tell a changed bag from a processed one; both are 0 if
-    there is no such bag.
-    """
-
-    path: str
-    stage: str = ""
-    size: int = 0
-    modified: int = 0
+    path: str  # absolute, folder or file
+    stage: str = ""  # from a CSV list; "": the bag's hardware id names it
+    size: int = 0  # bytes
+    modified: int = 0  # ns
 
 
 def find_bags(sources: Sequence[_Path]) -> list[Bag]:
-    """Return the bags of all sources, each once, sorted by path.
-
-    Sources are bags, folders that are searched recursively (hidden entries are skipped), and CSV files with the columns
-    ``bag`` and ``stage``; relative paths in a list start at its folder. UsageError if there is no source, or a list has
-    other columns or two stages for one bag; RecordError if a source does not exist.
-    """
+    """Return the bags of all sources, each once, sorted by path."""
+    # Sources are bags, folders that are searched recursively (hidden entries are skipped), and CSV files with the
+    # columns ``bag`` and ``stage``; relative paths in a list start at its folder.
     if not sources:
         raise UsageError("no source given; name bags, folders of bags or CSV lists of bags")
     found: dict[str, str] = {}
@@ -55,10 +47,8 @@ def find_bags(sources: Sequence[_Path]) -> list[Bag]:
 
 
 def is_complete(bag: Bag, now: float, patience: float) -> bool:
-    """Return whether a bag is completely written, or has not grown for `patience` seconds before `now` (s, Unix time).
-
-    A folder is complete when it contains ``metadata.yaml``, a single mcap file when it ends as mcap files do.
-    """
+    """Return whether a bag is completely written, or has not grown for `patience` (s) before `now` (s, Unix time)."""
+    # A folder is complete when it contains ``metadata.yaml``, a single mcap file when it ends as mcap files do.
     path = Path(bag.path)
     try:
         if path.is_dir() and (path / "metadata.yaml").stat().st_size:
@@ -74,10 +64,7 @@ def is_complete(bag: Bag, now: float, patience: float) -> bool:
 
 
 def load_models(folder: _Path | None) -> dict[str, StageModel]:
-    """Return the newest model document of each stage in a folder, searched recursively; files that name no stage fail.
-
-    UsageError if there is no such folder, or a model has no hardware id; ModelError if a document cannot be read.
-    """
+    """Return the newest model of each stage in a folder, searched recursively; files that name no stage fail."""
     if folder is None:
         return {}
     if not Path(folder).is_dir():

@@ -26,37 +26,28 @@ QUANTITIES = {
 
 @dataclass(frozen=True)
 class Exchange:
-    """Bags that belong to another stage than named; the model of `like_stage` describes them.
+    """Bags that belong to another stage than named."""
 
-    `date_ns` and `before_ns` are the times of the first of them and of the last bag before it, if any; `mutual` tells
-    whether that stage has bags that belong to this one.
-    """
-
-    like_stage: str
-    date_ns: int
-    before_ns: int | None
-    mutual: bool
+    like_stage: str  # whose model describes them
+    date_ns: int  # of the first of them
+    before_ns: int | None  # of the last bag before, if any
+    mutual: bool  # that stage has bags that belong to this one
 
 
 @dataclass(frozen=True)
 class StageSummary:
-    """Summary of one axis of a stage; its health is `GOOD`, `REFITTED`, `EXCHANGED` or `CALIBRATE`.
-
-    Of the `bags`, `refused` ones cannot be used. `date_ns` is the time of the latest usable bag, and `model` the path
-    of the model that describes it, "" if there is none. `changes` are those of ``gain`` and ``width`` (relative to the
-    reference model) and of ``offset`` (m); the `rows` are by date.
-    """
+    """Summary of one axis of a stage."""
 
     stage: str
     axis: str
-    health: str
+    health: str  # `GOOD`, `REFITTED`, `EXCHANGED` or `CALIBRATE`
     bags: int
-    refused: int
-    date_ns: int | None
-    model: str
-    changes: Mapping[str, tuple[Change, ...]]
+    refused: int  # of the bags
+    date_ns: int | None  # of the latest usable bag
+    model: str  # path of the model that describes it; "": none
+    changes: Mapping[str, tuple[Change, ...]]  # of ``gain``, ``width`` (relative to the model) and ``offset`` (m)
     exchanges: tuple[Exchange, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...]  # by date
 
     @property
     def largest(self) -> float:
@@ -107,10 +98,8 @@ def fleet_document(rows: Sequence[Row], stages: Sequence[StageSummary]) -> dict[
 
 
 def series(rows: Sequence[Row], quantity: str) -> tuple[Any, Any, Any]:
-    """Return times (int64, ns), values and standard deviations, shape (N,) each, of a quantity of one stage and axis.
-
-    Bags of other stages, and those that no model describes, are left out.
-    """
+    """Return times (int64, ns), values and standard deviations, (N,) each, of a quantity of one stage and axis."""
+    # Bags of other stages, and those that no model describes, are left out.
     value, uncertainty, times = QUANTITIES[quantity]
     points = [
         (row.date_ns, getattr(row, value), getattr(row, uncertainty) / times)

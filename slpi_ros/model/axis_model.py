@@ -35,17 +35,12 @@ WIPING_CYCLES = 10
 
 @dataclass(frozen=True)
 class Start:
-    """Initial state of the hysteresis memory: `voltage` (V) and `displacement` (m) after `history`.
+    """Initial state of the hysteresis memory."""
 
-    `history` holds earlier reversal voltages (V), oldest first; empty (default): the stage has never moved.
-    `from_rest`: the stage had never moved before it left the first voltage of `history`; False (default): that voltage
-    was reached by a long fall, which erased the memory.
-    """
-
-    voltage: float
-    displacement: float
-    history: tuple[float, ...] = ()
-    from_rest: bool = False
+    voltage: float  # V, after the history
+    displacement: float  # m, after the history
+    history: tuple[float, ...] = ()  # V, earlier reversals, oldest first; empty: never moved
+    from_rest: bool = False  # never moved before `history`; False: a long fall, which erased the memory, led there
 
 
 # An error up to this multiple of the repeatability floor counts as noise.
@@ -56,22 +51,16 @@ RESOLUTION = 2e-4
 
 @dataclass(frozen=True)
 class FitQuality:
-    """Free-run error of the model on the record, or records, `source` of its identification, at `samples` samples.
+    """Free-run error of the model on the record, or records, `source` of its identification, at `samples` samples."""
 
-    `rms` and `maximum` (m) are errors of the fitted samples, `held_out_rms` (m) is the held-out error, from
-    cross-validation, and `floor_rms` (m) the repeatability floor, estimated from the record. `covered` is the share of
-    the cells of the Everett function that the record visited, 0..1. `fastest` (V/s) is its fastest rate, see
-    `slpi_ros.model.coverage`; None (default): unknown, as in older documents.
-    """
-
-    rms: float
-    maximum: float
-    held_out_rms: float
-    floor_rms: float
+    rms: float  # m, of the fitted samples
+    maximum: float  # m
+    held_out_rms: float  # m, from cross-validation
+    floor_rms: float  # m, repeatability of the record
     samples: int
-    covered: float
+    covered: float  # 0..1, of the cells of the Everett function
     source: str
-    fastest: float | None = None
+    fastest: float | None = None  # V/s, see `slpi_ros.model.coverage`; None: unknown, as in older documents
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,9 @@ Motion = TypeVar("Motion", float, FloatArray)
 
 
 class Coupling:
-    """Linear coupling of all axes: the observed motions are ``(I + G) m``, with ``m`` the motions without coupling.
+    """Linear coupling of all axes: the observed motions are ``(I + G) m``, with ``m`` the motions without coupling."""
 
-    ``gains[x][y]`` is the displacement of x per metre of y; axes that are not in the mapping have no coupling, and
-    without any gain it is not `on`.
-    """
+    # ``gains[x][y]`` is the displacement of x per metre of y; axes that are not in the mapping have no coupling.
 
     def __init__(self, gains: Mapping[str, Mapping[str, float]]) -> None:
         self._gains = {
@@ -39,10 +37,7 @@ class Coupling:
         return {name: self.part(name, motions) for name in self._gains}
 
     def decouple(self, seen: Mapping[str, Motion], resting: Mapping[str, Any]) -> dict[str, Motion]:
-        """Return the own motions (m), those without coupling, that produce the observed ones, `seen` (m).
-
-        Each from the start, a number or of shape (N,). `resting` are own motions (m) of axes held in position.
-        """
+        """Return the own motions (m) that produce the observed ones, with `resting` those of held axes."""
         left = {name: motion - self.part(name, resting) for name, motion in seen.items()}
         rows = self._solution(tuple(seen))
         own = {}

@@ -14,15 +14,12 @@ PERIOD = 1e-3
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of voltage, slew rate and acceleration of an axis; UsageError if lower > upper or a rate is not positive.
+    """Limits of voltage, slew rate and acceleration of an axis; UsageError if empty or not positive."""
 
-    They are in V, V/s and V/s^2; inf for `slew` or `acceleration`: no limit.
-    """
-
-    lower: float
-    upper: float
-    slew: float = inf
-    acceleration: float = inf
+    lower: float  # V
+    upper: float  # V
+    slew: float = inf  # V/s; inf: no limit
+    acceleration: float = inf  # V/s^2; inf: no limit
 
     def __post_init__(self) -> None:
         if not self.lower <= self.upper or not self.slew > 0 or not self.acceleration > 0:
@@ -47,17 +44,13 @@ class Limits:
 
 
 class RateLimiter:
-    """Voltage of one axis at the output: the last limits before publishing, by the steady clock of the process.
+    """Voltage of one axis at the output: the last limits before publishing, by the steady clock of the process (ns)."""
 
-    The voltage changes by at most the slew limit times the time since its last change, of which at most two output
-    periods count: a late step is made up, a pause is not. With an acceleration limit every step leaves enough distance
-    to stop at the voltage limits and at the goal; a step after a pause starts from rest and counts one output period.
-
-    All times `now_ns` are nanoseconds on the steady clock, never ROS time and never stamps.
-
-    The `limits` may be replaced at any time, see `change`; `period` is the output period (s). `voltage` (V) is the last
-    output, or the voltage found at the amplifier, and `rate` (V/s) the rate of the last step.
-    """
+    # The voltage changes by at most the slew limit times the time since its last change, of which at most two output
+    # periods count: a late step is made up, a pause is not. With an acceleration limit every step leaves enough
+    # distance to stop at the voltage limits and at the goal; a step after a pause starts from rest and counts one
+    # output period. `voltage` (V) is the last output, or found at the amplifier, `rate` (V/s) that of the last step,
+    # `period` in seconds.
 
     __slots__ = ("_changed_ns", "_goal", "_limits", "_pending", "period", "rate", "voltage")
 
@@ -211,12 +204,9 @@ class RateLimiter:
 
 
 def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:
-    """Return the reversal voltages (V) of a decaying oscillation, followed by the final voltage `final` (V).
-
-    The first cycle reaches both limits and so erases every loop between the limits. The amplitude then decreases
-    linearly over the cycles; on each side it is proportional to the distance from the final voltage to the limit.
-    UsageError if `cycles` is below 1, or `final` is outside the limits.
-    """
+    """Return the reversal voltages (V) of a decaying oscillation, followed by the final voltage `final` (V)."""
+    # The first cycle reaches both limits and so erases every loop between the limits. The amplitude then decreases
+    # linearly over the cycles; on each side it is proportional to the distance from the final voltage to the limit.
     if cycles < 1 or not limits.lower <= final <= limits.upper:
         raise UsageError(
             f"a reset of {cycles} cycles to {final:g} V within {limits.lower:g}..{limits.upper:g} V; "

@@ -89,12 +89,11 @@ IDEAL = Sensor()
 
 
 class StreamingSensor:
-    """The sensor of an axis for readings that come one by one: its timing, and its effects, which have no memory.
+    """The sensor of an axis for readings that come one by one: its timing, and its effects, which have no memory."""
 
-    A delay cannot be undone when the reading comes, and undoing a lag would amplify the noise of each reading. So, if
-    the sensor is `late`, the reading is compared with what it would be for the setpoint, or for the model: with a
-    `Sensed` signal.
-    """
+    # A delay cannot be undone when the reading comes, and undoing a lag would amplify the noise of each reading. So, if
+    # the sensor is `late`, the reading is compared with what it would be for the setpoint, or for the model: with a
+    # `Sensed` signal.
 
     def __init__(self, timing: Sensor, effects: tuple[Effect, ...]) -> None:
         self.timing, self.late = timing, bool(timing)
@@ -114,12 +113,11 @@ class StreamingSensor:
 
 
 class Sensed:
-    """A displacement that is held between samples, as corrected readings of it would be: after lag and delay.
+    """A displacement that is held between samples, as corrected readings of it would be: after lag and delay."""
 
-    If the stage is where the displacement is, at first at `displacement` (m), `at` is what `StreamingSensor.correct`
-    makes of the reading, while it moves too: with ``S`` the periodic error and ``L`` the lag, the reading is ``L S x``,
-    and both are ``S^-1 L S x``.
-    """
+    # If the stage is where the displacement is, at first at `displacement` (m), `at` is what `StreamingSensor.correct`
+    # makes of the reading, while it moves too: with ``S`` the periodic error and ``L`` the lag, the reading is ``L S
+    # x``, and both are ``S^-1 L S x``.
 
     __slots__ = ("_before", "_delay_ns", "_lag_ns", "_samples", "_sensor")
 
@@ -171,11 +169,9 @@ class Sensed:
 
 
 def corrected(record: Record, corrections: Mapping[str, Callable[[FloatArray, FloatArray], FloatArray]]) -> Record:
-    """Return a record with corrected readings; one whose stamps step back is unchanged: what evaluates it refuses it.
-
-    `corrections` holds by axis what returns the displacement of the stage for times (s) and readings (m), shape (N,)
-    each: `AxisModel.correct`, or `Sensor.undo`. Axes that are not in the record are ignored.
-    """
+    """Return a record with corrected readings; `corrections` by axis (s, m): `AxisModel.correct`, `Sensor.undo`."""
+    # One whose stamps step back is unchanged: what evaluates it refuses it. Axes that are not in the record are
+    # ignored.
     own = [name for name in corrections if name in record.axes]
     if not own or first_step_back(record.time_ns) is not None:
         return record

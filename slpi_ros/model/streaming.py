@@ -28,37 +28,25 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class StreamState:
-    """Complete state of a `StreamingInverse`: of its memory, and of its effects by name.
-
-    `voltage` (V) is the present command, and `goal` (V) the voltage required by the last desired displacement.
-    `desired` (m) is the last setpoint of the hysteresis, and `displacement` (m) that of the axis without
-    cross-coupling.
-    """
+    """Complete state of a `StreamingInverse`."""
 
     memory: MemoryState
-    voltage: float
-    goal: float
-    desired: float
-    displacement: float
-    effects: Mapping[str, Any] = field(default_factory=dict)
+    voltage: float  # V, present command
+    goal: float  # V, required by the last desired displacement
+    desired: float  # m, last setpoint of the hysteresis
+    displacement: float  # m, of the axis without cross-coupling
+    effects: Mapping[str, Any] = field(default_factory=dict)  # states by name
 
 
 class StreamingInverse:
-    """Causal compensation of one axis: ``v = step(t, y)``.
+    """Causal compensation of one axis: ``v = step(t, y)``."""
 
-    The desired displacement of the stage is inverted through the effects after the hysteresis, the hysteresis, and the
-    effects before it. The resulting voltage is limited and then propagated forward, so that the hysteresis memory and
-    the effects follow the voltage that is really applied.
-
-    `memory`, in its initial state, is modified in place; the effects start in equilibrium, and those of sensor and
-    record are ignored. Displacements in the range `accepted` (m), which is wider than the identified
-    `displacement_range` (m), are accepted. `limits` of the command are further restricted to what passes the effects.
-
-    `pace` limits voltage, slew rate and acceleration; alone, in the time of the samples, of which at most `MAX_DT`
-    counts. A compensator gives it that of its output, on the steady clock. `goal` (V) is the voltage that the last
-    sample asked for, before slew rate and acceleration limits, and `desired` (m) the last setpoint of the hysteresis.
-    `coupled` (m), the displacement added by other axes, is to be set before each sample; default 0.
-    """
+    # The desired displacement of the stage is inverted through the effects after the hysteresis, the hysteresis, and
+    # the effects before it. The resulting voltage is limited and then propagated forward, so that the hysteresis memory
+    # and the effects follow the voltage that is really applied. The effects start in equilibrium; those of sensor and
+    # record are ignored. Displacements in the range `accepted` (m), wider than the identified one, are accepted. `pace`
+    # limits voltage, slew rate and acceleration; alone, in the time of the samples, of which at most `MAX_DT` counts. A
+    # compensator gives it that of its output, on the steady clock.
 
     def __init__(
         self,
@@ -72,7 +60,7 @@ class StreamingInverse:
         self.accepted = self._lowest, self._highest = accepted_range(displacement_range)
         self._rounding = ROUNDING * (displacement_range[1] - displacement_range[0])
         self._t = -inf
-        self.coupled = 0.0
+        self.coupled = 0.0  # m, displacement added by other axes, to be set before each sample
         self._before, self._behind = _streaming(chain.before), _streaming(chain.own)
         self._around: StreamingAround | None = chain.around.streaming() if chain.around else None
         self._around_name = chain.around.name if chain.around else ""
@@ -159,11 +147,7 @@ class StreamingInverse:
         return max(missing, short) < 0.0 and v <= limits.lower + ROUNDING * (1.0 + abs(limits.lower))
 
     def check(self, t: float, y: float) -> None:
-        """Raise the error that `step` would raise, without a change of state.
-
-        UsageError if `t` (s) or `y` (m) is not finite, or time runs backwards; UnreachableError if `y` lies far outside
-        the identified displacement range.
-        """
+        """Raise the error that `step` would raise for `t` (s) and `y` (m), without a change of state."""
         if not (isfinite(t) and isfinite(y)):
             raise UsageError(f"sample t = {t} s, displacement = {y} m is not finite; omit the sample")
         if t < self._t:
@@ -193,11 +177,7 @@ class StreamingInverse:
     __call__ = step
 
     def move(self, dt: float, y: float, now_ns: int) -> float:
-        """Return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last sample, without checks.
-
-        `now_ns` (ns) is the time on the clock of `pace`. UsageError if the model cannot reach `y`; without effects the
-        state is unchanged.
-        """
+        """Return the voltage (V) for the displacement `y` (m), `dt` (s) after the last sample, without checks."""
         if self._direct:
             self.desired = y - self.coupled
             self._command = self._move(dt, dt, self.desired, now_ns)
@@ -220,11 +200,9 @@ class StreamingInverse:
         return v
 
     def run(self, t: FloatArray, y: FloatArray, coupled: FloatArray | float = 0.0) -> tuple[FloatArray, Mask]:
-        """Return what `step` gives for each sample of a path, and where it is `held`, shape (N,) each.
-
-        `t` (s) and `y` (m) have shape (N,); `coupled` (m) is as the attribute. For a new stream only, whose state
-        afterwards is not defined: long paths are evaluated by compiled code, equal to `step` but for rounding errors.
-        """
+        """Return what `step` gives for each sample of a path (s, m), and where it is `held`, shape (N,) each."""
+        # For a new stream only, whose state afterwards is not defined: long paths are evaluated by compiled code, equal
+        # to `step` but for rounding errors.
         limits = self.pace.limits
         unlimited = limits.slew == limits.acceleration == inf
         if unlimited and self.timeless:
@@ -282,10 +260,7 @@ class StreamingInverse:
         return np.asarray(above | ((missing < -self._rounding) & (v <= lower + ROUNDING * (1.0 + abs(lower)))))
 
     def approach(self, dt: float, now_ns: int) -> float:
-        """Go on towards `goal`, `dt` (s) after the last sample, as `pace` allows at `now_ns` (ns); return the voltage.
-
-        For what a slew or acceleration limit has held back of the last sample.
-        """
+        """Go on, `dt` (s) later, towards `goal`, which rate limits have held back; return the voltage (V)."""
         if self._direct:
             self._command = self._move(dt, dt, self.desired, now_ns)
             return self._command
@@ -361,11 +336,9 @@ class StreamingInverse:
         return other
 
     def _move(self, dt: float, elapsed: float, h: float, now_ns: int) -> float:
-        """Move command and memory towards a displacement of the hysteresis (m); return the command (V).
-
-        `dt` (s) is the time for the effects, `elapsed` (s) that for the effect around the hysteresis, `now_ns` (ns)
-        that for the rate limits.
-        """
+        """Move command and memory towards a displacement of the hysteresis (m); return the command (V)."""
+        # `dt` (s) is the time for the effects, `elapsed` (s) that for the effect around the hysteresis, `now_ns` (ns)
+        # that for the rate limits.
         memory, pace, around = self.memory, self.pace, self._around
         if not self._before and pace.limits.acceleration == inf:
             v = self.goal = pace.move(self._invert(elapsed, h, *pace.reach(now_ns)), now_ns)
@@ -444,11 +417,9 @@ def refusal(y: float, accepted: tuple[float, float], kind: str = "desired") -> s
 
 
 class StageStream:
-    """Causal compensation of several axes: ``{axis: v} = step(t, {axis: y})``.
+    """Causal compensation of several axes: ``{axis: v} = step(t, {axis: y})``."""
 
-    The `streams` of the axes are modified in place. `origins` (m) are the displacements from which the motion of each
-    axis is measured for cross-coupling.
-    """
+    # `origins` (m) are the displacements from which the motion of each axis is measured for cross-coupling.
 
     def __init__(
         self, streams: Mapping[str, StreamingInverse], coupling: Coupling, origins: Mapping[str, float]
@@ -457,10 +428,7 @@ class StageStream:
         self._coupling, self._origins = coupling, origins
 
     def step(self, t: float, y: Mapping[str, float]) -> dict[str, float]:
-        """Return the voltages (V) for desired displacements `y` (m) at time `t` (s); other axes hold their voltage.
-
-        Errors, as in `StreamingInverse.check` or for an axis that there is not, change nothing.
-        """
+        """Return voltages (V) for displacements `y` (m) at `t` (s), or raise unchanged; other axes hold theirs."""
         for name, desired in y.items():
             if name not in self.streams:
                 raise UsageError(f"no axis '{name}'; there are {', '.join(self.streams)}")

@@ -52,13 +52,10 @@ def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
 
 
 class DeferredService:
-    """Trigger service with a deferred response that does not block the executor.
-
-    `start` starts the requested action, and returns the reason if this is not possible, else "".
-    """
+    """Trigger service with a deferred response that does not block the executor."""
 
     def __init__(self, node: Node, name: str, start: Callable[[], str]) -> None:
-        self._start = start
+        self._start = start  # starts the action; returns the reason if that is not possible, else ""
         self._waiting: list[Any] = []
         self._service = node.create_service(Trigger, name, self._on_request)
         # The executor sends the returned response; the request header is available only here.
@@ -83,10 +80,8 @@ class DeferredService:
 
 
 def refuse_impossible_transitions(node: LifecycleNode) -> None:
-    """Refuse requests for a lifecycle transition that the present state does not allow.
-
-    Otherwise rclpy ends the process, for instance after two calls of ``ros2 lifecycle set NODE configure``.
-    """
+    """Refuse requests for a lifecycle transition that the present state does not allow."""
+    # Otherwise rclpy ends the process, for instance after two calls of ``ros2 lifecycle set NODE configure``.
     for service in node.services:
         if service.srv_type is ChangeState:
             service.callback = _refusing(node, service.callback)
@@ -115,11 +110,9 @@ def ask_for_priority(node: Node, priority: int) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc's malloc keep up to `KEPT_BYTES` of freed memory for later use; without effect on other systems.
-
-    Otherwise each large message is received in new memory pages, and the system takes longer to provide them than the
-    message takes to be copied and decoded.
-    """
+    """Let glibc's malloc keep up to `KEPT_BYTES` of freed memory for later use; without effect on other systems."""
+    # Otherwise each large message is received in new memory pages, and the system takes longer to provide them than the
+    # message takes to be copied and decoded.
     with suppress(OSError, AttributeError):
         allocator = ctypes.CDLL(None)
         allocator.mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)
@@ -133,15 +126,11 @@ ERROR: bytes = DiagnosticStatus.ERROR
 
 @dataclass(frozen=True)
 class Health:
-    """Diagnostic status of a node.
+    """Diagnostic status of a node."""
 
-    `problems` are (level, text), in any order; `summary` is the message if there are none. `values` are counters and
-    states, shown as text; `hardware_id` is "" if unknown.
-    """
-
-    problems: tuple[tuple[bytes, str], ...]
-    summary: str
-    values: Mapping[str, object]
+    problems: tuple[tuple[bytes, str], ...]  # (level, text), in any order
+    summary: str  # the message if there are no problems
+    values: Mapping[str, object]  # counters and states, shown as text
     hardware_id: str = ""
 
     @property
@@ -182,11 +171,10 @@ class Diagnostics:
 
 @runtime_checkable
 class HasDeadlines(Protocol):
-    """A node that has to act at certain times, which change often.
+    """A node that has to act at certain times, which change often."""
 
-    A timer that is reset often does not serve: if the events executor is late, each reset lets it call every timer that
-    is due once more, which moves the next calls of all of them by a period each.
-    """
+    # A timer that is reset often does not serve: if the events executor is late, each reset lets it call every timer
+    # that is due once more, which moves the next calls of all of them by a period each.
 
     def seconds_to_deadline(self) -> float:
         """Return the time (s) until the next call of `meet_deadline`; infinite if there is no deadline."""
@@ -210,21 +198,15 @@ _stop = Stop()
 
 
 def request_stop(failure: SlpiError | None = None) -> None:
-    """Stop the node that ``run`` is spinning; for use in callbacks.
-
-    An exception raised out of a callback would make the events executor print a traceback. If `failure` causes the
-    stop, ``run`` prints its message and returns its exit code.
-    """
+    """Stop the node that ``run`` is spinning, which prints the message of a `failure` and returns its exit code."""
+    # For use in callbacks: an exception raised out of one would make the events executor print a traceback.
     _stop.requested = True
     _stop.failure = _stop.failure or failure
 
 
 def make_executor(kind: str) -> Executor:
-    """Return a new executor of the `kind` "events" or "default"; UsageError for another value.
-
-    The events executor needs much less processor time; if rclpy lacks it, the default executor is returned. Call only
-    its ``spin_once``, with a timeout: its ``spin`` may miss SIGINT and SIGTERM.
-    """
+    """Return a new executor of the `kind` "events" (needs much less processor time) or "default", if rclpy lacks it."""
+    # Call only its ``spin_once``, with a timeout: its ``spin`` may miss SIGINT and SIGTERM.
     if kind not in ("events", "default"):
         raise UsageError(f"no executor '{kind}'; choose events or default")
     if kind == "events":
@@ -236,13 +218,9 @@ def make_executor(kind: str) -> Executor:
 
 
 def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
-    """Create a node, spin it until a signal or ``request_stop``, and shut it down cleanly.
-
-    The ROS context stays valid until the node's ``destroy_node`` has returned, so that the node may still publish in
-    that method. Return the exit code of the process: 0 after a signal, a shutdown of ROS or a stop without an error. If
-    `make_node` raises a SlpiError, the message is printed and the exit code of the error returned. `executor` is as in
-    `make_executor`; a node with an attribute `executor_kind` chooses its executor itself.
-    """
+    """Create a node, spin it until a signal or ``request_stop``, shut it down cleanly; return the exit code."""
+    # The ROS context stays valid until the node's ``destroy_node`` has returned, so that the node may still publish in
+    # that method. A node with an attribute `executor_kind` chooses its executor itself.
     global _stop
     _stop = start.of_process or Stop()
     with _signals_to(_stop.on_signal):

@@ -76,21 +76,15 @@ DECLARATIONS = (
 
 @dataclass(frozen=True)
 class ExciterSettings:
-    """Validated settings of the exciter: all parameters by name (`values`), and the limits of each axis.
+    """Validated settings of the exciter."""
 
-    `rest` is the voltage (V) of each axis before and after the excitation; None: as reported by ``stage_state``.
-    """
-
-    values: Values
+    values: Values  # all parameters by name
     limits: tuple[Limits, ...]
-    rest: list[float] | None
+    rest: list[float] | None  # V, before and after; None: as reported by ``stage_state``
 
     @classmethod
     def of(cls, given: Values) -> "ExciterSettings":
-        """Return the settings from a mapping of parameter names to values.
-
-        UsageError if a value is not valid, or the values do not allow an excitation.
-        """
+        """Return the settings from a mapping of parameter names to values."""
         values, axes = validated(DECLARATIONS, given), given["axes"]
         low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
         rest = given["rest_voltage"]
@@ -106,10 +100,7 @@ class ExciterSettings:
         return settings
 
     def drawn(self, found: Sequence[float]) -> Drive:
-        """Return the excitation, from and to rest: `rest`, or the voltages (V) at which the amplifier was found.
-
-        UsageError if the settings do not allow an excitation.
-        """
+        """Return the excitation, from and to rest: `rest`, or the voltages (V) at which the amplifier was found."""
         rest = self.rest or [limits.clip(v) for limits, v in zip(self.limits, found, strict=True)]
         given = {name: self.values[name] for name in ("axes", "duration", "rate", "seed", "drive")}
         return excite(
@@ -147,11 +138,6 @@ class Exciter(Node):
     voltages can have caused (`slpi_ros.calibration.drive_watch`). Else it returns to rest at the slew limit and ends
     with exit code 1 (without ``autostart`` it stays). A trajectory is not watched: the device plays it by itself.
     Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
-
-    Raises
-    ------
-    UsageError
-        If the parameters are not valid.
     """
 
     def __init__(self) -> None:

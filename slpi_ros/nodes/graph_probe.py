@@ -31,11 +31,7 @@ DEPTH = 1000
 
 
 def probe(state_topic: str, command_topic: str, namespace: str, seconds: float) -> Graph:
-    """Watch a running graph for some seconds, without publishing anything.
-
-    `state_topic` and `command_topic` are those of the stage state and of the voltages, relative to `namespace`, "" for
-    the root; the state is received for `seconds`. UsageError if ROS refuses the names.
-    """
+    """Watch a running graph for some `seconds`, without publishing anything; topics are relative to `namespace`."""
     context = Context()
     try:
         rclpy.init(args=[], context=context)

@@ -29,14 +29,12 @@ OnState = Callable[[bytes, int], None]
 
 
 class GuardedDrive:
-    """Drive a stage within its limits, alone, from where it is, and only while it does what it is told.
+    """Drive a stage within its limits, alone, from where it is, and only while it does what it is told."""
 
-    Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock.
-    Sequences are in the order of the voltages. The name of `node` begins the messages of errors; `rate` (Hz) is that at
-    which `move` is called, and `timeout` (s) the longest time without a valid state during a drive. `on_state` is
-    called with each serialized state and its time on the clock of the node; `publisher` is a new one of
-    ``voltage_command`` by default. `reported` (V) and `hardware_id` are those of the last valid state.
-    """
+    # Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock; it
+    # is called at `rate` (Hz). `timeout` (s) is the longest time without a valid state during a drive. `on_state` is
+    # called with each serialized state and its time on the clock of the node. The name of the node begins messages of
+    # errors.
 
     def __init__(
         self,
@@ -53,7 +51,7 @@ class GuardedDrive:
         self._simulated = bool(node.get_parameter("use_sim_time").value)
         self.publisher: Any = publisher or node.create_publisher(Float64MultiArray, COMMAND, COMMANDS)
         self._subscription = None
-        self.reported: list[float] | None = None
+        self.reported: list[float] | None = None  # V, last valid
         self.hardware_id, self._count = "", 0
         self.prepare(limits, rate)
 
@@ -124,10 +122,7 @@ class GuardedDrive:
         return self.watch.started_from(time.monotonic_ns(), self._since_ns)
 
     def start(self, voltages: Sequence[float]) -> None:
-        """Start from voltages (V) at which the amplifier is.
-
-        RecordError if one is outside the limits by more than `TOLERATED_SHARE` of the range.
-        """
+        """Start from voltages (V) at which the amplifier is; RecordError if one is far outside the limits."""
         for axis, limits, v in zip(self._axes, self._limits, voltages, strict=True):
             slack = TOLERATED_SHARE * (limits.upper - limits.lower)
             if not limits.lower - slack <= v <= limits.upper + slack:

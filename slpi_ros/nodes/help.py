@@ -19,10 +19,7 @@ WIDEST = 110
 
 
 def help_asked(name: str, node: type[Node], declarations: Sequence[Declaration]) -> bool:
-    """Print the help of a node program if the command line asks for it; return whether it does.
-
-    The docstring of `node`, the class of the node, says what it does.
-    """
+    """Print the help of a node program, from the docstring of its class, if asked for; return whether it was."""
     if not {"-h", "--help"} & set(sys.argv[1:]):
         return False
     print("\n".join(_lines(name, node, declarations)))

@@ -87,16 +87,12 @@ DECLARATIONS = (
 
 @dataclass(frozen=True)
 class IdentifySettings:
-    """Validated settings of the node; `request` is also used for bags of the watched folder.
+    """Validated settings of the node."""
 
-    `watch_directory` is "" for none, `diagnosis_directory` "" for a temporary folder; `diagnostic_period` is in
-    seconds.
-    """
-
-    request: FitRequest
-    watch_directory: str
-    diagnosis_directory: str
-    diagnostic_period: float
+    request: FitRequest  # also used for bags of the watched folder
+    watch_directory: str  # "": none
+    diagnosis_directory: str  # "": a temporary folder
+    diagnostic_period: float  # s
 
     @classmethod
     def of(cls, values: Values) -> "IdentifySettings":
@@ -145,12 +141,10 @@ NO_MODEL = "nothing to diagnose: no bag has been identified yet"
 
 
 class DiagnosisService:
-    """Service ``~/diagnose``: find the causes of the model errors on the bags of the fit; respond when complete.
+    """Service ``~/diagnose``: find the causes of the model errors on the bags of the fit; respond when complete."""
 
-    The diagnosis only writes files; it does not change the published model. `identified` returns the request for that
-    model and its bags, None without a model; `folder` returns the output folder, "" for a temporary one. `report` is
-    called at the start and at the end of a diagnosis.
-    """
+    # The diagnosis only writes files, in `folder` ("": a temporary one); it does not change the published model.
+    # `identified` returns the request for that model and its bags; `report` is called at start and end of a diagnosis.
 
     def __init__(
         self,
@@ -265,8 +259,6 @@ class Identify(Node):
     model on its bags. A bag that cannot be identified, or a bag of the watched folder that was recorded on another
     stage, is reported and skipped; the last valid model stays published. So it does if the new model is worse than the
     model in use: the last one on ``stage_model``, by whomever, or else the one in the file ``output``.
-
-    Raises UsageError if the parameters are not valid.
     """
 
     def __init__(self) -> None:

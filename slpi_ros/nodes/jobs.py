@@ -26,11 +26,10 @@ Outcome = TypeVar("Outcome")
 
 
 class WorkerProcess(Generic[Request, Outcome]):
-    """Run a function in a worker process and return its outcome without blocking.
+    """Run a function of a module in a worker process and return its outcome without blocking."""
 
-    `work` is a module-level function that returns the outcome of a request. `outcome` is a dataclass of plain values,
-    created with only `error` set, which names `what` was done, if the process ends without a result.
-    """
+    # `outcome` is a dataclass of plain values, created with only `error` set, which names `what` was done, if the
+    # process ends without a result.
 
     def __init__(
         self, work: Callable[[Request], Outcome], request: Request, outcome: Callable[..., Outcome], what: str
@@ -112,26 +111,19 @@ class StageIdentity:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """Request of an identification from all `bags` in one fit.
-
-    `start`, `stop` (s): start and end of the fitted part of the record; None: first stamp, or last stamp. `output`:
-    file for the model document; "" if none. `stage`: stage that the bags must belong to; None: any. `in_use`: document
-    of the model in use, with which the new one is compared; "": that in `output`, if any. `unconditional`: the new
-    model is published whatever the comparison says. `sensor_delay`, `sensor_lag` (s): known delay and lag of the
-    sensor.
-    """
+    """Request of an identification from all `bags` in one fit."""
 
     bags: tuple[str, ...]
     topic: str
     kind: str
-    start: float | None
-    stop: float | None
-    output: str
-    stage: StageIdentity | None = None
-    in_use: str = ""
-    unconditional: bool = False
-    sensor_delay: float = 0.0
-    sensor_lag: float = 0.0
+    start: float | None  # s, of the fitted part; None: first stamp
+    stop: float | None  # s; None: last stamp
+    output: str  # file for the model document; "": none
+    stage: StageIdentity | None = None  # that the bags must belong to; None: any
+    in_use: str = ""  # model document to compare with; "": that in `output`, if any
+    unconditional: bool = False  # published whatever the comparison says
+    sensor_delay: float = 0.0  # s, known
+    sensor_lag: float = 0.0  # s, known
 
     @property
     def source(self) -> str:
@@ -141,14 +133,11 @@ class FitRequest:
 
 @dataclass(frozen=True)
 class FitOutcome:
-    """Outcome of an identification: a model document or an error.
-
-    `doubt` is the reason why the model must not replace the one in use automatically.
-    """
+    """Outcome of an identification: a model document or an error."""
 
     document: str = ""
     error: str = ""
-    doubt: str = ""
+    doubt: str = ""  # why the model must not replace the one in use automatically
 
 
 def fit(request: FitRequest) -> FitOutcome:

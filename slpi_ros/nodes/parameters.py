@@ -17,29 +17,20 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Declaration:
-    """Declaration of one node parameter, whose type is that of its default value.
-
-    `description` is shown by ``ros2 param describe``. A `read_only` value can only be set at the start of the node.
-    `between` are the smallest and largest value of a number, by default any; `choices` are the allowed values of a
-    string, if empty any. With `number`, a double may also be given as an integer or as one value for each axis; this is
-    not for integer parameters. With `each_axis`, each axis may have its own value.
-    """
+    """Declaration of one node parameter, whose type is that of its default value."""
 
     name: str
     default: Any
-    description: str
-    read_only: bool = False
-    between: tuple[float, float] | None = None
-    number: bool = False
-    each_axis: bool = False
-    choices: tuple[str, ...] = ()
+    description: str  # for ``ros2 param describe``
+    read_only: bool = False  # can only be set at the start of the node
+    between: tuple[float, float] | None = None  # smallest and largest number; None: any
+    number: bool = False  # a double, also given as an integer or as one value for each axis
+    each_axis: bool = False  # each axis may have its own value
+    choices: tuple[str, ...] = ()  # of a string; (): any
 
     def read(self, values: Values, axes: Sequence[str]) -> Any:
-        """Return the validated value from `values`: a tuple with one value per axis if `each_axis`.
-
-        None stands for NaN, if that is the default: it depends on other parameters. UsageError if the value is not
-        valid; the message names the parameter and the allowed values.
-        """
+        """Return the validated value from `values`: a tuple with one value per axis if `each_axis`."""
+        # None stands for NaN, if that is the default: it depends on other parameters.
         given = values[self.name]
         if self._is_nan(given) and self._is_nan(self.default):
             return None
@@ -74,10 +65,7 @@ class Declaration:
 
 
 def validated(declarations: Sequence[Declaration], values: Values) -> dict[str, Any]:
-    """Return all parameters by name, each validated.
-
-    UsageError if a value is not valid, or the parameter ``axes`` is empty or holds a name twice.
-    """
+    """Return all parameters by name, each validated; ``axes`` holds each name once."""
     # An empty list is given as None.
     axes = values.get("axes") or ()
     if "axes" in values and not (axes and all(axes) and len(set(axes)) == len(axes)):
@@ -86,11 +74,7 @@ def validated(declarations: Sequence[Declaration], values: Values) -> dict[str, 
 
 
 class Parameters(Generic[Settings]):
-    """Node parameters and the settings derived from them, changed atomically.
-
-    `make` returns the settings from a mapping of names to values, and raises SlpiError if they are not valid.
-    UsageError if the initial values are not valid.
-    """
+    """Node parameters and the settings that `make` derives from them, changed atomically."""
 
     def __init__(self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]) -> None:
         self._node, self._make = node, make
@@ -132,10 +116,7 @@ def number(values: Values, name: str, low: float, high: float) -> float:
 
 
 def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: float) -> list[float]:
-    """Return the parameter `name` as floats, one for each axis; a single value applies to all axes.
-
-    UsageError if not all are finite numbers from `low` to `high`, or there is not one for each axis.
-    """
+    """Return the parameter `name` as floats from `low` to `high`, one for each axis; one value applies to all axes."""
     given = values[name]
     if isinstance(given, Sequence) and not isinstance(given, str):
         # Arrays are converted to lists for messages.

@@ -41,13 +41,6 @@ class Recorder(Node):
     Subscribes to the topics named by the parameter ``topics``, with the reliability and durability that their
     publishers offer; messages are not deserialized. An incomplete bag is kept in ``.NAME.partial`` in
     the folder of the output. Parameters in `DECLARATIONS`.
-
-    Raises
-    ------
-    UsageError
-        If a parameter is not valid.
-    RecordError
-        If the bag cannot be created.
     """
 
     def __init__(self) -> None:

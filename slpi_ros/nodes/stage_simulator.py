@@ -119,11 +119,6 @@ class StageSimulator(Node):
     ----------
     ignored : int
         Number of commands ignored because of a wrong length or a value that is not finite.
-
-    Raises
-    ------
-    UsageError
-        If a parameter is not valid.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,4 @@
-"""Executables of the nodes: signals are handled before ROS is imported, which takes most of the time of a start.
-
-``python -m slpi_ros.nodes.start NAME`` starts a node as its executable does.
-"""
+"""Executables of the nodes: signals are handled before ROS is imported, which takes most of the time of a start."""
 
 # Few imports: until the handlers are set, SIGINT ends the process with a traceback.
 import signal

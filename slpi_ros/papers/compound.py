@@ -57,14 +57,11 @@ PID = "PID"
 
 @dataclass(frozen=True)
 class Outcome:
-    """Desired, measured and true displacement (m) along a path, shape (N,) each.
-
-    `measured` are the sensor readings, `displacement` is the true one, without sensor errors.
-    """
+    """Displacements (m) along a path, shape (N,) each."""
 
     desired: FloatArray
-    measured: FloatArray
-    displacement: FloatArray
+    measured: FloatArray  # readings
+    displacement: FloatArray  # true one, without sensor errors
 
     @property
     def by_sensor(self) -> ErrorMetrics:
@@ -98,17 +95,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class AxisStudy:
-    """Results of the experiments on one axis, by model.
-
-    `feedforward` is without feedback, Fig. 11. `compound` are the segments of Table 6, Fig. 13, by model, "" for no
-    feedforward, and by whether with PID. `rested` is the same with PID, with a rest at 0 V between warm-up and zeroing
-    of the sensor. `gains` are those of the controller.
-    """
+    """Results of the experiments on one axis, by model."""
 
     gains: PidGains
-    feedforward: Mapping[str, Outcome]
-    compound: Mapping[tuple[str, bool], Outcome]
-    rested: Mapping[str, Outcome]
+    feedforward: Mapping[str, Outcome]  # without feedback, Fig. 11
+    compound: Mapping[tuple[str, bool], Outcome]  # segments of Table 6, Fig. 13, by model ("": none) and with PID
+    rested: Mapping[str, Outcome]  # with PID, with a rest at 0 V between warm-up and zeroing of the sensor
 
 
 def run_study(axis: PreisachStage, name: str, path_cycles: int = 3) -> AxisStudy:
@@ -148,15 +140,11 @@ def path(parts: Sequence[tuple[float, float]], path_cycles: int) -> FloatArray:
 
 
 def tune(stage: StageParameters, gain: float) -> PidGains:
-    """Return PI gains for an axis with a lightly damped mode (frequency ``w``, damping ``z``) and static gain ``g``.
-
-    At the mode the gain of the stage is ``g / 2z``, so the loop gain there would be 1 with integral action alone of
-    ``K_i = 2 z w / g``, or proportional action alone of ``K_p = 2 z / g``. With one third of the former and one tenth
-    of the latter it is below 0.35 for any phase, so for any lag and delay. Derivative action would increase it.
-
-    Of `stage`, only the frequency and damping of the mode are used, which could be measured by a ring-down test; `gain`
-    is ``g`` (m/V).
-    """
+    """Return PI gains for an axis with a lightly damped mode (frequency ``w``, damping ``z``) and gain ``g`` (m/V)."""
+    # At the mode the gain of the stage is ``g / 2z``, so the loop gain there would be 1 with integral action alone of
+    # ``K_i = 2 z w / g``, or proportional action alone of ``K_p = 2 z / g``. With one third of the former and one tenth
+    # of the latter it is below 0.35 for any phase, so for any lag and delay. Derivative action would increase it.
+    # Frequency and damping could be measured by a ring-down test.
     omega, double_damping = 2.0 * math.pi * stage.resonance_frequency, 2.0 * stage.resonance_damping
     return PidGains(PROPORTIONAL_SHARE * double_damping / gain, INTEGRAL_SHARE * double_damping * omega / gain)
 
@@ -169,14 +157,8 @@ def follow(
     warm_up: float,
     rest: float = 0.0,
 ) -> Outcome:
-    """Warm up an axis, zero the sensor, and let the axis follow a path.
-
-    A voltage is reached one sample after its command. The path is known, so the feedforward is one sample ahead.
-
-    `desired` (m), starting at 0, and `feedforward` (V) have the shape (N,). `gains` is None for no feedback, `warm_up`
-    is the amplitude (V) of the warm-up cycles, and `rest` the time (s) at 0 V between warm-up and zeroing of the
-    sensor.
-    """
+    """Warm up an axis to `warm_up` (V), `rest` (s) at 0 V, zero the sensor, and follow a path (m, (N,))."""
+    # A voltage is reached one sample after its command. The path is known, so the feedforward (V) is one sample ahead.
     axis.rest()
     v = np.append(triangles(warm_up, 1.0, WARM_UP, round(RATE))[1], np.zeros(1 + round(rest * RATE)))
     displacement, readings = axis.run(np.arange(v.size) / RATE, v)

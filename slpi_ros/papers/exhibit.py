@@ -28,16 +28,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Exhibit:
-    """Comparison of a result of a paper with the reproduced one; a section of the page.
+    """Comparison of a result of a paper with the reproduced one; a section of the page."""
 
-    `title` is the figure or table of the paper, `paper` its result in words or numbers, `ours` the reproduced result,
-    and `remark` explains the differences.
-    """
-
-    title: str
-    paper: str
-    ours: str
-    remark: str
+    title: str  # figure or table of the paper
+    paper: str  # its result in words or numbers
+    ours: str  # the reproduced result
+    remark: str  # explains the differences
     tables: tuple[Table, ...] = ()
     pictures: tuple[Picture, ...] = ()
 

@@ -19,10 +19,9 @@ from slpi_ros.papers.exhibit import Exhibit, Table
 
 @dataclass(frozen=True)
 class Case:
-    """The parts of the record ``<name>.csv`` that are fitted and predicted, the latter by name.
+    """The parts of the record ``<name>.csv`` that are fitted and predicted."""
 
-    Each part is its start and its end (s); values up to 1 are shares of the record.
-    """
+    # Each part is its start and its end (s); values up to 1 are shares of the record.
 
     name: str
     fitted: tuple[float, float]

@@ -107,15 +107,12 @@ class Drive:
 
 @dataclass(frozen=True)
 class CycleFit:
-    """A model fitted to the settled cycle of a drive; `simulated` (m), shape (n,), is its displacement on this cycle.
-
-    `fitted` and `following` are the errors on the fitted cycle, and on the next one.
-    """
+    """A model fitted to the settled cycle of a drive."""
 
     model: AxisModel
-    simulated: FloatArray
+    simulated: FloatArray  # m, (n,), on this cycle
     fitted: ErrorMetrics
-    following: ErrorMetrics
+    following: ErrorMetrics  # errors on the next cycle
 
 
 @dataclass(frozen=True)
@@ -128,33 +125,23 @@ class ScaledFit:
 
 @dataclass(frozen=True)
 class VariablePath:
-    """The path of Fig. 8: times (s) and sensor readings `y` (m), shape (N,) each.
+    """The path of Fig. 8."""
 
-    `parts` are the samples of each amplitude and frequency, as in `VARIABLE`. `models` are the displacements (m) by
-    name of the model, shape (N,), with an offset such that the mean error in the first part is 0.
-    """
-
-    t: FloatArray
-    y: FloatArray
-    parts: tuple[slice, ...]
-    models: Mapping[str, FloatArray]
+    t: FloatArray  # s, (N,)
+    y: FloatArray  # m, (N,), readings
+    parts: tuple[slice, ...]  # of each amplitude and frequency, as in `VARIABLE`
+    models: Mapping[str, FloatArray]  # m, (N,); mean error in the first part 0
 
 
 @dataclass(frozen=True)
 class Study:
-    """All measurements and fits.
+    """All measurements and fits."""
 
-    `drives` are by amplitude (V) and frequency (Hz). `peaks` is Eq. 1, fitted to the peaks of the first cycles, by
-    amplitude (V). `ringing` is the largest displacement (m) due to the flexure mode, at the highest amplitude, by
-    frequency (Hz). `fits`, at the highest frequency, are by name of the kind and amplitude (V), `scaled` by amplitude
-    (V).
-    """
-
-    drives: Mapping[tuple[float, float], Drive]
-    peaks: Mapping[float, PeakFrequency]
-    ringing: Mapping[float, float]
-    fits: Mapping[str, Mapping[float, CycleFit]]
-    scaled: Mapping[float, ScaledFit]
+    drives: Mapping[tuple[float, float], Drive]  # by amplitude (V) and frequency (Hz)
+    peaks: Mapping[float, PeakFrequency]  # Eq. 1, fitted to the peaks of the first cycles, by amplitude (V)
+    ringing: Mapping[float, float]  # m, largest, at the highest amplitude, by frequency (Hz)
+    fits: Mapping[str, Mapping[float, CycleFit]]  # at the highest frequency, by kind and amplitude (V)
+    scaled: Mapping[float, ScaledFit]  # by amplitude (V)
     variable: VariablePath
 
     @property
@@ -170,11 +157,7 @@ def run_study(
     frequencies: Sequence[float] = FREQUENCIES,
     samples: int = 1000,
 ) -> Study:
-    """Measure an axis and fit the models.
-
-    `amplitudes` (V) and `frequencies` (Hz) are in ascending order; the SMPI model is scaled from the last amplitude.
-    `samples` is the even number of samples per cycle.
-    """
+    """Measure an axis at ascending amplitudes (V) and frequencies (Hz), `samples` (even) per cycle; fit models."""
     drives = {(a, f): _drive(axis, a, f, samples) for f in frequencies for a in amplitudes}
     fastest = {a: drives[a, frequencies[-1]] for a in amplitudes}
     peaks = {a: fit_peak_frequency(frequencies, [drives[a, f].first_peak for f in frequencies]) for a in amplitudes}
@@ -192,10 +175,7 @@ def run_study(
 
 
 def triangles(amplitude: float, frequency: float, cycles: int, samples: int = 2000) -> tuple[FloatArray, FloatArray]:
-    """Return times (s) and a triangle wave from 0 to `amplitude` (V or m) and back, shape (cycles * samples,) each.
-
-    `frequency` is in hertz; `samples` is the even number of samples per cycle.
-    """
+    """Return times (s) and a triangle wave from 0 to `amplitude` (V or m) and back, shape (cycles * samples,) each."""
     k = np.arange(cycles * samples)
     phase = (k % samples) / samples
     return k / (samples * frequency), amplitude * (1.0 - np.abs(2.0 * phase - 1.0))

@@ -18,11 +18,7 @@ COLUMNS = "k,voltage_V,displacement_m,tr,lv,sp"
 
 
 def write_experiments(folder: Path, data: Path | None) -> Path:
-    """Run all experiments, write ``index.html`` and ``separation.csv`` into `folder`, and return the page's path.
-
-    The folder is created if it does not exist; `data` is the folder of measured records, or None. SlpiError if a file
-    cannot be read or written.
-    """
+    """Run all experiments (records in `data`), write ``index.html`` and ``separation.csv``, return the page's path."""
     make_folder(folder)
     random = study(RANDOM_PATH)
     parts = {

@@ -59,14 +59,11 @@ Drive = Memory | KnownPath
 
 @dataclass(frozen=True)
 class LoopErrors:
-    """Errors (m) of one model along a path, shape (N,).
+    """Errors (m) of one model along a path."""
 
-    `means` and `maxima` are the mean and largest absolute error (m) on each loop, the outer one first.
-    """
-
-    error: FloatArray
-    means: tuple[float, ...]
-    maxima: tuple[float, ...]
+    error: FloatArray  # (N,)
+    means: tuple[float, ...]  # absolute, of each loop, the outer one first
+    maxima: tuple[float, ...]  # absolute
 
     @classmethod
     def of(cls, error: FloatArray, loops: tuple[Loop, ...]) -> "LoopErrors":
@@ -91,28 +88,22 @@ class LoopErrors:
 
 @dataclass(frozen=True)
 class Study:
-    """One path on the stage with the reversals `turns` (V), and the errors of the models along it, by model name.
+    """One path on the stage with the reversals `turns` (V), and the errors (m) of the models along it, by name."""
 
-    `separation` is voltage and displacement, separated into loops. `at_rest` and `closing` are the published model with
-    play operators that start at rest in every loop, and primed, so that loops close.
-
-    `modelled` is model - measured. `compensated` is achieved - desired displacement, for `desired` (m), shape (N,),
-    which consists of straight lines between the measured reversals, and `voltages` (V), shape (N,). `straight` is the
-    same for a desired displacement proportional to the voltage (section 4.1 of the SLPI paper). `drives` are functions
-    that make the model anew in its initial state.
-    """
+    # `at_rest` and `closing` are the published model with play operators that start at rest in every loop, and primed,
+    # so that loops close.
 
     turns: tuple[float, ...]
-    separation: Separation
+    separation: Separation  # voltage and displacement, separated into loops
     classical: PrandtlIshlinskii
     at_rest: SeparatedLoops
     closing: SeparatedLoops
-    modelled: Mapping[str, LoopErrors]
-    compensated: Mapping[str, LoopErrors]
-    straight: Mapping[str, LoopErrors]
-    desired: FloatArray
-    voltages: Mapping[str, FloatArray]
-    drives: Mapping[str, Callable[[], Drive]]
+    modelled: Mapping[str, LoopErrors]  # model - measured
+    compensated: Mapping[str, LoopErrors]  # achieved - `desired`
+    straight: Mapping[str, LoopErrors]  # for a desired displacement proportional to the voltage (SLPI paper, 4.1)
+    desired: FloatArray  # m, (N,), straight lines between the measured reversals
+    voltages: Mapping[str, FloatArray]  # V, (N,), of `compensated`
+    drives: Mapping[str, Callable[[], Drive]]  # make the model anew in its initial state
 
 
 def study(turns: tuple[float, ...]) -> Study:
@@ -162,16 +153,12 @@ def study(turns: tuple[float, ...]) -> Study:
 
 @dataclass(frozen=True)
 class UnseenPaths:
-    """Errors of the models of one study along other paths with the reversals `turns` (V).
-
-    `mean_errors` (m), by name of the model, are the mean absolute free-run errors, model - stage, of each path. `loops`
-    is the number of inner loops of all paths, and `replaced` the number of those that were never identified.
-    """
+    """Errors of the models of one study along other paths with the reversals `turns` (V)."""
 
     turns: tuple[tuple[float, ...], ...]
-    mean_errors: Mapping[str, tuple[float, ...]]
-    loops: int
-    replaced: int
+    mean_errors: Mapping[str, tuple[float, ...]]  # m, absolute, free-run, of each path, by model
+    loops: int  # inner loops of all paths
+    replaced: int  # of them never identified
 
 
 def unseen_paths(known: Study, seed: int = 1) -> UnseenPaths:
@@ -220,10 +207,7 @@ def classical_model(v: FloatArray, y: FloatArray) -> PrandtlIshlinskii:
 
 
 def ramps(turns: Sequence[float], step: float) -> FloatArray:
-    """Return straight ramps between reversals, shape (N,), with a sample every `step` and at every reversal.
-
-    `step` is in the unit of `turns`, the reversals, whose successive values must differ.
-    """
+    """Return straight ramps between reversals, (N,), in their unit, sampled every `step` and at every reversal."""
     parts = [np.append(np.arange(a, b, step if b > a else -step)[1:], b) for a, b in pairwise(turns)]
     return np.concatenate([np.array([turns[0]], dtype=np.float64), *parts])
 

@@ -16,10 +16,7 @@ TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
 
 
 def write_files(folder: Path, outcome: Outcome) -> None:
-    """Write ``model.json``, ``report.html`` and the files of the last diagnosis into `folder`, each atomically.
-
-    The folder is created if it does not exist. SlpiError if a file cannot be written.
-    """
+    """Write ``model.json``, ``report.html`` and the files of the last diagnosis into `folder`, each atomically."""
     make_folder(folder)
     save_model(outcome.model, str(folder / MODEL))
     diagnosis_files.write_files(folder / DIAGNOSIS, outcome.diagnosis)

@@ -1,7 +1,4 @@
-"""Interactive charts, drawn by the plotly.js bundle that every page contains.
-
-Input is in SI units; `Quantity` converts it to the displayed unit.
-"""
+"""Interactive charts of SI values, drawn by the plotly.js bundle that every page contains."""
 
 import base64
 import html
@@ -46,13 +43,8 @@ _SMALL = {"size": 13}
 
 
 def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
-    """Return the sample indices of thinned lines: the extremes of each signal in each interval, and both ends.
-
-    Of NaN sequences at least as long as an interval, one NaN is kept, so that the line is interrupted.
-
-    The signals, shape (N,) each, have a common horizontal axis, and NaN for missing values. The indices, shape (K,)
-    with K up to about `most`, are in increasing order.
-    """
+    """Return sample indices (ascending, about `most`): ends, and extremes of each signal (N,) in each interval."""
+    # Of NaN sequences at least as long as an interval, one NaN is kept, so that the line is interrupted.
     size = signals[0].size
     if size <= most:
         return np.arange(size)
@@ -91,15 +83,12 @@ def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArr
 
 @dataclass(frozen=True)
 class Quantity:
-    """Quantity, unit and number format of a panel axis, as displayed.
-
-    `scale` is the factor from SI to the displayed unit; `digits` is the number format of values, as in d3-format.
-    """
+    """Quantity, unit and number format of a panel axis, as displayed."""
 
     name: str
     unit: str
-    scale: float = 1.0
-    digits: str = ".4~g"
+    scale: float = 1.0  # from SI to the displayed unit
+    digits: str = ".4~g"  # as in d3-format
     logarithmic: bool = False
 
     @property
@@ -122,27 +111,23 @@ SAMPLES = Quantity("samples", "", digits=",d")
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes.
-
-    `share` is that of the width (in a row) or height (in a column), relative to the other panels.
-    """
+    """One pair of axes."""
 
     x: Quantity
     y: Quantity
-    share: float = 1.0
+    share: float = 1.0  # of width (row) or height (column), relative to the other panels
 
 
 @dataclass
 class Chart:
-    """Panels in a row or a column with a common legend; a legend entry shows or hides its curves in all panels.
+    """Panels in a row or a column with a common legend; a legend entry shows or hides its curves in all panels."""
 
-    Panels in a row share the vertical axis, panels in a column the horizontal one, if they show the same quantity, so
-    that they zoom together. `height` is that of the chart in pixels.
-    """
+    # Panels in a row share the vertical axis, panels in a column the horizontal one, if they show the same quantity, so
+    # that they zoom together.
 
     panels: Sequence[Panel]
     arrangement: Literal["row", "column"] = "row"
-    height: int = 420
+    height: int = 420  # pixels
     _traces: list[dict[str, Any]] = field(default_factory=list, init=False)
     _shapes: list[dict[str, Any]] = field(default_factory=list, init=False)
     _ranges: dict[int, list[float]] = field(default_factory=dict, init=False)
@@ -166,10 +151,7 @@ class Chart:
         self._add(panel, name, np.append(counts, 0.0), edges, {"type": "scatter", **style})
 
     def cells(self, panel: int, edges: FloatArray, values: FloatArray, shade: Quantity, scale: Sequence[Any]) -> None:
-        """Add a map of `values`, shape (n, n), SI, in cells between `edges`, shape (n + 1,); NaN cells are empty.
-
-        The first index is vertical (upwards), the second one horizontal.
-        """
+        """Add a map of SI values (n, n), upwards first, in cells between `edges` (n + 1,); NaN cells are empty."""
         x, y = self.panels[panel].x, self.panels[panel].y
         start, stop = self._domain(panel)
         # Limit the colour scale, so that a few large values do not dominate it.

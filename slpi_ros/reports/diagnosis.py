@@ -35,10 +35,7 @@ FILES = (_, _, PAGE) = "diagnosis.json", "extended_model.json", "report.html"
 
 
 def write_files(folder: Path, diagnosis: Diagnosis) -> None:
-    """Write ``diagnosis.json``, ``extended_model.json`` and ``report.html`` into `folder`, each atomically.
-
-    The folder is created if it does not exist. SlpiError if a file cannot be written, or a value is not finite.
-    """
+    """Write ``diagnosis.json``, ``extended_model.json`` and ``report.html`` into `folder`, each atomically."""
     make_folder(folder, *FILES)
     try:
         texts = format_document(diagnosis.to_document(), "diagnosis"), format_model(diagnosis.extended)
@@ -235,10 +232,8 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
 
 
 def _parts(traces: Traces) -> list[Series]:
-    """Return the contribution of each effect to the residual of the model without effects.
-
-    The part absorbed by the hysteresis fitted alone is subtracted from the effects with which it is correlated.
-    """
+    """Return the contribution of each effect to the residual of the model without effects."""
+    # The part absorbed by the hysteresis fitted alone is subtracted from the effects with which it is correlated.
     effects = {name: values - np.mean(values) for name, values in traces.contributions.items()}
     if not effects:
         return []

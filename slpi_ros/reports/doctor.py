@@ -40,33 +40,23 @@ class Check:
 
 @dataclass(frozen=True)
 class Graph:
-    """What was seen of a running ROS graph.
+    """What was seen of a running ROS graph."""
 
-    `state_topic` and `command_topic` are the names after namespace and remapping. `seconds` is the time for which the
-    state was received. `nodes` are all other nodes. `state_publishers` are the types of the topic by name of the node,
-    `command_publishers` and `command_subscribers` the names of the nodes.
-
-    `stamps` and `arrivals` (s), shape (N,), are the stamps of the states, and the time of the node's clock at which
-    they came. `axes`, `displacement` (m), `voltage` (V) and `hardware_id` are those of the last state. `limits` (V) are
-    those of the node that publishes the voltages, by axis; empty if it does not tell. `model` is that on the topic
-    ``stage_model``; None: none.
-    """
-
-    state_topic: str
-    command_topic: str
-    seconds: float
-    nodes: Sequence[str] = ()
-    state_publishers: Mapping[str, str] = field(default_factory=dict)
-    command_publishers: Sequence[str] = ()
-    command_subscribers: Sequence[str] = ()
-    stamps: FloatArray = field(default_factory=lambda: np.empty(0))
-    arrivals: FloatArray = field(default_factory=lambda: np.empty(0))
-    axes: Sequence[str] = ()
-    displacement: Mapping[str, float] = field(default_factory=dict)
-    voltage: Mapping[str, float] = field(default_factory=dict)
+    state_topic: str  # full name
+    command_topic: str  # full name
+    seconds: float  # for which the state was received
+    nodes: Sequence[str] = ()  # all others
+    state_publishers: Mapping[str, str] = field(default_factory=dict)  # types of the topic, by node
+    command_publishers: Sequence[str] = ()  # nodes
+    command_subscribers: Sequence[str] = ()  # nodes
+    stamps: FloatArray = field(default_factory=lambda: np.empty(0))  # s, (N,), of the states
+    arrivals: FloatArray = field(default_factory=lambda: np.empty(0))  # s, (N,)
+    axes: Sequence[str] = ()  # of the last state
+    displacement: Mapping[str, float] = field(default_factory=dict)  # m, last
+    voltage: Mapping[str, float] = field(default_factory=dict)  # V, last
     hardware_id: str = ""
-    limits: Mapping[str, Range] = field(default_factory=dict)
-    model: StageModel | None = None
+    limits: Mapping[str, Range] = field(default_factory=dict)  # V, of the node that publishes the voltages; {}: untold
+    model: StageModel | None = None  # on ``stage_model``
 
 
 def check_record(record: Record, model: StageModel | None = None, limits: Range | None = None) -> list[Check]:
@@ -111,10 +101,7 @@ def check_model(model: StageModel, limits: Range | None = None) -> list[Check]:
 
 
 def check_graph(graph: Graph, model: StageModel | None = None) -> list[Check]:
-    """Check a running graph: discovery, the state of the stage, who commands, and whether the model fits the stage.
-
-    `model` is by default that on ``stage_model``, if any.
-    """
+    """Check a running graph: discovery, state of the stage, who commands, and whether the model fits the stage."""
     if not graph.nodes:
         text = "ROS: no other node; start the driver of the stage, and use its ROS_DOMAIN_ID and discovery range"
         return [Check(MEND, text)]

@@ -32,14 +32,9 @@ def write_report(
     start: float | None = None,
     stop: float | None = None,
 ) -> Path:
-    """Write ``report.html`` into `folder`, which is created if it does not exist, and return its path.
-
-    `record`, the first one of several bags, is that on which the identified model is shown. `held_out` are the held-out
-    errors and `found` the findings on the quality of the record, by axis; the findings are determined from the record
-    by default. `start` and `stop` (s) are those of the fitted part of the record, as for `slpi_ros.identify`; the rest
-    is drawn but not evaluated. SlpiError if the file cannot be written, or the record does not contain the model's
-    axes.
-    """
+    """Write ``report.html`` on the first record of a model into `folder`, created if missing, and return its path."""
+    # `found` are the findings on the quality of the record, by axis, by default determined from it; only the fitted
+    # part, `start` to `stop` (s), is evaluated, the rest is drawn.
     page = Page(f"Model of {record.source}")
     page.contents(tuple(model.axes))
     for name in model.axes:

@@ -130,10 +130,7 @@ class Page:
         caption: str = "",
         links: Mapping[str, str] | None = None,
     ) -> None:
-        """Add a table; row `best` is highlighted, and a row given as text is a group heading.
-
-        First cells that are in `links` are links to these paths, relative to the page.
-        """
+        """Add a table; row `best` is highlighted, a row of text is a group heading, first cells may be `links`."""
         below = f"<caption>{_text(caption)}</caption>" if caption else ""
         cells_of = [row for row in rows if not isinstance(row, str)]
         # Sentences and paths are aligned like text and broken into lines; numbers are neither.

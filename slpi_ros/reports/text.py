@@ -30,10 +30,8 @@ def verdict(limits: Mapping[str, str], good: str = "at the noise floor") -> str:
 
 
 def above_floor(rms: float, floor: float, stroke: float) -> str:
-    """Return by how much an error (m rms) exceeds the noise floor (m rms) as text; "" if it does not.
-
-    An error below `RESOLUTION` of the `stroke` (m) counts as noise, as no model of hysteresis does better.
-    """
+    """Return by how much an error (m rms) exceeds the noise floor (m rms) as text; "" if it does not."""
+    # An error below `RESOLUTION` of the `stroke` (m) counts as noise, as no model of hysteresis does better.
     if rms <= max(ABOVE_FLOOR * floor, RESOLUTION * stroke):
         return ""
     times = f"{rms / floor:.1f} times the noise floor" if floor > 0.0 else "without any noise"

@@ -47,10 +47,7 @@ _SMALLEST_SHARE = 0.01
 
 
 def write_files(folder: Path, found: Verification) -> None:
-    """Write ``verification.json`` and ``report.html`` into `folder`, each atomically.
-
-    The folder is created if it does not exist. SlpiError if a file cannot be written.
-    """
+    """Write ``verification.json`` and ``report.html`` into `folder`, each atomically."""
     make_folder(folder, *FILES)
     with all_or_nothing(folder / FILES[0]) as file:
         file.write(format_document(found.to_document(), "verification"))
@@ -95,10 +92,7 @@ def verification_good(found: Verification) -> str:
 
 
 def describe_verification(found: Verification, *, details: bool = True) -> list[str]:
-    """Return lines of text: for each axis the verdict, and the errors (nm) by record, level, speed and region.
-
-    Without `details`: the verdict, and the notes of each record.
-    """
+    """Return lines: for each axis the verdict and the notes of each record, in `details` errors (nm) by class."""
     lines = []
     for name, axis in found.axes.items():
         told = [f"{axis.verdict}: " + _summary(name, axis).removeprefix(f"Axis {name}: ")]

@@ -1,7 +1,4 @@
-"""Charts of models and a record: displacement and residual over voltage, time, speed and frequency.
-
-All residuals are measured - model.
-"""
+"""Charts of models and a record: displacement and residual (measured - model) over voltage, time, speed, frequency."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -72,18 +69,12 @@ _WINDOWS, _LONGEST_WINDOW, _SPECTRUM_POINTS = 8, 1 << 14, 400
 
 @dataclass(frozen=True)
 class Motion:
-    """Speed, reversals and branches of a voltage signal, by sample.
+    """Speed, reversals and branches of a voltage signal, by sample, (N,)."""
 
-    `speed` (V/s) is the rate of change, negative for a falling voltage, `since_turn` (s) the time since the last
-    reversal or stop of the voltage, and `branch_from` (V) the voltage at the start of the present hysteresis branch,
-    shape (N,) each. `runs`, shape (M + 1,), are the sample indices of the reversals, with the first and the last
-    sample.
-    """
-
-    speed: FloatArray
-    since_turn: FloatArray
-    branch_from: FloatArray
-    runs: IntArray
+    speed: FloatArray  # V/s, negative: falling
+    since_turn: FloatArray  # s, since the last reversal or stop of the voltage
+    branch_from: FloatArray  # V, at the start of the hysteresis branch
+    runs: IntArray  # (M + 1,), reversals with the first and the last sample
 
     @classmethod
     def of(cls, t: FloatArray, v: FloatArray) -> "Motion":
@@ -143,12 +134,8 @@ def show_model(
     noise: float,
     fitted: Mask,
 ) -> Motion:
-    """Add the charts of a model on a record: loops, time, and residual over voltage; return the motion.
-
-    The times (s), voltages (V), measured (`y`) and simulated displacement (m), and the mask of the samples to be
-    evaluated (`fitted`) have the shape (N,). `name` is the first part of the charts' names; `noise` (m) is the
-    half-width of the shaded noise band, 0 for none.
-    """
+    """Add the charts of a model on a record, (N,): loops, time, and residual over voltage; return the motion."""
+    # `name` is the first part of the charts' names; `noise` (m) is the half-width of the shaded noise band, 0: none.
     motion, models = Motion.of(t, v), [Series("model", simulated, AFTER)]
     chart, said = loops(v, y, models, motion, fitted)
     page.chart(f"{name}-loops", chart, f"{LOOPS} {said}")
@@ -166,12 +153,8 @@ def show_model(
 def loops(
     v: FloatArray, y: FloatArray, models: Sequence[Series], motion: Motion, fitted: Mask | None = None
 ) -> tuple[Chart, str]:
-    """Draw displacement over voltage, and the deviation from a straight-line fit in a second panel.
-
-    The voltages (V), the measured displacement `y` (m) and the mask of fitted samples, by default all, have the shape
-    (N,); the other samples have different colours. `models` are simulated displacements. The text is a note on the
-    share of branches that are drawn of a long record, or "".
-    """
+    """Draw displacement over voltage, and its deviation from a straight line; samples not `fitted` in other colours."""
+    # The text is a note on the share of branches that are drawn of a long record, or "".
     chart = Chart([Panel(VOLTAGE, DISPLACEMENT), Panel(VOLTAGE, OPENED)], height=470)
     kept, said = _some_runs(v, y, motion)
     gaps = np.isnan(kept)
@@ -239,13 +222,9 @@ def over_time(
     parts: Sequence[Series] = (),
     fitted: Mask | None = None,
 ) -> tuple[Chart, str]:
-    """Draw displacement over time, and the residuals of models below.
-
-    The times (s), the measured displacement `y` (m) and the mask of fitted samples, by default all, have the shape
-    (N,); the other samples are shaded. `noise` (m) is the half-width of the shaded noise band, 0 for none; `parts` are
-    contributions to the first model's residual. The text is a note on the number of samples outside the initial view,
-    or "".
-    """
+    """Draw displacement and residuals of models over time, with the `parts` of the first; not `fitted` is shaded."""
+    # `noise` (m) is the half-width of the shaded band, 0: none. The text is a note on the number of samples outside the
+    # initial view, or "".
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, ERROR, 1.2)], "column", 540)
     for start, stop in _rows(np.zeros(t.size, dtype=bool) if fitted is None else ~fitted):
         for panel in (0, 1):
@@ -324,10 +303,8 @@ def histogram(chart: Chart, panel: int, curve: Series) -> None:
 
 
 def coverage(v: FloatArray, left: FloatArray, motion: Motion) -> Chart:
-    """Draw the number of samples with a finite residual `left` (m) on the Everett plane, and their rms residual.
-
-    The plane covers the range of the voltages `v`, shape (N,); a point is a pair of branch start and present voltage.
-    """
+    """Draw the number of samples with a finite residual `left` (m) on the Everett plane, and their rms residual."""
+    # The plane covers the range of the voltages `v`, shape (N,); a point is a pair of branch start and present voltage.
     chart = Chart([Panel(BEGAN, NOW), Panel(BEGAN, NOW)], height=490)
     low, high = float(v.min()), float(v.max())
     edges = np.linspace(low, high, _CELLS + 1) if high > low else np.array([low - 0.5, low + 0.5])
@@ -359,11 +336,8 @@ def focus(chart: Chart, panels: Sequence[int], errors: Sequence[FloatArray], cho
 
 
 def over_motion(v: FloatArray, curves: Sequence[Series], parts: Sequence[Series], motion: Motion) -> tuple[Chart, str]:
-    """Draw residuals over voltage (V), shape (N,), and over its speed, with means for rising and falling voltage.
-
-    `curves` are the residuals, `parts` contributions to them, of which only the means are drawn. The text is a note on
-    the number of samples outside the initial view, or "".
-    """
+    """Draw residuals over voltage (V) and its speed, with their means, and those of `parts`, for each direction."""
+    # The text is a note on the number of samples outside the initial view, or "".
     chart = Chart([Panel(VOLTAGE, ERROR), Panel(SPEED, ERROR)], height=430)
     ways = [np.flatnonzero(motion.speed > 0.0), np.flatnonzero(motion.speed < 0.0)]
     _add(chart, 0, v, curves, parts, lambda values: _joined([_means(v[way], values[way]) for way in ways]))

@@ -28,11 +28,7 @@ class DiagnoseOutcome:
 
 
 def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
-    """Find the causes of the errors of a model; UsageError if a bag is given twice.
-
-    RecordError, IdentificationError or ModelError if the records cannot be read, do not allow a diagnosis, or do not
-    match the model.
-    """
+    """Find the causes of the errors of a model."""
     source, model = request.source, request.model
     records = source.read(coupled=True)
     with mismatch_in_data():

@@ -14,15 +14,11 @@ from slpi_ros.workflows.records import Findings, Source, require_records
 
 @dataclass(frozen=True)
 class IdentifyRequest:
-    """Request of an identification: one model from all records.
-
-    `kind`: kind of hysteresis model. `loops_at_rest`: for ``slpi-published``: whether its operators start at rest;
-    default False. `sensor`: known delay and lag of the sensors; default: none.
-    """
+    """Request of an identification: one model from all records."""
 
     source: Source
     kind: str = "slpi"
-    loops_at_rest: bool = False
+    loops_at_rest: bool = False  # ``slpi-published``: its operators start at rest
     sensor: Sensor = IDEAL
 
     def require_possible(self, *, uncertainty: bool = False) -> None:
@@ -70,10 +66,7 @@ class IdentifyOutcome:
 
 
 def identify(request: IdentifyRequest) -> IdentifyOutcome:
-    """Identify a model; UsageError if the kind or an option is unknown, or a bag is given twice.
-
-    RecordError or IdentificationError if the records cannot be read, or do not allow a fit.
-    """
+    """Identify a model."""
     request.require_possible()
     source, sensor = request.source, request.sensor
     records = source.read()

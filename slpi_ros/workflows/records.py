@@ -26,28 +26,18 @@ class UnusableRecordError(IdentificationError):
 
 @dataclass(frozen=True)
 class Source:
-    """Records of one stage: the bags that hold them, or the records themselves.
+    """Records of one stage: the bags that hold them, or the records themselves."""
 
-    `bags`: paths of the bags; not read if there are `records`. `topic`: where the bags hold voltage and displacement.
-    `axes`: axes in use; default: all. `start`, `stop` (s): part in use, from the first stamp of each record; default:
-    all. `assessed`: whether `assess_record` has found the axes in use usable already, so that it is not asked again;
-    default False.
-    """
-
-    bags: Sequence[str] = ()
-    topic: str | SeparateTopics = "stage_state"
-    axes: Sequence[str] | None = None
-    start: float | None = None
-    stop: float | None = None
+    bags: Sequence[str] = ()  # paths; not read if there are `records`
+    topic: str | SeparateTopics = "stage_state"  # of voltage and displacement
+    axes: Sequence[str] | None = None  # in use; default: all
+    start: float | None = None  # s, from the first stamp of each record
+    stop: float | None = None  # s
     records: Sequence[Record] = ()
-    assessed: bool = False
+    assessed: bool = False  # `assess_record` has found the axes in use usable already
 
     def read(self, *, coupled: bool = False) -> tuple[Record, ...]:
-        """Return the records; with `coupled`, also axes that are not in use, which may couple into the others.
-
-        UsageError if there is no bag, or one is given twice; RecordError if a bag cannot be read, or they are of
-        several stages.
-        """
+        """Return the records; with `coupled`, also axes that are not in use, which may couple into the others."""
         if self.records:
             return tuple(self.records)
         records = tuple(self._read(str(bag), coupled) for bag in require_different(self.bags))

@@ -36,11 +36,7 @@ class RefitOutcome:
 
 
 def refit(request: RefitRequest) -> RefitOutcome:
-    """Correct a model; each record corrects the model that the earlier ones have given.
-
-    UsageError if a bag is given twice, is of another stage, or the model's kind cannot be corrected; RecordError or
-    IdentificationError if the records cannot be read, or do not allow a correction.
-    """
+    """Correct a model; each record corrects the model that the earlier ones have given."""
     source, model, steps = request.source, request.model, []
     records = sorted(source.read(coupled=True), key=lambda record: int(record.time_ns[0]))
     for record in records:

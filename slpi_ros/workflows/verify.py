@@ -14,20 +14,14 @@ from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, requi
 
 @dataclass(frozen=True)
 class VerifyRequest:
-    """Request of a verification.
-
-    `tolerance` (m): largest rms error that passes, of the absolute error, or, if `without_offset`, of that without its
-    constant part; default: as for `slpi_ros.verify`. `desired_topic`: topic of the bags that holds the desired
-    displacement; default: ``desired_displacement``, where a bag has it. `start_memory`: initial state of the records,
-    if it is known.
-    """
+    """Request of a verification."""
 
     source: Source
     model: StageModel
-    tolerance: float | None = None
-    desired_topic: str | None = None
-    without_offset: bool = False
-    start_memory: StartMemory | None = None
+    tolerance: float | None = None  # m, rms; default: as for `slpi_ros.verify`
+    desired_topic: str | None = None  # default: ``desired_displacement``, where a bag has it
+    without_offset: bool = False  # the tolerance holds for the error without its constant part
+    start_memory: StartMemory | None = None  # initial state of the records, if known
 
 
 @dataclass(frozen=True)
@@ -40,11 +34,7 @@ class VerifyOutcome:
 
 
 def verify(request: VerifyRequest) -> VerifyOutcome:
-    """Verify a model; UsageError if a bag is given twice.
-
-    RecordError, IdentificationError or ModelError if the records cannot be read, allow no judgement, or do not match
-    the model.
-    """
+    """Verify a model."""
     source, model = request.source, request.model
     records = source.read(coupled=True)
     desired = None

@@ -121,6 +121,22 @@ def test_excite_identify_refit(tmp_path):
     )
 
 
+def test_a_drive_for_a_path_goes_along_its_voltages(folder, tmp_path):
+    options = ("excite", "--voltage-min", 0, "--voltage-max", 100, "--for-path", folder / "desired.csv")
+    done = slpi(*options, "-o", tmp_path / "own.csv", "--model", folder / "pi.json")
+    assert (done.returncode, done.stderr) == (0, "")
+    t, desired = read_table(folder / "desired.csv", "m")
+    v = slpi_ros.load_model(folder / "pi.json").compensate(t, desired["x"])
+    t_drive, drive = read_table(tmp_path / "own.csv", "V")
+    along = np.interp(np.arange(0.0, t[-1], t_drive[1]), t, v)
+    windows = np.lib.stride_tricks.sliding_window_view(drive["x"], along.size)
+    assert np.abs(windows - along).max(axis=1).min() < 1e-6
+    # Without a model it goes over the whole range; what the slew limit does not allow is told.
+    whole = slpi(*options, "-o", tmp_path / "whole.csv", "--slew", 80)
+    assert whole.returncode == 0 and "V/s" in whole.stderr and "--model" in whole.stderr
+    assert one_line(slpi("excite", *options[1:5], "-o", tmp_path / "no.csv", "--model", folder / "pi.json"), 2)
+
+
 def test_a_refit_takes_several_bags_in_the_order_of_their_records(tmp_path):
     t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=100.0, seed=2)
     for number, gain in enumerate((1.0, 1.01, 1.03)):

@@ -57,7 +57,8 @@ def _run(options: Namespace) -> Result:
         raise type(error)(f"{options.table}, {error}") from None
     for axis, (_, held) in answers.items():
         told = [held_message(held)] if held.any() else []
-        told += [beyond] if (beyond := path_beyond(model.axes[axis], t, known[axis])) else []
+        if beyond := path_beyond(model.axes[axis], t, known[axis]):
+            told.append(f"{beyond}; 'slpi excite --for-path' makes the drive for a record that covers it")
         options.remarks += [f"axis '{axis}': {'; '.join(told)}"] if told else []
     write_table(options.output, t, {axis: v for axis, (v, _) in answers.items()}, "V")
     lines = [describe_start(model, answers, options.start_memory)]

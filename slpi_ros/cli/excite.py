@@ -1,49 +1,117 @@
 """``slpi excite``: excitation voltages for an identification."""
 
 from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING
 
 from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result
+from slpi_ros.errors import SlpiError, UsageError
+
+if TYPE_CHECKING:
+    from slpi_ros.arrays import FloatArray
+
+RATE = 200.0
 
 
 def _add_options(command: ArgumentParser) -> None:
     from slpi_ros.excitation.drives import DRIVES
 
     common.add_output(command, "DRIVE.csv", "columns time_s, <axis>_V")
-    common.add_axes(command, default=("x",), help="axes to excite, one after the other; default: x")
+    common.add_axes(command, help="axes to excite, one after the other; default: x, or those of the path")
     common.add_limits(command, "slew limit, of which the drive uses 80 %%")
-    command.add_argument("--duration", metavar="S", type=float, default=30.0, help="duration; default: 30 s")
-    command.add_argument("--rate", metavar="HZ", type=float, default=200.0, help="sample rate; default: 200 Hz")
+    command.add_argument(
+        "--duration", metavar="S", type=float, default=30.0, help="duration, before a path; default: 30 s"
+    )
+    command.add_argument(
+        "--rate", metavar="HZ", type=float, help=f"sample rate; default: {RATE:g} Hz, or that of the path if higher"
+    )
     command.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the random sequence; default: 0")
     command.add_argument(
         "--for", dest="drive", metavar="EFFECT", choices=DRIVES, default=DRIVES[0],
         help=f"effect that the record must distinguish from others: {', '.join(DRIVES[1:])}; default: {DRIVES[0]}",
     )  # fmt: skip
+    command.add_argument(
+        "--for-path", metavar="PATH",
+        help="desired path whose range, rates and turns the record must cover: a table, as for slpi compensate, or a "
+        "bag with desired_trajectory or desired_displacement",
+    )  # fmt: skip
+    command.add_argument(
+        "--model", metavar="MODEL.json",
+        help="first model of the stage, for the voltages of the path; default: the path takes the whole voltage range",
+    )  # fmt: skip
 
 
 def _run(options: Namespace) -> Result:
+    import numpy as np
+
     from slpi_ros.excitation.drives import SLEW_USED, excite
+    from slpi_ros.excitation.path import with_path
     from slpi_ros.io.outputs import allow_table
     from slpi_ros.io.tables import table_header, write_table
+    from slpi_ros.model.coverage import FASTER, fastest
 
-    common.require_axis_names(options.axis)
-    options.remarks += allow_table(options.output, table_header(options.axis, "V"), overwrite=options.overwrite)
+    if options.model and not options.for_path:
+        raise UsageError("--model is of use with --for-path only; give the path, or leave it out")
+    path, rate = _path_of(options) if options.for_path else ({}, options.rate or RATE)
+    axes = options.axis or list(path) or ["x"]
+    common.require_axis_names(axes)
+    options.remarks += allow_table(options.output, table_header(axes, "V"), overwrite=options.overwrite)
+    slew = SLEW_USED * common.slew_of(options)
     drive = excite(
-        options.axis,
+        axes,
         voltage_min=options.voltage_min,
         voltage_max=options.voltage_max,
-        slew_limit=SLEW_USED * common.slew_of(options),
+        slew_limit=slew,
         duration=options.duration,
-        rate=options.rate,
+        rate=rate,
         seed=options.seed,
         drive=options.drive,
     )
+    if path:
+        drive = with_path(drive, path)
+    for axis, v in path.items():
+        wanted = fastest(np.arange(v.size) / rate, v)
+        if slew and wanted > FASTER * slew:
+            options.remarks.append(
+                f"axis '{axis}': the path needs up to {wanted:.3g} V/s, the drive keeps to {slew:.3g} V/s; give a "
+                "first model (--model), a higher --slew, or a slower path"
+            )
+        if v.min() < options.voltage_min or v.max() > options.voltage_max:
+            options.remarks.append(f"axis '{axis}': the path needs {v.min():.4g} to {v.max():.4g} V, beyond the limits")
     write_table(options.output, drive.t, drive.voltage, "V")
     return Result(
         [f"{options.output}: {drive.t.size} voltages in {drive.t[-1]:.6g} s; {drive.why}"],
         {"table": options.output, "samples": drive.t.size, "seconds": float(drive.t[-1]), "why": drive.why},
         "slpi import DATA.csv -o BAG, with DATA.csv the voltage and the displacement measured during this drive",
     )
+
+
+def _path_of(options: Namespace) -> tuple[dict[str, "FloatArray"], float]:
+    """Return the voltages (V) of the path by axis, (N,), and their sampling rate (Hz)."""
+    import numpy as np
+
+    from slpi_ros.io.desired import read_path
+    from slpi_ros.model.document import load_model
+    from slpi_ros.model.stage_model import check_time
+
+    t, desired = read_path(options.for_path, options.axis or ())
+    desired = {axis: desired[axis] for axis in options.axis or desired if axis in desired}
+    steps = np.diff(check_time(t))
+    if not desired or not steps.size or not t[-1] > 0.0:
+        raise UsageError(f"{options.for_path}: no path of axis {', '.join(options.axis or ['x'])} over time; give one")
+    rate = options.rate or max(RATE, 1.0 / float(np.median(steps[steps > 0.0])))
+    if options.model:
+        model = load_model(options.model)
+        try:
+            answers = model.command(t, common.model_columns(desired, model, options.for_path))
+        except SlpiError as error:
+            raise type(error)(f"{options.for_path}, {error}") from None
+        volts = {axis: v for axis, (v, _) in answers.items()}
+    else:
+        low, span = options.voltage_min, options.voltage_max - options.voltage_min
+        volts = {axis: low + span * (y - y.min()) / (float(np.ptp(y)) or 1.0) for axis, y in desired.items()}
+    even = np.arange(int(t[-1] * rate) + 1) / rate
+    return {axis: np.interp(even, t, v) for axis, v in volts.items()}, rate
 
 
 COMMAND = Command(

@@ -11,7 +11,7 @@ from slpi_ros.errors import UsageError
 
 
 def _add_options(command: ArgumentParser) -> None:
-    from slpi_ros.io.bag_reader import DESIRED
+    from slpi_ros.io.desired import DESIRED, TRAJECTORY
     from slpi_ros.model.axis_model import START_MEMORIES
 
     common.add_bags(command)
@@ -28,7 +28,8 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_output(command, "DIR", "folder of verification.json and report.html; default: none", required=False)
     command.add_argument(
         "--desired-topic", metavar="TOPIC",
-        help=f"also evaluate the tracking error against this topic; default: {DESIRED}, if present in the bag",
+        help="also evaluate the tracking error against this topic; default: those of "
+        f"{DESIRED} and {TRAJECTORY} that a bag has",
     )  # fmt: skip
     command.add_argument(
         "--start-memory", choices=START_MEMORIES,

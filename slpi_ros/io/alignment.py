@@ -83,8 +83,8 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
     v_columns = _filled(voltage, ("effort", "position", "data", "vector"), where)
     d_columns = _filled(displacement, ("position", "data", "vector"), where)
     wanted = tuple(axes) or _common_axes(voltage, displacement)
-    moved = _assign(d_columns, displacement.named, wanted, f"{where}: displacement", alone=False)
-    driven = _assign(v_columns, voltage.named, wanted, f"{where}: voltage", alone=True)
+    moved = assigned(d_columns, displacement.named, wanted, f"{where}: displacement", alone=False)
+    driven = assigned(v_columns, voltage.named, wanted, f"{where}: voltage", alone=True)
     v_time, d_time, notes = _times(voltage, displacement, topics, where)
     resample = _on_displacement if topics.clock == "displacement" else _on_voltage
     time, v, y = resample(_Series(v_time, driven), _Series(d_time, moved), topics.held)
@@ -98,25 +98,6 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
         hardware_id=displacement.frame_id or voltage.frame_id,
         notes=(*notes, *_naming(voltage, topics.voltage, wanted), *_naming(displacement, topics.displacement, wanted)),
     )
-
-
-def held_at(desired: Signals, record: Record, where: str) -> dict[str, FloatArray]:
-    """Return displacements (m), (N,), each held until the next message, at the samples of a record; NaN before."""
-    time = desired.logged if desired.stamp is None else desired.stamp
-    if not _overlap(time, record.time_ns):
-        raise RecordError(f"{where}: at no time were it and {record.source} both recorded; record them with one clock")
-    fields = (desired.fields.get(field, {}) for field in ("position", "data", "vector"))
-    columns = next(filter(None, fields), {})
-    axes = [axis for axis in record.axes if axis in columns] if desired.named else record.axes
-    order = np.argsort(time, kind="stable")
-    last = np.searchsorted(time[order], record.time_ns, side="right") - 1
-    held = {}
-    for axis, column in _assign(columns, desired.named, axes, where, alone=False).items():
-        # An axis that a message does not name keeps its last value.
-        known = np.maximum.accumulate(np.where(np.isfinite(column[order]), np.arange(order.size), -1))
-        at = np.where(last >= 0, known[last], -1)
-        held[axis] = np.where(at >= 0, column[order][at], np.nan)
-    return held
 
 
 def _filled(signals: Signals, fields: Sequence[str], where: str) -> Mapping[str, FloatArray]:
@@ -136,7 +117,7 @@ def _common_axes(voltage: Signals, displacement: Signals) -> tuple[str, ...]:
     return voltage.names if voltage.named else _AXES[: len(displacement.names)]
 
 
-def _assign(
+def assigned(
     columns: Mapping[str, FloatArray], named: bool, axes: Sequence[str], what: str, *, alone: bool
 ) -> dict[str, FloatArray]:
     """Return one column for each axis; if `alone`, a single column may be used for all axes."""

@@ -25,7 +25,7 @@ from slpi_ros.io.input_limits import (
     require_inputs,
 )
 
-_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 # The parts of a split bag end in their number.
 _PART = re.compile(r"(.*)_(\d+)(\.(?:mcap|db3)(?:\.zstd)?)")
 _WANTED = "give a rosbag2 folder or an .mcap or .db3 file"
@@ -53,7 +53,7 @@ def locate(path: Path) -> list[Path]:
             hint = f"its recording is unfinished, in {partial_path(path)}: wait for the recorder to end"
         raise RecordError(f"{path}: no such bag; {hint}")
     if path.is_file():
-        if path.name.endswith(_SUFFIXES):
+        if path.name.endswith(SUFFIXES):
             return [path]
         hint = {
             ".csv": "import the table first with `slpi import`",
@@ -65,7 +65,7 @@ def locate(path: Path) -> list[Path]:
         raise RecordError(f"{path}: neither a folder nor a regular file; {_WANTED}")
     if (path / "metadata.yaml").exists():
         return [path]
-    files = [file for file in path.iterdir() if file.name.endswith(_SUFFIXES)]
+    files = [file for file in path.iterdir() if file.name.endswith(SUFFIXES)]
     if not files:
         raise RecordError(f"{path}: a folder without metadata.yaml and without .mcap or .db3 file; not a bag")
     return files if len(files) == 1 else _parts(files, path)

@@ -3,7 +3,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.io.alignment import SeparateTopics, Signals, combine, held_at
+from slpi_ros.io.alignment import SeparateTopics, Signals, combine
 from slpi_ros.io.bag_files import absolute_name, locate, match_topic, require_bounded, translated, unpacked
 from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.input_limits import MOST_AXES, require_count
@@ -22,8 +22,6 @@ from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, SECOND_NS, Message,
 from slpi_ros.io.record import BLOCK, Record, each_block, first_step_back, new_column, release
 
 _Path = str | os.PathLike[str]
-
-DESIRED = "desired_displacement"
 
 
 def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: Sequence[str] | None = None) -> Record:
@@ -52,7 +50,7 @@ def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: 
     """
     path = Path(path)
     sources = locate(path)
-    with _Bag(sources, path) as bag:
+    with Bag(sources, path) as bag:
         if isinstance(topic, SeparateTopics):
             voltage = bag.read(topic.voltage, MESSAGE_TYPES)
             displacement = bag.read(topic.displacement, MESSAGE_TYPES)
@@ -94,18 +92,7 @@ def _stage_of(record: Record) -> str:
     return f"stage '{record.hardware_id}'" if record.hardware_id else "a stage without hardware id"
 
 
-def read_desired(path: _Path, record: Record, topic: str | None = None) -> dict[str, NDArray[np.float64]] | None:
-    """Read the desired displacement (m) of each axis at the samples of a record of the same bag, held, NaN before."""
-    # By default of ``desired_displacement``; None if `topic` is not given and the bag has no message on that one.
-    path = Path(path)
-    with _Bag(locate(path), path) as bag:
-        if topic is None and not bag.holds(DESIRED):
-            return None
-        desired = bag.read(topic or DESIRED, MESSAGE_TYPES)
-    return held_at(desired, record, f"{path}, topic '{topic or DESIRED}'")
-
-
-class _Bag:
+class Bag:
     """Bag opened for reading; a context manager that removes decompressed files at its end."""
 
     def __init__(self, sources: Sequence[Path], path: Path) -> None:
@@ -158,6 +145,16 @@ class _Bag:
         if signals is None:
             raise RecordError(f"{self._path}: no message on topic '{topic}'; was the stage's driver running?")
         return signals
+
+    def type_of(self, topic: str, msgtypes: Collection[str]) -> str:
+        """Return the message type of a topic, which must be one of these."""
+        return self._topics[match_topic(self._topics, topic, tuple(msgtypes), self._path)]
+
+    def messages(self, topic: str) -> Iterator[tuple[int, bytes]]:
+        """Yield the messages of a topic, each with its recording time (ns)."""
+        with translated(self._path):
+            for block in self._blocks(match_topic(self._topics, topic, tuple(self._topics.values()), self._path)):
+                yield from zip(block.logged.tolist(), block.each(), strict=True)
 
     def _blocks(self, topic: str) -> Iterator[MessageBlock]:
         for storage, source in self._storages:

@@ -12,7 +12,7 @@ from slpi_ros.errors import RecordError
 from slpi_ros.io.cdr import CdrLayout, CdrReader, serialise
 from slpi_ros.io.input_limits import MOST_AXES, LimitError, require_count
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
+JOINT_STATE, JOINT_TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
 SECOND_NS = 1_000_000_000
 # header stamps count seconds in int32
 _STAMP_END = 2**31 * SECOND_NS

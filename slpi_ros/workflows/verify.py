@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from slpi_ros.diagnosis import verify as verification
 from slpi_ros.diagnosis.verify import Verification
-from slpi_ros.io.bag_reader import read_desired
+from slpi_ros.io.desired import desired_of
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import StartMemory
 from slpi_ros.model.stage_model import StageModel
@@ -40,7 +40,7 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
     desired = None
     if not source.records:
         read = zip(source.bags, records, strict=True)
-        desired = [read_desired(bag, record, request.desired_topic) for bag, record in read]
+        desired = [desired_of(bag, record, request.desired_topic) for bag, record in read]
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)

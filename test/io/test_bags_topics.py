@@ -11,7 +11,8 @@ from refusals import holds, refusal
 
 from slpi_ros.errors import RecordError
 from slpi_ros.io.alignment import SeparateTopics, Signals, combine
-from slpi_ros.io.bag_reader import read_bag, read_desired
+from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.desired import desired_of
 
 BOTH = SeparateTopics("command", "sensor")
 MS = 10**6
@@ -247,6 +248,6 @@ def test_a_desired_displacement_of_three_axes_in_a_vector(tmp_path):
         "/wanted": [(stamp, vector(stamp, 1e-6 * k, 2e-6 * k, 3e-6 * k)) for k, stamp in enumerate(stamps)],
     }
     bag = rosbags_bag(tmp_path / "bag", topics)
-    held = read_desired(bag, read_bag(bag), "wanted")
+    held = desired_of(bag, read_bag(bag), "wanted")
     assert held.keys() == {"x", "y", "z"}
     assert np.allclose(held["z"], 3e-6 * np.arange(60), rtol=0, atol=1e-18)

@@ -14,17 +14,17 @@ from paths import scan_path
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 FloatArray = NDArray[np.float64]
 V_MAX = 100.0
 NOISE = 8e-9
 
 
-def fresh(seed: int) -> PreisachStage:
+def fresh(seed: int) -> SimulatedAxis:
     """Return the stage for a seed, never moved before."""
-    return PreisachStage(replace(StageParameters.random(seed), noise_rms=NOISE), seed)
+    return SimulatedAxis(replace(AxisParameters.random(seed), noise_rms=NOISE), seed)
 
 
 def record_of(t: FloatArray, v: FloatArray, y: FloatArray) -> slpi_ros.Record:

@@ -24,8 +24,8 @@ from slpi_ros.fleet.sources import find_bags
 from slpi_ros.fleet.stages import StageSummary, summarise
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 FloatArray = NDArray[np.float64]
 DAY_NS, START_NS = 86_400 * 10**9, 1_767_225_600 * 10**9
@@ -138,7 +138,7 @@ def write_fleet(folder: Path, stages: int, count: int, seed: int) -> tuple[list[
     drive = excite(("x",), voltage_min=0.0, voltage_max=100.0, duration=DURATION, rate=SAMPLES / DURATION)
     t, v = drive.t[:SAMPLES], drive.voltage["x"][:SAMPLES]
     paths = [
-        PreisachStage(replace(StageParameters.random(seed + k), noise_rms=0.0, quantisation=0.0)).run(t, v)[0]
+        SimulatedAxis(replace(AxisParameters.random(seed + k), noise_rms=0.0, quantisation=0.0)).run(t, v)[0]
         for k in range(stages)
     ]
     truths = histories(stages, count, rng)

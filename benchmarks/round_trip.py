@@ -26,8 +26,8 @@ import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import make_executor
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 FloatArray = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ DISCOVERY_S, LAST_ANSWERS_S = 20.0, 5.0
 def identified_stage() -> StageModel:
     """Return a model of two axes."""
     t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=200.0, seed=1)
-    y = PreisachStage(StageParameters.random(1), 1).run(t, v)[1]
+    y = SimulatedAxis(AxisParameters.random(1), 1).run(t, v)[1]
     stamps = np.round(t * 1e9).astype(np.int64)
     return slpi_ros.identify(slpi_ros.Record(stamps, dict.fromkeys(AXES, v), dict.fromkeys(AXES, y)))
 

@@ -16,8 +16,8 @@ import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.free_run import match
 from slpi_ros.identification.samples import select_samples
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 FloatArray = NDArray[np.float64]
 RATE, NOISE, GAIN, ZERO = 200.0, 8e-9, 0.01, 0.3e-6
@@ -29,8 +29,8 @@ WITHIN = 0.2
 
 def record(seed: int, t: FloatArray, v: FloatArray, before: FloatArray, gain: float, zero: float) -> slpi_ros.Record:
     """Return a record of a stage with a relative gain and a zero offset (m), after the voltages `before` (V) only."""
-    own = StageParameters.random(seed)
-    stage = PreisachStage(replace(own, noise_rms=NOISE, stroke=gain * own.stroke), seed)
+    own = AxisParameters.random(seed)
+    stage = SimulatedAxis(replace(own, noise_rms=NOISE, stroke=gain * own.stroke), seed)
     stage.run(np.arange(before.size) / RATE - 1e4, before)
     measured = stage.run(t, v)[1]
     return slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": measured + zero}, "again")

@@ -196,7 +196,6 @@ NAMING_EFFECTS = {"effects", "simulation"}
 # Other names of effects, with the reason.
 NAMED_ELSEWHERE = {
     "model/sensor.py": ({"delay", "lag"}, "the known timing of a sensor is the physics of these two"),
-    "nodes/stage_simulator.py": (set(EFFECTS), "parameters of the simulated stage"),
     "identification/record_quality.py": ({"creep", "delay", "lag"}, "what a drive lacks, in words"),
     "diagnosis/tracking.py": ({"delay"}, "a cause of a tracking error"),
 }

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.excitation.legs import DriveSpec
-from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.parameters import AxisParameters
 
 from .drives import drive, log_uniform
 from .nature import DRAWS, NAMES, Nature, Setting
@@ -15,7 +15,7 @@ from .physics import Amplifier, BoucWen, Physics, own_motion, sensed
 from .size import beyond_hysteresis, beyond_identified
 
 FloatArray = NDArray[np.float64]
-Base = StageParameters | BoucWen
+Base = AxisParameters | BoucWen
 
 BASES = ("preisach", "stiffening", "bouc_wen")
 NOISE = (3e-9, 15e-9)
@@ -34,7 +34,7 @@ class Drives:
 
     Parameters
     ----------
-    stage : dict of axis name to StageParameters or BoucWen
+    stage : dict of axis name to AxisParameters or BoucWen
     t : ndarray, shape (N,), seconds
     v : dict of axis name to ndarray, shape (N,), volts
     before : dict of axis name to ndarray, shape (M,), volts, optional
@@ -131,7 +131,7 @@ def _stage(rng: np.random.Generator, base: str) -> Base:
             asymmetry=softening * float(rng.uniform(-0.5, 0.5)),
             offset=float(rng.uniform(-0.2e-6, 0.2e-6)),
         )
-    drawn = StageParameters.random(int(rng.integers(2**31)))
+    drawn = AxisParameters.random(int(rng.integers(2**31)))
     return drawn if base == "stiffening" else replace(drawn, stiffening=0.0)
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from slpi_ros.errors import UsageError
 from slpi_ros.simulation.dynamics import FlexureMode, Relaxation
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.parameters import AxisParameters
+from slpi_ros.simulation.preisach import PreisachHysteresis
 from slpi_ros.simulation.surroundings import Hum, Interferometer
 
 FloatArray = NDArray[np.float64]
@@ -411,13 +411,13 @@ class Physics:
     hum: Hum | None = None
 
 
-def own_motion(base: StageParameters | BoucWen, physics: Physics, t: FloatArray, command: FloatArray) -> FloatArray:
+def own_motion(base: AxisParameters | BoucWen, physics: Physics, t: FloatArray, command: FloatArray) -> FloatArray:
     """Return the displacement of one axis for a voltage command, starting from rest at 0 V.
 
     Parameters
     ----------
-    base : StageParameters or BoucWen
-        Hysteresis of the axis; dynamics and sensor of StageParameters are not used.
+    base : AxisParameters or BoucWen
+        Hysteresis of the axis; the sensor of AxisParameters is not used.
     physics : Physics
         Other physics; only the parts before the coupling are used.
     t : ndarray, shape (N,), seconds
@@ -475,12 +475,13 @@ def sensed(physics: Physics, t: FloatArray, motion: Mapping[str, FloatArray], ax
 
 
 def _hysteresis(
-    base: StageParameters | BoucWen, viscosity: Viscosity | None, t: FloatArray, v: FloatArray
+    base: AxisParameters | BoucWen, viscosity: Viscosity | None, t: FloatArray, v: FloatArray
 ) -> FloatArray:
     seen = viscosity.relay_voltage(t, v) if viscosity else v
     if isinstance(base, BoucWen):
         return base.run(seen)
-    return PreisachStage(base).respond(v, np.clip(seen, base.threshold_min, base.threshold_max))
+    hysteresis, relays = PreisachHysteresis(base), np.clip(seen, base.threshold_min, base.threshold_max)
+    return base.offset + np.array([hysteresis.step(*both) for both in zip(v.tolist(), relays.tolist(), strict=True)])
 
 
 def _creeping(domains: SlowDomains, t: FloatArray, y: FloatArray) -> FloatArray:

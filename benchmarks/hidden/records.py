@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.excitation.legs import DriveSpec
 from slpi_ros.io.record import Record
-from slpi_ros.simulation.preisach import Sensor
+from slpi_ros.simulation.surroundings import Sensor
 
 from .attempt import BASES, CLOSE, NOISE, RATE_BEFORE, Base, Draw, Drives, together
 from .drives import log_uniform, wandering
@@ -79,7 +79,7 @@ class Hidden:
         Readings without noise and without any effect.
     floor : dict of axis name to float, metres
         Noise floor of the sensor: noise and quantization, rms.
-    stage : dict of axis name to StageParameters or BoucWen
+    stage : dict of axis name to AxisParameters or BoucWen
         Hysteresis of each axis.
     seed : int
     """

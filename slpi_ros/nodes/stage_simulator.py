@@ -21,7 +21,7 @@ from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes.common import COMMANDS, run
 from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
-from slpi_ros.simulation.character import Character, CharacterAxis
+from slpi_ros.simulation.character import Character
 from slpi_ros.simulation.stage import Stage, p11_stage
 
 LOG_PERIOD = 5.0
@@ -31,24 +31,6 @@ QUIET = 0.3
 DAY = 86_400.0
 VOLTAGE = (-10_000.0, 10_000.0)
 GIVEN, DRAWN, HIDDEN = "given", "drawn", "hidden"
-# What `ros2 param describe` says of each effect, with the smallest and the largest value.
-EFFECTS = {
-    "delay": ("Delay of the amplifier, seconds.", 0.0, 10.0),
-    "lag": ("Time constant of the amplifier, seconds.", 0.0, 10.0),
-    "saturation": ("Upper limit of the amplifier's output, below the commands, volts; 0: none.", 0.0, 1e4),
-    "rate_dependence": ("Growth of the coercivity at 100 V/s, volts.", 0.0, 100.0),
-    "creep": ("Creep per decade of time, share of the displacement.", 0.0, 0.2),
-    "resonance": ("Frequency of the flexure mode, hertz; 0: none.", 0.0, 1e4),
-    "damping": ("Damping ratio of the flexure mode.", 1e-4, 0.999),
-    "coupling": ("Share of the motion of every other axis.", -0.499, 0.499),
-    "thermal_drift": ("Final value of the drift, metres.", -1e-3, 1e-3),
-    "gain_drift": ("Final relative change of the sensitivity.", -0.499, 0.499),
-    "drift_time": ("Time constant of both drifts, seconds.", 1e-3, 1e6),
-    "sensor_period": ("Period of the sensor's periodic error, metres.", 1e-9, 1e-3),
-    "sensor_amplitude": ("Amplitude of the sensor's periodic error, metres.", 0.0, 1e-4),
-    "hum_frequency": ("Frequency of the hum, hertz.", 1e-3, 1e4),
-    "hum_amplitude": ("Amplitude of the hum, metres.", 0.0, 1e-4),
-}
 DECLARATIONS = (
     Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
     Declaration(
@@ -94,10 +76,10 @@ DECLARATIONS = (
     ),
     *(
         Declaration(
-            effect.name, effect.default, EFFECTS[effect.name][0] + " One value, or one for each axis.",
-            read_only=True, between=EFFECTS[effect.name][1:], number=True, each_axis=True,
+            figure.name, figure.default, figure.metadata["meaning"] + " One value, or one for each axis.",
+            read_only=True, between=figure.metadata["between"], number=True, each_axis=True,
         )
-        for effect in fields(Character)
+        for figure in fields(Character)
     ),
 )  # fmt: skip
 
@@ -114,16 +96,11 @@ class StageSimulator(Node):
     Without a preset the stage has random hysteresis, drawn from the seed, and the effects of its character. Preset
     "p11" is the stage of the MPI paper with axes x and y, creep, resonance and its own sensor noise; the seed affects
     its noise only. The dynamics run on the clock of the node, or with ``speed`` on the clock that the node publishes.
-
-    Attributes
-    ----------
-    ignored : int
-        Number of commands ignored because of a wrong length or a value that is not finite.
     """
 
     def __init__(self) -> None:
         super().__init__("stage_simulator")
-        self.ignored = 0
+        self.ignored = 0  # commands, because of a wrong length or a value that is not finite
         values = Parameters(self, DECLARATIONS, partial(validated, DECLARATIONS)).settings
         axes, preset, seed = list(values["axes"]), values["preset"], values["seed"]
         self._stage, identity = _make_stage(values)
@@ -132,7 +109,7 @@ class StageSimulator(Node):
         self._state = JointState(name=axes)
         self._state.header.frame_id = values["hardware_id"] or f"simulated-{preset or seed}{identity}"
         for axis, one in self._stage.axes.items():
-            if values["character"] == DRAWN and isinstance(one, CharacterAxis):
+            if values["character"] == DRAWN:
                 self.get_logger().info(f"axis {axis}: {one.character}")
         self._speed, self._begun_ns = values["speed"], time.monotonic_ns()
         self._origin_ns, self._latest_ns = self.get_clock().now().nanoseconds, 0
@@ -221,7 +198,7 @@ def _time(nanoseconds: int) -> Time:
 def _make_stage(values: Values) -> tuple[Stage, str]:
     """Return the stage, and what its hardware id says of its character."""
     axes, preset, seed, noise = list(values["axes"]), values["preset"], values["seed"], values["noise_rms"]
-    names = [effect.name for effect in fields(Character)]
+    names = [figure.name for figure in fields(Character)]
     given = [Character(**{name: values[name][place] for name in names}) for place in range(len(axes))]
     own = values["character"] != GIVEN or any(character.effects for character in given)
     if preset:

@@ -32,9 +32,9 @@ from slpi_ros.papers.mpi_study import (
     triangles,
 )
 from slpi_ros.reports.chart import COLOURS, DESIRED
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
-from slpi_ros.simulation.stage import p11_axes
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.character import Character
+from slpi_ros.simulation.stage import p11_stage
 
 # Sampling rate of the controller, hertz.
 RATE = 2000.0
@@ -103,13 +103,13 @@ class AxisStudy:
     rested: Mapping[str, Outcome]  # with PID, with a rest at 0 V between warm-up and zeroing of the sensor
 
 
-def run_study(axis: PreisachStage, name: str, path_cycles: int = 3) -> AxisStudy:
+def run_study(axis: SimulatedAxis, name: str, path_cycles: int = 3) -> AxisStudy:
     """Identify models of an axis and run the paths of Fig. 11 and of Table 6, with `path_cycles` cycles per segment."""
     record = triangle_record(axis, name, RECORD, 1.0, RECORD_SAMPLES)
     models = {label: _warm(identify(record, kind, start=1.0).axis(name)) for label, kind in KINDS.items()}
     smpi = models[SMPI].hysteresis
     assert isinstance(smpi, AmplitudeScaled)
-    gains = tune(axis.parameters, smpi.peak(max(RECORD)) / max(RECORD))
+    gains = tune(axis.character, smpi.peak(max(RECORD)) / max(RECORD))
     single = path([(smpi.peak(FEEDFORWARD_VOLTAGE), 1.0)], path_cycles)
     segments = path([(peak * 1e-6, frequency) for peak, frequency in TABLE_6], path_cycles)
     voltages = {
@@ -139,18 +139,18 @@ def path(parts: Sequence[tuple[float, float]], path_cycles: int) -> FloatArray:
     return np.append(np.concatenate(waves), 0.0)
 
 
-def tune(stage: StageParameters, gain: float) -> PidGains:
+def tune(axis: Character, gain: float) -> PidGains:
     """Return PI gains for an axis with a lightly damped mode (frequency ``w``, damping ``z``) and gain ``g`` (m/V)."""
     # At the mode the gain of the stage is ``g / 2z``, so the loop gain there would be 1 with integral action alone of
     # ``K_i = 2 z w / g``, or proportional action alone of ``K_p = 2 z / g``. With one third of the former and one tenth
     # of the latter it is below 0.35 for any phase, so for any lag and delay. Derivative action would increase it.
     # Frequency and damping could be measured by a ring-down test.
-    omega, double_damping = 2.0 * math.pi * stage.resonance_frequency, 2.0 * stage.resonance_damping
+    omega, double_damping = 2.0 * math.pi * axis.resonance, 2.0 * axis.damping
     return PidGains(PROPORTIONAL_SHARE * double_damping / gain, INTEGRAL_SHARE * double_damping * omega / gain)
 
 
 def follow(
-    axis: PreisachStage,
+    axis: SimulatedAxis,
     desired: FloatArray,
     feedforward: FloatArray,
     gains: PidGains | None,
@@ -236,7 +236,7 @@ def scheme() -> Figure:
 
 def exhibits(seed: int = 0) -> list[Exhibit]:
     """Run the experiments and return their exhibits; `seed` is the seed of the sensor noise."""
-    return present({name: run_study(axis, name) for name, axis in p11_axes(seed).items()})
+    return present({name: run_study(axis, name) for name, axis in p11_stage(seed).axes.items()})
 
 
 def present(studies: Mapping[str, AxisStudy]) -> list[Exhibit]:

@@ -32,7 +32,7 @@ from slpi_ros.papers.mpi_study import (
     run_study,
 )
 from slpi_ros.reports.chart import COLOURS, DESIRED, MEASURED
-from slpi_ros.simulation.stage import p11_axes
+from slpi_ros.simulation.stage import p11_stage
 
 COLOUR = {
     **dict(zip((MPI, PI, FAMILY, SMPI), COLOURS, strict=True)),
@@ -146,7 +146,7 @@ def legend(figure: Figure, drawn: Sequence[Axes], used: int) -> None:
 
 def exhibits(seed: int = 0) -> list[Exhibit]:
     """Run the experiments and return their exhibits; `seed` is the seed of the sensor noise."""
-    return present(run_study(p11_axes(seed)["x"]))
+    return present(run_study(p11_stage(seed).axes["x"]))
 
 
 def present(study: Study) -> list[Exhibit]:

@@ -14,7 +14,7 @@ from slpi_ros.identification.published_kinds import PeakFrequency, fit_peak_freq
 from slpi_ros.identification.signal_statistics import ErrorMetrics, error_metrics
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
 
 # By amplitude (V): a (µm) and b of Eq. 1.
 TABLE_1: dict[float, tuple[float, float]] = {
@@ -152,7 +152,7 @@ class Study:
 
 
 def run_study(
-    axis: PreisachStage,
+    axis: SimulatedAxis,
     amplitudes: Sequence[float] = AMPLITUDES,
     frequencies: Sequence[float] = FREQUENCIES,
     samples: int = 1000,
@@ -182,7 +182,7 @@ def triangles(amplitude: float, frequency: float, cycles: int, samples: int = 20
 
 
 def triangle_record(
-    axis: PreisachStage, name: str, amplitudes: Sequence[float], frequency: float, samples: int
+    axis: SimulatedAxis, name: str, amplitudes: Sequence[float], frequency: float, samples: int
 ) -> Record:
     """Drive one triangle of each amplitude (V) from rest and return the record of the axis `name`."""
     axis.rest()
@@ -195,15 +195,15 @@ def _record(t: FloatArray, v: FloatArray, y: FloatArray, name: str = "x") -> Rec
     return Record(np.round(t * 1e9).astype(np.int64), {name: v}, {name: y})
 
 
-def _drive(axis: PreisachStage, amplitude: float, frequency: float, samples: int) -> Drive:
+def _drive(axis: SimulatedAxis, amplitude: float, frequency: float, samples: int) -> Drive:
     axis.rest()
     t, v = triangles(amplitude, frequency, CYCLES, samples)
     return Drive(t, v, axis.run(t, v)[1])
 
 
-def _ringing(axis: PreisachStage, amplitude: float, frequency: float, samples: int) -> float:
+def _ringing(axis: SimulatedAxis, amplitude: float, frequency: float, samples: int) -> float:
     """Return the largest difference (m) between a settled cycle and that of the same axis without the flexure mode."""
-    stiff = PreisachStage(replace(axis.parameters, resonance_frequency=0.0))
+    stiff = SimulatedAxis(axis.parameters, character=replace(axis.character, resonance=0.0))
     t, v = triangles(amplitude, frequency, SETTLED + 1, samples)
     axis.rest()
     apart = (axis.run(t, v)[0] - stiff.run(t, v)[0])[-samples:]
@@ -239,7 +239,7 @@ def _scale(drives: Mapping[float, Drive], base: MultiSlope) -> dict[float, Scale
 
 
 def _variable_path(
-    axis: PreisachStage, fits: Mapping[float, CycleFit], peaks: Mapping[float, PeakFrequency], samples: int
+    axis: SimulatedAxis, fits: Mapping[float, CycleFit], peaks: Mapping[float, PeakFrequency], samples: int
 ) -> VariablePath:
     """Run the path of Fig. 8 and the models on it; the first part is run twice, and its first run is discarded."""
     path = (VARIABLE[0], *VARIABLE)

@@ -23,7 +23,7 @@ from slpi_ros.identification.fit import identify
 from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
 from slpi_ros.identification.published_kinds import default_thresholds, fit_plays, least_iterations
 from slpi_ros.io.record import Record
-from slpi_ros.simulation.stage import flexure_stage
+from slpi_ros.simulation.stage import flexure_axis
 
 # Tables 2 (level II), 3 (level I), 4 (level 0) and 5 (classical PI). They give no unit for the weights, which are taken
 # as micrometres per volt.
@@ -226,12 +226,12 @@ def _times(v: FloatArray) -> FloatArray:
 
 def measure(v: FloatArray, seed: int) -> FloatArray:
     """Drive a new stage through `v`, shape (N,), volts, and return the sensor readings, shape (N,), metres."""
-    return flexure_stage(seed).run(_times(v), v)[1]
+    return flexure_axis(seed).run(_times(v), v)[1]
 
 
 def reached(v: FloatArray) -> FloatArray:
     """Drive a new stage through `v`, shape (N,), volts, and return its true displacement, shape (N,), metres."""
-    return flexure_stage().run(_times(v), v)[0]
+    return flexure_axis().run(_times(v), v)[0]
 
 
 def forward(drive: Drive, v: FloatArray) -> FloatArray:

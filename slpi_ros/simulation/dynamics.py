@@ -1,12 +1,10 @@
-"""Dynamics of a stage: the amplifier before the hysteresis; rate dependence; creep and a flexure mode after it."""
+"""Linear dynamics of a stage: relaxations, as of an amplifier, a flexure mode, and creep."""
 
 import math
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.errors import UsageError
-from slpi_ros.simulation.parameters import StageParameters
 
 # Shortest step (s); in a shorter one the input jumps, because its slope would cause a loss of precision.
 SHORTEST_STEP = 1e-12
@@ -115,41 +113,3 @@ class Creep:
         """Return the ratio of displacements with and without creep at the end of a ramp from rest in `duration` (s)."""
         chain = Relaxation(self.time_constants)
         return 1.0 + float(self.gains @ chain.step(duration, 1.0))
-
-
-class Dynamics:
-    """Amplifier lag, creep and flexure mode of one axis; each is optional."""
-
-    def __init__(self, parameters: StageParameters) -> None:
-        p = parameters
-        self._amplifier = Relaxation(np.array([p.amplifier_lag])) if p.amplifier_lag else None
-        self._creep = Creep(p.creep_gain, p.creep_shortest, p.creep_longest) if p.creep_gain else None
-        self._mode = FlexureMode(p.resonance_frequency, p.resonance_damping) if p.resonance_frequency else None
-        self.rest()
-
-    def rest(self) -> None:
-        """Reset all states and the clock."""
-        self._time: float | None = None
-        for part in (self._amplifier, self._creep, self._mode):
-            if part:
-                part.rest()
-
-    def advance(self, t: float) -> float:
-        """Set the clock to `t` (s) and return the time (s) since the previous call, 0 after a reset.
-
-        UsageError if the time is not finite or decreases.
-        """
-        last = t if self._time is None else self._time
-        if not last <= t < math.inf:
-            raise UsageError(f"stage: time {t} s after {last} s; times must be finite and non-decreasing")
-        self._time = t
-        return t - last
-
-    def amplify(self, duration: float, command: float) -> float:
-        """Return the voltage at the piezo (V) after the command has changed to `command` (V) in `duration` (s)."""
-        return float(self._amplifier.step(duration, command)[0]) if self._amplifier else command
-
-    def follow(self, duration: float, displacement: float) -> float:
-        """Return the stage position (m) after the hysteresis has moved to `displacement` (m) in `duration` (s)."""
-        crept = self._creep.step(duration, displacement) if self._creep else displacement
-        return self._mode.step(duration, crept) if self._mode else crept

@@ -1,4 +1,4 @@
-"""Parameters of a simulated stage."""
+"""Parameters of the hysteresis and of the sensor of a simulated axis."""
 
 import math
 from dataclasses import dataclass, fields
@@ -9,56 +9,34 @@ from slpi_ros.errors import UsageError
 
 
 @dataclass(frozen=True)
-class StageParameters:
-    """Parameters of one axis of a simulated stage; UsageError if a value is not finite or out of range.
+class AxisParameters:
+    """Hysteresis and sensor noise of one axis of a simulated stage; UsageError if a value is out of range."""
 
-    `stroke` (m), `hysteresis`: height of the closed loop between 0 V and `nominal_voltage` (V), and its width at the
-    middle voltage as a share of the stroke. `threshold_min`, `threshold_max` (V): range of the relay thresholds; one
-    that begins below 0 V leaves a remanence at 0 V. `levels`: of the relay grid. `width_scale` (V): distance between
-    the two thresholds of a relay at which the density has decreased to 1/e; `width_growth`: its relative change from
-    the middle to the upper end of the threshold range. `bias_slope`, `bias_bow`: parts, odd and even in the bias, of
-    the logarithm of the density at the upper end of the threshold range relative to its middle. `curvature`: cubic
-    share of the reversible part; negative values saturate towards the ends of the threshold range. `stiffening`:
-    curvature of the displacement as a function of the summed relay and reversible parts, as a share of the stroke:
-    positive if the flexure stiffens towards the upper end. With curvature, loops between the same voltages differ.
-
-    `exponent`: of the power-law material (`PowerLawMaterial`), whose loops are similar at all amplitudes: peaks grow as
-    voltage, from `origin` (V), to this power. 0 selects the exponential material, to which alone `width_scale`,
-    `width_growth`, `bias_slope`, `bias_bow` and `curvature` apply. `width_exponent`: exponent by which the density of
-    the power law decreases with relay width.
-
-    `noise_rms` (m): standard deviation of the Gaussian sensor noise. `quantisation` (m): resolution of the sensor.
-    `offset` (m): sensor reading at rest. `creep_gain`: creep per decade of time, as a share of the displacement,
-    between the shortest and longest time constants `creep_shortest` and `creep_longest` (s). `resonance_frequency`
-    (Hz), `resonance_damping`: undamped frequency and damping ratio of the flexure mode. `amplifier_lag` (s): time
-    constant of the amplifier; the relays see the lagged voltage. A `quantisation`, `creep_gain`, `resonance_frequency`
-    or `amplifier_lag` of 0 means none.
-    """
-
-    stroke: float = 22e-6
-    hysteresis: float = 0.14
-    nominal_voltage: float = 100.0
-    threshold_min: float = -20.0
-    threshold_max: float = 120.0
-    levels: int = 280
-    width_scale: float = 40.0
-    width_growth: float = 0.3
-    bias_slope: float = 0.3
-    bias_bow: float = 0.2
-    curvature: float = 0.1
+    stroke: float = 22e-6  # m, height of the closed loop between 0 V and `nominal_voltage`
+    hysteresis: float = 0.14  # width of that loop at the middle voltage, as a share of the stroke
+    nominal_voltage: float = 100.0  # V
+    threshold_min: float = -20.0  # V, of the relays; below 0 V: there is a remanence at 0 V
+    threshold_max: float = 120.0  # V
+    levels: int = 280  # of the relay grid
+    # Curvature of the displacement over the sum of relays and reversible part, as a share of the stroke: positive if
+    # the flexure stiffens towards the upper end. With it, loops between the same voltages differ.
     stiffening: float = 0.0
-    noise_rms: float = 8e-9
-    quantisation: float = 1e-9
-    offset: float = 0.0
-    exponent: float = 0.0
-    origin: float = 0.0
-    width_exponent: float = 1.0
-    creep_gain: float = 0.0
-    creep_shortest: float = 1e-3
-    creep_longest: float = 100.0
-    resonance_frequency: float = 0.0
-    resonance_damping: float = 0.04
-    amplifier_lag: float = 0.0
+
+    # The exponential material:
+    width_scale: float = 40.0  # V, relay width at which the density has decreased to 1/e
+    width_growth: float = 0.3  # its relative change from the middle to the upper end of the threshold range
+    bias_slope: float = 0.3  # part of the logarithm of the density at the upper end that is odd in the bias
+    bias_bow: float = 0.2  # the even part
+    curvature: float = 0.1  # cubic share of the reversible part; negative: saturates towards the ends of the range
+
+    # The power-law material, whose loops are similar at all amplitudes:
+    exponent: float = 0.0  # peaks grow as voltage, from `origin`, to this power; 0: the exponential material
+    origin: float = 0.0  # V
+    width_exponent: float = 1.0  # by which the density decreases with relay width
+
+    noise_rms: float = 8e-9  # m, Gaussian
+    quantisation: float = 1e-9  # m, resolution of the sensor; 0: none
+    offset: float = 0.0  # m, sensor reading at rest
 
     def __post_init__(self) -> None:
         """Validate the parameters."""
@@ -82,27 +60,13 @@ class StageParameters:
             ("exponent", self.exponent == 0 or 1 <= self.exponent <= 1.5, "from 1 to 1.5, or 0 for none"),
             ("origin", self.threshold_min <= self.origin <= 0, "from threshold_min to 0 V"),
             ("width_exponent", 1 <= self.width_exponent <= 10, "from 1 to 10"),
-            ("creep_gain", 0 <= self.creep_gain <= 0.2, "from 0 to 0.2 for one decade"),
-            ("creep_shortest", self.creep_shortest > 0, "more than 0 s"),
-            ("creep_longest", self.creep_longest > self.creep_shortest, "more than creep_shortest"),
-            ("resonance_frequency", self.resonance_frequency >= 0, "0 Hz or more"),
-            ("resonance_damping", 0 < self.resonance_damping < 1, "between 0 and 1"),
-            ("amplifier_lag", self.amplifier_lag >= 0, "0 s or more"),
         ):
             if not holds:
                 raise UsageError(f"stage: {name} is {getattr(self, name)}; it must be {need}")
 
-    @property
-    def has_dynamics(self) -> bool:
-        """Whether the displacement depends on time in addition to the sequence of voltages."""
-        return bool(self.creep_gain or self.resonance_frequency or self.amplifier_lag)
-
     @classmethod
-    def random(cls, seed: int) -> "StageParameters":
-        """Return a random plausible stage: 20 to 25 µm, 12 to 17 % hysteresis, a density that varies with bias.
-
-        The same `seed` gives the same stage; sensor noise and quantisation have their default values.
-        """
+    def random(cls, seed: int) -> "AxisParameters":
+        """Return a random plausible axis: 20 to 25 µm, 12 to 17 % hysteresis, a density that varies with bias."""
         rng = np.random.default_rng(seed)
 
         def draw(low: float, high: float) -> float:

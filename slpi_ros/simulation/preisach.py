@@ -1,4 +1,4 @@
-"""One axis of a simulated piezo stage: amplifier, Preisach relays, reversible curve, creep, flexure mode and sensor."""
+"""Hysteresis of a simulated piezo stage: Preisach relays and a reversible curve."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,8 +8,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.dynamics import Dynamics
-from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.parameters import AxisParameters
 
 
 class Material(Protocol):
@@ -25,7 +24,7 @@ class Material(Protocol):
 class ExponentialMaterial:
     """A relay density that decreases exponentially with width and varies with bias, and a cubic reversible curve."""
 
-    def __init__(self, parameters: StageParameters) -> None:
+    def __init__(self, parameters: AxisParameters) -> None:
         self._parameters = parameters
         low, high = parameters.threshold_min, parameters.threshold_max
         self._centre, self._half_range = (low + high) / 2, (high - low) / 2
@@ -63,7 +62,7 @@ class PowerLawMaterial:
     I. D. Mayergoyz, Mathematical Models of Hysteresis, Springer 1991, Sec. 1.2 (Everett function).
     """
 
-    def __init__(self, parameters: StageParameters) -> None:
+    def __init__(self, parameters: AxisParameters) -> None:
         self._origin, self._exponent = parameters.origin, parameters.exponent
         self._width_exponent = parameters.width_exponent
         self._half_cell = (parameters.threshold_max - parameters.threshold_min) / parameters.levels / 2
@@ -97,7 +96,7 @@ class PowerLawMaterial:
         return np.asarray(up**p * fall / (m + 1 - p), dtype=np.float64)
 
 
-def material(parameters: StageParameters) -> Material:
+def material(parameters: AxisParameters) -> Material:
     """Return the material of a stage: with an `exponent` other than 0 the power law, else the exponential density."""
     return PowerLawMaterial(parameters) if parameters.exponent else ExponentialMaterial(parameters)
 
@@ -186,22 +185,6 @@ class RelayTriangle:
         self._state[block] = after
 
 
-class Sensor:
-    """A sensor with Gaussian noise of `noise_rms` (m), the same for the same `seed`, and quantisation (m; 0: none)."""
-
-    def __init__(self, noise_rms: float, quantisation: float, seed: int) -> None:
-        self._noise_rms = noise_rms
-        self._quantisation = quantisation
-        self._rng = np.random.default_rng(seed)
-
-    def read(self, displacement: FloatArray) -> FloatArray:
-        """Return the readings (m) for true displacements (m), in order, arrays of one shape."""
-        reading = displacement + self._noise_rms * self._rng.standard_normal(displacement.shape)
-        if self._quantisation:
-            reading = self._quantisation * np.round(reading / self._quantisation)
-        return np.asarray(reading, dtype=np.float64)
-
-
 @dataclass(frozen=True)
 class LoopFigure:
     """Displacements (m) that characterise a closed major loop.
@@ -244,100 +227,37 @@ def measure_loop(respond: Callable[[float], float], low: float, high: float) -> 
     return LoopFigure(start, bottom, top, rising_middle, falling_middle)
 
 
-class PreisachStage:
-    """A stage whose displacement is a relay sum plus a reversible function of the voltage.
+class PreisachHysteresis:
+    """Hysteresis of one axis: a relay sum plus a reversible function of the voltage, bent by a stiffening flexure."""
 
-    With the corresponding `parameters`, it includes the lag of the amplifier, creep, and the resonance of the flexure.
-    `seed` is that of the sensor noise. UsageError if the hysteresis would require a relay part larger than the stroke.
-    """
-
-    def __init__(self, parameters: StageParameters | None = None, seed: int = 0) -> None:
-        self.parameters = parameters = parameters or StageParameters()
-        low, high = parameters.threshold_min, parameters.threshold_max
+    def __init__(self, parameters: AxisParameters) -> None:
+        self._parameters = parameters
         self._material = material(parameters)
-        self._dynamics = Dynamics(parameters) if parameters.has_dynamics else None
-        self._sensor = Sensor(parameters.noise_rms, parameters.quantisation, seed)
+        low, high = parameters.threshold_min, parameters.threshold_max
         self._relays = RelayTriangle(low, high, parameters.levels, self._material.density)
         self._reversible_gain = self._share_stroke()
         self._zero = 0.0
         self._bottom = measure_loop(self._unbowed, 0.0, parameters.nominal_voltage).bottom
         self.rest()
-        self._zero = self._displacement() - parameters.offset
+        self._zero = self._bowed(self._sum(0.0))
 
     def rest(self) -> None:
         """Reset to rest: all relays down at the lowest voltage, then 0 V for a long time."""
         self._relays.all_down()
         self._relays.step(0.0)
-        if self._dynamics:
-            self._dynamics.rest()
 
-    def step(self, t: float, v: float) -> float:
-        """Apply the voltage `v` (V) at time `t` (s); return the displacement (m) without sensor errors.
+    def check(self, voltage: float) -> None:
+        """Raise UsageError if a voltage (V) is not a number within the threshold range."""
+        self._relays.check(voltage)
 
-        Without dynamics the time is ignored. With dynamics, voltage and displacement are linear since the previous
-        call; the first call after a reset has no duration. UsageError if `v` is not a number within the threshold
-        range or, with dynamics, `t` decreases.
-        """
-        if self._dynamics:
-            return self._step_in_time(self._dynamics, t, v)
-        self._relays.step(v)
-        return self._displacement()
-
-    # Alone in its stage, or beside others that do not move it; it does not drift.
-    coupling = 0.0
-
-    def begin_drift(self, t: float) -> None:
-        """Do nothing."""
-
-    def read(self, t: float, motion: float) -> float:
-        """Return the displacement (m), which is the reading without noise."""
-        return motion
-
-    def measure(self, y_true: float) -> float:
-        """Return the sensor reading (m) at a displacement (m)."""
-        return float(self._sensor.read(np.asarray(y_true)))
-
-    def run(self, t: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Apply voltages (V) at times (s) to the current state; return displacements and readings (m), (N,) each.
-
-        UsageError as for `step`, or if the lengths differ.
-        """
-        if t.shape != v.shape:
-            raise UsageError(f"stage: {t.shape} times for {v.shape} voltages; give one time for each voltage")
-        samples = zip(t.tolist(), v.tolist(), strict=True)
-        y_true = np.array([self.step(*sample) for sample in samples], dtype=np.float64)
-        return y_true, self._sensor.read(y_true)
-
-    def respond(self, v: FloatArray, relay_voltage: FloatArray) -> FloatArray:
-        """Apply one voltage (V) to the reversible part and another to the relays; return displacements (m), (N,) each.
-
-        Amplifier and dynamics are left out.
-        """
-        y = np.empty_like(v)
-        for index, (voltage, seen) in enumerate(zip(v.tolist(), relay_voltage.tolist(), strict=True)):
-            y[index] = self.switch(voltage, seen)
-        return y
-
-    def switch(self, v: float, relay_voltage: float) -> float:
-        """Apply one voltage (V) to the reversible part and one to the relays, as `respond`; return displacement (m)."""
+    def step(self, v: float, relay_voltage: float) -> float:
+        """Apply one voltage (V) to the reversible part and one to the relays; return the displacement (m)."""
         self._relays.step(relay_voltage)
         return self._bowed(self._sum(v))
 
-    def _step_in_time(self, dynamics: Dynamics, t: float, v: float) -> float:
-        self._relays.check(v)
-        duration = dynamics.advance(t)
-        lagged = dynamics.amplify(duration, v)
-        # Rounding must not move the lagged voltage beyond the highest threshold.
-        self._relays.step(min(max(lagged, self.parameters.threshold_min), self.parameters.threshold_max))
-        offset = self.parameters.offset
-        return offset + dynamics.follow(duration, self._displacement() - offset)
-
-    def _displacement(self) -> float:
-        return self._bowed(self._sum(self._relays.voltage))
-
     def _bowed(self, unbowed: float) -> float:
         force = unbowed - self._bottom
-        bow = 4.0 * self.parameters.stiffening * force * (1.0 - force / self.parameters.stroke)
+        bow = 4.0 * self._parameters.stiffening * force * (1.0 - force / self._parameters.stroke)
         return self._bottom + force + bow - self._zero
 
     def _sum(self, voltage: float) -> float:
@@ -349,7 +269,7 @@ class PreisachStage:
 
     def _share_stroke(self) -> float:
         """Scale the relays to the specified hysteresis; return the gain of the reversible part for the full stroke."""
-        wanted, nominal = self.parameters, self.parameters.nominal_voltage
+        wanted, nominal = self._parameters, self._parameters.nominal_voltage
         relays = measure_loop(self._relays.step, 0.0, nominal)
         share = wanted.hysteresis / relays.hysteresis
         if share > 1:

@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.character import STRENGTHS, Character, CharacterAxis, draw
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.character import PLAIN, STRENGTHS, Character, draw
 from slpi_ros.simulation.dynamics import Creep
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.parameters import AxisParameters
 
 # Seeds of the axes of one stage differ by this number.
 NEXT_AXIS = 1000
@@ -18,25 +19,28 @@ NEXT_AXIS = 1000
 class Stage:
     """Axes, each with hysteresis, other effects and a sensor, which may move each other; UsageError without axes."""
 
-    def __init__(self, axes: Mapping[str, PreisachStage] | Mapping[str, CharacterAxis]) -> None:
+    def __init__(self, axes: Mapping[str, SimulatedAxis]) -> None:
         if not axes:
             raise UsageError("stage: it has no axis; name at least one")
-        self.axes: dict[str, PreisachStage | CharacterAxis] = dict(axes)
+        self.axes = dict(axes)
 
     @classmethod
     def random(cls, names: Sequence[str], seed: int, noise_rms: float | None = None) -> "Stage":
-        """Return a random plausible stage at rest, without effects but hysteresis.
-
-        The first axis equals ``StageParameters.random(seed)``, the others differ. `noise_rms` (m) is the sensor noise
-        of every axis, by default that of StageParameters. UsageError if `names` are not unique.
-        """
-        return cls({name: PreisachStage(*each) for name, each in _drawn(names, seed, noise_rms).items()})
+        """Return a random plausible stage at rest, without effects but hysteresis; the first axis is of that seed."""
+        return cls.of(names, [PLAIN] * len(names), seed, noise_rms)
 
     @classmethod
-    def of(cls, names: Sequence[str], characters: Sequence[Character], seed: int, noise_rms: float) -> "Stage":
+    def of(cls, names: Sequence[str], characters: Sequence[Character], seed: int, noise_rms: float | None) -> "Stage":
         """Return a stage at rest with the hysteresis of `random`, and one character for each axis."""
-        drawn = zip(_drawn(names, seed, noise_rms).items(), characters, strict=True)
-        return cls({name: CharacterAxis(own, character, number) for (name, (own, number)), character in drawn})
+        if len(set(names)) != len(names):
+            raise UsageError(f"stage: axes {', '.join(names)} are not unique; give each axis its own name")
+        axes = {}
+        for own, (name, character) in zip(count(seed, NEXT_AXIS), zip(names, characters, strict=True), strict=False):
+            parameters = AxisParameters.random(own)
+            if noise_rms is not None:
+                parameters = replace(parameters, noise_rms=noise_rms)
+            axes[name] = SimulatedAxis(parameters, own, character)
+        return cls(axes)
 
     @classmethod
     def hidden(cls, names: Sequence[str], seed: int, noise_rms: float, *, rate: float, voltage_max: float) -> "Stage":
@@ -45,18 +49,18 @@ class Stage:
         others = [name for name in STRENGTHS if name != "cross_coupling"]
         characters = []
         for _ in names:
-            count = int(rng.integers(1, 3))
+            number = int(rng.integers(1, 3))
             if len(names) > 1:
-                effects = ["cross_coupling", *rng.choice(others, count - 1, replace=False).tolist()]
+                effects = ["cross_coupling", *rng.choice(others, number - 1, replace=False).tolist()]
             else:
-                effects = rng.choice(others, count, replace=False).tolist()
+                effects = rng.choice(others, number, replace=False).tolist()
             characters.append(draw(rng, effects, rate=rate, voltage_max=voltage_max))
         return cls.of(names, characters, seed, noise_rms)
 
     @property
     def effects(self) -> dict[str, tuple[str, ...]]:
-        """Names of the effects of each axis that has a character."""
-        return {name: axis.character.effects for name, axis in self.axes.items() if isinstance(axis, CharacterAxis)}
+        """Names of the effects of each axis."""
+        return {name: axis.character.effects for name, axis in self.axes.items()}
 
     @property
     def voltage_range(self) -> tuple[float, float]:
@@ -70,37 +74,24 @@ class Stage:
             axis.begin_drift(t)
 
     def step(self, t: float, voltages: Sequence[float]) -> list[float]:
-        """Apply one voltage (V) to each axis at time `t` (s), which does not decrease; return readings without noise.
-
-        Voltages and readings (m) are in the order of `axes`.
-        """
+        """Apply one voltage (V) to each axis at time `t` (s), not decreasing; return readings (m) without noise."""
         axes = list(self.axes.values())
-        motion = [axis.step(t, v) for axis, v in zip(axes, voltages, strict=True)]
+        motion = [axis.move(t, v) for axis, v in zip(axes, voltages, strict=True)]
         whole = sum(motion)
-        return [axis.read(t, own + axis.coupling * (whole - own)) for axis, own in zip(axes, motion, strict=True)]
+        coupled = [own + axis.character.coupling * (whole - own) for axis, own in zip(axes, motion, strict=True)]
+        return [axis.read(t, own) for axis, own in zip(axes, coupled, strict=True)]
 
     def measure(self, readings: Sequence[float]) -> list[float]:
         """Return the readings (m) with noise and resolution of the sensors, in the order of `axes`."""
         return [axis.measure(y) for axis, y in zip(self.axes.values(), readings, strict=True)]
 
 
-def _drawn(names: Sequence[str], seed: int, noise_rms: float | None) -> dict[str, tuple[StageParameters, int]]:
-    """Return hysteresis and seed of each axis."""
-    if len(set(names)) != len(names):
-        raise UsageError(f"stage: axes {', '.join(names)} are not unique; give each axis its own name")
-    drawn = {}
-    for own, name in zip(range(seed, seed + NEXT_AXIS * len(names), NEXT_AXIS), names, strict=True):
-        parameters = StageParameters.random(own)
-        drawn[name] = parameters if noise_rms is None else replace(parameters, noise_rms=noise_rms), own
-    return drawn
-
-
 _P11_PEAK = 89.189e-6
 _P11_HALF_PERIOD = 0.5
 
 
-def flexure_stage(seed: int = 0) -> PreisachStage:
-    """Return a stage similar to that of the SLPI paper: 0 to 100 V, quasi-static, loops that vary with bias.
+def flexure_axis(seed: int = 0) -> SimulatedAxis:
+    """Return an axis similar to that of the SLPI paper: 0 to 100 V, quasi-static, loops that vary with bias.
 
     - 0 to 100 V: the range of the paper's voltage controller (section 2.2).
     - Stroke 24 µm: chosen. The paper states none; its Table 4 gives 6.5 at 100 V, in an unstated unit.
@@ -112,9 +103,9 @@ def flexure_stage(seed: int = 0) -> PreisachStage:
     - Noise 5 nm rms, resolution 1 nm: chosen; the resolution of a laser interferometer such as the paper's is 1 nm,
       and the mean of two passes (2.2) leaves little noise.
 
-    The stage is at rest at 0 V. `seed` is that of the sensor noise; the stage does not depend on it.
+    It is at rest at 0 V. `seed` is that of the sensor noise; nothing else depends on it.
     """
-    parameters = StageParameters(
+    parameters = AxisParameters(
         stroke=24e-6,
         hysteresis=0.14,
         nominal_voltage=100.0,
@@ -126,16 +117,11 @@ def flexure_stage(seed: int = 0) -> PreisachStage:
         noise_rms=5e-9,
         quantisation=1e-9,
     )
-    return PreisachStage(parameters, seed)
+    return SimulatedAxis(parameters, seed)
 
 
 def p11_stage(seed: int = 0) -> Stage:
-    """Return the stage with the axes of `p11_axes`."""
-    return Stage(p11_axes(seed))
-
-
-def p11_axes(seed: int = 0) -> dict[str, PreisachStage]:
-    """Return axes similar to those of the P11.XY100 of the MPI paper: 0 to 120 V nominal, with creep and resonance.
+    """Return a stage similar to the P11.XY100 of the MPI paper: 0 to 120 V nominal, with creep and resonance.
 
     - -20 to 150 V: stated (section 2.1).
     - Peak of 89.189 µm for a triangle of 120 V at 1 Hz: Table 1, where ``a`` is the peak at 1 Hz. The stroke of the
@@ -158,7 +144,10 @@ def p11_axes(seed: int = 0) -> dict[str, PreisachStage]:
     The axes ``x`` and ``y`` are at rest at 0 V. `seed` is that of the sensor noise, which differs between them; nothing
     else depends on it.
     """
-    x = StageParameters(
+    moving = Character(lag=0.2e-3, creep=0.042, creep_shortest=1e-3, creep_longest=100.0, resonance=350.0, damping=0.05)
+    creep = Creep(moving.creep, moving.creep_shortest, moving.creep_longest)
+    x = AxisParameters(
+        stroke=_P11_PEAK / creep.after_ramp(_P11_HALF_PERIOD),
         hysteresis=0.11,
         nominal_voltage=120.0,
         threshold_min=-20.0,
@@ -166,16 +155,9 @@ def p11_axes(seed: int = 0) -> dict[str, PreisachStage]:
         levels=340,
         exponent=1.15,
         stiffening=0.03,
-        creep_gain=0.042,
-        creep_shortest=1e-3,
-        creep_longest=100.0,
-        resonance_frequency=350.0,
-        resonance_damping=0.05,
-        amplifier_lag=0.2e-3,
         noise_rms=10e-9,
         quantisation=3e-9,
     )
-    creep = Creep(x.creep_gain, x.creep_shortest, x.creep_longest)
-    x = replace(x, stroke=_P11_PEAK / creep.after_ramp(_P11_HALF_PERIOD))
-    y = replace(x, stroke=0.97 * x.stroke, hysteresis=0.115, exponent=1.14, creep_gain=0.040, resonance_frequency=330.0)
-    return {"x": PreisachStage(x, seed), "y": PreisachStage(y, seed + NEXT_AXIS)}
+    y = replace(x, stroke=0.97 * x.stroke, hysteresis=0.115, exponent=1.14)
+    y_moving = replace(moving, creep=0.040, resonance=330.0)
+    return Stage({"x": SimulatedAxis(x, seed, moving), "y": SimulatedAxis(y, seed + NEXT_AXIS, y_moving)})

@@ -1,4 +1,4 @@
-"""What acts on the reading of a stage besides its motion: mains hum and the error of an interferometer."""
+"""What acts on the reading of a stage besides its motion: mains hum, the error of an interferometer, and noise."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -44,3 +44,19 @@ class Interferometer:
             return np.asarray(y + self.amplitude * np.sin(angle))
         # Angle of the phasor e^(i fringe) relative to a centre with an offset of this fraction of its length.
         return np.asarray(y + np.angle(1.0 - wave * self.amplitude * np.exp(-1j * angle)) / wave)
+
+
+class Sensor:
+    """A sensor with Gaussian noise of `noise_rms` (m), the same for the same `seed`, and quantisation (m; 0: none)."""
+
+    def __init__(self, noise_rms: float, quantisation: float, seed: int) -> None:
+        self._noise_rms = noise_rms
+        self._quantisation = quantisation
+        self._rng = np.random.default_rng(seed)
+
+    def read(self, displacement: FloatArray) -> FloatArray:
+        """Return the readings (m) for true displacements (m), in order, arrays of one shape."""
+        reading = displacement + self._noise_rms * self._rng.standard_normal(displacement.shape)
+        if self._quantisation:
+            reading = self._quantisation * np.round(reading / self._quantisation)
+        return np.asarray(reading, dtype=np.float64)

@@ -10,12 +10,12 @@ from benchmarks.hidden.physics import Amplifier, Physics, own_motion
 from slpi_ros.effects.delay import Delay
 from slpi_ros.io.record import Record
 from slpi_ros.io.schemas import format_document
-from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.parameters import AxisParameters
 
 pytestmark = pytest.mark.slow
 
 RATE, NOISE, HIGH = 500.0, 6e-9, 100.0
-STAGE = replace(StageParameters.random(3), stiffening=0.0)
+STAGE = replace(AxisParameters.random(3), stiffening=0.0)
 
 
 def drive(hertz, seconds=12.0, before=(), seed=0):

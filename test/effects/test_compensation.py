@@ -20,8 +20,9 @@ from slpi_ros.effects.resonance import Resonance
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.simulation import dynamics as physics
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.character import Character
+from slpi_ros.simulation.parameters import AxisParameters
 
 AXES = ("x", "y")
 RATE, DURATION = 500.0, 12.0
@@ -30,9 +31,9 @@ COUPLING = {"x": 0.03, "y": -0.02}
 
 SLOW = physics.Creep(0.02, 1e-2, 1e3)
 CREEP = Creep(tuple(SLOW.time_constants.tolist()), tuple(SLOW.gains.tolist()))
-CREEPING = {"creep_gain": 0.02, "creep_shortest": 1e-2, "creep_longest": 1e3}
-LAG, LAGGING = Lag(0.015), {"amplifier_lag": 0.015}
-MODE, RINGING = Resonance((Mode(80.0, 0.03),)), {"resonance_frequency": 80.0, "resonance_damping": 0.03}
+CREEPING = {"creep": 0.02, "creep_shortest": 1e-2, "creep_longest": 1e3}
+LAG, LAGGING = Lag(0.015), {"lag": 0.015}
+MODE, RINGING = Resonance((Mode(80.0, 0.03),)), {"resonance": 80.0, "damping": 0.03}
 CASES = {
     "creep": ((CREEP,), CREEPING),
     "lag": ((LAG,), LAGGING),
@@ -43,8 +44,8 @@ CASES = {
 }
 
 
-def stage(place: int, **effects: float) -> PreisachStage:
-    return PreisachStage(replace(StageParameters.random(11 + place), noise_rms=8e-9, **effects), place)
+def stage(place: int, **effects: float) -> SimulatedAxis:
+    return SimulatedAxis(AxisParameters.random(11 + place), place, Character(**effects))
 
 
 @cache
@@ -72,7 +73,7 @@ def wishes(smooth: bool) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     return t, paths
 
 
-def achieved(model: StageModel, stages: dict[str, PreisachStage], coupled: bool, smooth: bool) -> dict[str, np.ndarray]:
+def achieved(model: StageModel, stages: dict[str, SimulatedAxis], coupled: bool, smooth: bool) -> dict[str, np.ndarray]:
     """Return the errors of the real displacement, metres, from one second on."""
     t, desired = wishes(smooth)
     stream, real = model.streams(start_memory="start"), {name: np.empty(t.size) for name in AXES}

@@ -12,8 +12,8 @@ from slpi_ros.errors import UsageError
 from slpi_ros.excitation.drives import calibration_drive, excite
 from slpi_ros.identification.bases import SurfaceBasis
 from slpi_ros.identification.design_matrix import Walk
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 CASES = [(30.0, 100.0, 0), (60.0, 200.0, 1), (80.0, 100.0, 7), (10.0, 200.0, 0)]
 
@@ -62,7 +62,7 @@ def test_full_loops_come_first(seed, slew):
 def test_the_memory_is_wiped_whatever_went_before(seed):
     t, v = drive(seed=seed, rate=100.0)
     history = np.random.default_rng(seed).uniform(0.0, 100.0, 40)
-    one, other = PreisachStage(), PreisachStage()
+    one, other = SimulatedAxis(), SimulatedAxis()
     other.run(np.arange(40.0), history)
     y, again = one.run(t, v)[0], other.run(t, v)[0]
     wiped = int(np.flatnonzero(v == 100.0)[0])
@@ -133,7 +133,7 @@ def test_the_same_seed_gives_the_same_drive():
 @pytest.mark.parametrize("seed", [3, 7])
 def test_thirty_seconds_are_enough(seed):
     def stage():
-        return PreisachStage(StageParameters.random(seed), seed)
+        return SimulatedAxis(AxisParameters.random(seed), seed)
 
     t, v = drive(seed=seed)
     true, measured = stage().run(t, v)

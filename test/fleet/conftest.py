@@ -10,8 +10,8 @@ from distributed import Client, LocalCluster
 from slpi_ros.excitation.drives import excite
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 DAY_NS = 86_400 * 10**9
 NOISE = 8e-9
@@ -19,8 +19,8 @@ NOISE = 8e-9
 
 def stage_path(drive, seed):
     """Return the displacement of a simulated stage without noise, shape (N,), metres."""
-    parameters = replace(StageParameters.random(seed), noise_rms=0.0, quantisation=0.0, levels=120)
-    return PreisachStage(parameters).run(drive.t, drive.voltage["x"])[0]
+    parameters = replace(AxisParameters.random(seed), noise_rms=0.0, quantisation=0.0, levels=120)
+    return SimulatedAxis(parameters).run(drive.t, drive.voltage["x"])[0]
 
 
 class Stages:

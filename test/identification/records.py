@@ -6,8 +6,8 @@ import numpy as np
 
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.record import Record
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 
 def record_of(t, v, y, axis="x"):
@@ -15,7 +15,7 @@ def record_of(t, v, y, axis="x"):
 
 
 def stage(seed, noise=8e-9):
-    return PreisachStage(replace(StageParameters.random(seed), noise_rms=noise), seed)
+    return SimulatedAxis(replace(AxisParameters.random(seed), noise_rms=noise), seed)
 
 
 def calibration(seed, duration=20.0, noise=8e-9):

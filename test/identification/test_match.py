@@ -12,7 +12,7 @@ from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.free_run import match
 from slpi_ros.identification.refit import refit
 from slpi_ros.identification.samples import select_samples
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
 
 SEED = 1
 
@@ -25,7 +25,7 @@ def model():
 def again(before, v, gain=1.0, zero=0.0, rate=200.0):
     """Record the stage again after the voltages `before`, with another gain and zero (m)."""
     parameters = stage(SEED).parameters
-    other = PreisachStage(replace(parameters, stroke=gain * parameters.stroke), SEED)
+    other = SimulatedAxis(replace(parameters, stroke=gain * parameters.stroke), SEED)
     before = np.append(before, v[0])
     other.run(np.arange(before.size) / rate - 1e3, before)
     t = np.arange(v.size) / rate

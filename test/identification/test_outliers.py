@@ -13,8 +13,8 @@ from slpi_ros.identification.bad_readings import far_outliers, outliers_by_model
 from slpi_ros.identification.free_run import InitialHistoryWarning
 from slpi_ros.identification.record_quality import assess
 from slpi_ros.identification.samples import select_samples
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 NOISE = 5e-9
 # Multiples of the noise and numbers of outliers; the others are long.
@@ -25,7 +25,7 @@ CORNERS = ((2, 600), (100, 50), (10_000, 5), (10_000, 600))
 def clean():
     """Return a record of a simulated stage."""
     t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=200.0, seed=1)
-    y = PreisachStage(StageParameters.random(1), 1).run(t, v)[1]
+    y = SimulatedAxis(AxisParameters.random(1), 1).run(t, v)[1]
     return slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y})
 
 
@@ -155,7 +155,7 @@ def test_outliers_beside_each_other_are_found_with_a_model(clean, of_clean, besi
 @pytest.mark.parametrize("kind", ["slpi", "pi"])
 def test_what_a_model_gets_wrong_is_no_outlier(kind, noise):
     t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=200.0, seed=2)
-    y = PreisachStage(StageParameters.random(2), 2).run(t, v)[0]
+    y = SimulatedAxis(AxisParameters.random(2), 2).run(t, v)[0]
     y = y + noise * np.random.default_rng(6).standard_normal(t.size)
     model = slpi_ros.identify(slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y}), kind).axes["x"]
     assert not outliers_by_model(model.memory("start").forward_array(v), y, v).size
@@ -215,7 +215,7 @@ def test_a_wrong_voltage_beside_a_rest_at_an_end_is_no_range(at, by, rest):
     t = np.arange(2600) / 100.0
     v = 50.0 * (1.0 - np.cos(2.0 * np.pi * 0.5 * np.clip(t - 0.01 * rest, 0.0, 26.0 - 0.02 * rest)))
     v[-rest:] = v[-rest - 1]
-    y = PreisachStage(StageParameters.random(1), 1).run(t, v)[1]
+    y = SimulatedAxis(AxisParameters.random(1), 1).run(t, v)[1]
     record = slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y})
     clean = select_samples(record, "x", None, None).v
     found = select_samples(spoiled(record, "voltage", at, by), "x", None, None).v

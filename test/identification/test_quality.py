@@ -12,8 +12,9 @@ from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
 from slpi_ros.io.tables import import_table
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.character import Character
+from slpi_ros.simulation.parameters import AxisParameters
 
 NOISE = 8e-9
 seeds = pytest.mark.parametrize("seed", range(8))
@@ -45,11 +46,10 @@ def moves(y, noise=6.0):
 def test_a_clean_record_is_clean(seed):
     assert warnings(*measured(seed)) == []
     t, v, _ = measured(seed)
-    y = PreisachStage(replace(StageParameters.random(seed), quantisation=0.0, noise_rms=0.0), seed).run(t, v)[1]
+    y = SimulatedAxis(replace(AxisParameters.random(seed), quantisation=0.0, noise_rms=0.0), seed).run(t, v)[1]
     assert warnings(t, v, y) == []
-    dynamic = StageParameters.random(seed)
-    dynamic = replace(dynamic, creep_gain=0.02, amplifier_lag=5e-3, resonance_frequency=40.0)
-    assert warnings(t, v, PreisachStage(dynamic, seed).run(t, v)[1]) == []
+    moving = Character(lag=5e-3, creep=0.02, creep_shortest=1e-3, resonance=40.0, damping=0.04)
+    assert warnings(t, v, SimulatedAxis(AxisParameters.random(seed), seed, moving).run(t, v)[1]) == []
 
 
 T = np.arange(8000) * 1e-3
@@ -217,7 +217,7 @@ def test_faults_of_the_voltage(seed):
 def test_digits_of_a_sensor(bits):
     t, v, _ = measured(3)
     step = 25e-6 / 2**bits
-    y = PreisachStage(replace(StageParameters.random(3), quantisation=step), 3).run(t, v)[1]
+    y = SimulatedAxis(replace(AxisParameters.random(3), quantisation=step), 3).run(t, v)[1]
     found = quality(t, v, y)
     assert found.displacement.digit == pytest.approx(step, rel=1e-6)
     assert found.displacement.stuck == found.displacement.stale == found.displacement.spikes == 0

@@ -14,7 +14,7 @@ from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.refit import refit
 from slpi_ros.model.document import format_model, parse_model
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
 
 SEED = 1
 
@@ -26,7 +26,7 @@ def model():
 
 def drifted_stage(gain):
     parameters = stage(SEED).parameters
-    return PreisachStage(replace(parameters, stroke=gain * parameters.stroke), SEED)
+    return SimulatedAxis(replace(parameters, stroke=gain * parameters.stroke), SEED)
 
 
 def small_loops():

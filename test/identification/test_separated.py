@@ -13,8 +13,8 @@ from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, separ
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.published_kinds import default_thresholds, least_iterations
 from slpi_ros.model.document import format_model, parse_model
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 
 def ramps(*turns):
@@ -34,7 +34,7 @@ def loop(level, direction, vertex, span, slope, run_in):
 
 
 def stage_record(parameters=None):
-    stage = PreisachStage(parameters or StageParameters(stroke=24e-6), 0)
+    stage = SimulatedAxis(parameters or AxisParameters(stroke=24e-6), 0)
     t = 0.1 * np.arange(PATH.size)
     return record_of(t, PATH, stage.run(t, PATH)[0])
 
@@ -97,7 +97,7 @@ def test_compensates_a_path_with_the_same_loops():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         v = model.axes["x"].hysteresis.along(0.0, float(y[0])).inverse_array(desired)
-    reached = PreisachStage(StageParameters(stroke=24e-6), 0).run(record.t, np.clip(v, -20, 120))[0]
+    reached = SimulatedAxis(AxisParameters(stroke=24e-6), 0).run(record.t, np.clip(v, -20, 120))[0]
     assert np.mean(np.abs(reached - desired)) < 0.01 * np.ptp(y)
 
 

@@ -9,7 +9,7 @@ from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.papers import mpi_study as published
 from slpi_ros.papers.compound import RATE, WARM_UP, Outcome, follow, path, present, run_study, tune
 from slpi_ros.papers.mpi_study import FAMILY, SMPI
-from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.character import Character
 from slpi_ros.simulation.stage import p11_stage
 
 GAIN = 0.7e-6
@@ -62,7 +62,7 @@ def test_the_path_turns_at_the_peaks_and_at_zero():
     delay=st.floats(0, 2e-3),
 )
 def test_the_loop_gain_stays_below_one_around_the_mode_whatever_the_delay(frequency, damping, gain, delay):
-    gains = tune(StageParameters(resonance_frequency=frequency, resonance_damping=damping), gain)
+    gains = tune(Character(resonance=frequency, damping=damping), gain)
     s = 2j * np.pi * np.linspace(0.7, 5, 2000) * frequency
     omega = 2 * np.pi * frequency
     stage = gain * omega**2 / (s**2 + 2 * damping * omega * s + omega**2) * np.exp(-s * delay)

@@ -134,7 +134,7 @@ def test_the_variable_path_has_its_parts_and_models(study):
 def test_what_rings_is_the_mode(axis, study):
     assert study.ringing[20] > 5 * study.ringing[2] > 0
     # From one ramp to another, a mode w swings by the change of slope over w; here the turn is not quite so sharp.
-    swing = 4 * 20 * study.fastest[120].settled_peak / (2 * np.pi * axis.parameters.resonance_frequency)
+    swing = 4 * 20 * study.fastest[120].settled_peak / (2 * np.pi * axis.character.resonance)
     assert 0.5 * swing < study.ringing[20] < swing
 
 

@@ -18,16 +18,17 @@ from benchmarks.hidden.physics import (
     own_motion,
     sensed,
 )
-from slpi_ros.simulation.parameters import StageParameters
-from slpi_ros.simulation.preisach import PreisachStage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
+from slpi_ros.simulation.preisach import PreisachHysteresis
 
-STAGE = StageParameters(levels=140, stiffening=0.02, offset=1e-7)
+STAGE = AxisParameters(levels=140, stiffening=0.02, offset=1e-7)
 T = np.arange(1500) / 2000
 V = 50 - 45 * np.cos(40 * T) - 5 * np.cos(173 * T)
 
 
 def hysteresis(v):
-    return PreisachStage(STAGE).run(np.zeros(v.size), v)[0]
+    return SimulatedAxis(STAGE).run(np.zeros(v.size), v)[0]
 
 
 def motion(**physics):
@@ -80,12 +81,15 @@ def test_loops_widen_with_the_rate(form):
 
 
 def test_relays_and_reversible_part_may_see_different_voltages():
-    stage = PreisachStage(replace(STAGE, stiffening=0.0))
-    same, shifted = stage.respond(V, V), PreisachStage(replace(STAGE, stiffening=0.0)).respond(V, V[::-1].copy())
-    np.testing.assert_allclose(same, PreisachStage(replace(STAGE, stiffening=0.0)).run(T, V)[0], atol=1e-18)
-    only_relays = PreisachStage(replace(STAGE, stiffening=0.0)).respond(np.zeros_like(V), V[::-1].copy())
-    only_curve = PreisachStage(replace(STAGE, stiffening=0.0)).respond(V, np.zeros_like(V))
-    np.testing.assert_allclose(shifted - STAGE.offset, only_relays + only_curve - 2 * STAGE.offset, atol=1e-15)
+    straight = replace(STAGE, stiffening=0.0)
+
+    def respond(v, relay_voltage):
+        stage = PreisachHysteresis(straight)
+        return np.array([stage.step(*both) for both in zip(v, relay_voltage, strict=True)])
+
+    np.testing.assert_allclose(respond(V, V), SimulatedAxis(straight).run(T, V)[0] - STAGE.offset, atol=1e-18)
+    alone = respond(np.zeros_like(V), V[::-1]) + respond(V, np.zeros_like(V))
+    np.testing.assert_allclose(respond(V, V[::-1]), alone, atol=1e-15)
 
 
 def test_what_the_sensor_shows():

@@ -5,8 +5,8 @@ import pytest
 
 from slpi_ros.errors import UsageError
 from slpi_ros.excitation.drives import excite
-from slpi_ros.simulation.character import STRENGTHS, Character, CharacterAxis, draw
-from slpi_ros.simulation.parameters import StageParameters
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.character import STRENGTHS, Character, draw
 from slpi_ros.simulation.stage import Stage
 
 RATE = 250.0
@@ -101,15 +101,17 @@ def test_hidden_stages_are_drawn_from_their_seed(names):
 
 
 def test_impossible_characters_are_refused():
-    for wrong in ({"lag": -1.0}, {"creep": float("nan")}, {"damping": 1.0}, {"sensor_amplitude": 1e-6}):
-        with pytest.raises(UsageError):
-            Character(**wrong)
+    wrong = {"lag": -1e-3, "creep": float("nan"), "resonance": -1.0, "damping": 1.0, "sensor_amplitude": 1e-6}
+    wrong |= {"creep_shortest": 0.0, "creep_longest": 1e-3, "delay": float("inf"), "coupling": 0.5}
+    for name, value in (*wrong.items(), ("creep", 0.3), ("damping", 0.0)):
+        with pytest.raises(UsageError, match=name):
+            Character(**{name: value})
     with pytest.raises(UsageError):
         draw(np.random.default_rng(0), ["mood"], rate=RATE)
 
 
 def test_time_does_not_run_backwards():
-    axis = CharacterAxis(StageParameters.random(0), Character(), 0)
+    axis = SimulatedAxis(character=Character(lag=0.01))
     axis.step(1.0, 0.0)
     with pytest.raises(UsageError):
         axis.step(0.5, 0.0)

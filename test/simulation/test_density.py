@@ -6,17 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
-from slpi_ros.simulation.preisach import (
-    ExponentialMaterial,
-    PowerLawMaterial,
-    PreisachStage,
-    RelayTriangle,
-    StageParameters,
-    material,
-    measure_loop,
-)
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
+from slpi_ros.simulation.preisach import ExponentialMaterial, PowerLawMaterial, RelayTriangle, material, measure_loop
 
-POWER_LAW = StageParameters(
+POWER_LAW = AxisParameters(
     stroke=80e-6,
     hysteresis=0.11,
     nominal_voltage=120.0,
@@ -38,7 +32,7 @@ def everett(up, down, parameters=POWER_LAW):
 
 
 def driven(parameters, history):
-    stage = PreisachStage(parameters)
+    stage = SimulatedAxis(parameters)
     return stage, [stage.step(0.0, v) for v in history]
 
 
@@ -51,7 +45,7 @@ def branches(amplitude, count=501, parameters=POWER_LAW):
 
 def test_the_exponent_chooses_the_material():
     assert isinstance(material(POWER_LAW), PowerLawMaterial)
-    assert isinstance(material(StageParameters()), ExponentialMaterial)
+    assert isinstance(material(AxisParameters()), ExponentialMaterial)
 
 
 @pytest.mark.parametrize(("exponent", "width_exponent"), [(1.0, 1.0), (1.15, 1.0), (1.4, 3.0)])
@@ -100,7 +94,7 @@ def test_its_simplest_fall_is_a_parabola_as_in_rayleighs_law():
 
 @pytest.mark.parametrize("amplitude", [20.0, 40.0, 80.0, 120.0, 150.0])
 def test_loops_of_every_amplitude_look_alike(amplitude):
-    stage = PreisachStage(POWER_LAW)
+    stage = SimulatedAxis(POWER_LAW)
     figure = measure_loop(lambda v: stage.step(0.0, v), 0.0, amplitude)
     assert figure.hysteresis == pytest.approx(0.11, rel=1e-3)
     assert figure.stroke == pytest.approx(80e-6 * (amplitude / 120) ** 1.15, rel=1e-3)

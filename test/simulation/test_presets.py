@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slpi_ros.simulation.preisach import PreisachStage, measure_loop
-from slpi_ros.simulation.stage import flexure_stage, p11_stage
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.preisach import measure_loop
+from slpi_ros.simulation.stage import flexure_axis, p11_stage
 
 # Second paper, Table 1: amplitude (V), a (µm), b.
 TABLE_1 = [
@@ -21,8 +22,9 @@ SAMPLES = 1000
 
 def axis(name="x", **changes):
     """Return an axis of the P11, as changed, with a perfect sensor."""
-    parameters = p11_stage().axes[name].parameters
-    return PreisachStage(replace(parameters, noise_rms=0.0, quantisation=0.0, **changes))
+    given = p11_stage().axes[name]
+    quiet = replace(given.parameters, noise_rms=0.0, quantisation=0.0)
+    return SimulatedAxis(quiet, character=replace(given.character, **changes))
 
 
 def triangles(stage, amplitude, frequency, periods=1):
@@ -65,7 +67,7 @@ def test_the_p11_widens_its_loop_with_frequency_but_not_much():
 
 
 def test_the_p11_rings_at_high_frequencies_only():
-    stage, stiff = axis(), axis(resonance_frequency=0.0)
+    stage, stiff = axis(), axis(resonance=0.0)
     swings = [np.max(np.abs(triangles(stage, 120, f, 2) - triangles(stiff, 120, f, 2))) for f in (1, 10, 20)]
     assert swings[0] < 0.15e-6
     assert swings[1] > 0.8e-6
@@ -87,16 +89,16 @@ def test_the_axes_of_the_p11_differ_by_a_few_per_cent():
 
 
 def test_the_flexure_stage_has_the_stroke_and_hysteresis_it_says():
-    stage = flexure_stage()
+    stage = flexure_axis()
     figure = measure_loop(lambda v: stage.step(0.0, v), 0.0, 100.0)
     assert figure.stroke == pytest.approx(24e-6)
     assert figure.hysteresis == pytest.approx(0.14, rel=0.03)
     assert figure.remanence / figure.stroke == pytest.approx(0.08, abs=0.01)
-    assert not stage.parameters.has_dynamics
+    assert not stage.character.depends_on_time
 
 
 def test_inner_loops_of_the_flexure_stage_incline_with_bias():
-    stage = flexure_stage()
+    stage = flexure_axis()
     figures = []
     for low in (5.0, 40.0, 75.0):
         stage.rest()
@@ -109,7 +111,7 @@ def test_inner_loops_of_the_flexure_stage_incline_with_bias():
 
 @pytest.mark.parametrize(
     ("preset", "noise"),
-    [(flexure_stage, 5e-9), (lambda seed: p11_stage(seed).axes["x"], 10e-9)],
+    [(flexure_axis, 5e-9), (lambda seed: p11_stage(seed).axes["x"], 10e-9)],
     ids=["flexure", "p11"],
 )
 def test_a_seed_is_a_noise_and_the_stage_is_the_same(preset, noise):

@@ -6,10 +6,9 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
@@ -266,7 +265,7 @@ def _starts(model: AxisModel, part: Part) -> list[Start]:
     return likely_starts(model, float(part.v[0]), part.history)
 
 
-def _known(part: Part) -> NDArray[np.bool_]:
+def _known(part: Part) -> Mask:
     """Return the mask of used samples to which the initial history only adds a constant; all used ones if too few."""
     known = part.used & part.wiped
     return known if np.count_nonzero(known) >= FEWEST else part.used
@@ -330,7 +329,7 @@ def _compared(bare: AxisModel, one: Explanation) -> Given:
     )
 
 
-def _since(own: NDArray[np.bool_], one: Explanation) -> Given:
+def _since(own: Mask, one: Explanation) -> Given:
     """Compare new records with those from which the given model was identified, the mask `own`, shape (records,)."""
     # The given model has absorbed the effects in its own records, which act differently in others. Therefore the
     # residuals of one joint fit to all records show whether the stage has changed in between.

@@ -16,10 +16,9 @@ from itertools import pairwise
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, of_starts, steps
 from slpi_ros.diagnosis.prepare import Evidence
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
@@ -130,7 +129,7 @@ class Joint:
         return folds, [held_out(everything[k : k + FOLDS + 1], record=True) for k in everything[:: FOLDS + 1]]
 
     @cached_property
-    def predictable(self) -> NDArray[np.bool_]:
+    def predictable(self) -> Mask:
         """Mask of the samples, shape (N,), that the other records can predict for any initial history."""
         whole = self.everything.gram()
         found = np.zeros(self.evidence.t.size, dtype=bool)
@@ -151,7 +150,7 @@ class Joint:
         return found
 
     @cached_property
-    def blocks(self) -> list[NDArray[np.int64]]:
+    def blocks(self) -> list[IntArray]:
         """Row indices of each held-out block, in time order."""
         left_out = [self._groups[group] for fold in self.held_out[0] for group in fold.left]
         return np.array_split(np.sort(np.concatenate(left_out)), BLOCKS)
@@ -225,7 +224,7 @@ class _HeldOut:
     left: Sequence[int]
     rest: Sequence[int]
     factor: Factor
-    judged: NDArray[np.bool_]
+    judged: Mask
 
 
 @dataclass(frozen=True)
@@ -311,7 +310,7 @@ def _solved(factor: Factor, of: FloatArray) -> FloatArray:
     return solution
 
 
-def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
+def _groups(problem: Problem, evidence: Evidence) -> list[IntArray]:
     """Return, for each record, the rows that are in every fit, followed by the rows of each fold."""
     # The beginning of a record is never held out, because relaxation from before the record is visible only there.
     judged, groups = _judged(problem), []
@@ -327,16 +326,14 @@ def _groups(problem: Problem, evidence: Evidence) -> list[NDArray[np.int64]]:
     return groups
 
 
-def _judged(problem: Problem) -> NDArray[np.bool_]:
+def _judged(problem: Problem) -> Mask:
     """Return the mask of the rows, shape (N,), that other parts of the record or other records can predict."""
     walk = problem.design.walk
     # Before the first motion the hysteresis state does not matter; the signal there is not due to hysteresis.
     return np.asarray((problem.judged & ~walk.first_rise) | (walk.direction == 0))
 
 
-def _predicted(
-    own: Rows, known: NDArray[np.bool_], rest: FloatArray, factor: Factor, size: int, every: int
-) -> NDArray[np.bool_]:
+def _predicted(own: Rows, known: Mask, rest: FloatArray, factor: Factor, size: int, every: int) -> Mask:
     """Return the mask of the rows of a record, shape (n,), that the other records can predict."""
     # The record has the rows `own`; to those where `known`, shape (n,), the initial history only adds a constant.
     # `rest`, shape (p, p), are the normal equations of the other records, and `factor` is their factor with the
@@ -434,7 +431,7 @@ class Explanation:
         return self.evidence.y
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Mask:
         """Mask of the samples used in the fit, shape (N,)."""
         return self.evidence.used
 
@@ -660,7 +657,7 @@ class RecordLeft:
     u: FloatArray
     h: FloatArray
     y: FloatArray
-    used: NDArray[np.bool_]
+    used: Mask
     residual: FloatArray
     around: EffectContext
 

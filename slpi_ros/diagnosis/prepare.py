@@ -5,9 +5,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.effects.base import EffectContext, usual_step
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import RecordError
@@ -62,9 +61,9 @@ class Part:
     t: FloatArray  # s, from the first stamp
     v: FloatArray  # V, as commanded or read
     y: FloatArray  # m
-    used: NDArray[np.bool_]  # in the fit; outliers, drop-outs and an unknown start only drive the hysteresis
-    seen: NDArray[np.bool_]  # valid displacement within the selected time
-    wiped: NDArray[np.bool_]  # both ends of the voltage range visited: `history` only adds a constant
+    used: Mask  # in the fit; outliers, drop-outs and an unknown start only drive the hysteresis
+    seen: Mask  # valid displacement within the selected time
+    wiped: Mask  # both ends of the voltage range visited: `history` only adds a constant
     history: tuple[float, ...]  # V, as in `slpi_ros.model.axis_model.Start`
     others: Mapping[str, FloatArray]  # m, of the other axes from the start of the record
     digit: float  # m, resolution of the readings, 0: continuous
@@ -102,7 +101,7 @@ class Evidence:
         return np.concatenate([part.y for part in self.parts])
 
     @cached_property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Mask:
         """Mask of the samples to be fitted, shape (N,)."""
         return np.concatenate([part.used for part in self.parts])
 
@@ -123,10 +122,10 @@ class Evidence:
         return tuple(slice(*pair) for pair in zip(ends[:-1], ends[1:], strict=True))
 
     @cached_property
-    def rows(self) -> NDArray[np.int64]:
+    def rows(self) -> IntArray:
         """Indices of the rows of the problem that are samples, without those of initial histories, shape (N,)."""
         leads = np.cumsum([len(part.history) for part in self.parts])
-        rows: NDArray[np.int64] = np.arange(self.t.size) + np.repeat(leads, [part.t.size for part in self.parts])
+        rows: IntArray = np.arange(self.t.size) + np.repeat(leads, [part.t.size for part in self.parts])
         return rows
 
     @cached_property
@@ -253,7 +252,7 @@ def _residual(evidence: Evidence) -> FloatArray:
     return (problem.y - problem.design.predict(x))[evidence.rows] * problem.scale
 
 
-def _at_limit(samples: Samples) -> NDArray[np.bool_]:
+def _at_limit(samples: Samples) -> Mask:
     """Return the mask of the samples, shape (N,), at which the sensor is at an end of its range."""
     y, limited = samples.y, np.zeros(samples.y.size, dtype=bool)
     levels, count = np.unique(y[samples.fitted], return_counts=True)
@@ -263,7 +262,7 @@ def _at_limit(samples: Samples) -> NDArray[np.bool_]:
     return limited
 
 
-def _beginning_disagrees(residual: FloatArray, used: NDArray[np.bool_], wiped: NDArray[np.bool_]) -> bool:
+def _beginning_disagrees(residual: FloatArray, used: Mask, wiped: Mask) -> bool:
     """Return whether residuals before the reset of the hysteresis state are much larger than those after it."""
     before, after = residual[used & ~wiped], residual[used & wiped]
     if not before.size or after.size < ENOUGH_WIPED * (before.size + after.size):
@@ -335,12 +334,12 @@ def _smoothness(samples: Sequence[Samples], basis: Basis) -> float:
     return SMOOTHNESS[int(np.argmin(problem.scores(SMOOTHNESS)))]
 
 
-def _outliers(residual: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _outliers(residual: FloatArray, used: Mask) -> Mask:
     """Return the mask of single-sample outliers, shape (N,)."""
     size = np.where(used, np.abs(residual), 0.0)
     beside = np.maximum(np.append(size[1:], 0.0), np.insert(size[:-1], 0, 0.0))
     spread = 1.4826 * float(np.median(size[used]))
-    alone: NDArray[np.bool_] = (size > OUTLIER * spread) & (beside < 0.5 * size)
+    alone: Mask = (size > OUTLIER * spread) & (beside < 0.5 * size)
     return alone
 
 

@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.diagnosis.tracking import ErrorPart, Tracking, track
 from slpi_ros.errors import SlpiError, UsageError
@@ -32,8 +31,6 @@ from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import RESOLUTION, START_MEMORIES, AxisModel, StartMemory
 from slpi_ros.model.coverage import rates, record_beyond
 from slpi_ros.model.stage_model import StageModel
-
-IntArray = NDArray[np.int64]
 
 SCHEMA = "slpi_ros/verification/2"
 # Default tolerance as a multiple of the repeatability floor.

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects.excitation import Excitation
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.effects.parameters import Leaf, facts_of, leaves, require_facts, with_leaves
@@ -202,7 +202,7 @@ class EffectBase(Protocol):
         """Return the simpler effect that looks the same in records with a sampling interval of `step` (s), if any."""
         return None
 
-    def starting(self, around: EffectContext, used: NDArray[np.bool_], *, older: bool = False) -> FloatArray:
+    def starting(self, around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
         """Return what is left (m, (N, k)) of its state before each record, with `older` also of long before."""
         return np.empty((around.t.size, 0))
 
@@ -365,7 +365,7 @@ class ResidualView(Protocol):
         """Measured displacement, shape (N,), metres."""
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Mask:
         """Mask of the samples used in the fit, shape (N,)."""
 
     @property
@@ -395,7 +395,7 @@ class FitView:
     u: FloatArray
     h: FloatArray
     y: FloatArray
-    used: NDArray[np.bool_]
+    used: Mask
     # Rms rounding error of the sensor (m).
     rounding: float
     effects: Sequence[Effect]

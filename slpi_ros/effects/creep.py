@@ -7,9 +7,8 @@ from math import inf
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
@@ -180,7 +179,7 @@ class Creep(EffectBase):
         soon = sum(gain for tau, gain in zip(self.time_constants, self.gains, strict=True) if tau < SOON)
         return not (max(self.gains) < (1.0 - NEAR) * LARGEST and soon < (1.0 - NEAR) * LARGEST_SOON)
 
-    def starting(self, around: EffectContext, used: NDArray[np.bool_], *, older: bool = False) -> FloatArray:
+    def starting(self, around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
         """Return the decay of creep from a move before each record, shape (N, k), one column per unknown move."""
         return _settling(self.time_constants, around, used, older=older)
 
@@ -289,9 +288,7 @@ def _reduced(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[f
     return tuple(gain * share if tau < SOON else gain for tau, gain in zip(time_constants, gains, strict=True))
 
 
-def _settling(
-    time_constants: Sequence[float], around: EffectContext, used: NDArray[np.bool_], *, older: bool = False
-) -> FloatArray:
+def _settling(time_constants: Sequence[float], around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
     """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation."""
     # The logarithmic law has a single column, for a move just before the record. With `older` there is a second one,
     # for a move one record duration before the record, of which only the slow part remains.
@@ -304,9 +301,7 @@ def _settling(
     return np.column_stack([np.empty((around.t.size, 0)), *whole])
 
 
-def _settling_of(
-    time_constants: Sequence[float], t: FloatArray, used: NDArray[np.bool_], older: bool
-) -> list[FloatArray]:
+def _settling_of(time_constants: Sequence[float], t: FloatArray, used: Mask, older: bool) -> list[FloatArray]:
     times = t[used]
     since = np.maximum(t - times[0], 0.0)
     if len(time_constants) >= LAW_FEWEST:

@@ -5,9 +5,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects import filters
 from slpi_ros.effects.filters import DAMPING, WIDEST
 from slpi_ros.hysteresis import compiled as engine
@@ -229,7 +228,7 @@ def inverse_path(
     far: float,
     laws: Laws,
     out: FloatArray,
-    held: NDArray[np.bool_],
+    held: Mask,
     point: FloatArray,
     turns: FloatArray,
     direction: float,

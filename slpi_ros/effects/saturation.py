@@ -6,9 +6,8 @@ from math import inf, isinf
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects.base import EffectBase, EffectContext, FitView, ResidualView, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
@@ -104,7 +103,7 @@ class Saturation(EffectBase):
         return f"the amplifier clips {' and '.join(where) or 'nowhere'}"
 
 
-def outward_steps(v: FloatArray, y: FloatArray, used: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def outward_steps(v: FloatArray, y: FloatArray, used: Mask) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return mean voltage (V), its change and displacement (m), (M,), of steps away from the middle of the range."""
     # Beyond a clipping limit they give no displacement.
     low, high = float(v.min()), float(v.max())

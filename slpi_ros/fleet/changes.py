@@ -4,12 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from slpi_ros.arrays import FloatArray
-
-IntArray = NDArray[np.int64]
+from slpi_ros.arrays import FloatArray, IntArray
 
 # A change is told if noise alone would show one in a series with this probability at most.
 CHANCE = 1e-3

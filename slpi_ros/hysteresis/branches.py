@@ -3,13 +3,10 @@
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.hysteresis.shapes import END, Branches, Curve
 from slpi_ros.hysteresis.turning_points import Memory, worth_compiling
-
-IntArray = NDArray[np.int64]
 
 # Origins of branches that started before the first sample.
 AT_REST, LONG_FALL = -1, -2

@@ -5,9 +5,8 @@ from math import asinh, inf, sinh
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.hysteresis import compilation, rate_law
 from slpi_ros.hysteresis.rate_law import LARGEST
 from slpi_ros.hysteresis.shapes import END, Branches
@@ -103,7 +102,7 @@ def through(
     point: FloatArray,
     turns: FloatArray,
     depth: int,
-    walk: NDArray[np.int64],
+    walk: IntArray,
     ends: FloatArray,
     knots: FloatArray,
     rest: FloatArray,
@@ -214,7 +213,7 @@ def along(
     lower: float,
     upper: float,
     point: FloatArray,
-    at: NDArray[np.int64],
+    at: IntArray,
     ends: FloatArray,
     knots: FloatArray,
 ) -> bool:
@@ -241,7 +240,7 @@ def moved(
     upper: float,
     point: FloatArray,
     turns: FloatArray,
-    at: NDArray[np.int64],
+    at: IntArray,
     ends: FloatArray,
     knots: FloatArray,
     rest: FloatArray,

@@ -3,12 +3,9 @@
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import UsageError
-
-IntArray = NDArray[np.int64]
 
 
 def reversals(x: FloatArray, dead_band: float = 0.0) -> IntArray:

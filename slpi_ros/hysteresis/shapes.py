@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 
 # Largest distance of a voltage from rest (V); the last knot of every branch lies `END` beyond the others.
 FAR = 1e5
@@ -38,7 +37,7 @@ class Branches(NamedTuple):
     vertices: FloatArray = np.empty((2, 0))  # V, (2, n), ascending
     knots: FloatArray = np.empty((2, 0, 2, 0))  # V and m, (2, n + 1, 2, m), from vertex k
     change: FloatArray = np.empty((2, 0, 2, 0))  # their derivative with respect to the start's distance (V) below k
-    last: NDArray[np.int64] = np.empty((2, 0), dtype=np.int64)  # (2, n + 1), index of the last knot
+    last: IntArray = np.empty((2, 0), dtype=np.int64)  # (2, n + 1), index of the last knot
     operators: FloatArray = np.empty((2, 0))  # (2, k): thresholds (V), weights (m/V) of `MultiSlope`
     scale: tuple[float, float] = (0.0, 0.0)  # V, its origin and amplitude
 

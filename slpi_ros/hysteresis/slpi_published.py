@@ -9,15 +9,12 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import ModelError, RecordError
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.reversals import count_before, monotone_runs, require_finite, without_small_reversals
 from slpi_ros.hysteresis.turning_points import Memory
-
-IntArray = NDArray[np.int64]
 
 # Values of column ``sp`` of a separated record.
 NO_VERTEX, SUSPECTED, TRUE_VERTEX = 0, 1, 2

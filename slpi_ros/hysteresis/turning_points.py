@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from math import asinh, copysign, inf, sinh
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.compilation import compiler
 from slpi_ros.hysteresis.rate_law import LARGEST, solved
@@ -292,7 +291,7 @@ class Memory:
         return np.array([self.forward(v) for v in x.tolist()])
 
     def run_compiled(
-        self, x: FloatArray, coordinate: int, lower: float, upper: float, walk: NDArray[np.int64] | None = None
+        self, x: FloatArray, coordinate: int, lower: float, upper: float, walk: IntArray | None = None
     ) -> FloatArray:
         """Return the other coordinate along `x`; `slpi_ros.hysteresis.compiled.through` describes the arguments."""
         from slpi_ros.hysteresis.compiled import room, through

@@ -5,11 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
 from scipy.special import betainc, ndtri
 
-from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.signal_statistics import ENOUGH, FEWEST, digit, median_rms, noise, spread
 
@@ -44,8 +43,8 @@ _WINDOW, _END_WINDOWS = 2 * _TURN_REACH + 1, 3
 class Repeats:
     """Runs of equal consecutive readings: index of the `first` one and number (`length`, at least 2), shape (M,)."""
 
-    first: NDArray[np.int64]
-    length: NDArray[np.int64]
+    first: IntArray
+    length: IntArray
 
     @classmethod
     def within(cls, x: FloatArray) -> "Repeats":
@@ -89,7 +88,7 @@ def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: fl
     return repeats.where(due | (improbable & (moved > 0.0)))
 
 
-def stuck(y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
+def stuck(y: FloatArray, v: FloatArray) -> IntArray:
     """Return repeated displacements (m), in runs of three or more; none if the noise is below the resolution."""
     repeats = Repeats.within(y)
     if not np.any(repeats.length > 2):
@@ -119,7 +118,7 @@ def stopped(v: FloatArray, y: FloatArray, gain: float, noise_rms: float) -> Repe
     return repeats.where((moved > least) & (before < 0.5 * moved) & (after > 0.5 * moved))
 
 
-def far_outliers(v: FloatArray, y: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def far_outliers(v: FloatArray, y: FloatArray) -> tuple[IntArray, IntArray]:
     """Return the indices of large outliers in `v` (V) and `y` (m), (N,), that the other signal does not explain."""
     # Unlike `lone_outliers`, this needs no noise estimate, which such large outliers would distort. Readings where both
     # signals are suddenly 0 are outliers of both: a lost message, and no motion that the other signal explains.
@@ -176,7 +175,7 @@ def _running_median(x: FloatArray) -> FloatArray:
     return middle
 
 
-def outliers_by_model(path: FloatArray, y: FloatArray, v: FloatArray) -> NDArray[np.int64]:
+def outliers_by_model(path: FloatArray, y: FloatArray, v: FloatArray) -> IntArray:
     """Return the indices of displacements (m) that deviate suddenly from a model's (m), which no reversal explains."""
     # This includes groups of outliers and outliers at kinks, which cannot be distinguished from motion without a model.
     kept = np.arange(y.size)
@@ -229,7 +228,7 @@ def _sudden_deviations(path: FloatArray, y: FloatArray, v: FloatArray) -> Mask:
     return far
 
 
-def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:
+def without(x: FloatArray, outliers: IntArray) -> FloatArray:
     """Return readings `x`, shape (N,), with outliers replaced by linear interpolation between their neighbours."""
     if not outliers.size:
         return x
@@ -239,9 +238,7 @@ def without(x: FloatArray, outliers: NDArray[np.int64]) -> FloatArray:
     return cleaned
 
 
-def lone_of(
-    t: FloatArray, v: FloatArray, y: FloatArray, at_kinks: bool = True
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def lone_of(t: FloatArray, v: FloatArray, y: FloatArray, at_kinks: bool = True) -> tuple[IntArray, IntArray]:
     """Return the indices of the isolated outliers of a voltage (V) and of a displacement (m), neither constant."""
     # An outlier of both signals at the same sample is attributed to the voltage, which the displacement follows.
     gain, noise_v, noise_y = spread(y) / spread(v), noise(v, t), noise(y, v, t)
@@ -256,7 +253,7 @@ def lone_of(
 
 def lone_outliers(
     y: FloatArray, v: FloatArray, gain: float, noise_y: float, noise_v: float, at_kinks: bool = True
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Return the readings that deviate from a line through their four neighbours although the voltage does not."""
     # `at_kinks` includes readings that a kink in the displacement plus noise (rms, m and V) could explain.
     if not noise_y:
@@ -279,9 +276,7 @@ def lone_outliers(
     return np.unique(np.concatenate(found))
 
 
-def _outliers_at_start(
-    y: FloatArray, v: FloatArray, gain: float, limit: float, follows: bool = True
-) -> NDArray[np.int64]:
+def _outliers_at_start(y: FloatArray, v: FloatArray, gain: float, limit: float, follows: bool = True) -> IntArray:
     """Return which of the first two readings deviate from a line through the next five, but not the voltage."""
     # `limit` (m) is the largest deviation of a reading from the mean of four others by noise. If `follows`, one signal
     # may jump at the start and the other follow later.
@@ -304,7 +299,7 @@ def _outliers_at_start(
 
 def _outliers_of_block(
     y: FloatArray, v: FloatArray, gain: float, noise_y: float, limits: tuple[float, float], jump: float
-) -> NDArray[np.int64]:
+) -> IntArray:
     if y.size < 5:
         return np.empty(0, np.int64)
     limit, beyond_kink = limits
@@ -334,7 +329,7 @@ def _off_neighbours(x: FloatArray) -> FloatArray:
     return np.asarray(x[2:-2] - 0.25 * (x[:-4] + x[1:-3] + x[3:-1] + x[4:]))
 
 
-def stale(y: FloatArray, outliers: NDArray[np.int64], noise_rms: float) -> NDArray[np.int64]:
+def stale(y: FloatArray, outliers: IntArray, noise_rms: float) -> IntArray:
     """Return the outliers that are equal, within the noise, to one of the preceding readings."""
     # If outliers match later readings almost as often, the matches are coincidental and none is returned.
     near = 3.0 * np.sqrt(2.0) * noise_rms
@@ -363,7 +358,7 @@ _MIXED_MOST = 1.3
 class Mixed(NamedTuple):
     """Readings of a displacement that are early, late or a mixture of two neighbouring values."""
 
-    readings: NDArray[np.int64]  # indices
+    readings: IntArray  # indices
     judged: int  # number of readings tested: those not next to a reversal
     side: int  # 1: mixed with the next reading, -1: with the preceding one, 0: none found
 
@@ -392,7 +387,7 @@ def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
     return Mixed(np.concatenate(found), judged, side)
 
 
-def mixed_by_model(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> NDArray[np.int64]:
+def mixed_by_model(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> IntArray:
     """Return the mixed ones of the `fitted` readings, also near reversals, by the displacement of a model (m, (N,))."""
     at = np.flatnonzero(fitted)
     off = (y - path)[at]
@@ -402,7 +397,7 @@ def mixed_by_model(path: FloatArray, y: FloatArray, fitted: Mask, side: int) -> 
     return at[_mixed(side * off, way[at], _MIXED_BY_MODEL)]
 
 
-def _mixed(off: FloatArray, way: FloatArray, least: float) -> NDArray[np.int64]:
+def _mixed(off: FloatArray, way: FloatArray, least: float) -> IntArray:
     """Return the readings whose deviation `off` (m) exceeds the share `least` of the step `way` (m) to a neighbour."""
     known, ahead = way != 0.0, np.sign(way) * off
     noise_off = _MIXED_DEVIATIONS * median_rms(off[known]) if known.any() else 0.0

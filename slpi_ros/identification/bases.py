@@ -7,9 +7,8 @@ from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
@@ -73,7 +72,7 @@ class SurfaceBasis:
         return n * (n - 1) // 2 + n
 
     @cached_property
-    def _column(self) -> NDArray[np.int64]:
+    def _column(self) -> IntArray:
         """Parameter index of each vertex pair, shape (n, n); -1 on and above the diagonal."""
         n = self.grid.size
         column = np.full((n, n), -1)
@@ -81,7 +80,7 @@ class SurfaceBasis:
         return column
 
     @property
-    def _rise_columns(self) -> NDArray[np.int64]:
+    def _rise_columns(self) -> IntArray:
         n = self.grid.size
         return n * (n - 1) // 2 + np.arange(n)
 
@@ -100,7 +99,7 @@ class SurfaceBasis:
             part = part + self._rise_rows(v, rise) - self._rise_rows(v_origin, rise)
         return sp.csr_array(part)
 
-    def _cell(self, v: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+    def _cell(self, v: FloatArray) -> tuple[IntArray, FloatArray]:
         x = (v - self.grid[0]) / (self.grid[1] - self.grid[0])
         cell = np.clip(np.floor(x).astype(np.int64), 0, self.grid.size - 2)
         return cell, x - cell
@@ -153,7 +152,7 @@ class SurfaceBasis:
         rows = sp.vstack(blocks, format="csr")
         return sp.csr_array(sp.hstack([rows, sp.csr_array((rows.shape[0], 1))], format="csr"))
 
-    def _differences(self, stencil: list[tuple[NDArray[np.int64], NDArray[np.int64], float]]) -> sp.csr_array:
+    def _differences(self, stencil: list[tuple[IntArray, IntArray, float]]) -> sp.csr_array:
         """Return rows of weighted sums of Everett values for stencils within the triangle; the diagonal is zero."""
         n = self.grid.size
         fits = np.ones(stencil[0][0].size, dtype=bool)

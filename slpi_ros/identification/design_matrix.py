@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, trace
 
 
@@ -24,9 +24,9 @@ class Walk:
     """Hysteresis branch of each sample of a voltage; all arrays have shape (N,)."""
 
     v: FloatArray  # V
-    origin: NDArray[np.int64]  # the sample at which the branch started, or `AT_REST` or `LONG_FALL`
-    direction: NDArray[np.int64]  # 1: rising, -1: falling, 0: before the first motion
-    first: NDArray[np.int64]  # the first sample of the record
+    origin: IntArray  # the sample at which the branch started, or `AT_REST` or `LONG_FALL`
+    direction: IntArray  # 1: rising, -1: falling, 0: before the first motion
+    first: IntArray  # the first sample of the record
 
     @classmethod
     def along(cls, v: FloatArray, *, symmetric_rest: bool, primed: bool) -> "Walk":
@@ -56,17 +56,17 @@ class Walk:
         return np.where(self.origin >= 0, self.v[np.maximum(self.origin, 0)], self.v_rest)
 
     @property
-    def first_rise(self) -> NDArray[np.bool_]:
+    def first_rise(self) -> Mask:
         """Mask of the samples on the first rise from rest, shape (N,)."""
         return np.asarray((self.origin == AT_REST) & (self.direction > 0))
 
     @property
-    def from_rest(self) -> NDArray[np.bool_]:
+    def from_rest(self) -> Mask:
         """Mask of the samples on a branch that starts at rest, shape (N,)."""
         return np.asarray((self.origin == AT_REST) & (self.direction != 0))
 
     @property
-    def long_fall(self) -> NDArray[np.bool_]:
+    def long_fall(self) -> Mask:
         """Mask of the samples on the long fall that initialised the hysteresis state, shape (N,)."""
         return np.asarray(self.origin == LONG_FALL)
 
@@ -76,11 +76,11 @@ class Design:
     """Design matrix of the linear prediction: one column per parameter, then each record's displacement at rest."""
 
     local: sp.csr_array  # (N, p): increments along the branch of each sample
-    turns: NDArray[np.int64]  # reversals, samples at which branches start, ascending
+    turns: IntArray  # reversals, samples at which branches start, ascending
     walk: Walk
 
     @cached_property
-    def _branch(self) -> NDArray[np.int64]:
+    def _branch(self) -> IntArray:
         """Index into `turns` of the reversal at which each sample's branch started, shape (N,); -1 for none."""
         origin = self.walk.origin
         return np.where(origin >= 0, np.searchsorted(self.turns, origin), -1)

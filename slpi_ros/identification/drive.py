@@ -3,13 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.hysteresis.reversals import reversals
-
-IntArray = NDArray[np.int64]
 
 # Cells per dimension of the grid of last reversal voltage and present voltage.
 _CELLS = 10

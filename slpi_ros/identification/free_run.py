@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.identification.samples import FEWEST, Samples
 from slpi_ros.model.axis_model import AxisModel, Start
 
@@ -140,8 +139,8 @@ def free_run(
     t: FloatArray,
     v: FloatArray,
     y: FloatArray,
-    used: NDArray[np.bool_],
-    known: NDArray[np.bool_],
+    used: Mask,
+    known: Mask,
     starts: Sequence[Start],
     *,
     others: Mapping[str, FloatArray],
@@ -208,7 +207,7 @@ class Match:
     rms: float  # m, of the `known` samples, without the offset
     rms_explained: float  # m, after a fit of gain, width, lag and linear drift
     known_from: int  # first sample after which the history affects only the offset; N: none
-    known: NDArray[np.bool_]  # (N,), fitted, no outliers, in stretches long enough for a comparison
+    known: Mask  # (N,), fitted, no outliers, in stretches long enough for a comparison
     residual: FloatArray  # m, (N,), model minus measured, free-run from `start`; NaN where not fitted
 
     @property
@@ -298,7 +297,7 @@ def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
     return [*wiped, axis.after(np.array([v])), axis.after(np.array([v]), "end")]
 
 
-def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> NDArray[np.int64]:
+def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> IntArray:
     """Return the stretch number of each sample, shape (N,); in a stretch the initial history adds only a constant."""
     # `apart` (m, (N,)) is the range of the displacements over all candidate histories; changes below `tolerance` (m)
     # are ignored.
@@ -312,7 +311,7 @@ def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> NDArray[np
     return np.cumsum(extends | np.append(False, extends[:-1]))
 
 
-def _inliers(residual: FloatArray, stretch: NDArray[np.int64], counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _inliers(residual: FloatArray, stretch: IntArray, counted: Mask) -> Mask:
     """Return the mask, shape (N,), of the counted samples whose residual (m) is close to that of their neighbours."""
     inside = np.zeros(residual.size, dtype=bool)
     at = np.flatnonzero(counted)
@@ -332,8 +331,8 @@ def _changes(
     samples: Samples,
     t: FloatArray,
     predicted: FloatArray,
-    stretch: NDArray[np.int64],
-    known: NDArray[np.bool_],
+    stretch: IntArray,
+    known: Mask,
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """Return changes of gain and width, their standard deviations, and the rms errors (m) before and after the fit."""
     if np.count_nonzero(known) < FEWEST:

@@ -9,9 +9,8 @@ import osqp
 import scipy.linalg
 import scipy.sparse as sp
 import scipy.sparse.linalg
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.identification.bases import Basis
@@ -101,7 +100,7 @@ class Problem:
     design: Design
     y: FloatArray  # in units of `scale`, (N,)
     weights: FloatArray  # 0: not fitted
-    judged: NDArray[np.bool_]  # can be held out
+    judged: Mask  # can be held out
     rough: FloatArray  # roughness matrix, (p, p)
     scale: float  # m
     gain: float  # m/V, mean
@@ -181,7 +180,7 @@ class Problem:
             problem = replace(self, weights=weights)
         return problem
 
-    def folds(self) -> list[NDArray[np.int64]]:
+    def folds(self) -> list[IntArray]:
         """Return the sample indices of each fold."""
         # The first rise is part of every fit: it occurs only once in a record, so no other part can predict it.
         return blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise)
@@ -232,15 +231,13 @@ class Problem:
         return float(np.sqrt(max(squares, 0.0) / total)) * self.scale
 
 
-def blocked_folds(allowed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+def blocked_folds(allowed: Mask) -> list[IntArray]:
     """Return the sample indices of each fold, from the mask `allowed`; a fold is a set of blocks across the record."""
     blocks = np.array_split(np.flatnonzero(allowed), FOLDS * BLOCKS_OF_FOLD)
     return [np.concatenate(blocks[fold::FOLDS]) for fold in range(FOLDS)]
 
 
-def held_out_errors(
-    samples: Samples, allowed: NDArray[np.bool_], predict: Callable[[NDArray[np.bool_]], FloatArray]
-) -> FloatArray:
+def held_out_errors(samples: Samples, allowed: Mask, predict: Callable[[Mask], FloatArray]) -> FloatArray:
     """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit."""
     # `predict` takes the mask of samples to be fitted, and returns the displacement of all (m).
     errors = np.full(samples.v.size, np.nan)

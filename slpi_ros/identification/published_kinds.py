@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.hysteresis.multi_slope import (
     BACK,
@@ -81,7 +81,7 @@ def least_iterations(samples: int, all_samples: int) -> int:
 
 
 def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
-    def predict(kept: NDArray[np.bool_]) -> FloatArray:
+    def predict(kept: Mask) -> FloatArray:
         return _predict(*fit_loops(samples, kept, at_rest=at_rest), samples.v)
 
     loops, offset = fit_loops(samples, samples.fitted, at_rest=at_rest)
@@ -108,7 +108,7 @@ def _predict(loops: SeparatedLoops, offset: float, v: FloatArray) -> FloatArray:
 
 
 def fit_loops(
-    samples: Samples, fitted: NDArray[np.bool_], *, at_rest: bool, thresholds: FloatArray | None = None
+    samples: Samples, fitted: Mask, *, at_rest: bool, thresholds: FloatArray | None = None
 ) -> tuple[SeparatedLoops, float]:
     """Fit a PI model to each separated loop of a record; return the loops and the displacement at rest (m)."""
     # Play operators start in their state after a reversal or, as published, `at_rest`.
@@ -159,7 +159,7 @@ class Plays(NamedTuple):
 def fit_plays(
     drive: FloatArray,
     y: FloatArray,
-    used: NDArray[np.bool_],
+    used: Mask,
     thresholds: FloatArray,
     run_in: float | None,
     *,
@@ -187,7 +187,7 @@ def fit_plays(
 class _SingleLoopFit:
     """Fit of one loop in coordinates relative to its vertex."""
 
-    def __init__(self, loop: Loop, samples: Samples, fitted: NDArray[np.bool_], thresholds: FloatArray) -> None:
+    def __init__(self, loop: Loop, samples: Samples, fitted: Mask, thresholds: FloatArray) -> None:
         self._loop, self._thresholds = loop, thresholds
         path = loop.path
         self._v = loop.direction * (samples.v[path] - samples.v[loop.vertex])
@@ -359,7 +359,7 @@ def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
             "drive from the lowest voltage to the highest and back"
         )
 
-    def predict(kept: NDArray[np.bool_]) -> FloatArray:
+    def predict(kept: Mask) -> FloatArray:
         model, offset = _fit_scaled(samples, kept, largest)
         return model.along(float(samples.v[0]), offset).forward_array(samples.v)
 
@@ -377,7 +377,7 @@ def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
     )
 
 
-def in_largest_cycles(v: FloatArray) -> NDArray[np.bool_]:
+def in_largest_cycles(v: FloatArray) -> Mask:
     """Return the mask, shape (N,), of samples in cycles that reach the highest voltage of the record."""
     low, high = float(v.min()), float(v.max())
     chosen = np.zeros(v.size, dtype=bool)
@@ -390,7 +390,7 @@ def _ends(samples: Samples) -> tuple[float, float]:
     return float(samples.v.min()), float(samples.v.max())
 
 
-def _fit_scaled(samples: Samples, kept: NDArray[np.bool_], largest: NDArray[np.bool_]) -> tuple[AmplitudeScaled, float]:
+def _fit_scaled(samples: Samples, kept: Mask, largest: Mask) -> tuple[AmplitudeScaled, float]:
     """Return the model fitted to the samples `kept`, and the initial displacement (m)."""
     part = replace(samples, fitted=kept & largest)
     problem = Problem.pose([part], MultiSlopeBasis.over(*_ends(samples)))

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import IdentificationError
 from slpi_ros.identification import bad_readings, drive, signal_statistics
 from slpi_ros.identification.drive import SPEED_FACTOR
@@ -231,8 +230,8 @@ def _signal(
     noise: float,
     digit: float,
     repeats: bad_readings.Repeats,
-    outliers: NDArray[np.int64],
-    explained: NDArray[np.int64] | tuple[()] = (),
+    outliers: IntArray,
+    explained: IntArray | tuple[()] = (),
 ) -> SignalQuality:
     low, high = float(x.min()), float(x.max())
     several = repeats.where(repeats.length > 2)
@@ -253,9 +252,7 @@ def _signal(
     )
 
 
-def _drive(
-    t: FloatArray, v: FloatArray, at: NDArray[np.int64], voltage: SignalQuality, wiped: float | None
-) -> DriveQuality:
+def _drive(t: FloatArray, v: FloatArray, at: IntArray, voltage: SignalQuality, wiped: float | None) -> DriveQuality:
     """Return the properties of a voltage, shape (N,), at samples `at` of a record."""
     runs = drive.Runs.of(t, v, drive.smallest_turn(v, voltage.noise))
     near = NEAR_END * np.ptp(v)

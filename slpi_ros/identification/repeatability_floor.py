@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn
@@ -108,7 +107,7 @@ class Move(NamedTuple):
     signal: FloatArray
 
 
-def _difference(own: Move, other: Move, within: NDArray[np.bool_], same: float) -> FloatArray:
+def _difference(own: Move, other: Move, within: Mask, same: float) -> FloatArray:
     """Return the difference (m) of two moves at samples `within`; empty if their voltages differ by over `same` (V)."""
     t, v, signal = (x[within] for x in own)
     if min(t.size, other.t.size) < _FEWEST_OF_MOVE:

@@ -5,9 +5,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.identification.bad_readings import (
@@ -45,7 +44,7 @@ class Samples:
 
     v: FloatArray  # V, measurement noise removed, also where not fitted
     y: FloatArray  # m, finite where fitted
-    fitted: NDArray[np.bool_]
+    fitted: Mask
     history: int = 0
     mixed: int = 0  # samples not fitted because they are mixed, see `bad_readings.Mixed`
     side: int = 0  # of the neighbour that they are mixed with
@@ -66,7 +65,7 @@ class Samples:
             history=before.size + self.history,
         )
 
-    def only(self, chosen: NDArray[np.bool_]) -> "Samples":
+    def only(self, chosen: Mask) -> "Samples":
         """Return all samples, with the fit restricted to the mask `chosen`, shape (N,)."""
         return replace(self, fitted=self.fitted & chosen)
 
@@ -97,7 +96,7 @@ class Samples:
         kept = self.thinning(most)
         return self if kept.all() else self.at(kept)
 
-    def thinning(self, most: int) -> NDArray[np.bool_]:
+    def thinning(self, most: int) -> Mask:
         """Return the mask, shape (N,), of the samples that `thinned` keeps."""
         every = max(1, round(self.v.size / most))
         kept = np.zeros(self.v.size, dtype=bool)
@@ -108,7 +107,7 @@ class Samples:
             kept[ends[ends < self.v.size]] = kept[np.maximum(ends - 1, 0)] = True
         return kept
 
-    def at(self, kept: NDArray[np.bool_]) -> "Samples":
+    def at(self, kept: Mask) -> "Samples":
         """Return only the samples selected by the mask `kept`, shape (N,)."""
         history = int(np.count_nonzero(kept[: self.history]))
         return replace(self, v=self.v[kept], y=self.y[kept], fitted=self.fitted[kept], history=history)
@@ -126,7 +125,7 @@ class Samples:
         return float(v[1] - v[0]), float(y[1] - y[0])
 
     @property
-    def wiped(self) -> NDArray[np.bool_]:
+    def wiped(self) -> Mask:
         """Mask of the samples after visits to both ends of the voltage range, which reset the state, shape (N,)."""
         low, high = self.v.min(), self.v.max()
         margin = NEAR_END * (high - low)
@@ -143,7 +142,7 @@ class Samples:
         return bool(way @ self.wiped[self.history :] >= 0.5 * way.sum())
 
     @property
-    def judged(self) -> NDArray[np.bool_]:
+    def judged(self) -> Mask:
         """Mask of the samples that can be held out, (N,)."""
         # Those before the reset of the hysteresis state depend on the initial history: not if `mostly_wiped`.
         return self.fitted & self.wiped if self.mostly_wiped else self.fitted
@@ -168,7 +167,7 @@ def select_samples(record: Record, axis: str, start: float | None, stop: float |
 
 def select_thinned(
     record: Record, axis: str, start: float | None, stop: float | None, most: int
-) -> tuple[Samples, NDArray[np.int64]]:
+) -> tuple[Samples, IntArray]:
     """Return what `thinned` returns for the samples of `select_samples`, and their indices in the record."""
     # A record longer than `WINDOW` is examined in windows, which need little memory: noise, resolution and outliers are
     # those of each window.
@@ -246,7 +245,7 @@ def _require_enough(record: Record, axis: str, count: int, start: float | None, 
         )
 
 
-def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> Samples:
+def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: str) -> Samples:
     """Return samples with a finite voltage without outliers, stuck and mixed readings, and noise of the voltage."""
     # The mask `fitted` has at least `FEWEST` samples and is modified in place. `where` names the record in the error of
     # signals without motion; "" for a part of a record, which is not tested.
@@ -289,7 +288,7 @@ def bounds(record: Record, start: float | None, stop: float | None) -> tuple[int
     return first, until
 
 
-def _require_motion(v: FloatArray, y: FloatArray, fitted: NDArray[np.bool_], where: str) -> None:
+def _require_motion(v: FloatArray, y: FloatArray, fitted: Mask, where: str) -> None:
     """Raise RecordError for constant, implausible or opposing signals, IdentificationError if there is no reversal."""
     turns = bool((v[1:] > v[:-1]).any() and (v[1:] < v[:-1]).any())
     if not fitted.all():

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import IntArray
 from slpi_ros.io.cdr import ByteArray
 from slpi_ros.io.input_limits import BAG_BYTES, CHUNK_BYTES, MESSAGE_BYTES, LimitError, most_unpacked, open_input
 
@@ -33,7 +33,7 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 class MessageBlock:
     """Block of consecutive serialised messages of one topic."""
 
-    logged: NDArray[np.int64]  # ns, (n,), recording times
+    logged: IntArray  # ns, (n,), recording times
     messages: ByteArray | list[bytes]  # (n, L) if all have the same length L
 
     @classmethod
@@ -228,7 +228,7 @@ class _McapFile:
             raise LimitError("the chunks unpack to more than any recording")
         return records
 
-    def _walk(self, records: bytes) -> NDArray[np.int64]:
+    def _walk(self, records: bytes) -> IntArray:
         """Return the offsets of the wanted messages in a chunk without index."""
         offsets, position = [], 0
         while position < len(records):
@@ -242,7 +242,7 @@ class _McapFile:
         return np.array(offsets, np.int64)
 
 
-def _indexed(indexes: list[bytes], channels: set[int]) -> NDArray[np.int64]:
+def _indexed(indexes: list[bytes], channels: set[int]) -> IntArray:
     """Return the offsets of the wanted messages according to the indexes of a chunk, in ascending order."""
     offsets = [np.empty(0, np.int64)]
     for index in indexes:
@@ -269,7 +269,7 @@ def _records_of_chunk(chunk: bytes) -> bytes:
     return records
 
 
-def _gather(records: ByteArray, offsets: NDArray[np.int64], channels: set[int]) -> MessageBlock:
+def _gather(records: ByteArray, offsets: IntArray, channels: set[int]) -> MessageBlock:
     """Return the messages at the `offsets`, shape (n,), in the records of a chunk."""
     heads = _rows(records, offsets, _MESSAGE_HEAD.itemsize).view(_MESSAGE_HEAD)[:, 0]
     if (heads["op"] != _MESSAGE).any() or not np.isin(heads["channel"], list(channels)).all():
@@ -289,7 +289,7 @@ def _gather(records: ByteArray, offsets: NDArray[np.int64], channels: set[int]) 
     )
 
 
-def _rows(data: ByteArray, starts: NDArray[np.int64], length: int) -> ByteArray:
+def _rows(data: ByteArray, starts: IntArray, length: int) -> ByteArray:
     """Return `length` bytes from each of the ascending offsets `starts`, shape (n, length)."""
     if starts[0] < 0 or starts[-1] + length > data.size:
         raise EOFError("a message reaches beyond its chunk")

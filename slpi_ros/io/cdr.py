@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.io.input_limits import MOST_AXES, require_count
 
 ByteArray = NDArray[np.uint8]
@@ -31,7 +32,7 @@ class CdrLayout:
     """Offsets of the numbers in messages of one layout."""
 
     template: ByteArray  # (M,), one message of this layout
-    fixed: NDArray[np.bool_]  # (M,), bytes that all messages share: neither numbers nor padding
+    fixed: Mask  # (M,), bytes that all messages share: neither numbers nor padding
     fields: Mapping[str, tuple[Any, int]]  # NumPy type and offset by name
 
     def decode(self, rows: ByteArray) -> NDArray[np.void] | None:
@@ -131,7 +132,7 @@ class CdrReader:
         self._pass(8 * number, f"{number}d", name, (self.order + "f8", (number,)))
         return number, begin
 
-    def array(self, name: str) -> NDArray[np.float64]:
+    def array(self, name: str) -> FloatArray:
         """Return the doubles that were read with the field name `name`, shape (n,)."""
         (dtype, (count,)), offset = self._fields[name]
         return np.frombuffer(self.data, dtype, count, offset).astype(np.float64)

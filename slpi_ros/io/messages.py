@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.cdr import CdrLayout, CdrReader, serialise
 from slpi_ros.io.input_limits import MOST_AXES, LimitError, require_count
@@ -73,7 +73,7 @@ class Message:
     stamp_ns: int  # 0 without header
     frame_id: str
     names: tuple[str, ...]  # of the columns, K
-    values: Mapping[str, NDArray[np.float64]]  # by field; n < K: without the last columns
+    values: Mapping[str, FloatArray]  # by field; n < K: without the last columns
     layout: CdrLayout  # of all messages with the same strings and lengths
 
     def is_regular(self) -> bool:
@@ -94,9 +94,9 @@ def read_message(data: bytes, msgtype: str) -> Message:
 
 
 def encode_joint_states(
-    stamp_ns: NDArray[np.int64],
-    position: NDArray[np.float64],
-    effort: NDArray[np.float64],
+    stamp_ns: IntArray,
+    position: FloatArray,
+    effort: FloatArray,
     names: tuple[str, ...],
     frame_id: str = "",
 ) -> list[bytes]:
@@ -173,8 +173,8 @@ class TrajectoryArrays:
 
     start_ns: int  # header stamp
     names: tuple[str, ...]
-    time_from_start_ns: NDArray[np.int64]  # (N,)
-    positions: NDArray[np.float64]  # m, (N, names)
+    time_from_start_ns: IntArray  # (N,)
+    positions: FloatArray  # m, (N, names)
 
 
 def decode_trajectory(data: bytes) -> TrajectoryArrays | None:

@@ -11,7 +11,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.input_limits import LONGEST_NAME, MOST_AXES
 
@@ -55,7 +55,7 @@ def each_block(*columns: NDArray[Any]) -> Iterator[tuple[NDArray[Any], ...]]:
         release(*columns)
 
 
-def first_step_back(times: NDArray[np.int64]) -> int | None:
+def first_step_back(times: IntArray) -> int | None:
     """Return the first sample whose time is before that of the preceding one, or None."""
     for number, (part,) in enumerate(each_block(times)):
         back = part[1:] < part[:-1]
@@ -94,7 +94,7 @@ class Record:
         If the arrays do not have the same length or the axes differ.
     """
 
-    time_ns: NDArray[np.int64]
+    time_ns: IntArray
     voltage: Mapping[str, FloatArray]
     displacement: Mapping[str, FloatArray]
     source: str = "record"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import RecordError
 from slpi_ros.io.columns import is_unit, joined, printable
 from slpi_ros.io.input_limits import (
@@ -130,7 +130,7 @@ class CsvTable:
                 f"{self.path}: line {reader.line_num + self.header_line}: not a table ({error})"
             ) from error
 
-    def require(self, good: NDArray[np.bool_], column: str, values: FloatArray, rule: str) -> None:
+    def require(self, good: Mask, column: str, values: FloatArray, rule: str) -> None:
         """Raise RecordError, with the `rule`, for the first of the values (N,) that is not `good`."""
         if not good.all():
             row = int(np.argmin(good))
@@ -293,7 +293,7 @@ class MatTable:
                 )
         return {column: vector.astype(np.float64) for column, vector in values.items()}
 
-    def require(self, good: NDArray[np.bool_], column: str, values: FloatArray, rule: str) -> None:
+    def require(self, good: Mask, column: str, values: FloatArray, rule: str) -> None:
         """Raise RecordError for the first value that is not good; see `CsvTable.require`."""
         if not good.all():
             at = int(np.argmin(good))

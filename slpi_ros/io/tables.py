@@ -7,9 +7,8 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.columns import Column, ColumnChoice, ColumnOptions, choose_columns, match_column
@@ -131,12 +130,12 @@ def _ending(suffix: str) -> str:
     return f"_{suffix.strip('_')}"
 
 
-def _nanoseconds(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> NDArray[np.int64]:
+def _nanoseconds(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> IntArray:
     """Return time stamps (ns); if the first time is negative, all are shifted to start at 0, as messages require."""
     table.require(np.isfinite(seconds), column, seconds, "every row needs a time")
     table.require(np.abs(seconds) < _TIME_END, column, seconds, "more than 2^31 s; is the unit right?")
     _require_order(seconds, column, table)
-    stamps: NDArray[np.int64] = np.rint((seconds - min(seconds[0], 0.0)) * 1e9).astype(np.int64)
+    stamps: IntArray = np.rint((seconds - min(seconds[0], 0.0)) * 1e9).astype(np.int64)
     return stamps
 
 

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import RecordError, SlpiError, UsageError
@@ -232,7 +232,7 @@ def _as_array(values: ArrayLike, what: str) -> FloatArray:
         raise UsageError(f"{what} is not an array of numbers: {error}") from None
 
 
-def held_message(held: NDArray[np.bool_]) -> str:
+def held_message(held: Mask) -> str:
     """Return the message for unreachable displacements: number and first sample."""
     return (
         f"{np.count_nonzero(held)} of {held.size} desired displacements need a voltage beyond the limits, "

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.errors import shown
 
 MEASURED, DESIRED, NOISE = "#8a97a5", "#1b2733", "#c9d2da"
@@ -23,8 +22,6 @@ CAUSES = ("#3b6ea5", "#d99a26", "#8d5fb0", "#1f9aa6", "#b5467d", "#7a6a53")
 # Sequential colour scales for counts and errors: dark on white, suitable for colour blindness.
 SCALE = ((0.0, "#c3d8ea"), (0.5, "#5b8db8"), (1.0, "#173a5c"))
 ERROR_SCALE = ((0.0, "#c9e4d8"), (0.5, "#e0b04a"), (1.0, "#a8321c"))
-
-IntArray = NDArray[np.int64]
 
 # Largest number of points of a line, and of dots of a scatter plot, each of which is an element of the page.
 LINE_POINTS, CLOUD_POINTS = 5000, 1500
@@ -284,7 +281,7 @@ class Chart:
         return {f"xaxis{number}": across, f"yaxis{number}": up}
 
 
-def _alone(y: FloatArray) -> NDArray[np.bool_]:
+def _alone(y: FloatArray) -> Mask:
     """Return a mask of the finite points, shape (N,), without a finite neighbour."""
     finite = np.pad(np.isfinite(y), 1)
     return np.asarray(finite[1:-1] & ~finite[:-2] & ~finite[2:])

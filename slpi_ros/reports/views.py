@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
-from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn
@@ -36,8 +35,6 @@ from slpi_ros.reports.chart import (
     thin_line,
 )
 from slpi_ros.reports.page import Page
-
-IntArray = NDArray[np.int64]
 
 RISING, FALLING = COLOURS[3], COLOURS[0]
 OPENED = Quantity("displacement - straight line", "µm", 1e6, ".4f")
@@ -179,7 +176,7 @@ def _add_loops(
     curves: Sequence[tuple[Series, float]],
     across: FloatArray,
     line: FloatArray,
-    at: NDArray[np.int64],
+    at: IntArray,
     chosen: Mask,
 ) -> None:
     """Add curves with line widths at the `chosen` samples over `across`, and their deviation from `line`."""

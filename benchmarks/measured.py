@@ -12,7 +12,7 @@ import numpy as np
 
 import slpi_ros
 from slpi_ros.identification.fit import KINDS
-from slpi_ros.identification.repeatability_floor import floor_of
+from slpi_ros.identification.repeatability import repeatability_of
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 from slpi_ros.papers.measured import CASES, score
@@ -61,7 +61,7 @@ def _row(name: str, record: Record, axis: str, until: float, mark: float) -> Non
         error = model.simulate(record.t[driven], {axis: v[driven]})[axis] - y[driven]
         predicted.append(1e6 * float(np.sqrt(np.nanmean(error[record.t[driven] >= until] ** 2))))
         left_out.append(1e6 * model.axes[axis].quality.held_out_rms)
-    floor = floor_of(record.t, v, y)
+    floor = repeatability_of(record.t, v, y)
     asked = f"   mark {mark:.3f}" if mark else ""
     print(
         f"{name + ' ' + axis + f', {until:g} s on':<30}{predicted[0]:8.4f}{predicted[1]:8.4f}"

@@ -30,7 +30,9 @@ def slpi(*arguments):
 def assert_in_form(text):
     """Check that a verdict comes first, few lines follow, and a command comes last."""
     first, *lines, last = text.splitlines()
-    assert first.startswith(("GOOD: ", "LIMITED BY: ")) and len(lines) <= MOST_LINES and last.startswith("next: slpi ")
+    assert (
+        first.startswith(("GOOD: ", "ERROR SOURCES: ")) and len(lines) <= MOST_LINES and last.startswith("next: slpi ")
+    )
 
 
 def one_line(result, code):
@@ -393,7 +395,7 @@ def test_the_doctor_checks_files_without_ros(folder, tmp_path):
     (tmp_path / "half.json").write_text((folder / "pi.json").read_text()[:300])
     for wrong in (("--voltage-min", 0, "--voltage-max", 40), ("--model", tmp_path / "half.json"), ("--topic", "other")):
         done = slpi(*command, *wrong)
-        assert done.returncode == 1 and done.stdout.startswith("MEND: ") and "\nmend " in done.stdout
+        assert done.returncode == 1 and done.stdout.startswith("FAILED: ") and "\nfailed " in done.stdout
         assert done.stdout.splitlines()[-1].startswith("next: slpi doctor ") and not done.stderr
     for wrong in (("--voltage-min", 0), ("--voltage-min", 5, "--voltage-max", 5), ("--seconds", 0)):
         assert one_line(slpi(*command, *wrong), 2)

@@ -102,7 +102,7 @@ def test_a_hidden_hum_is_named_and_mended(folder, hidden, diagnosed):
     assert parameters["lines"][0]["frequency"] == pytest.approx(truth.parameters["frequency"], rel=1e-2)
     assert parameters["lines"][0]["amplitude"] == pytest.approx(truth.parameters["amplitude"], rel=0.1)
     told = diagnosed.stdout.splitlines()
-    assert told[0].startswith("LIMITED BY: axis x: hum ")
+    assert told[0].startswith("ERROR SOURCES: axis x: hum ")
     assert told[1] == "axis x: verdict: named" and told[2] == f"axis x: {found['summary']}"
     assert told[3] == f"axis x: hum: {found['effects'][0]['evidence']}"
     assert told[-2].startswith(str(folder / "out" / "report.html"))
@@ -315,8 +315,9 @@ def told(folder, after_rms=2e-9):
     axis = AxisDiagnosis(
         verdict=AMBIGUOUS,
         summary="lag or delay.",
-        floor_rms=1e-9,
-        floor_source="repeats",
+        noise_rms=1e-9,
+        repeatability_rms=1e-9,
+        repeatability_source="repeats",
         given_rms=9e-9,
         before_rms=8e-9,
         after_rms=after_rms,
@@ -333,7 +334,7 @@ def test_what_cannot_be_told_apart_comes_with_the_next_experiment(slpi, folder, 
     code, said, _ = slpi("diagnose", folder / "hum", "--model", folder / "model.json", "-o", tmp_path / "out")
     lines = ["ambiguous", "lag or delay.", "lag: It comes 15 ms late.", "Go faster."]
     first, *told_lines, _, _ = said.splitlines()
-    assert code == 0 and first.startswith("LIMITED BY: axis x: lag or delay")
+    assert code == 0 and first.startswith("ERROR SOURCES: axis x: lag or delay")
     assert all(line.startswith("axis x: ") for line in told_lines)
     assert all(line.endswith(end) for line, end in zip(told_lines, lines, strict=True))
     effect = document_in(tmp_path / "out")["axes"]["x"]["effects"][0]
@@ -376,7 +377,7 @@ def test_a_stage_that_has_changed_is_told_from_a_clean_one(diagnose, clean, tmp_
     assert (code, complaints) == (0, "")
     found = document_in(tmp_path / "out")["axes"]["x"]
     assert found["effects"] == [] and found["given_rms_m"] > 3.0 * found["before_rms_m"]
-    assert "+3 %" in found["summary"] and found["summary"] in said and said.startswith("LIMITED BY: axis x: ")
+    assert "+3 %" in found["summary"] and found["summary"] in said and said.startswith("ERROR SOURCES: axis x: ")
     assert "slpi refit" in found["next_experiment"]
 
 
@@ -395,7 +396,7 @@ def test_digits_without_noise_are_explained_by_nothing(clean):
     record = replace(clean, displacement={"x": np.round(2e-7 * clean.voltage["x"], 11)})
     found = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"]
     assert found.verdict == "nothing_found"
-    assert 0.5e-12 < found.floor_rms < 10e-12
+    assert 0.5e-12 < found.repeatability_rms < 10e-12
 
 
 def test_records_of_two_stages_are_refused(slpi, folder, tmp_path, hidden, clean):

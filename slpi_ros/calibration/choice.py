@@ -8,7 +8,7 @@ from slpi_ros.diagnosis.result import AMBIGUOUS, UNEXPLAINED, AxisDiagnosis
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.effects import separating
-from slpi_ros.model.axis_model import ABOVE_FLOOR
+from slpi_ros.model.axis_model import ABOVE_NOISE
 
 # A cause that is named is worth this part of its share until the drive for it has been recorded; nothing below
 # LEAST is worth a record. No drive is recorded more often than MOST.
@@ -61,10 +61,10 @@ def _promises(found: AxisDiagnosis | None) -> list[tuple[str, float, str]]:
                 drive = separating((named.name, *named.alternatives))
                 others = ", ".join(named.alternatives)
                 offers.append((drive, named.share_of_residual, f"{named.name} may as well be {others}"))
-    if found.verdict == UNEXPLAINED and found.after_rms > ABOVE_FLOOR * found.floor_rms:
-        share = 1.0 - (found.floor_rms / found.after_rms) ** 2
+    if found.verdict == UNEXPLAINED and found.after_rms > ABOVE_NOISE * found.repeatability_rms:
+        share = 1.0 - (found.repeatability_rms / found.after_rms) ** 2
         offers.append((CALIBRATION_DRIVE, share, "an error that no known cause explains; more loops of every size"))
-    if found.after_rms > ABOVE_FLOOR * found.floor_rms:
+    if found.after_rms > ABOVE_NOISE * found.repeatability_rms:
         for named in found.effects:
             if not named.alternatives:
                 share = CONFIRMED * named.share_of_residual

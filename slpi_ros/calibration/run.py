@@ -243,7 +243,7 @@ class _Calibration:
         count = len(self._records)
         self._begin(f"diagnosing {count} records")
         diagnosis = _diagnosed(self._records, first)
-        self._floors = {name: found.floor_rms for name, found in diagnosis.axes.items()}
+        self._floors = {name: found.repeatability_rms for name, found in diagnosis.axes.items()}
         finding = "; ".join(f"axis {name}: {found.summary}" for name, found in diagnosis.axes.items())
         self._steps.append(
             Step("diagnose", 0.0, f"causes of the error, judged on each of {count} records held out in turn", finding)

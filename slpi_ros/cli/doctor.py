@@ -37,7 +37,7 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.io.bag_reader import read_bag
     from slpi_ros.model.document import load_model
     from slpi_ros.reports.doctor import (
-        MEND,
+        FAILED,
         NOTE,
         Check,
         check_graph,
@@ -62,16 +62,16 @@ def _run(options: Namespace) -> Result:
             model = load_model(options.model)
             checks += check_model(model, limits)
         except SlpiError as error:
-            checks.append(Check(MEND, str(error)))
+            checks.append(Check(FAILED, str(error)))
     for bag in options.bags:
         report_progress(f"reading {bag}")
         try:
             checks += check_record(read_bag(bag, options.topic), model, limits)
         except SlpiError as error:
-            checks.append(Check(MEND, str(error)))
+            checks.append(Check(FAILED, str(error)))
     if options.no_ros or find_spec("rclpy") is None:
         why = "--no-ros" if options.no_ros else "no rclpy; source the setup file of ROS 2 to check a running graph"
-        checks.append(Check(NOTE if files or options.no_ros else MEND, f"ROS: not checked: {why}"))
+        checks.append(Check(NOTE if files or options.no_ros else FAILED, f"ROS: not checked: {why}"))
     else:
         from slpi_ros.nodes.graph_probe import probe
 
@@ -82,7 +82,7 @@ def _run(options: Namespace) -> Result:
         else:
             checks.append(Check(NOTE, "ROS: no node is running; only the files were checked"))
     verdict, lines, details = described(checks)
-    well = not any(check.level == MEND for check in checks)
+    well = not any(check.level == FAILED for check in checks)
     if not well:
         next_command = command_line("slpi", "doctor", *options.bags, *(["--model", options.model] if model else []))
     elif options.bags and model is None:
@@ -97,7 +97,7 @@ def _run(options: Namespace) -> Result:
 
 
 COMMAND = Command(
-    "check bags, a model and a running ROS graph, and say what to mend",
+    "check bags, a model and a running ROS graph, and say what to do",
     "slpi doctor calibration --model model.json",
     _add_options,
     _run,

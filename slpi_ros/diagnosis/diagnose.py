@@ -13,16 +13,17 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, NO_WORSE, Selection, counts, is_own, seen, select
+from slpi_ros.diagnosis.selection import BIAS, FINEST, NO_WORSE, Selection, counts, is_own, seen, select
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.free_run import FreeRun, free_run, likely_starts, rms_of
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
-from slpi_ros.identification.repeatability_floor import Floor, floor_of
+from slpi_ros.identification.repeatability import Repeatability, repeatability_of
+from slpi_ros.identification.signal_statistics import white_noise
 from slpi_ros.io.record import Record, common_stage
-from slpi_ros.model.axis_model import ABOVE_FLOOR, AxisModel, Start
+from slpi_ros.model.axis_model import ABOVE_NOISE, AxisModel, Start
 from slpi_ros.model.coverage import fastest
 from slpi_ros.model.sensor import IDEAL, corrected
 from slpi_ros.model.stage_model import StageModel
@@ -148,8 +149,8 @@ def _diagnose_axis(
         selection = replace(selection, now=selection.base)
     extension = extension or _Extension(model, [named.name for named in selection.named], runs)
     outcomes = _outcomes(runs, extension.runs, selection.now)
-    floor, alike = _floor(selection.now), driven_alike(records, axis)
-    found = judged(selection, floor, before, given, outcomes, extension.left_out, alike)
+    noise, repeats, alike = _noise(selection.now), _repeatability(selection.now), driven_alike(records, axis)
+    found = judged(selection, noise, repeats, before, given, outcomes, extension.left_out, alike)
     return found, extension.model
 
 
@@ -173,7 +174,7 @@ def _extension(model: AxisModel, selection: Selection, given: Given, source: str
 def _extended_by(model: AxisModel, selection: Selection, left_out: Sequence[str], source: str) -> _Extension:
     """Return the extension of a model by the effects of a selection but those `left_out`."""
     final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
-    extended = _extended(model, final, _floor(selection.now), source)
+    extended = _extended(model, final, source)
     return _Extension(extended, left_out, _runs(extended, selection.now))
 
 
@@ -184,7 +185,10 @@ def _of_another_kind(selection: Selection) -> bool:
 
 def _more_than_noise(selection: Selection) -> bool:
     """Return whether there are effects, and they leave more than what does not repeat."""
-    return bool(selection.named) and selection.now.held_out.rms_of_records > ABOVE_FLOOR * _floor(selection.now).rms
+    return (
+        bool(selection.named)
+        and selection.now.held_out.rms_of_records > ABOVE_NOISE * _repeatability(selection.now).rms
+    )
 
 
 def _share_left(selection: Selection) -> float:
@@ -246,14 +250,26 @@ def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
     return select(base, family) if counts(selection.now.held_out, with_effects.held_out) else selection
 
 
-def _floor(now: Explanation) -> Floor:
-    """Return the largest repeatability floor of the records, between the rounding error and the held-out error."""
-    floors = []
-    for part, rows in zip(now.evidence.parts, now.evidence.slices, strict=True):
-        residual = np.where(part.used, now.residual[rows], np.nan)
-        floors.append(floor_of(part.t, part.v, part.y, residual))
-    worst = max(floors, key=lambda floor: floor.rms)
+def _noise(now: Explanation) -> float:
+    """Return the sensor noise (m rms): the white part of the residual, the largest of the records.
+
+    At least the rounding error, and the resolution of the best of sensors.
+    """
+    finest = FINEST * float(np.ptp(now.y[now.used]))
+    return max([finest, now.evidence.rounding, *(white_noise(residual) for _, residual in _residuals(now))])
+
+
+def _repeatability(now: Explanation) -> Repeatability:
+    """Return the largest repeatability of the records, between the rounding error and the held-out error."""
+    repeats = [repeatability_of(part.t, part.v, part.y, residual) for part, residual in _residuals(now)]
+    worst = max(repeats, key=lambda one: one.rms)
     return replace(worst, rms=min(max(worst.rms, now.evidence.rounding), now.held_out.rms))
+
+
+def _residuals(now: Explanation) -> list[tuple[Part, FloatArray]]:
+    """Return the data of each record with its residual (m), NaN at samples that are not used."""
+    parts = zip(now.evidence.parts, now.evidence.slices, strict=True)
+    return [(part, np.where(part.used, now.residual[rows], np.nan)) for part, rows in parts]
 
 
 def _run(model: AxisModel, part: Part, *, of_record: bool) -> FreeRun:
@@ -383,7 +399,7 @@ def _outcomes(runs: Sequence[FreeRun], runs_after: Sequence[FreeRun], now: Expla
     )
 
 
-def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> AxisModel:
+def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
     """Return the model with jointly fitted hysteresis and effects, in the initial state of the first record."""
     evidence, first = now.evidence, now.evidence.parts[0]
     hysteresis, starts = now.hysteresis()
@@ -406,7 +422,7 @@ def _extended(model: AxisModel, now: Explanation, floor: Floor, source: str) -> 
             rms=float(np.sqrt(np.mean(errors**2))),
             maximum=float(np.abs(errors).max()),
             held_out_rms=now.held_out.rms,
-            floor_rms=floor.rms,
+            floor_rms=_noise(now),
             samples=y.size,
             source=source,
             fastest=max(fastest(part.t[part.used], part.v[part.used]) for part in evidence.parts),

@@ -8,6 +8,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord
+from slpi_ros.diagnosis.fingerprint import HINTS, Left, Signals, fingerprint
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import Evidence, one_speed
 from slpi_ros.diagnosis.selection import (
@@ -22,8 +23,8 @@ from slpi_ros.diagnosis.selection import (
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
 from slpi_ros.excitation.effects import for_effect, separating
-from slpi_ros.identification.repeatability_floor import Floor
-from slpi_ros.model.axis_model import ABOVE_FLOOR, RESOLUTION
+from slpi_ros.identification.repeatability import Repeatability
+from slpi_ros.model.axis_model import ABOVE_NOISE
 from slpi_ros.model.stage_model import StageModel
 
 OTHER_FREQUENCIES = "This record has one drive frequency; other frequencies tell these apart. "
@@ -45,7 +46,8 @@ AS_BEFORE = 1.1
 CHANGED, LEAST_CHANGE, CERTAIN = 1e-3, 3e-3, 5.0
 
 SCHEMA = "slpi_ros/diagnosis/2"
-NAMED, AMBIGUOUS, UNEXPLAINED, NOTHING_FOUND = "named", "ambiguous", "unexplained", "nothing_found"
+NAMED, PARTLY_NAMED, AMBIGUOUS = "named", "partly_named", "ambiguous"
+UNEXPLAINED, NOTHING_FOUND = "unexplained", "nothing_found"
 
 
 @dataclass(frozen=True)
@@ -113,16 +115,18 @@ class AxisDiagnosis:
     # `before_rms` and `after_rms` are of the refitted hysteresis without and with effects, on held-out blocks or, if
     # there are several records, on held-out records.
 
-    verdict: str  # `NAMED`, `AMBIGUOUS`, `UNEXPLAINED` or `NOTHING_FOUND`
+    verdict: str  # `NAMED`, `PARTLY_NAMED`, `AMBIGUOUS`, `UNEXPLAINED` or `NOTHING_FOUND`
     summary: str  # a few sentences
-    floor_rms: float  # m, repeatability, which no model can explain
-    floor_source: str
+    noise_rms: float  # m, sensor noise: the white part of the residual
+    repeatability_rms: float  # m, how much repetitions of a motion differ, vibration and drift included
+    repeatability_source: str  # what it was estimated from
     given_rms: float  # m, free-run, of the given model as it is, without the offset of each record
     before_rms: float  # m, held-out, free-run
     after_rms: float  # m, held-out, free-run
     effects: tuple[NamedEffect, ...]  # the largest gain first
     next_experiment: str | None  # recommended next recording or other action
     traces: Traces  # of the first record
+    left: tuple[Left, ...] = ()  # variables that go with what is left, the largest share first
     records: tuple[RecordOutcome, ...] = ()
     dropped: tuple[str, ...] = ()  # found on some records, but do not carry over to others
     given: "Given | None" = None
@@ -132,11 +136,13 @@ class AxisDiagnosis:
         return {
             "verdict": self.verdict,
             "summary": self.summary,
-            "floor_rms_m": self.floor_rms,
-            "floor_source": self.floor_source,
+            "floor_rms_m": self.noise_rms,
+            "repeatability_rms_m": self.repeatability_rms,
+            "repeatability_source": self.repeatability_source,
             "given_rms_m": self.given_rms,
             "before_rms_m": self.before_rms,
             "after_rms_m": self.after_rms,
+            "left": [one.to_document() for one in self.left],
             "effects": [
                 {
                     **effect_document(named.effect),
@@ -200,34 +206,39 @@ class Given:
 
 def judged(
     selection: Selection,
-    floor: Floor,
+    noise_rms: float,
+    repeatability: Repeatability,
     before_rms: float,
     given: Given,
     records: tuple[RecordOutcome, ...],
     left_out_of_model: Sequence[str],
     driven_alike: Sequence[str],
 ) -> AxisDiagnosis:
-    """Return the diagnosis of one axis; `before_rms` (m) is the held-out rms error without effects."""
+    """Return the diagnosis of one axis; `noise_rms` is that of the sensor, `before_rms` the held-out error (m)."""
     # `left_out_of_model` are identified effects that the extended model does not contain, and `driven_alike` other axes
     # with the same drive as this one.
     base, now = selection.base, selection.now
     effects = _named_effects(selection)
-    verdict = _verdict(selection, effects, floor, left_out_of_model)
+    verdict = _verdict(selection, effects, noise_rms, left_out_of_model)
+    left = _left(now)
     return AxisDiagnosis(
         verdict=verdict,
         summary=_of_given(given, selection, before_rms)
-        + _summary(verdict, selection, effects, floor, before_rms)
+        + _summary(verdict, selection, effects, noise_rms, before_rms)
+        + _goes_with(left)
         + _not_in_model(now, left_out_of_model, selection.dropped)
         + _mixed(now.evidence)
         + _cannot_tell(driven_alike),
-        floor_rms=floor.rms,
-        floor_source=floor.source,
+        noise_rms=noise_rms,
+        repeatability_rms=repeatability.rms,
+        repeatability_source=repeatability.source,
         given_rms=given.rms,
         before_rms=before_rms,
         after_rms=now.held_out.rms_of_records,
         effects=effects,
-        next_experiment=_next(verdict, selection, effects, stale=_stale(given, selection)),
+        next_experiment=_next(verdict, selection, effects, left, stale=_stale(given, selection)),
         traces=_traces(base, now),
+        left=left,
         records=records,
         dropped=selection.dropped,
         given=given,
@@ -262,7 +273,7 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) ->
     on = "records" if named.after.records.size and not named.own else "blocks"
     gained = (
         f"with it the error on held-out {on} falls from {before:.3g} to {after:.3g} nm rms "
-        f"(so much is gained by chance in {100 * chance:.2g} % of cases)"
+        f"(p = {chance:.2g}: the probability that chance gains as much)"
     )
     if not named.runner_up:
         return f"{sentence}; {gained}, and no other effect comes near"
@@ -271,22 +282,27 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) ->
     return f"{sentence}; {gained}; {instead}"
 
 
-def _resolved(selection: Selection) -> float:
-    """Return the lowest error (m) that a hysteresis model can reach."""
-    evidence = selection.now.evidence
-    return RESOLUTION * float(np.ptp(evidence.y[evidence.used]))
+def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float, left_out: Sequence[str]) -> str:
+    more_than_noise = selection.now.held_out.rms_of_records > ABOVE_NOISE * noise_rms
+    if not effects:
+        return UNEXPLAINED if more_than_noise or BIAS in selection.structures else NOTHING_FOUND
+    if left_out or any(named.alternatives for named in effects):
+        return AMBIGUOUS
+    return PARTLY_NAMED if more_than_noise else NAMED
 
 
-def _left(selection: Selection, floor: Floor) -> bool:
-    """Return whether the held-out error exceeds the noise and the accuracy of a hysteresis model."""
-    return selection.now.held_out.rms > max(ABOVE_FLOOR * floor.rms, _resolved(selection))
+def _left(now: Explanation) -> tuple[Left, ...]:
+    """Return the measured variables that go with what a joint fit leaves."""
+    evidence = now.evidence
+    records = []
+    for part, rows in zip(evidence.parts, evidence.slices, strict=True):
+        used = part.used
+        records.append(Signals(part.t[used], part.v[used], part.y[used], now.residual[rows][used]))
+    return fingerprint([record for record in records if record.t.size])
 
 
-def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor, left_out: Sequence[str]) -> str:
-    if effects:
-        return AMBIGUOUS if left_out or any(named.alternatives for named in effects) else NAMED
-    wrong_kind = BIAS in selection.structures
-    return UNEXPLAINED if wrong_kind or _left(selection, floor) else NOTHING_FOUND
+def _goes_with(left: Sequence[Left]) -> str:
+    return f" Of what is left, {left[0].evidence}." if left else ""
 
 
 def _stale(given: Given, selection: Selection) -> bool:
@@ -328,10 +344,10 @@ def _mixed(evidence: Evidence) -> str:
 
 
 def _summary(
-    verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], floor: Floor, before_rms: float
+    verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float, before_rms: float
 ) -> str:
     before, after = before_rms * 1e9, selection.now.held_out.rms_of_records * 1e9
-    left = f"{after:.3g} nm rms are left, the floor of the record is {floor.rms * 1e9:.3g} nm"
+    left = f"{after:.3g} nm rms are left, the sensor noise is {noise_rms * 1e9:.3g} nm"
     found = ", then ".join(
         f"{named.name}, which reduces {'the rest' if place else 'the error'} by {named.gain_percent:.0f} %"
         for place, named in enumerate(effects)
@@ -356,13 +372,17 @@ def _cannot_tell(driven_alike: Sequence[str]) -> str:
     return f" Axis {', '.join(driven_alike)} has the same drive: whether it couples into this one cannot be told."
 
 
-def _next(verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], *, stale: bool) -> str | None:
+def _next(
+    verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], left: Sequence[Left], *, stale: bool
+) -> str | None:
     steps = [UP_TO_DATE] if stale else []
     steps += [] if verdict == NOTHING_FOUND else [_of_structure(structure) for structure in selection.structures]
     if verdict == AMBIGUOUS:
         first = next((named for named in effects if named.alternatives), effects[0])
         steps.append(_separating((first.name, *first.alternatives), selection.now.evidence))
-    if verdict == UNEXPLAINED and not steps:
+    if verdict == PARTLY_NAMED and left:
+        steps.append(f"For what is left, {HINTS[left[0].variable]}.")
+    elif verdict in (UNEXPLAINED, PARTLY_NAMED) and not steps:
         steps.append(_more_loops(selection.now.evidence))
     return " ".join(steps) or None
 

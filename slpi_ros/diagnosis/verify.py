@@ -25,7 +25,7 @@ from slpi_ros.identification.cross_validation import (
     speed_classes,
 )
 from slpi_ros.identification.free_run import AS_WELL, Match, match, starts_at_end
-from slpi_ros.identification.repeatability_floor import floor_of
+from slpi_ros.identification.repeatability import repeatability_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import RESOLUTION, START_MEMORIES, AxisModel, StartMemory
@@ -33,8 +33,8 @@ from slpi_ros.model.coverage import rates, record_beyond
 from slpi_ros.model.stage_model import StageModel
 
 SCHEMA = "slpi_ros/verification/2"
-# Default tolerance as a multiple of the repeatability floor.
-TIMES_THE_FLOOR = 3.0
+# Default tolerance as a multiple of the repeatability.
+TIMES_REPEATABILITY = 3.0
 # A change of gain contributes to the offset if the error after fitting it is below this share of the error before.
 MOSTLY = 0.5
 # Approximate number of samples from which tables are computed.
@@ -66,8 +66,8 @@ class RecordVerification:
     history: tuple[float, ...]
     moving: ErrorPart | None  # absolute error, where there is a standing one
     standing: ErrorPart | None
-    floor_rms: float  # m, repeatability of the record
-    floor_source: str
+    repeatability_rms: float  # m
+    repeatability_source: str  # what it was estimated from
     zero_moved: bool  # the offset exceeds its uncertainty
     gain: float  # relative change of the loops' height
     width: float  # relative change of the loops' width, in addition
@@ -127,8 +127,8 @@ class RecordVerification:
             "standing_rms_m": self.standing.rms if self.standing else None,
             "limit_m": self.limit,
             "limit_of": "rms_m" if self.absolute else "rest_rms_m",
-            "floor_rms_m": self.floor_rms,
-            "floor_source": self.floor_source,
+            "repeatability_rms_m": self.repeatability_rms,
+            "repeatability_source": self.repeatability_source,
             "start": "known" if self.begins_known or self.known_from is not None else "estimated",
             "known_from_s": self.known_from,
             "offset_m": self.offset,
@@ -242,7 +242,7 @@ def verify(
         Model of the same stage. What it knows of the sensor is taken out of the readings first: all errors are those of
         the stage.
     tolerance : float, metres, optional
-        Largest absolute rms error that passes. By default three times the record's repeatability floor, but at least
+        Largest absolute rms error that passes. By default three times the record's repeatability, but at least
         the fraction `RESOLUTION` of the stroke, the best accuracy of a hysteresis model, for the error without its
         constant part.
     axes : sequence of str, optional
@@ -291,7 +291,7 @@ def verify(
                 tracking = track(
                     (record.source, name), run.t, one.v, one.measured, followed,
                     one.model - run.explained, run.assumed, zero=one.offset if one.zero_moved else 0.0,
-                    noise_rms=one.floor_rms, effects=_effects(one, record, model, name),
+                    noise_rms=one.repeatability_rms, effects=_effects(one, record, model, name),
                 )  # fmt: skip
                 one = replace(one, tracking=tracking)
             found[name].append(one)
@@ -428,9 +428,9 @@ def _spread(found: Match, first: int = 0) -> float:
 
 
 def _default_limit(axis: AxisModel, floor: float) -> float:
-    """Return the default limit of the rms error (m) for a repeatability floor (m)."""
+    """Return the default limit of the rms error (m) for a repeatability (m)."""
     low, high = axis.displacement_range
-    return max(TIMES_THE_FLOOR * floor, RESOLUTION * (high - low))
+    return max(TIMES_REPEATABILITY * floor, RESOLUTION * (high - low))
 
 
 def _judge(
@@ -439,7 +439,9 @@ def _judge(
     samples, judged, found = run.samples, run.judged, run.found
     t, v, y = run.t[judged], samples.v[judged], samples.y[judged]
     # What the model explains, such as the motion of another axis, is no noise.
-    floor = min(floor_of(t, v, y), floor_of(t, v, y, y - run.simulated[judged]), key=lambda one: one.rms)
+    floor = min(
+        repeatability_of(t, v, y), repeatability_of(t, v, y, y - run.simulated[judged]), key=lambda one: one.rms
+    )
     low, high = axis.voltage_range
     margin = 1e-6 * (high - low)
     rest = (samples.y - run.simulated)[judged]
@@ -460,8 +462,8 @@ def _judge(
         history=found.start.history,
         moving=ErrorPart.of("moving", (rest + run.constant)[~stands]) if both else None,
         standing=ErrorPart.of("standing", (rest + run.constant)[stands]) if both else None,
-        floor_rms=floor.rms,
-        floor_source=floor.source,
+        repeatability_rms=floor.rms,
+        repeatability_source=floor.source,
         zero_moved=bool(abs(run.offset) > found.offset_uncertainty),
         gain=found.gain_change,
         width=found.width_change,
@@ -520,7 +522,7 @@ def _thinned(record: RecordVerification, most: int) -> IntArray:
 
 def _effects(one: RecordVerification, record: Record, model: StageModel, name: str) -> tuple[tuple[str, ...], float]:
     """Return the effects that a diagnosis identifies, and their share of the residual; none if the error is small."""
-    if one.rest.rms <= _default_limit(model.axis(name), one.floor_rms):
+    if one.rest.rms <= _default_limit(model.axis(name), one.repeatability_rms):
         return (), 0.0
     try:
         found = diagnose(record, model, axes=[name]).axes[name].effects

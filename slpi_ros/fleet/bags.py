@@ -66,7 +66,7 @@ class Row:
     width_uncertainty: float | None = None
     offset_m: float | None = None
     offset_uncertainty_m: float | None = None
-    floor_rms_m: float | None = None
+    repeatability_rms_m: float | None = None
     held_out_rms_m: float | None = None
     explained_rms_m: float | None = None
     limit_rms_m: float | None = None
@@ -336,7 +336,7 @@ def _measured(one: Examined, axis: str, found: Verification, model: AxisModel) -
         width_uncertainty=_finite(match.width_uncertainty),
         offset_m=judged.offset,
         offset_uncertainty_m=_finite(judged.offset_uncertainty),
-        floor_rms_m=judged.floor_rms,
+        repeatability_rms_m=judged.repeatability_rms,
         held_out_rms_m=judged.rest.rms,
         explained_rms_m=min(match.rms_explained, judged.rest.rms),
         limit_rms_m=judged.limit,

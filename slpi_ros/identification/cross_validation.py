@@ -14,7 +14,7 @@ from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.identification.drive import smallest_turn
 from slpi_ros.identification.fit import FITS, fit_of
 from slpi_ros.identification.free_run import InitialHistoryWarning
-from slpi_ros.identification.repeatability_floor import Floor, floor_of
+from slpi_ros.identification.repeatability import Repeatability, repeatability_of
 from slpi_ros.identification.samples import Samples, select_thinned
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
@@ -52,7 +52,7 @@ class CrossValidationReport:
 
     axis: str
     kind: str
-    floor: Floor  # of the record, or the median of several
+    repeatability: Repeatability  # of the record, or the median of several
     overall: Slice
     by_level: tuple[Slice, ...]  # by nesting of the loop, 0 is the outer one
     by_region: tuple[Slice, ...]  # by voltage, ascending
@@ -66,7 +66,7 @@ class CrossValidationReport:
         """Return the held-out errors as a text table, in nanometres."""
         head = f"{'held-out error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}{'classical PI':>14}"
         parts = (self.overall, *self.by_level, *self.by_region, *self.by_speed)
-        floor = f"{'repeatability floor':<33}{self.floor.rms * 1e9:9.1f}   from {self.floor.source}"
+        floor = f"{'repeatability':<33}{self.repeatability.rms * 1e9:9.1f}   from {self.repeatability.source}"
         return [head, *(part.line() for part in parts), floor]
 
 
@@ -118,7 +118,7 @@ def cross_validate(
     return CrossValidationReport(
         axis=axis,
         kind=kind,
-        floor=floors[len(floors) // 2],
+        repeatability=floors[len(floors) // 2],
         overall=_slice("all", error, classical),
         by_level=cut(level_classes(level)),
         by_region=cut(region_classes(v)),
@@ -138,8 +138,8 @@ def _classical(samples: Sequence[Samples]) -> FloatArray:
         return np.full(sum(part.v.size for part in samples), np.nan)
 
 
-def _floor(part: _Part, judged: Mask) -> Floor:
-    return floor_of(part.t, part.samples.v, np.where(judged, part.samples.y, np.nan))
+def _floor(part: _Part, judged: Mask) -> Repeatability:
+    return repeatability_of(part.t, part.samples.v, np.where(judged, part.samples.y, np.nan))
 
 
 def _slice(name: str, error: FloatArray, classical: FloatArray) -> Slice:

@@ -9,11 +9,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
-from slpi_ros.identification.least_squares import Fitted, noise_rms
+from slpi_ros.identification.least_squares import Fitted
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES, fit_family, fit_multi_slope, fit_plays
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import fit_amplitude_scaled, fit_at_rest, fit_primed
 from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_thinned
+from slpi_ros.identification.signal_statistics import white_noise
 from slpi_ros.io.record import Record, common_stage, release
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.coverage import fastest
@@ -153,7 +154,7 @@ def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:
             rms=float(np.sqrt(np.mean(fitted.errors**2))),
             maximum=float(np.max(np.abs(fitted.errors))),
             held_out_rms=fitted.held_out_rms,
-            floor_rms=noise_rms(fitted.errors),
+            floor_rms=white_noise(fitted.errors),
             samples=y.size,
             covered=fitted.covered,
             source=source,

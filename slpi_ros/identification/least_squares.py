@@ -247,8 +247,3 @@ def held_out_errors(samples: Samples, allowed: Mask, predict: Callable[[Mask], F
         kept[chosen] = False
         errors[chosen] = (predict(kept) - samples.y)[chosen]
     return errors
-
-
-def noise_rms(errors: FloatArray) -> float:
-    """Return the robust rms of the sample-to-sample noise in `errors`, in their unit."""
-    return float(1.4826 * np.median(np.abs(np.diff(errors))) / np.sqrt(2))

@@ -21,9 +21,10 @@ from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
 from slpi_ros.identification.free_run import Match, match
-from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, noise_rms, solve_free
+from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, solve_free
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
+from slpi_ros.identification.signal_statistics import white_noise
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, Start
 from slpi_ros.model.coverage import fastest
@@ -160,7 +161,7 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
     history = found.start.history
     samples = samples.after(history)
     problem = Problem.pose([samples], basis).reweighted()
-    repeatability = max(old.quality.held_out_rms, noise_rms(found.residual[np.isfinite(found.residual)]))
+    repeatability = max(old.quality.held_out_rms, white_noise(found.residual[np.isfinite(found.residual)]))
     anew = problem.residual()[problem.weights > 0] * problem.scale
     require_own(found.rms, _rms(anew), max(samples.spread[1], float(np.ptp(old.displacement_range))))
     otherwise = found.rms_explained > BEYOND_REPEATABILITY * repeatability
@@ -199,7 +200,7 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
             old.quality,
             rms=_rms(errors),
             maximum=float(np.max(np.abs(errors))),
-            floor_rms=noise_rms(errors),
+            floor_rms=white_noise(errors),
             samples=old.quality.samples + y.size,
             source=f"{old.quality.source}, {source}",
         ),
@@ -255,7 +256,7 @@ def _solved(problem: Problem, x_old: FloatArray, gain_spread: float = 0.0, shape
         at_rest = (vector[size:] - matrix[size:, :size] @ x_old) / np.diag(matrix)[size:]
         return np.concatenate([x_old, at_rest])
     free = solve_free(matrix + problem.penalty(FIRST_SMOOTHNESS, problem.count), vector)
-    noise = noise_rms(problem.design.predict(free)[problem.weights > 0] - problem.y[problem.weights > 0])
+    noise = white_noise(problem.design.predict(free)[problem.weights > 0] - problem.y[problem.weights > 0])
     prior = np.zeros_like(matrix)
     prior[:size, :size] = _precision(problem.rough[:size, :size], x_old, gain_spread, shape_spread)
     old = np.append(x_old, np.zeros(matrix.shape[0] - size))

@@ -101,6 +101,26 @@ def noise(x: FloatArray, *drivers: FloatArray) -> float:
     return float(min(estimates))
 
 
+# Lengths (samples) of the pieces whose spectra are pooled: the longest one, and the shortest that has a spectrum.
+_LONGEST, _SHORTEST = 1024, 64
+
+
+def white_noise(x: FloatArray) -> float:
+    """Return the rms of the white noise in `x`, shape (N,): the level between the lines of its spectrum's top octave.
+
+    `x` is a residual, or a signal that is smooth from sample to sample. Values that are not finite are left out.
+    """
+    x = x[np.isfinite(x)]
+    length = min(_LONGEST, x.size)
+    if length < _SHORTEST:
+        return median_rms(np.diff(x)) / np.sqrt(2.0) if x.size > 1 else 0.0
+    pieces = x[: x.size // length * length].reshape(-1, length)
+    window = np.hanning(length)
+    power = np.abs(np.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * window)) ** 2 / np.sum(window**2)
+    # Power at one frequency is distributed exponentially, with a median of log 2 times its mean.
+    return float(np.sqrt(np.median(power[:, length // 4 : (length - 1) // 2 + 1]) / np.log(2.0)))
+
+
 # Range of plausible noise of a measured voltage, as shares of its range: a commanded voltage has less, motion more.
 LEAST_NOISE, MOST_NOISE = 1e-4, 5e-3
 # Orders of the differences that leave only noise.

@@ -43,8 +43,8 @@ class Start:
     from_rest: bool = False  # never moved before `history`; False: a long fall, which erased the memory, led there
 
 
-# An error up to this multiple of the repeatability floor counts as noise.
-ABOVE_FLOOR = 1.5
+# An error up to this multiple of the repeatability counts as noise.
+ABOVE_NOISE = 1.5
 # Best accuracy of a hysteresis model without noise, as a share of the displacement range.
 RESOLUTION = 2e-4
 
@@ -56,7 +56,7 @@ class FitQuality:
     rms: float  # m, of the fitted samples
     maximum: float  # m
     held_out_rms: float  # m, from cross-validation
-    floor_rms: float  # m, repeatability of the record
+    floor_rms: float  # m, sensor noise: the white part of the residual
     samples: int
     covered: float  # 0..1, of the cells of the Everett function
     source: str

@@ -466,7 +466,7 @@ class Identify(Node):
                 f"{name}.rms_nm": f"{quality.rms * 1e9:.2f}",
                 f"{name}.held_out_rms_nm": f"{quality.held_out_rms * 1e9:.2f}",
                 f"{name}.maximum_nm": f"{quality.maximum * 1e9:.2f}",
-                f"{name}.floor_rms_nm": f"{quality.floor_rms * 1e9:.2f}",
+                f"{name}.noise_rms_nm": f"{quality.floor_rms * 1e9:.2f}",
                 f"{name}.samples": quality.samples,
                 f"{name}.covered": f"{quality.covered:.3f}",
                 f"{name}.source": quality.source,

@@ -43,7 +43,7 @@ def page_of(outcome: Outcome) -> Page:
             "of the stroke": f"{error.mean / error.stroke:.3%}",
             "maximum": nm(error.maximum),
             "target": nm(error.goal),
-            "repeatability floor, rms": nm(found.floor_rms),
+            "repeatability, rms": nm(found.repeatability_rms),
         })  # fmt: skip
         page.definitions({named.name: named.evidence for named in found.effects})
         page.chart(

@@ -9,6 +9,7 @@ from slpi_ros.diagnosis.result import (
     AMBIGUOUS,
     NAMED,
     NOTHING_FOUND,
+    PARTLY_NAMED,
     UNEXPLAINED,
     AxisDiagnosis,
     Diagnosis,
@@ -19,16 +20,17 @@ from slpi_ros.effects.registry import to_document
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import format_document
-from slpi_ros.model.axis_model import ABOVE_FLOOR
 from slpi_ros.model.document import format_model
 from slpi_ros.reports import views
-from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, NOISE
+from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, DISPLACEMENT, ERROR, NOISE, Chart, Panel, Quantity
 from slpi_ros.reports.page import Page, Severity, Share
-from slpi_ros.reports.text import above_floor, nm
+from slpi_ros.reports.text import above_noise, nm
 from slpi_ros.reports.views import Motion, Series
 
 # Relative difference of equal errors.
 _SAME = 0.01
+# Largest number of variables whose part of the residual is drawn.
+_MOST_DRAWN = 3
 
 BEFORE_NAME, AFTER_NAME = "without effects", "with effects"
 FILES = (_, _, PAGE) = "diagnosis.json", "extended_model.json", "report.html"
@@ -56,6 +58,7 @@ def page_of(diagnosis: Diagnosis) -> Page:
         page.verdict(name, f"Axis {name}: {found.summary}", _severity(found), found.verdict)
         page.tiles(_figures(found))
         _show_causes(page, found)
+        _show_left(page, name, found)
         _show_records(page, found)
         if found.next_experiment:
             page.section("Next step")
@@ -65,11 +68,9 @@ def page_of(diagnosis: Diagnosis) -> Page:
 
 
 def _severity(found: AxisDiagnosis) -> Severity:
-    if found.verdict == NOTHING_FOUND:
+    if found.verdict in (NOTHING_FOUND, NAMED):
         return "good"
-    if found.verdict == NAMED:
-        return "good" if found.after_rms <= ABOVE_FLOOR * found.floor_rms else "warn"
-    return "warn" if found.verdict == AMBIGUOUS else "bad"
+    return "warn" if found.verdict in (PARTLY_NAMED, AMBIGUOUS) else "bad"
 
 
 def _figures(found: AxisDiagnosis) -> dict[str, str]:
@@ -81,7 +82,7 @@ def _figures(found: AxisDiagnosis) -> dict[str, str]:
         figures["with the identified effects"] = nm(found.after_rms)
         if found.before_rms > 0.0:
             figures["reduction by the effects"] = f"{1.0 - found.after_rms / found.before_rms:.0%}"
-    return figures | {"repeatability floor, rms": nm(found.floor_rms)}
+    return figures | {"sensor noise, rms": nm(found.noise_rms), "repeatability, rms": nm(found.repeatability_rms)}
 
 
 def _show_causes(page: Page, found: AxisDiagnosis) -> None:
@@ -91,7 +92,29 @@ def _show_causes(page: Page, found: AxisDiagnosis) -> None:
     for named in found.effects:
         page.subsection(named.name)
         page.definitions(_cause(named))
-    page.table(("Model", "error, rms (nm)", "times the floor", "reduction"), *_steps(found))
+    page.table(("Model", "error, rms (nm)", "times the sensor noise", "reduction"), *_steps(found))
+
+
+def _show_left(page: Page, name: str, found: AxisDiagnosis) -> None:
+    """Add which measured variables go with what is left, and charts of the residual over these."""
+    page.section("What is left")
+    if not found.left:
+        page.text("None of the measured variables predicts what is left on held-out data.")
+        return
+    rows = [[one.variable, f"{one.share:.0%}", one.evidence] for one in found.left]
+    caption = (
+        "Share of the mean square of the residual that each variable alone predicts on held-out data; they overlap."
+    )
+    page.table(("Variable", "share", "evidence"), rows, None, caption)
+    drawn = [one for one in found.left if one.curve[0].size][:_MOST_DRAWN]
+    if drawn:
+        chart = Chart(
+            [Panel(DISPLACEMENT if one.unit == "m" else Quantity(one.variable, one.unit), ERROR) for one in drawn],
+            height=330,
+        )
+        for panel, one in enumerate(drawn):
+            chart.dots(panel, one.variable, *one.curve, BEFORE)
+        page.chart(f"{name}-left", chart, "Measured - model as predicted by each of these variables alone.")
 
 
 def _show_records(page: Page, found: AxisDiagnosis) -> None:
@@ -122,7 +145,7 @@ def _shares(found: AxisDiagnosis) -> list[Share]:
         for named, colour in zip(found.effects, _colours(len(found.effects)), strict=True)
     ]
     left = max(1.0 - sum(part.share for part in parts), 0.0)
-    noise = min((found.floor_rms / found.before_rms) ** 2, left) if found.before_rms > 0.0 else left
+    noise = min((found.noise_rms / found.before_rms) ** 2, left) if found.before_rms > 0.0 else left
     return [*parts, Share("noise", noise, NOISE), Share("unexplained", left - noise, BEFORE)]
 
 
@@ -180,7 +203,7 @@ def _steps(found: AxisDiagnosis) -> tuple[list[list[str]], int, str]:
     """Return the rows of the table of held-out errors, the index of the best row, and the caption."""
 
     def row(name: str, error: float, gain: str = "") -> list[str]:
-        times = f"{error / found.floor_rms:.2f}" if found.floor_rms > 0.0 else ""
+        times = f"{error / found.noise_rms:.2f}" if found.noise_rms > 0.0 else ""
         return [name, f"{error * 1e9:.1f}", times, gain]
 
     rows = [row("given model", found.given_rms), row("its hysteresis, refitted", found.before_rms)]
@@ -191,8 +214,12 @@ def _steps(found: AxisDiagnosis) -> tuple[list[list[str]], int, str]:
     if abs(found.after_rms - error) > _SAME * error:
         rows.append(row("all effects, fitted jointly", found.after_rms))
     best = len(rows) - 1
-    caption = f"Free-run errors; all but that of the given model are held out. Floor: {found.floor_source}."
-    return [*rows, row("repeatability floor", found.floor_rms)], best, caption
+    caption = (
+        "Free-run errors; all but that of the given model are held out. Sensor noise: the white part of the residual. "
+        f"Repeatability: {found.repeatability_source}."
+    )
+    rows += [row("repeatability", found.repeatability_rms), row("sensor noise", found.noise_rms)]
+    return rows, best, caption
 
 
 def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
@@ -210,12 +237,12 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
     left = [Series(model.name, y - model.values, model.colour) for model in models]
     parts = _parts(traces)
     drawings = {
-        "time": views.over_time(t, y, models, found.floor_rms, parts),
+        "time": views.over_time(t, y, models, found.noise_rms, parts),
         "motion": views.over_motion(v, left, parts, motion),
-        "frequency": views.over_frequency(t, left, parts, motion, found.floor_rms),
+        "frequency": views.over_frequency(t, left, parts, motion, found.noise_rms),
     }
     captions = {
-        "time": "Displacement and measured - model over time; the grey band is plus or minus the repeatability floor.",
+        "time": "Displacement and measured - model over time; the grey band is plus or minus the sensor noise.",
         "motion": "Measured - model over voltage (lines: means for rising and falling voltage) and over its speed.",
         "frequency": "Measured - model over the time since the last reversal or stop, with means, and its spectrum.",
     }
@@ -250,7 +277,7 @@ def _parts(traces: Traces) -> list[Series]:
 
 
 def diagnosis_limits(diagnosis: Diagnosis) -> dict[str, str]:
-    """Return what limits the accuracy of the given model on each axis; axes at the repeatability floor are left out."""
+    """Return what limits the accuracy of the given model on each axis; axes at the sensor noise are left out."""
     limits = {}
     for name, found in diagnosis.axes.items():
         low, high = diagnosis.extended.axes[name].displacement_range
@@ -259,7 +286,7 @@ def diagnosis_limits(diagnosis: Diagnosis) -> dict[str, str]:
         ]
         if found.verdict == UNEXPLAINED:
             causes.append("a cause that is none of the known effects")
-        if not causes and above_floor(found.given_rms, found.floor_rms, high - low):
+        if not causes and above_noise(found.given_rms, found.noise_rms, high - low):
             causes.append("a model that does not fit the stage as it is now")
         if causes:
             limits[name] = ", ".join(causes)

@@ -1,4 +1,4 @@
-"""What ``slpi doctor`` says of a record, a model and a running ROS graph: what is well, and what to mend."""
+"""What ``slpi doctor`` says of a record, a model and a running ROS graph: what is well, and what failed."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from slpi_ros.reports.text import model_limits
 
 Range = tuple[float, float]
 
-OK, NOTE, MEND = "ok", "note", "mend"
+OK, NOTE, FAILED = "ok", "note", "failed"
 STATE_TYPE = "sensor_msgs/msg/JointState"
 # Largest share of the period by which 95 % of the steps of the stamps may differ from it, and longest gap in periods.
 JITTER, GAP = 0.5, 5.0
@@ -28,14 +28,17 @@ FEWEST = 10
 
 @dataclass(frozen=True)
 class Check:
-    """One statement: `level` is "ok", "note" or "mend"; `text` is what was found, for "mend" also what to do."""
+    """One statement: `level` is "ok", "note" or "failed"; `text` is what was found, after a semicolon what to do."""
 
     level: str
     text: str
 
     def line(self) -> str:
-        """Return the statement as a line of text."""
-        return f"{self.level:4} {self.text}"
+        """Return the statement as a line of text; what to do about a failed check is on the next line."""
+        found, separator, remedy = self.text.rpartition("; ")
+        if self.level == FAILED and separator:
+            return f"{self.level:6} {found}\n{'':6} {remedy}"
+        return f"{self.level:6} {self.text}"
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ def check_record(record: Record, model: StageModel | None = None, limits: Range 
 def _of_record(record: Record, model: StageModel | None, limits: Range | None) -> Iterator[Check]:
     for axis in record.axes:
         for finding in findings(assess(record, axis)):
-            yield Check(OK if finding.level == "ok" else MEND, f"axis {axis}: {finding.text}")
+            yield Check(OK if finding.level == "ok" else FAILED, f"axis {axis}: {finding.text}")
         v = record.voltage[axis]
         reached = float(np.nanmin(v)), float(np.nanmax(v))
         if limits is not None:
@@ -85,12 +88,12 @@ def check_model(model: StageModel, limits: Range | None = None) -> list[Check]:
     limited = model_limits(model)
     for name, axis in model.axes.items():
         if name in limited:
-            checks.append(Check(MEND, f"model: axis {name}: {limited[name]}; find it with 'slpi diagnose'"))
+            checks.append(Check(FAILED, f"model: axis {name}: {limited[name]}; find it with 'slpi diagnose'"))
         else:
-            checks.append(Check(OK, f"model: axis {name}: its error is at the noise floor"))
+            checks.append(Check(OK, f"model: axis {name}: its error is at the sensor noise"))
         if axis.end is None:
             checks.append(
-                Check(MEND, f"model: axis {name}: the memory at the end of its record is unknown; identify it again")
+                Check(FAILED, f"model: axis {name}: the memory at the end of its record is unknown; identify it again")
             )
         if limits is not None:
             told = "identify within the limits, or correct them"
@@ -104,7 +107,7 @@ def check_graph(graph: Graph, model: StageModel | None = None) -> list[Check]:
     """Check a running graph: discovery, state of the stage, who commands, and whether the model fits the stage."""
     if not graph.nodes:
         text = "ROS: no other node; start the driver of the stage, and use its ROS_DOMAIN_ID and discovery range"
-        return [Check(MEND, text)]
+        return [Check(FAILED, text)]
     checks = [Check(OK, f"ROS: nodes {', '.join(sorted(graph.nodes))}")]
     checks += _of_publishers(graph)
     if graph.stamps.size:
@@ -122,16 +125,16 @@ def check_graph(graph: Graph, model: StageModel | None = None) -> list[Check]:
 def _of_publishers(graph: Graph) -> Iterator[Check]:
     topic, publishers = graph.state_topic, graph.state_publishers
     if not publishers:
-        yield Check(MEND, f"{topic}: no publisher; start the driver of the stage, or name its topic by --topic")
+        yield Check(FAILED, f"{topic}: no publisher; start the driver of the stage, or name its topic by --topic")
         return
     wrong = {kind for kind in publishers.values() if kind != STATE_TYPE}
     if wrong:
-        yield Check(MEND, f"{topic}: of type {', '.join(sorted(wrong))}; publish {STATE_TYPE}")
+        yield Check(FAILED, f"{topic}: of type {', '.join(sorted(wrong))}; publish {STATE_TYPE}")
     elif len(publishers) > 1:
-        yield Check(MEND, f"{topic}: {len(publishers)} publishers: {', '.join(publishers)}; leave one")
+        yield Check(FAILED, f"{topic}: {len(publishers)} publishers: {', '.join(publishers)}; leave one")
     elif not graph.stamps.size:
         yield Check(
-            MEND, f"{topic}: {', '.join(publishers)} sent nothing for {graph.seconds:.3g} s; make the driver publish"
+            FAILED, f"{topic}: {', '.join(publishers)} sent nothing for {graph.seconds:.3g} s; make the driver publish"
         )
     else:
         yield Check(OK, f"{topic}: published by {', '.join(publishers)}")
@@ -143,46 +146,48 @@ def _of_times(graph: Graph) -> Iterator[Check]:
         text = (
             f"{topic}: {stamps.size} states in {graph.seconds:.3g} s, too few to be judged; publish at 100 Hz or more"
         )
-        yield Check(MEND, text)
+        yield Check(FAILED, text)
         return
     if not stamps.any():
-        yield Check(MEND, f"{topic}: without stamps; stamp each state with the time of its measurement")
+        yield Check(FAILED, f"{topic}: without stamps; stamp each state with the time of its measurement")
         return
     steps = np.diff(stamps)
     if np.any(steps < 0.0):
-        yield Check(MEND, f"{topic}: {np.count_nonzero(steps < 0.0)} stamps run backwards; send the states in order")
+        yield Check(FAILED, f"{topic}: {np.count_nonzero(steps < 0.0)} stamps run backwards; send the states in order")
     period = float(np.median(steps))
     if period <= 0.0:
-        yield Check(MEND, f"{topic}: most stamps are equal; stamp each state with the time of its measurement")
+        yield Check(FAILED, f"{topic}: most stamps are equal; stamp each state with the time of its measurement")
         return
     jitter = float(np.percentile(np.abs(steps - period), 95)) / period
     text = f"{topic}: {1.0 / period:.4g} states per second, jitter {jitter:.0%} of the period"
     if jitter > JITTER:
-        yield Check(MEND, f"{text}; stamp each state with the time of its measurement")
+        yield Check(FAILED, f"{text}; stamp each state with the time of its measurement")
     else:
         yield Check(OK, text)
     longest = float(np.max(steps))
     if longest > GAP * period:
-        yield Check(MEND, f"{topic}: a gap of {longest:.3g} s; relieve the processor or the network")
+        yield Check(FAILED, f"{topic}: a gap of {longest:.3g} s; relieve the processor or the network")
     offset = float(np.median(arrivals - stamps))
     text = f"{topic}: the stamps are {abs(offset):.3g} s {'old' if offset >= 0.0 else 'ahead'} when they come"
     if -NEWEST <= offset <= OLDEST:
         yield Check(OK, text)
     else:
-        yield Check(MEND, f"{text}; synchronise the clocks (chrony, PTP), or use use_sim_time in all nodes or in none")
+        yield Check(
+            FAILED, f"{text}; synchronise the clocks (chrony, PTP), or use use_sim_time in all nodes or in none"
+        )
 
 
 def _of_values(graph: Graph) -> Iterator[Check]:
     topic = graph.state_topic
     if not graph.axes:
-        yield Check(MEND, f"{topic}: names no axis; fill name[], position[] (m) and effort[] (V)")
+        yield Check(FAILED, f"{topic}: names no axis; fill name[], position[] (m) and effort[] (V)")
     for axis in graph.axes:
         y, v = graph.displacement.get(axis, np.nan), graph.voltage.get(axis, np.nan)
         if not (np.isfinite(y) and np.isfinite(v)):
             text = f"axis {axis}: position {y:g} m, effort {v:g} V; fill both with finite numbers"
-            yield Check(MEND, f"{topic}: {text}")
+            yield Check(FAILED, f"{topic}: {text}")
         elif abs(y) > FARTHEST:
-            yield Check(MEND, f"{topic}: axis {axis}: position {y:.4g} is no displacement in metres; publish metres")
+            yield Check(FAILED, f"{topic}: axis {axis}: position {y:.4g} is no displacement in metres; publish metres")
         else:
             yield Check(OK, f"{topic}: axis {axis} at {y * 1e6:.4g} µm, {v:.4g} V")
     if not graph.hardware_id:
@@ -193,23 +198,23 @@ def _of_commands(graph: Graph) -> Iterator[Check]:
     topic, publishers = graph.command_topic, graph.command_publishers
     if len(publishers) > 1:
         text = f"{len(publishers)} publishers: {', '.join(publishers)}; stop all but one, as the voltage would jump"
-        yield Check(MEND, f"{topic}: {text}")
+        yield Check(FAILED, f"{topic}: {text}")
     else:
         yield Check(OK, f"{topic}: published by {', '.join(publishers) or 'nobody'}")
     if graph.command_subscribers:
         yield Check(OK, f"{topic}: received by {', '.join(graph.command_subscribers)}")
     else:
-        yield Check(MEND, f"{topic}: no subscriber; start the driver of the amplifier, or remap its topic")
+        yield Check(FAILED, f"{topic}: no subscriber; start the driver of the amplifier, or remap its topic")
 
 
 def _same_stage(hardware_id: str, axes: Sequence[str], model: StageModel) -> Iterator[Check]:
     if hardware_id and model.hardware_id and hardware_id != model.hardware_id:
         text = f"model: of stage '{model.hardware_id}', but the stage is '{hardware_id}'; take its own model"
-        yield Check(MEND, text)
+        yield Check(FAILED, text)
     lacking = [axis for axis in model.axes if axis not in axes]
     if lacking:
         text = f"model: axes {', '.join(lacking)} are not among those of the stage, {', '.join(axes) or 'none'}"
-        yield Check(MEND, f"{text}; name the axes alike")
+        yield Check(FAILED, f"{text}; name the axes alike")
     elif not (hardware_id and model.hardware_id and hardware_id != model.hardware_id):
         known = "hardware id and axes agree" if hardware_id and model.hardware_id else "axes agree"
         yield Check(OK, f"model: {known} with those of the stage")
@@ -233,29 +238,29 @@ def _within(axis: str, what: str, reached: Range, allowed: Range, whose: str, re
     bounds = f"{allowed[0]:.4g} to {allowed[1]:.4g} V of {whose}"
     if allowed[0] - slack <= reached[0] and reached[1] <= allowed[1] + slack:
         return Check(OK, f"{text}, within {bounds}")
-    return Check(MEND, f"{text}, outside {bounds}; {remedy}")
+    return Check(FAILED, f"{text}, outside {bounds}; {remedy}")
 
 
 def _overlap(what: str, known: Range, limits: Range, remedy: str) -> Check:
     text = f"{what}: identified from {known[0]:.4g} to {known[1]:.4g} V, limits {limits[0]:.4g} to {limits[1]:.4g} V"
     if max(known[0], limits[0]) > min(known[1], limits[1]):
-        return Check(MEND, f"{text} do not meet; {remedy}")
+        return Check(FAILED, f"{text} do not meet; {remedy}")
     slack = TOLERATED_SHARE * (known[1] - known[0])
     narrower = limits[0] > known[0] + slack or limits[1] < known[1] - slack
     return Check(NOTE, f"{text}: a part of the stroke is not used") if narrower else Check(OK, text)
 
 
 def described(checks: Iterable[Check]) -> tuple[str, list[str], list[str]]:
-    """Return the verdict, the lines of what is not well, and all lines; what is to be mended comes first."""
-    ordered = sorted(checks, key=lambda check: (MEND, NOTE, OK).index(check.level))
-    count = sum(check.level == MEND for check in ordered)
-    verdict = f"MEND: {count} thing{'s' * (count > 1)}" if count else "GOOD: nothing to mend"
+    """Return the verdict, the lines of what is not well, and all lines; failed checks come first."""
+    ordered = sorted(checks, key=lambda check: (FAILED, NOTE, OK).index(check.level))
+    count = sum(check.level == FAILED for check in ordered)
+    verdict = f"FAILED: {count} check{'s' * (count > 1)}" if count else f"GOOD: {len(ordered)} checks passed"
     return verdict, [check.line() for check in ordered if check.level != OK], [check.line() for check in ordered]
 
 
 def doctor_document(checks: Sequence[Check]) -> dict[str, Any]:
     """Return the checks as a document for ``--json``."""
     return {
-        "well": all(check.level != MEND for check in checks),
+        "well": all(check.level != FAILED for check in checks),
         "checks": [{"level": check.level, "text": check.text} for check in checks],
     }

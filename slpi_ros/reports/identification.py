@@ -10,7 +10,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.identification.cross_validation import CLASSICAL, CrossValidationReport, Slice
 from slpi_ros.identification.record_quality import Finding, assess, findings
 from slpi_ros.io.record import Record
-from slpi_ros.model.axis_model import ABOVE_FLOOR, AxisModel
+from slpi_ros.model.axis_model import ABOVE_NOISE, AxisModel
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE
@@ -59,7 +59,7 @@ def write_report(
         if not fitted.all():
             page.text(_part(t, fitted))
         if t.size:
-            floor = told.floor.rms if told else axis.quality.floor_rms
+            floor = told.repeatability.rms if told else axis.quality.floor_rms
             v, y = record.voltage[name][driven], record.displacement[name][driven]
             page.section("Model and measurement")
             motion = views.show_model(page, name, t, v, y, simulated[name], floor, fitted)
@@ -83,15 +83,15 @@ def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None)
     noise, floor_is = "the sensor noise", f"the sensor noise is {nm(floor)} rms"
     beside = ""
     if held_out is not None:
-        error, floor = held_out.overall.rms, held_out.floor.rms
-        noise, floor_is = "the floor", f"the repeatability floor is {nm(floor)} rms"
+        error, floor = held_out.overall.rms, held_out.repeatability.rms
+        noise, floor_is = "the floor", f"the repeatability is {nm(floor)} rms"
         if np.isfinite(held_out.overall.classical_rms) and held_out.kind != CLASSICAL:
             beside = f" Classical PI: {nm(held_out.overall.classical_rms)}."
     share = f"{error / _stroke(axis):.3%}" if _stroke(axis) > 0.0 else "?"
     said = f"Axis {name}: the held-out error is {nm(error)} rms ({share} of the stroke)"
     if not floor > 0.0:
         return f"{said}; the record has no noise for comparison.{beside}", "warn"
-    if error <= ABOVE_FLOOR * floor:
+    if error <= ABOVE_NOISE * floor:
         return f"{said}; {floor_is}, so the error is close to the noise.{beside}", "good"
     said = f"{said}; {floor_is}, and the error is {error / floor:.1f} times {noise}."
     if error <= _MORE_THAN_NOISE * floor:
@@ -104,7 +104,7 @@ def _figures(axis: AxisModel, held_out: CrossValidationReport | None) -> dict[st
     if held_out:
         figures = {
             "held-out error, rms": nm(held_out.overall.rms),
-            "repeatability floor, rms": nm(held_out.floor.rms),
+            "repeatability, rms": nm(held_out.repeatability.rms),
             "classical PI held-out, rms": nm(held_out.overall.classical_rms),
         }
     else:
@@ -136,7 +136,7 @@ def _findings(record: Record, name: str, start: float | None, stop: float | None
 def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> None:
     """Add the table and the chart of held-out errors."""
     page.section("Held-out errors")
-    floor = held_out.floor
+    floor = held_out.repeatability
     groups = {
         "by loop level": held_out.by_level,
         "by region": held_out.by_region,
@@ -150,7 +150,7 @@ def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> No
         rows,
         best=0,
         caption="Free-run held-out errors; the classical PI model on the same blocks. "
-        f"Floor: {nm(floor.rms)} rms, {floor.source}.",
+        f"Repeatability: {nm(floor.rms)} rms, {floor.source}.",
     )
     curves = [Series(held_out.kind, -held_out.error, AFTER)]
     if held_out.kind != CLASSICAL and np.isfinite(held_out.classical).any():

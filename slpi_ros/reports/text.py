@@ -9,7 +9,7 @@ from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops
-from slpi_ros.model.axis_model import ABOVE_FLOOR, RESOLUTION, AxisModel, StartMemory
+from slpi_ros.model.axis_model import ABOVE_NOISE, RESOLUTION, AxisModel, StartMemory
 from slpi_ros.model.coverage import fastest_displacement
 from slpi_ros.model.stage_model import StageModel
 
@@ -22,29 +22,29 @@ def nm(metres: float) -> str:
     return f"{metres * 1e9:.1f} nm" if np.isfinite(metres) else "none"
 
 
-def verdict(limits: Mapping[str, str], good: str = "at the noise floor") -> str:
+def verdict(limits: Mapping[str, str], good: str = "at the sensor noise") -> str:
     """Return the verdict on all axes in one line: what limits the accuracy of each axis of `limits`, else `good`."""
     if limits:
-        return f"LIMITED BY: {'; '.join(f'axis {axis}: {limit}' for axis, limit in limits.items())}"
+        return f"ERROR SOURCES: {'; '.join(f'axis {axis}: {limit}' for axis, limit in limits.items())}"
     return f"GOOD: {good}"
 
 
-def above_floor(rms: float, floor: float, stroke: float) -> str:
-    """Return by how much an error (m rms) exceeds the noise floor (m rms) as text; "" if it does not."""
+def above_noise(rms: float, noise: float, stroke: float) -> str:
+    """Return by how much an error (m rms) exceeds the noise (m rms) as text; "" if it does not."""
     # An error below `RESOLUTION` of the `stroke` (m) counts as noise, as no model of hysteresis does better.
-    if rms <= max(ABOVE_FLOOR * floor, RESOLUTION * stroke):
+    if rms <= max(ABOVE_NOISE * noise, RESOLUTION * stroke):
         return ""
-    times = f"{rms / floor:.1f} times the noise floor" if floor > 0.0 else "without any noise"
+    times = f"{rms / noise:.1f} times the sensor noise" if noise > 0.0 else "without any noise"
     return f"an error of {nm(rms)} rms, {times}"
 
 
 def model_limits(model: StageModel) -> dict[str, str]:
-    """Return what limits the accuracy of each axis of a model; axes at the noise floor are left out."""
+    """Return what limits the accuracy of each axis of a model; axes at the sensor noise are left out."""
     limits = {}
     for name, axis in model.axes.items():
         quality, (low, high) = axis.quality, axis.displacement_range
         error = quality.held_out_rms if np.isfinite(quality.held_out_rms) else quality.rms
-        if limit := above_floor(error, quality.floor_rms, high - low):
+        if limit := above_noise(error, quality.floor_rms, high - low):
             limits[name] = f"{limit}, of unknown cause"
     return limits
 
@@ -54,8 +54,8 @@ def change_limits(changes: Mapping[str, "AxisChange"], model: StageModel) -> dic
     limits = {}
     for name, change in changes.items():
         low, high = model.axes[name].displacement_range
-        if limit := above_floor(change.error_after, change.repeatability, high - low):
-            limits[name] = limit.replace("the noise floor", "the repeatability") + ", that the refit leaves"
+        if limit := above_noise(change.error_after, change.repeatability, high - low):
+            limits[name] = limit.replace("the sensor noise", "the repeatability") + ", that the refit leaves"
     return limits
 
 

@@ -11,7 +11,7 @@ from slpi_ros.diagnosis.verify import (
     FEW,
     MOST_KNOWN,
     PASSED,
-    TIMES_THE_FLOOR,
+    TIMES_REPEATABILITY,
     UNPROVED,
     AxisVerification,
     RecordVerification,
@@ -19,7 +19,7 @@ from slpi_ros.diagnosis.verify import (
 )
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import format_document
-from slpi_ros.model.axis_model import ABOVE_FLOOR
+from slpi_ros.model.axis_model import ABOVE_NOISE
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import (
     AFTER,
@@ -74,7 +74,7 @@ def verification_limits(found: Verification) -> dict[str, str]:
         tracked = [record.tracking for record in axis.records if record.tracking]
         if not axis.passed:
             worst = axis.worst
-            noisy = worst.rest.rms <= ABOVE_FLOOR * worst.floor_rms
+            noisy = worst.rest.rms <= ABOVE_NOISE * worst.repeatability_rms
             model = "unproved" if axis.verdict == UNPROVED else "the noise of the record" if noisy else "the model"
             limits[name] = f"{model}, {nm(worst.judged_error)} rms where {nm(worst.limit)} are allowed"
         elif tracked:
@@ -87,7 +87,7 @@ def verification_limits(found: Verification) -> dict[str, str]:
 def verification_good(found: Verification) -> str:
     """Return how good a verified model is that nothing limits."""
     records = [record for axis in found.axes.values() for record in axis.records]
-    noise = all(record.error.rms <= ABOVE_FLOOR * record.floor_rms for record in records)
+    noise = all(record.error.rms <= ABOVE_NOISE * record.repeatability_rms for record in records)
     return "at the repeatability of the record" if noise else "within its limit on every record"
 
 
@@ -136,7 +136,7 @@ def _error(record: RecordVerification) -> str:
     return (
         f"measured - model is {nm(error.rms)} rms, {nm(error.maximum)} at most; of it constant "
         f"{_um(record.constant)} µm, the rest {nm(record.rest.rms)} rms (limit {nm(record.limit)}{limit}; "
-        f"repeatability {nm(record.floor_rms)}); {_judged_share(record)}"
+        f"repeatability {nm(record.repeatability_rms)}); {_judged_share(record)}"
     )
 
 
@@ -194,7 +194,7 @@ def _figures(axis: AxisVerification) -> dict[str, str]:
         "at most": nm(axis.overall.maximum),
         "without its constant part, rms": nm(axis.rest.rms),
         f"limit of the {'rms' if worst.absolute else 'rms without the constant'}": nm(worst.limit),
-        "repeatability, rms": nm(worst.floor_rms),
+        "repeatability, rms": nm(worst.repeatability_rms),
         "samples judged": f"{min(record.share for record in axis.records):.0%}",
         "held-out error of the model": nm(axis.resolution),
     }
@@ -219,15 +219,15 @@ def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence
     ]
     held_to = "rms" if axis.worst.absolute else "rms of the rest"
     caption = (
-        f"Measured - model, free-run. The limit holds for the {held_to}: the tolerance, else {TIMES_THE_FLOOR:g} times "
-        f"the repeatability, but at least 0.02 % of the stroke. Repeatability: {nm(axis.records[0].floor_rms)}, "
-        f"{axis.records[0].floor_source}."
+        f"Measured - model, free-run. The limit holds for the {held_to}: the tolerance, else {TIMES_REPEATABILITY:g} "
+        "times the repeatability, but at least 0.02 % of the stroke. Repeatability: "
+        f"{nm(axis.records[0].repeatability_rms)}, {axis.records[0].repeatability_source}."
     )
     return header, rows, None, caption
 
 
 def _parts_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[str] | str], int, str]:
-    floor = float(np.median([record.floor_rms for record in axis.records]))
+    floor = float(np.median([record.repeatability_rms for record in axis.records]))
 
     def row(part: ErrorPart) -> list[str]:
         times = f"{part.rms / floor:.2f}" if floor > 0.0 else ""
@@ -251,7 +251,7 @@ def _show_record(page: Page, name: str, record: RecordVerification) -> None:
     page.section(record.error.name)
     if record.tracking:
         _show_tracking(page, name, record.tracking)
-    views.show_model(page, name, t, v, y, record.model, record.floor_rms, record.judged)
+    views.show_model(page, name, t, v, y, record.model, record.repeatability_rms, record.judged)
 
 
 def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:

@@ -37,8 +37,8 @@ from slpi_ros.reports.chart import (
 from slpi_ros.reports.page import Page
 
 RISING, FALLING = COLOURS[3], COLOURS[0]
-OPENED = Quantity("displacement - straight line", "µm", 1e6, ".4f")
-BEGAN, NOW = Quantity("branch began at", "V", digits=".2f"), Quantity("voltage", "V", digits=".2f")
+OPENED = Quantity("deviation from linearity", "µm", 1e6, ".4f")
+BEGAN, NOW = Quantity("last reversal voltage", "V", digits=".2f"), Quantity("voltage", "V", digits=".2f")
 SPEED = Quantity("speed of the voltage", "V/s", digits=".4~g")
 SINCE = Quantity("time since the last reversal or stop", "s", digits=".3~g", logarithmic=True)
 FREQUENCY = Quantity("frequency", "Hz", digits=".4~g", logarithmic=True)
@@ -138,9 +138,7 @@ def show_model(
     page.chart(f"{name}-loops", chart, f"{LOOPS} {said}")
     chart, said = over_time(t, y, models, noise, fitted=fitted)
     unused = "" if fitted.all() else f" Shaded: {UNUSED}."
-    page.chart(
-        f"{name}-time", chart, f"Over time; the grey band is plus or minus the repeatability floor.{unused} {said}"
-    )
+    page.chart(f"{name}-time", chart, f"Over time; the grey band is plus or minus the repeatability.{unused} {said}")
     chart, said = over_voltage(v, y - simulated, motion, noise, fitted)
     how = "Measured - model over rising and falling voltage, and the histogram."
     page.chart(f"{name}-residual", chart, f"{how} {said}")
@@ -346,7 +344,7 @@ def over_motion(v: FloatArray, curves: Sequence[Series], parts: Sequence[Series]
 def over_frequency(
     t: FloatArray, curves: Sequence[Series], parts: Sequence[Series], motion: Motion, noise: float
 ) -> tuple[Chart, str]:
-    """Draw residuals over the time since the last reversal, and their spectra; `noise` (m rms) is the floor."""
+    """Draw residuals over the time since the last reversal, and their spectra; `noise` (m rms) that of the sensor."""
     chart = Chart([Panel(SINCE, ERROR), Panel(FREQUENCY, DENSITY)], height=430)
     later = np.flatnonzero(motion.since_turn > 0.0)
     since = motion.since_turn[later]
@@ -362,7 +360,7 @@ def over_frequency(
     rate = _rate(t)
     if noise > 0.0 and rate > 0.0:
         ends = np.array([max(rate / t.size, 1e-9), rate / 2.0])
-        chart.line(1, "repeatability floor", ends, np.full(2, noise * np.sqrt(2.0 / rate)), DESIRED, width=1.0)
+        chart.line(1, "sensor noise", ends, np.full(2, noise * np.sqrt(2.0 / rate)), DESIRED, width=1.0)
     return chart, focus(chart, (0,), [curve.values for curve in curves])
 
 

@@ -20,7 +20,17 @@ SURVEY = [(drive, ("x",)) for drive in UNCOVERED]
 
 def diagnosis(verdict, *effects, after=8e-9, floor=8e-9):
     return AxisDiagnosis(
-        verdict, "", floor, "", 1e-7, 1e-7, after, effects, None, Traces(NOTHING, NOTHING, NOTHING, NOTHING, NOTHING)
+        verdict,
+        "",
+        floor,
+        floor,
+        "",
+        1e-7,
+        1e-7,
+        after,
+        effects,
+        None,
+        Traces(NOTHING, NOTHING, NOTHING, NOTHING, NOTHING),
     )
 
 

@@ -151,7 +151,7 @@ def test_a_coupled_axis_is_judged_with_the_motion_of_the_other(model):
 
 
 def test_explained_motion_of_another_axis_is_no_noise(model):
-    """Else the limit, three times the repeatability floor, would let a bad model pass."""
+    """Else the limit, three times the repeatability, would let a bad model pass."""
     t = np.arange(4000) / RATE
     v, other = (50.0 - 50.0 * np.cos(2.0 * np.pi * t / period) for period in (1.0, 3.1))
     y, z = stage(SEED).run(t, v)[1], stage(SEED).run(t, other)[1]
@@ -161,7 +161,7 @@ def test_explained_motion_of_another_axis_is_no_noise(model):
     effect = slpi_ros.effects.cross_coupling.CrossCoupling({"z": 0.01})
     coupled = replace(model, axes={"x": replace(axis, effects=(effect,)), "z": axis})
     found = slpi_ros.verify(record, coupled, axes=["x"]).axes["x"].records[0]
-    assert found.floor_rms == pytest.approx(alone.floor_rms, rel=0.1)
+    assert found.repeatability_rms == pytest.approx(alone.repeatability_rms, rel=0.1)
     assert found.limit == pytest.approx(alone.limit, rel=0.1)
 
 

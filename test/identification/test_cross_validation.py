@@ -35,7 +35,7 @@ def test_every_cut_holds_every_sample_once(found):
 def test_it_is_what_the_identification_says(recorded, found):
     quality = slpi_ros.identify(recorded).axes["x"].quality
     assert found.overall.rms == pytest.approx(quality.held_out_rms, rel=1e-9)
-    assert found.overall.rms < 1.2 * found.floor.rms
+    assert found.overall.rms < 1.2 * found.repeatability.rms
     classical = slpi_ros.identify(recorded, "pi").axes["x"].quality
     assert found.overall.classical_rms == pytest.approx(classical.held_out_rms, rel=0.02)
 
@@ -88,14 +88,14 @@ def test_windows_gaps_and_several_records(recorded):
     later = calibration(seed=1, duration=25.0)[0]
     both = cross_validate([gappy, later], "x")
     assert both.overall.samples > judged.overall.samples
-    assert both.overall.rms < 1.5 * both.floor.rms
+    assert both.overall.rms < 1.5 * both.repeatability.rms
 
 
 def test_the_table_says_it_all(found):
     lines = found.lines()
     assert len(lines) == 3 + len(found.by_level) + len(found.by_region) + len(found.by_speed)
     assert "classical PI" in lines[0] and f"{found.overall.rms * 1e9:.1f}" in lines[1]
-    assert found.floor.source in lines[-1]
+    assert found.repeatability.source in lines[-1]
     unknown = replace(found.overall, classical_rms=float("nan"))
     assert replace(found, overall=unknown).lines()[1].endswith("-")
 

@@ -11,11 +11,11 @@ from std_msgs.msg import Float64MultiArray  # noqa: E402
 
 from slpi_ros.cli import main  # noqa: E402
 from slpi_ros.nodes.graph_probe import probe  # noqa: E402
-from slpi_ros.reports.doctor import MEND, check_graph  # noqa: E402
+from slpi_ros.reports.doctor import FAILED, check_graph  # noqa: E402
 
 
 def faults(topic, found):
-    return [check.text for check in check_graph(found) if check.level == MEND and check.text.startswith(topic)]
+    return [check.text for check in check_graph(found) if check.level == FAILED and check.text.startswith(topic)]
 
 
 def complete(found):

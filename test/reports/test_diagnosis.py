@@ -47,8 +47,9 @@ def found(**changes):
     axis = AxisDiagnosis(
         verdict=NAMED,
         summary="creep and hum make the error.",
-        floor_rms=5e-9,
-        floor_source="repeats: 9 moves",
+        noise_rms=5e-9,
+        repeatability_rms=5e-9,
+        repeatability_source="repeats: 9 moves",
         given_rms=170e-9,
         before_rms=150e-9,
         after_rms=6e-9,
@@ -96,13 +97,13 @@ def test_shares_of_causes_add_up_to_what_effects_explain(written):
     assert np.isclose(before.max(), (of.measured - of.before).max() * 1e9, rtol=1e-5)
 
 
-def test_spectrum_shows_the_line_and_the_floor(written):
+def test_spectrum_shows_the_line_and_the_noise(written):
     chart = parsed(written).charts["x-frequency"]
     frequency, density = trace(chart, "without effects", "y2")
     high = frequency > 10.0
     assert np.isclose(frequency[high][np.argmax(density[high])], 50.0, rtol=0.02)
     frequency, density = trace(chart, "with effects", "y2")
-    _, floor = trace(chart, "repeatability floor", "y2")
+    _, floor = trace(chart, "sensor noise", "y2")
     assert np.allclose(floor, 5.0 * np.sqrt(2.0 / 500.0), rtol=1e-3)
     assert np.isclose(np.sqrt(np.mean(density[frequency > 5.0] ** 2)), floor[0], rtol=0.2)
 
@@ -136,7 +137,7 @@ def test_small_records(size, tmp_path):
     full = traces()
     parts = {name: values[:size] for name, values in full.contributions.items()}
     short = Traces(*(getattr(full, name)[:size] for name in ("t", "voltage", "measured", "before", "after")), parts)
-    zero = dict.fromkeys(("floor_rms", "before_rms", "after_rms", "given_rms"), 0.0)
+    zero = dict.fromkeys(("noise_rms", "repeatability_rms", "before_rms", "after_rms", "given_rms"), 0.0)
     page = parsed(write(tmp_path, {"x": found(traces=short, **zero)}))
     assert len(page.charts) == (len(CHARTS) if size else 0)
 
@@ -153,7 +154,7 @@ def test_missing_readings(tmp_path):
 def test_hostile_texts_stay_text(tmp_path):
     named = replace(found().effects[0], evidence=HOSTILE, alternatives=(HOSTILE,))
     loud = replace(traces(), contributions={HOSTILE: traces().contributions["creep"]})
-    axis = found(summary=HOSTILE, floor_source=HOSTILE, next_experiment=HOSTILE, effects=(named,), traces=loud)
+    axis = found(summary=HOSTILE, repeatability_source=HOSTILE, next_experiment=HOSTILE, effects=(named,), traces=loud)
     page = parsed(write(tmp_path, {HOSTILE: axis}, HOSTILE))
     assert not page.tags("img") and len(page.tags("script")) == 2 + len(CHARTS)
     assert HOSTILE in page.texts[f"verdict-{HOSTILE}"]

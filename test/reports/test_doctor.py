@@ -7,7 +7,7 @@ import pytest
 from identification.records import calibration
 
 import slpi_ros
-from slpi_ros.reports.doctor import MEND, STATE_TYPE, Graph, check_graph, check_model, check_record
+from slpi_ros.reports.doctor import FAILED, STATE_TYPE, Graph, check_graph, check_model, check_record
 
 LIMITS = (0.0, 100.0)
 
@@ -33,7 +33,7 @@ def graph(**changes):
 
 
 def to_mend(checks):
-    return [check.text for check in checks if check.level == MEND]
+    return [check.text for check in checks if check.level == FAILED]
 
 
 def test_what_is_well_needs_nothing(record, model):

@@ -13,7 +13,7 @@ import slpi_ros
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.cross_validation import CrossValidationReport, Slice
-from slpi_ros.identification.repeatability_floor import Floor
+from slpi_ros.identification.repeatability import Repeatability
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.stage_model import StageModel
@@ -41,7 +41,7 @@ def truth_of(record):
     return CrossValidationReport(
         axis="x",
         kind="slpi",
-        floor=Floor(8.7e-9, "repeats: 5 <moves>"),
+        repeatability=Repeatability(8.7e-9, "repeats: 5 <moves>"),
         overall=part,
         by_level=(replace(part, name="outer loop", classical_rms=np.nan),),
         by_region=(replace(part, name="0 to 20 V", rms=34.5e-9),),

@@ -1,4 +1,4 @@
-"""The repeatability floor of a record: how much repetitions of the same motion differ."""
+"""The repeatability of a record: how much repetitions of the same motion differ."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -28,15 +28,15 @@ NO_NOISE = 1e-9
 
 
 @dataclass(frozen=True)
-class Floor:
-    """Repeatability floor of a record."""
+class Repeatability:
+    """Repeatability of a record."""
 
     rms: float  # m, of the differences between repetitions, per reading
     source: str  # the data from which it was estimated, with numbers
 
 
-def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray | None = None) -> Floor:
-    """Estimate the repeatability floor of a record: noise and all other differences between repetitions of a motion."""
+def repeatability_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray | None = None) -> Repeatability:
+    """Estimate the repeatability of a record: noise and all other differences between repetitions of a motion."""
     # Estimated from repeated moves between the same reversals if there are enough; else from holds; else from the
     # sample-to-sample noise. Slow and smooth differences (drift, creep) do not count. Neither do outliers. The residual
     # of a model (m) replaces `y` (m, NaN where unknown), so that drift and hum described by the model do not count.
@@ -44,25 +44,27 @@ def floor_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: FloatArray |
     usable = np.isfinite(v) & np.isfinite(signal)
     t, v, y, signal = t[usable], v[usable], y[usable], signal[usable]
     if t.size < _FEWEST_READINGS:
-        raise RecordError(f"{t.size} samples have no repeatability floor; give at least {_FEWEST_READINGS}")
+        raise RecordError(f"{t.size} samples have no repeatability; give at least {_FEWEST_READINGS}")
     found = _seen(t, v, signal, alone=residual is not None)
     step = digit(y)
     if found.rms < step / np.sqrt(12.0):
-        return Floor(step / np.sqrt(12.0), f"digits: {step * 1e9:.3g} nm from one reading to the next")
+        return Repeatability(step / np.sqrt(12.0), f"digits: {step * 1e9:.3g} nm from one reading to the next")
     if found.rms < NO_NOISE * np.ptp(y):
-        return Floor(0.0, f"no noise in {found.source}")
+        return Repeatability(0.0, f"no noise in {found.source}")
     return found
 
 
-def _seen(t: FloatArray, v: FloatArray, signal: FloatArray, *, alone: bool) -> Floor:
+def _seen(t: FloatArray, v: FloatArray, signal: FloatArray, *, alone: bool) -> Repeatability:
     for name, seen in (("repeats", _repeats(t, v, signal)), ("holds", _holds(t, v, signal))):
         parts = list(seen)
         pooled = np.concatenate([np.empty(0), *parts])
         if pooled.size >= FEWEST:
             what = {"repeats": "moves made again", "holds": "pieces of holds"}[name]
-            return Floor(robust_rms(pooled), f"{name}: {len(parts)} {what}, {pooled.size} samples")
+            return Repeatability(robust_rms(pooled), f"{name}: {len(parts)} {what}, {pooled.size} samples")
     level = noise(signal, t) if alone else noise(signal, t, v)
-    return Floor(level, f"high frequencies: {signal.size} samples, each beside its neighbours; slow noise is not seen")
+    return Repeatability(
+        level, f"high frequencies: {signal.size} samples, each beside its neighbours; slow noise is not seen"
+    )
 
 
 def robust_rms(x: FloatArray) -> float:

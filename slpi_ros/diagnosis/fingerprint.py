@@ -1,0 +1,300 @@
+"""Measured variables that predict what a model leaves of the displacement, on held-out data.
+
+The residual is fitted by a smooth function of each variable alone, on four fifths of the blocks of a record, and judged
+on the others. The share of its mean square that such a function predicts tells where to look for an unknown cause.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from slpi_ros.arrays import FloatArray
+from slpi_ros.hysteresis.reversals import reversals
+from slpi_ros.identification.drive import smallest_turn
+from slpi_ros.identification.signal_statistics import noise
+
+# Number of blocks of a record, of which every fifth is held out in turn.
+BLOCKS, FOLDS = 40, 5
+# Number of knots of the function of a variable; for time one for each two blocks, so that it spans a held-out block.
+KNOTS, KNOTS_OF_TIME = 12, 20
+# Weight of the roughness of a function, relative to the largest eigenvalue of its equations.
+ROUGHNESS = 1e-5
+# Smallest share of the mean square that is told.
+LEAST_SHARE = 0.05
+# Largest number of spectral lines and of jumps; power of a line relative to the median of its surroundings; size of a
+# jump relative to the rms difference of the means before and after all other samples.
+MOST_LINES, MOST_JUMPS, LINE, JUMP = 6, 8, 30.0, 5.0
+# Largest number of samples of a record, evenly thinned, for functions of a variable.
+ENOUGH = 40_000
+
+# What each variable suggests to look at.
+HINTS: Mapping[str, str] = {
+    "time": "look for temperature, a mount that relaxes, or a drift of the sensor",
+    "voltage": "look for a nonlinearity of amplifier or sensor, or record more loops of every size",
+    "displacement": "look for a nonlinearity of the sensor, or a contact of the stage",
+    "rate": "look for dynamics of stage, amplifier or sensor: record several drive frequencies",
+    "acceleration": "look for a flexure mode or the mass of the load: record faster turns",
+    "direction": "look for friction or backlash: record the same loop at several rates",
+    "time since the last turn": "look for creep or ringing after turns: record holds after steps",
+    "position in the loop": "look for a hysteresis that depends on the loop: record loops of every size",
+    "lines of the spectrum": "look for mains, pumps, fans and their frequencies",
+    "jumps": "look for a slip of the mount, a fringe jump of the sensor, or somebody at the table",
+}
+
+
+class Signals(NamedTuple):
+    """Used samples of one record, shape (N,) each: time (s), voltage (V), displacement and residual of a model (m)."""
+
+    t: FloatArray
+    v: FloatArray
+    y: FloatArray
+    residual: FloatArray
+
+
+@dataclass(frozen=True)
+class Left:
+    """Measured variable that predicts a share (0..1) of the mean square of a residual on held-out data.
+
+    `curve` is the predicted residual (m) over the variable, in its `unit`, for a chart; empty for lines and jumps.
+    """
+
+    variable: str
+    share: float
+    evidence: str
+    curve: tuple[FloatArray, FloatArray] = field(default=(np.empty(0), np.empty(0)), compare=False)
+    unit: str = ""
+
+    def to_document(self) -> dict[str, str | float]:
+        """Return the part of the diagnosis document."""
+        return {"variable": self.variable, "share": self.share, "evidence": self.evidence}
+
+
+def fingerprint(records: Sequence[Signals]) -> tuple[Left, ...]:
+    """Return the measured variables that predict the residuals of records of one axis, the largest share first."""
+    thin = [_thinned(record) for record in records]
+    found = [*_of_variables(thin), *_of_lines(records), *_of_jumps(records)]
+    return tuple(sorted((one for one in found if one.share >= LEAST_SHARE), key=lambda one: -one.share))
+
+
+def _thinned(record: Signals) -> Signals:
+    every = -(-record.t.size // ENOUGH)
+    return Signals(*(x[::every] for x in record))
+
+
+def _of_variables(records: Sequence[Signals]) -> Iterator[Left]:
+    residual = [record.residual - record.residual.mean() for record in records]
+    values = [_variables(record) for record in records]
+    up = np.concatenate([np.sign(one["rate"]) for one in values])
+    for name, unit, branches in (
+        ("time", "s", False), ("voltage", "V", False), ("displacement", "m", False), ("rate", "V/s", False),
+        ("acceleration", "V/s²", False), ("direction", "V", True), ("time since the last turn", "s", True),
+        ("position in the loop", "", True),
+    ):  # fmt: skip
+        own = [one["voltage" if name == "direction" else name] for one in values]
+        x = np.concatenate(own)
+        if name == "time":
+            # Drift belongs to its record.
+            columns = scipy.linalg.block_diag(*(_hats(one, KNOTS_OF_TIME, even=True) for one in own))
+        else:
+            columns = _hats(x, KNOTS, even=name == "voltage")
+        if branches:
+            columns = np.hstack([columns * (up > 0.0)[:, None], columns * (up < 0.0)[:, None]])
+        if name == "direction":
+            # Only what rising and falling voltage differ by: the rest goes with the voltage.
+            columns = columns[:, :KNOTS] - columns[:, KNOTS:]
+        share, fitted = _share([columns], residual)
+        if share >= LEAST_SHARE:
+            yield Left(name, share, _evidence(name, unit, share, x, fitted), _curve(x, fitted), unit)
+
+
+def _variables(record: Signals) -> dict[str, FloatArray]:
+    """Return the variables of a record, shape (N,) each, in SI units; the position in the loop is 0..1."""
+    t, v = record.t, record.v
+    ends = reversals(v, max(smallest_turn(v, noise(v, t)), 1e-9 * float(np.ptp(v)))) if v.size > 4 else np.array([0])
+    last = ends[np.maximum(np.searchsorted(ends, np.arange(v.size), side="right") - 1, 0)]
+    way = np.abs(np.diff(v[ends], append=v[-1]))[np.searchsorted(ends, last)]
+    rate = _slope(t, v)
+    return {
+        "time": t,
+        "voltage": v,
+        "displacement": record.y,
+        "rate": rate,
+        "acceleration": _slope(t, rate),
+        "time since the last turn": np.maximum(t - t[last], 0.0),
+        "position in the loop": np.divide(np.abs(v - v[last]), way, out=np.zeros_like(v), where=way > 0.0).clip(
+            0.0, 1.0
+        ),
+    }
+
+
+def _slope(t: FloatArray, x: FloatArray) -> FloatArray:
+    """Return the derivative of `x` from differences over a few samples, as voltages may be noisy."""
+    at = np.arange(t.size)
+    before, after = np.maximum(at - 2, 0), np.minimum(at + 2, t.size - 1)
+    step = t[after] - t[before]
+    return np.divide(x[after] - x[before], step, out=np.zeros(t.size), where=step > 0.0)
+
+
+def _hats(x: FloatArray, knots: int, *, even: bool) -> FloatArray:
+    """Return the piecewise linear functions of `x`, shape (N, knots), at even knots or at quantiles."""
+    places = np.linspace(x.min(), x.max(), knots) if even else np.quantile(x, np.linspace(0.0, 1.0, knots))
+    places = np.unique(places)
+    columns = np.zeros((x.size, knots))
+    if places.size < 2:
+        return columns
+    k = np.clip(np.searchsorted(places, x, side="right") - 1, 0, places.size - 2)
+    share = np.clip((x - places[k]) / (places[k + 1] - places[k]), 0.0, 1.0)
+    columns[np.arange(x.size), k], columns[np.arange(x.size), k + 1] = 1.0 - share, share
+    return columns
+
+
+def _share(columns: Sequence[FloatArray], residual: Sequence[FloatArray]) -> tuple[float, FloatArray]:
+    """Return the share of the mean square that columns predict on held-out blocks, and the fit to all samples (m)."""
+    matrix, y = np.vstack(columns), np.concatenate(residual)
+    fold = np.concatenate([np.arange(one.size) * BLOCKS // max(one.size, 1) % FOLDS for one in residual])
+    grams = [matrix[fold == k].T @ matrix[fold == k] for k in range(FOLDS)]
+    products = [matrix[fold == k].T @ y[fold == k] for k in range(FOLDS)]
+    whole, right = sum(grams), sum(products)
+    ridge = ROUGHNESS * max(float(np.linalg.norm(whole, 2)), 1e-300) * np.eye(matrix.shape[1])
+
+    def fitted(gram: FloatArray, product: FloatArray) -> FloatArray:
+        return np.asarray(scipy.linalg.solve(gram + ridge, product, assume_a="pos"))
+
+    missed = np.zeros_like(y)
+    for k in range(FOLDS):
+        out = fold == k
+        missed[out] = y[out] - matrix[out] @ fitted(whole - grams[k], right - products[k])
+    total = float(np.sum(y**2))
+    share = 1.0 - float(np.sum(missed**2)) / total if total > 0.0 else 0.0
+    return float(np.clip(share, 0.0, 1.0)), matrix @ fitted(whole, right)
+
+
+def _evidence(name: str, unit: str, share: float, x: FloatArray, fitted: FloatArray) -> str:
+    low, high = int(np.argmin(fitted)), int(np.argmax(fitted))
+    of = {"direction": "voltage"}.get(name, name)
+    return (
+        f"{share:.0%} of the mean square goes with the {name}: from {1e9 * fitted[low]:+.3g} nm at "
+        f"{_quantity(x[low], unit)} to {1e9 * fitted[high]:+.3g} nm at {_quantity(x[high], unit)} of {of}; "
+        f"{HINTS[name]}"
+    )
+
+
+def _quantity(value: float, unit: str) -> str:
+    return f"{1e6 * value:.3g} µm" if unit == "m" else f"{value:.3g} {unit}".rstrip()
+
+
+def _curve(x: FloatArray, fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    order = np.argsort(x)[:: max(1, x.size // 400)]
+    return x[order], fitted[order]
+
+
+def _of_lines(records: Sequence[Signals]) -> Iterator[Left]:
+    found = [_lines(record) for record in records]
+    residual = [record.residual - record.residual.mean() for record in records]
+    columns = [_waves(record.t, lines) for record, lines in zip(records, found, strict=True)]
+    if not sum(own.shape[1] for own in columns):
+        return
+    share, _ = _share([scipy.linalg.block_diag(*columns)], residual)
+    told = []
+    for lines, own, left in zip(found, columns, residual, strict=True):
+        if not lines:
+            continue
+        gains = np.linalg.lstsq(own, left, rcond=None)[0].reshape(-1, 2)
+        told += [f"{f:.4g} Hz ({1e9 * np.hypot(*gain):.3g} nm)" for f, gain in zip(lines, gains, strict=True)]
+    name = "lines of the spectrum"
+    yield Left(
+        name, share, f"{share:.0%} of the mean square is in lines at {', '.join(told[:MOST_LINES])}; {HINTS[name]}"
+    )
+
+
+def _lines(record: Signals) -> list[float]:
+    """Return the frequencies (Hz) of lines that stand out of the spectrum of a residual and are none of the drive."""
+    t, step = record.t, float(np.median(np.diff(record.t))) if record.t.size > 1 else 0.0
+    if t.size < 8 * KNOTS or not step > 0.0:
+        return []
+    grid = np.arange(t[0], t[-1], step)
+    window = np.hanning(grid.size)
+    power, drive = (
+        np.abs(np.fft.rfft((np.interp(grid, t, x) - np.mean(x)) * window, 4 * grid.size)) ** 2
+        for x in (record.residual, record.v)
+    )
+    frequency = np.fft.rfftfreq(4 * grid.size, step)
+    # Bins of four times the length: a line with this window is 16 bins wide.
+    wide = 16
+    rest = power.copy()
+    found: list[float] = []
+    for _ in range(4 * MOST_LINES):
+        k = int(np.argmax(rest[wide:])) + wide
+        around = power[max(k - 20 * wide, wide) : k + 20 * wide]
+        if rest[k] < LINE * np.median(around) or len(found) == MOST_LINES:
+            break
+        near = slice(max(k - wide, 0), k + wide)
+        # A harmonic of the drive is no line of its own: what goes with it repeats with the motion.
+        driven = drive[k] > 1e-6 * drive[wide:].max() and drive[k] >= 0.5 * drive[near].max()
+        if not driven:
+            found.append(_refined(t, record.residual, float(frequency[k]), 1.0 / (4 * grid.size * step)))
+        rest[near] = 0.0
+    return found
+
+
+def _refined(t: FloatArray, x: FloatArray, frequency: float, bin_width: float) -> float:
+    """Return the frequency (Hz) near `frequency` whose wave takes most of `x`."""
+    x = x - x.mean()
+
+    def power(f: float) -> float:
+        return float(np.abs(np.exp(-2j * np.pi * f * t) @ x))
+
+    for _ in range(3):
+        tried = frequency + bin_width * np.linspace(-1.0, 1.0, 9)
+        frequency = float(max(tried, key=power))
+        bin_width /= 4.0
+    return frequency
+
+
+def _waves(t: FloatArray, frequencies: Sequence[float]) -> FloatArray:
+    waves = [wave(2.0 * np.pi * f * t) for f in frequencies for wave in (np.cos, np.sin)]
+    return np.column_stack([np.empty((t.size, 0)), *waves])
+
+
+def _of_jumps(records: Sequence[Signals]) -> Iterator[Left]:
+    found = [_jumps(record) for record in records]
+    if not any(found):
+        return
+    residual = [record.residual - record.residual.mean() for record in records]
+    columns = [
+        np.column_stack([np.ones(record.t.size), *(np.arange(record.t.size) >= k for k, _ in jumps)])
+        for record, jumps in zip(records, found, strict=True)
+    ]
+    share, _ = _share([scipy.linalg.block_diag(*columns)], residual)
+    largest = sorted(
+        ((float(record.t[k]), size) for record, jumps in zip(records, found, strict=True) for k, size in jumps),
+        key=lambda jump: -abs(jump[1]),
+    )
+    told = ", ".join(f"{1e9 * size:+.3g} nm at {at:.4g} s" for at, size in largest[:MOST_JUMPS])
+    yield Left("jumps", share, f"{share:.0%} of the mean square is in jumps: {told}; {HINTS['jumps']}")
+
+
+def _jumps(record: Signals) -> list[tuple[int, float]]:
+    """Return the sample and the size (m) of sudden shifts of the mean of a residual, the largest first found."""
+    size = max(16, record.t.size // 200)
+    if record.t.size < 4 * size:
+        return []
+    left = record.residual - record.residual.mean()
+    found: list[tuple[int, float]] = []
+    for _ in range(MOST_JUMPS):
+        total = np.concatenate([[0.0], np.cumsum(left)])
+        square = np.concatenate([[0.0], np.cumsum(left**2)])
+        at = np.arange(size, left.size - size + 1)
+        before, after = (total[at] - total[at - size]) / size, (total[at + size] - total[at]) / size
+        spread = (square[at + size] - square[at - size]) / size - before**2 - after**2
+        step = after - before
+        score = np.abs(step) / np.sqrt(np.maximum(spread, 1e-300) / size + np.mean(step**2))
+        k = int(np.argmax(score))
+        if score[k] < JUMP:
+            break
+        found.append((int(at[k]), float(step[k])))
+        left = left - step[k] * (np.arange(left.size) >= at[k])
+    return found

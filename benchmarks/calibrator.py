@@ -131,15 +131,15 @@ class Row:
     @property
     def good(self) -> bool:
         """Whether the error is as small as it can be."""
-        return self.error.mean <= max(UNDONE * self.error.stroke, RATIO * self.reachable)
+        return self.error.rest <= max(UNDONE * self.error.stroke, RATIO * self.reachable)
 
     def line(self) -> str:
         """Return the row of the table."""
         return (
             f"{self.seed:4} {self.axis:4} {', '.join(self.hidden):36} {', '.join(self.found):36} "
-            f"{'yes' if self.named else 'NO':5} {self.error.mean / self.error.stroke:8.3%} "
+            f"{'yes' if self.named else 'NO':5} {self.error.rest / self.error.stroke:8.3%} "
             f"{self.reachable / self.error.stroke:8.3%} {'yes' if self.good else 'NO':5} "
-            f"{self.fixed.mean / self.fixed.stroke:8.3%} {self.seconds:6.0f}"
+            f"{self.fixed.rest / self.fixed.stroke:8.3%} {self.seconds:6.0f}"
         )
 
 
@@ -200,8 +200,8 @@ def characters(count: int, first: int) -> None:
         print(
             f"\nright causes on {whole} of {len(stages)} stages, {sum(row.named for row in rows)} of {len(rows)} axes; "
             f"error as small as it can be on {sum(row.good for row in rows)} of {len(rows)} axes; "
-            f"median error {np.median([row.error.mean / row.error.stroke for row in rows]):.3%}, fixed calibration "
-            f"{np.median([row.fixed.mean / row.fixed.stroke for row in rows]):.3%}; "
+            f"median error {np.median([row.error.rest / row.error.stroke for row in rows]):.3%}, fixed calibration "
+            f"{np.median([row.fixed.rest / row.fixed.stroke for row in rows]):.3%}; "
             f"most stage time {max(row.seconds for row in rows):.0f} s an axis"
         )
 

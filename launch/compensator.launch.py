@@ -17,6 +17,7 @@ TOPICS = {
     "trajectory_topic": ("desired_trajectory", "topic of the desired trajectories"),
     "measured_topic": ("measured_displacement", "topic of the measured displacements; stage_state for feedback"),
     "voltage_topic": ("voltage_command", "topic of the voltage commands"),
+    "state_topic": ("stage_state", "topic of the stage state: where the amplifier is"),
     "error_topic": ("tracking_error", "topic of the tracking errors"),
     "model_topic": ("stage_model", "topic of the stage model"),
     "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),

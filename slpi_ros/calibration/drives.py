@@ -13,6 +13,7 @@ from slpi_ros.errors import UsageError
 from slpi_ros.excitation.drives import SLEW_USED, SWEEP, Drive, excite
 from slpi_ros.excitation.legs import DriveSpec, Path
 from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.io.record import Record
 from slpi_ros.model.limits import Limits, RateLimiter
 from slpi_ros.model.stage_model import StageModel
 
@@ -29,6 +30,8 @@ SWEEP_SECONDS, RETURN_SECONDS = 4.0, 1.0
 PATIENCE, CLOSE = 1.0, 1e-6
 # A drive that is too short for its slew limit is made longer by this factor, at most this many times.
 LONGER, LENGTHENINGS = 1.4, 8
+# Time to compute between two records, for each of them: the stage rests; longest pause that is simulated; seconds.
+COMPUTING, LONGEST_PAUSE = 4.0, 300.0
 # Start of the stamps for the compensator: not 0, which means none, nanoseconds.
 FIRST_STAMP = SECOND_NS
 
@@ -80,7 +83,9 @@ def checking(settings: CalibrationSettings) -> Drive:
     return _drive(settings, voltage, "Does the voltage follow the command, and the displacement the voltage?")
 
 
-def compensated(settings: CalibrationSettings, model: StageModel, seed: int) -> tuple[Drive, dict[str, FloatArray]]:
+def compensated(
+    settings: CalibrationSettings, model: StageModel, seed: int, before: Sequence[Record] = ()
+) -> tuple[Drive, dict[str, FloatArray]]:
     """Return a drive along a random path through the compensator, after a sweep that makes the memory known."""
     # Also the desired displacement (m) of each axis, shape (N,): NaN in the sweep before and the return after the path.
     sweep = exciting(settings, SWEEP, _sweep_seconds(settings), settings.axes, seed)
@@ -88,6 +93,13 @@ def compensated(settings: CalibrationSettings, model: StageModel, seed: int) -> 
     controller = Controller(settings.axes, settings.limits, period=1.0 / settings.rate)
     controller.use_model(model, start_memory="wiped")
     dt = 1.0 / settings.rate
+    for axis in controller.axes if before else ():
+        if not axis.stream.timeless:
+            # Creep goes on from the records before.
+            t, voltage = driven_so_far(before)
+            for v, passed in zip(voltage[axis.name].tolist(), np.diff(t, prepend=t[0]).tolist(), strict=True):
+                axis.stream.drive(v, passed)
+            axis.stream.wait(COMPUTING * len(before))
     for row in swept.tolist():
         for axis, v in zip(controller.axes, row, strict=True):
             axis.stream.drive(v, dt)
@@ -112,6 +124,17 @@ def compensated(settings: CalibrationSettings, model: StageModel, seed: int) -> 
     why = "A path that no record holds, through the compensator: what the model is worth."
     drive = _drive(settings, voltage, why, limited=False)
     return drive, {axis: np.pad(y, (0, drive.t.size - y.size), constant_values=np.nan) for axis, y in wanted.items()}
+
+
+def driven_so_far(records: Sequence[Record]) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Return times (s) and voltages (V) of successive records; a long pause between them is shortened."""
+    known = [np.all([np.isfinite(v) for v in record.voltage.values()], axis=0) for record in records]
+    time_ns = np.concatenate([record.time_ns[own] for record, own in zip(records, known, strict=True)])
+    t = np.cumsum(np.minimum(np.diff(time_ns, prepend=time_ns[0]) * 1e-9, LONGEST_PAUSE))
+    return t, {
+        axis: np.concatenate([record.voltage[axis][own] for record, own in zip(records, known, strict=True)])
+        for axis in records[0].voltage
+    }
 
 
 def _path(

@@ -3,14 +3,14 @@
 from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
-from math import inf
+from math import inf, isfinite
 from statistics import median
 
 from slpi_ros.compensator.amplifier import BAND_NS, Amplifier
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
 from slpi_ros.compensator.model_swap import continue_from, require_near, take_over, turning_voltages, voltage_history
 from slpi_ros.compensator.path_watch import PathWatch
-from slpi_ros.compensator.persistence import RESETTING, MemoryConfidence
+from slpi_ros.compensator.persistence import RESETTING, MemoryConfidence, Zero
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
 from slpi_ros.compensator.statistics import TrackingStatistics
@@ -27,6 +27,8 @@ from slpi_ros.model.streaming import StreamingInverse
 FIT_SHARE, FIT_SIGMAS = 0.005, 4.0
 # The median of this many measurements of at most this age decides on the initial history.
 FIRST_READINGS, FIRST_AGE_NS = 5, SECOND_NS // 5
+# Most measurements for the offset of an axis.
+OFFSETS = 50
 # A hold begins after this many intervals between samples, and after times between these.
 HOLD_INTERVALS, SOONEST_HOLD_NS, LATEST_HOLD_NS = 3, SECOND_NS // 50, 3 * SECOND_NS
 # A held voltage is at rest if it changes by less than this share of the range per second over this time; it is then
@@ -54,6 +56,7 @@ class Axis:
         self.amplifier = Amplifier(limits.upper - limits.lower)  # what is reported of the voltage
         self.model: AxisModel | None = None
         self.confidence = MemoryConfidence()
+        self.zero = Zero()
         self.held = self.slewing = self.driven = False  # at a voltage limit; slew limited; ever had a model
         self.ramp: Ramp | Brake | None = None  # an active motion without desired displacements
         self.start_memory: StartMemory | None = None  # assumed; None once output, or if restored
@@ -67,6 +70,8 @@ class Axis:
         self._feedback: Feedback | None = None
         self._sensor_watch = SensorWatch(1.0)
         self._first_readings: deque[tuple[int, float]] = deque(maxlen=FIRST_READINGS)
+        # Measured - model, with the time (ns), also where the measurement is refused.
+        self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
         # Arrival of the last samples; whether the displacement is held, and since when the voltage is nearly at rest.
         self._arrivals: tuple[int, ...] = ()
         self._holding = False
@@ -140,7 +145,7 @@ class Axis:
         else:
             self.output.start(stream.voltage)
         planned = self.stream.pace if self._feedback and not self.ramp else self.output
-        self.model, self.stream, self.driven = model, stream, True
+        self.model, self.stream, self.driven, self.zero = model, stream, True, Zero()
         self.path = PathWatch(model)
         stream.pace = planned
         self._set_limits(allowed)
@@ -362,28 +367,48 @@ class Axis:
         """Store a displacement (m) without the sensor's known errors; only those stamped now choose the history."""
         if not self.driven:
             return
+        low, high = self.stream.accepted
+        x = self._sensor.correct(displacement) if low <= displacement <= high else displacement
+        expected = self._expected.span(now_ns) if self._expected and self._feedback else ()
+        own = self._applied if self._feedback else self.stream
+        told = expected[-1] if expected else own.uncoupled_displacement + self.stream.coupled
+        if fresh and isfinite(x):
+            self._offsets.append((now_ns, x - told))
         self.check(displacement, "measured")
-        x = self._sensor.correct(displacement)
         if self.start_memory:
             if fresh:
                 self._first_readings.append((now_ns, x))
             return
         if self._feedback is None:
             self._close_loop()
+            expected, told = (), self._applied.uncoupled_displacement + self.stream.coupled
         assert self._feedback
-        expected = self._expected.span(now_ns) if self._expected else ()
         for each in expected:
             self._residuals.expect(each)
         if expected or not self._expected:
             self._residuals.measure(x)
         if self.ramp is None:
-            told = expected[-1] if expected else self._applied.uncoupled_displacement + self.stream.coupled
             self._sensor_watch.read(told, x, now_ns)
         desired = self._setpoint.at(now_ns) if self._setpoint else None
         if desired is not None or not self._setpoint:
             if not self.fault:
                 self._feedback.measure(x, now_ns, desired)
             self.tracking.measure(x, desired)
+
+    def offset(self, now_ns: int) -> float | None:
+        """Return the present measured - model displacement (m); None without a measurement in the last 0.2 s."""
+        recent = [offset for t, offset in self._offsets if now_ns - t <= FIRST_AGE_NS]
+        return median(recent) if recent else None
+
+    def move_zero(self, zero: Zero, model: AxisModel) -> None:
+        """Continue with the same `model` with another zero, at the present voltage and without a goal."""
+        self._leave_feedback()
+        self.use(model, self.prepare(model))
+        self.zero = zero
+        self.drop_goal()
+        self._offsets.clear()
+        if self._feedback:
+            self._close_loop()
 
     def choose_memory(self, now_ns: int) -> None:
         """Choose the initial history that matches the first measurements; the voltage is unchanged."""

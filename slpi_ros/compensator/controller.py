@@ -12,7 +12,16 @@ from slpi_ros.compensator.amplifier import REARM_NS, STEADY_NS
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.ownership import Ownership
-from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESETTING, MemoryConfidence, SavedAxis
+from slpi_ros.compensator.persistence import (
+    INTERRUPTED,
+    KNOWN,
+    RESET,
+    RESETTING,
+    SENSOR,
+    MemoryConfidence,
+    SavedAxis,
+    Zero,
+)
 from slpi_ros.compensator.ramps import Ramp, Safety
 from slpi_ros.compensator.sensor_watch import Fault
 from slpi_ros.compensator.statistics import Counts
@@ -73,7 +82,9 @@ class Controller:
         self.voltages = array("d", [0.0] * len(self.axes))  # V, updated in place
         self.mode = OperatingMode.UNCONFIGURED
         self.counts = Counts()
+        # The model in use, and as it was identified, before its zeros were moved.
         self.model: StageModel | None = None
+        self.identified: StageModel | None = None
         self.trajectory = TrajectoryExecutor(period, self._place)
         self.watchdog = CommandWatchdog()
         self._stage: StageStream | None = None
@@ -105,7 +116,7 @@ class Controller:
 
     def cleanup(self) -> None:
         """Discard the model; the voltages are unchanged."""
-        self.mode, self.model = OperatingMode.UNCONFIGURED, None
+        self.mode, self.model, self.identified = OperatingMode.UNCONFIGURED, None, None
 
     def activate(self, now_ns: int) -> None:
         """Start processing messages at `now_ns` (ns), with all axes at rest at their present voltages."""
@@ -137,7 +148,8 @@ class Controller:
                 f"the model has hardware id '{model.hardware_id}', this stage has '{self._hardware_id}'; "
                 "use a model of this stage, or correct hardware_id"
             )
-        turns = {name: each.reversal_voltages for name, each in (saved or {}).items()}
+        turns, identified = {name: each.reversal_voltages for name, each in (saved or {}).items()}, model
+        model = model.shifted({name: each.zero.offset for name, each in (saved or {}).items()})
         prepared = []
         for axis in self.axes:
             one = model.axis(axis.name)
@@ -151,11 +163,31 @@ class Controller:
                 axis.start_memory = None if saved else start_memory
             axis.use(one, stream)
             if saved:
-                axis.confidence = saved[axis.name].confidence(one.hysteresis_range)
+                axis.confidence, axis.zero = saved[axis.name].confidence(one.hysteresis_range), saved[axis.name].zero
             elif first and last_voltages and axis.name in last_voltages:
                 axis.locate(last_voltages[axis.name])
-        self.model = model
+        self.model, self.identified = model, identified
         self._couple()
+
+    def set_zero(self, now_ns: int) -> dict[str, float | None]:
+        """Let the models agree with the sensors now; return by how much (m) each zero moves, None: not measured."""
+        self._require_ready()
+        self._begin_output(now_ns)
+        assert self.model
+        moved = {axis.name: axis.offset(now_ns) for axis in self.axes}
+        known = {name: offset for name, offset in moved.items() if offset is not None}
+        axes = [axis for axis in self.axes if axis.name in known]
+        model = self.model.shifted(known)
+        for axis in axes:
+            axis.prepare(model.axis(axis.name))
+        if axes:
+            self.hold(now_ns)
+            self.model = model
+            for axis in axes:
+                zero = Zero.now(SENSOR, axis.zero.offset + known[axis.name])
+                axis.move_zero(zero, model.axis(axis.name))
+            self._couple()
+        return moved
 
     # Where the amplifiers are
 
@@ -548,14 +580,13 @@ class Controller:
         """Check the command watchdog: on expiry, hold or ramp to safe voltages; return whether the state changed."""
         # A trajectory counts as a command until its last point. The watchdog is suspended during a reset of the memory.
         waiting = self.mode in (OperatingMode.STREAMING, OperatingMode.RAMPING)
-        before = self.watchdog.safe_voltages
         news = self.watchdog.update(safety, now_ns, waiting)
-        if news and self.watchdog.safe_voltages != before:
-            if self.watchdog.safe_voltages and self.ownership.owned:
-                self.ramp(safety.voltages, safety.rate, now_ns)
-            else:
-                self._release((), now_ns)
-                self.mode = OperatingMode.STREAMING
+        if news and self.watchdog.safe_voltages and self.ownership.owned:
+            self.ramp(safety.voltages, safety.rate, now_ns)
+        elif news:
+            # The voltages are held, not the displacements: nothing follows creep or a sensor without commands.
+            self._release((), now_ns)
+            self.mode = OperatingMode.STREAMING
         return news
 
     def _start_ramps(self, ramps: Sequence[Ramp], mode: OperatingMode, now_ns: int) -> None:
@@ -608,6 +639,8 @@ class Controller:
             axis.confidence = MemoryConfidence(doubt=INTERRUPTED)
             if axis.ramp and axis.ramp.done and axis.model:
                 axis.confidence = MemoryConfidence(KNOWN, spanned=span).over(axis.model.hysteresis_range)
+                if axis.zero.source != SENSOR:
+                    axis.zero = Zero.now(RESET)
 
     def _release(self, but: Collection[Axis], now_ns: int) -> None:
         """End all ramps; axes in `but` follow new commands, the others decelerate to rest if in motion, then hold."""

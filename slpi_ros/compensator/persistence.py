@@ -8,6 +8,8 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
 
 from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing, remove_file
@@ -42,6 +44,24 @@ class MemoryConfidence:
             f"{highest:.6g} V; reset it within wider voltage limits, or identify within these"
         )
         return replace(self, state=ASSUMED, doubt=doubt)
+
+
+# Where a zero comes from: the calibration, a reset of the memory on top of it, or `~/set_zero`.
+CALIBRATION, RESET, SENSOR = "calibration", "reset", "sensor"
+
+
+@dataclass(frozen=True)
+class Zero:
+    """Zero of an axis: `source`, `CALIBRATION`, `RESET` or `SENSOR`, and since when."""
+
+    source: str = CALIBRATION
+    offset: float = 0.0  # m, against that of the identified model
+    at: str = ""  # ISO 8601; of the calibration: see the model
+
+    @classmethod
+    def now(cls, source: str, offset: float = 0.0) -> "Zero":
+        """Return a zero of the present."""
+        return cls(source, offset, datetime.now(UTC).isoformat(timespec="seconds"))
 
 
 # Head of an entry: identifier of the saved memory that it belongs to, and sequence number.
@@ -113,6 +133,7 @@ class SavedAxis:
     reversal_voltages: tuple[float, ...]  # V, at least one: oldest first, then the last voltage
     certain: bool  # whether the memory was reset or restored when it was saved
     doubt: str = ""  # why the saved state may be incomplete; not written to the file
+    zero: Zero = Zero()
 
     def confidence(self, identified: tuple[float, float]) -> MemoryConfidence:
         """Return the confidence in the restored memory for a model identified on the voltage range `identified` (V)."""
@@ -123,7 +144,7 @@ class SavedAxis:
     def after_crash(self, voltage: float) -> "SavedAxis":
         """Return the state recovered after a crash: the saved reversals, then the last output `voltage` (V)."""
         moved = () if voltage == self.reversal_voltages[-1] else (voltage,)
-        return SavedAxis((*self.reversal_voltages, *moved), self.certain, CRASHED)
+        return replace(self, reversal_voltages=(*self.reversal_voltages, *moved), doubt=CRASHED)
 
 
 @dataclass(frozen=True)
@@ -160,7 +181,11 @@ def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
         "model": memory.model,
         "complete": memory.complete,
         "axes": {
-            name: {"went_through_V": list(axis.reversal_voltages), "certain": axis.certain}
+            name: {
+                "went_through_V": list(axis.reversal_voltages),
+                "certain": axis.certain,
+                "zero": {"from": axis.zero.source, "offset_m": axis.zero.offset, "at": axis.zero.at},
+            }
             for name, axis in memory.axes.items()
         },
     }
@@ -185,7 +210,7 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
     except RecursionError:
         raise ModelError(f"{path}: no saved memory: nested too deeply; it is ignored") from None
     axes = {
-        name: SavedAxis(tuple(map(float, axis["went_through_V"])), axis["certain"])
+        name: SavedAxis(tuple(map(float, axis["went_through_V"])), axis["certain"], zero=_zero(axis.get("zero")))
         for name, axis in document["axes"].items()
     }
     if not document["complete"]:
@@ -261,6 +286,10 @@ def _mark(text: str) -> int:
 
 def _beside(path: str | os.PathLike[str]) -> str:
     return f"{os.fspath(path)}.last"
+
+
+def _zero(saved: Mapping[str, Any] | None) -> Zero:
+    return Zero(saved["from"], float(saved["offset_m"]), saved["at"]) if saved else Zero()
 
 
 def _refuse(constant: str) -> float:

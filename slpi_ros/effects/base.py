@@ -235,6 +235,12 @@ class EffectBase(Protocol):
         """Return the effect with the displacement `rest` (m) as its origin, if it needs one and has none."""
         return self
 
+    def shifted(self, by: float) -> Self:
+        """Return the effect for a zero of the displacement that has moved by `by` (m)."""
+        if "origin" not in facts_of(type(self)):
+            return self
+        return replace(self, origin=self.origin + by)  # type: ignore[attr-defined, type-var]
+
     def streaming(self) -> Any:
         """Return the `StreamingEffect` or `StreamingAround`; None if it is not compensated sample by sample."""
         return

@@ -244,6 +244,17 @@ class AxisModel:
         """Return the sensor for readings that come one by one."""
         return StreamingSensor(self.sensor, self.chain.measured)
 
+    def shifted(self, by: float) -> "AxisModel":
+        """Return the model with a zero that has moved by `by` (m)."""
+        low, high = self.displacement_range
+        return replace(
+            self,
+            start=replace(self.start, displacement=self.start.displacement + by),
+            end=self.end and replace(self.end, displacement=self.end.displacement + by),
+            displacement_range=(low + by, high + by),
+            effects=tuple(effect.shifted(by) for effect in self.effects),
+        )
+
     @cached_property
     def stage_only(self) -> "AxisModel":
         """The model from the voltage to where the stage is: without the effects of sensor and record."""

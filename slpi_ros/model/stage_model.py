@@ -137,6 +137,11 @@ class StageModel:
         """
         return corrected(record, {name: axis.correct for name, axis in self.axes.items() if axis.corrects})
 
+    def shifted(self, offsets: Mapping[str, float]) -> "StageModel":
+        """Return the model with zeros that have moved by `offsets` (m, by axis)."""
+        moved = {name: axis.shifted(offsets[name]) if name in offsets else axis for name, axis in self.axes.items()}
+        return replace(self, axes=moved)
+
     @cached_property
     def stage_only(self) -> "StageModel":
         """The model from the voltages to where the stage is: without the effects of sensors and record."""

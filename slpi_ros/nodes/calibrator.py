@@ -218,7 +218,7 @@ class Calibrator(Node):
         said = worker.said()
         if isinstance(said, Progress):
             self._progress = said
-            error = "" if said.error is None else f", mean error so far {said.error * 1e6:.4f} µm"
+            error = "" if said.error is None else f", mean error {said.error * 1e6:.4f} µm"
             self.get_logger().info(f"step {said.step}: {said.doing}; {said.seconds_left:.0f} s of drives left{error}")
         elif said is not None:
             self._begin_job(said)

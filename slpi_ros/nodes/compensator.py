@@ -104,6 +104,7 @@ class Compensator(LifecycleNode):
         self._reporter = Reporter(self, self._controller)
         self._reset_service = DeferredService(self, "~/reset_memory", self._on_reset)
         self.create_service(Trigger, "~/arm", self._on_arm)
+        self.create_service(Trigger, "~/set_zero", self._on_set_zero)
         self._doubts: dict[str, str] = {}
         self._noted: set[str] = set()
         self._calibrations: dict[str, Calibration] = {}
@@ -345,6 +346,28 @@ class Compensator(LifecycleNode):
             self._report()
         return response
 
+    def _on_set_zero(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Let the zeros of the models agree with the sensors; nothing moves."""
+        try:
+            moved = self._controller.set_zero(time.monotonic_ns())
+        except SlpiError as error:
+            response.success, response.message = False, f"not set: {error}"
+            return response
+        said = [
+            f"axis '{name}': the zero moves by {offset * 1e6:+.4f} µm"
+            if offset is not None
+            else f"axis '{name}': not set, no measured_displacement in the last 0.2 s; remap it to that of the sensor"
+            for name, offset in moved.items()
+        ]
+        unsure = [axis.name for axis in self._controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
+        if unsure:
+            said.append(f"the memory of axis {', '.join(unsure)} is assumed: reset it, then set the zero again")
+        response.success, response.message = None not in moved.values(), "; ".join(said)
+        self.get_logger().info(f"~/set_zero: {response.message}")
+        self._save_memory(complete=False)
+        self._report()
+        return response
+
     def _wait_for_discovery(self) -> None:
         """Wait until this node may know whether stage_state has a publisher: commands are not taken before that."""
         while not self._reports_expected and time.monotonic_ns() - self._begun_ns < DISCOVERY_NS and self.context.ok():
@@ -502,7 +525,19 @@ class Compensator(LifecycleNode):
                 self._answer_reset()
             self._report()
 
+    def _other_publishers(self) -> list[str]:
+        """Return the other nodes that publish the voltages."""
+        if self._controller.mode is OperatingMode.UNCONFIGURED:
+            return []
+        own = self.get_name(), self.get_namespace()
+        found = self.get_publishers_info_by_topic(self._publisher.topic_name)
+        names = [(each.node_name, each.node_namespace) for each in found]
+        if own in names:
+            names.remove(own)
+        return sorted(f"{namespace.rstrip('/')}/{name}" for name, namespace in names)
+
     def _on_period(self) -> None:
+        self._reporter.others = self._other_publishers()
         self._report()
         self._reporter.start_window()
         if self._controller.active:
@@ -702,11 +737,11 @@ class Compensator(LifecycleNode):
         if not self._keeps_memory or controller.model is None:
             return
         axes = {
-            axis.name: SavedAxis(axis.reversal_voltages, axis.confidence.state in (KNOWN, RESTORED))
+            axis.name: SavedAxis(axis.reversal_voltages, axis.confidence.state in (KNOWN, RESTORED), zero=axis.zero)
             for axis in controller.axes
         }
         try:
-            self._memory_file.save(controller.model, axes, complete)
+            self._memory_file.save(controller.identified, axes, complete)
         except SlpiError as error:
             self.get_logger().error(str(error), throttle_duration_sec=FILE_LOG_PERIOD)
 

@@ -8,12 +8,16 @@ from rclpy.node import Node
 
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
+from slpi_ros.compensator.feedback import Drift
+from slpi_ros.compensator.persistence import KNOWN, RESTORED
 from slpi_ros.compensator.statistics import Timing, TimingReport
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 
 Problem = tuple[bool, bytes, str]
+# Residuals are a constant if their mean is this share of their rms.
+CONSTANT = 0.9
 
 
 class Reporter:
@@ -25,6 +29,7 @@ class Reporter:
         self.last_rejection = self.model_error = self.model_id = ""  # reasons; fingerprint
         self.models_refused = 0
         self.lost = self.worked_off = self.largest_backlog = 0  # messages: by the middleware, of a backlog
+        self.others: list[str] = []  # nodes that also publish the voltages
         self.age: float | None = None  # s, of the last answered command by its stamp
         self._controller = controller
         self._diagnostics = Diagnostics(node, "compensator")
@@ -41,7 +46,7 @@ class Reporter:
         values = self._counters() | self._timing_values() | self._model_values(model)
         if model:
             for axis in self._controller.axes:
-                values |= _axis_values(axis)
+                values |= _axis_values(axis, model.created)
                 values[f"{axis.name}.start_voltage"] = self._controller.ownership.notes.get(axis.name, "")
         problems = tuple((level, text) for wrong, level, text in self._problems(settings) if wrong)
         hardware_id = settings.values["hardware_id"] or (model.hardware_id if model else "")
@@ -173,6 +178,8 @@ class Reporter:
             yield obstacle is not None, WARN if ownership.armed else ERROR, obstacle[1] if obstacle else ""
             for name, note in ownership.notes.items():
                 yield note != "" and obstacle is None and not ownership.started, WARN, f"axis '{name}': {note}"
+        others = ", ".join(self.others)
+        yield others != "", WARN, f"{others} also publishes voltage_command; stop it, or the voltage jumps between both"
         yield self._controller.too_fast != "", WARN, f"trajectory {self._controller.too_fast}"
         silence = self._silence()
         yield silence != "", WARN, silence
@@ -189,7 +196,7 @@ def _microseconds(report: TimingReport | None) -> tuple[str, str, str]:
     return p50, p99, longest
 
 
-def _axis_values(axis: Axis) -> dict[str, object]:
+def _axis_values(axis: Axis, created: str) -> dict[str, object]:
     drift, quality = axis.drift, axis.model.quality if axis.model else None
     values = {
         "voltage_V": f"{axis.voltage:.4f}",
@@ -206,6 +213,9 @@ def _axis_values(axis: Axis) -> dict[str, object]:
         "feedback_fault": axis.fault.kind if axis.fault else "",
         "residual_rms_nm": f"{drift.rms * 1e9:.2f}" if drift else "",
         "residual_mean_nm": f"{drift.mean * 1e9:.2f}" if drift else "",
+        "zero_from": axis.zero.source,
+        "zero_age_h": _hours_since(axis.zero.at or created),
+        "zero_moved_nm": f"{axis.zero.offset * 1e9:.2f}",
     }
     return {f"{axis.name}.{key}": value for key, value in values.items()}
 
@@ -224,9 +234,18 @@ def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]
         usual = max(quality.held_out_rms, quality.floor_rms)
         text = (
             f"axis '{axis.name}' is off its model by {drift.rms * 1e9:.1f} nm rms, mean {drift.mean * 1e9:.1f} nm, in "
-            f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: reset the memory, or identify again"
+            f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {_remedy(axis, drift)}"
         )
         yield 0.0 < factor * usual < drift.rms, WARN, text
+
+
+def _remedy(axis: Axis, drift: Drift) -> str:
+    """Return what to do about residuals: what has been done already is not advised again."""
+    if axis.confidence.state not in (KNOWN, RESTORED):
+        return "reset the memory (~/reset_memory)"
+    if abs(drift.mean) > CONSTANT * drift.rms:
+        return f"the zero, from the {axis.zero.source}, has moved; call ~/set_zero, or switch the feedback on"
+    return "the stage has changed; record it and run slpi diagnose, or identify again"
 
 
 def _hours_since(created: str) -> str:

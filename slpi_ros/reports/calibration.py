@@ -31,9 +31,15 @@ def page_of(outcome: Outcome) -> Page:
     page.text(
         f"{outcome.why[0].upper()}{outcome.why[1:]}. The stage moved for {outcome.seconds:.0f} s in "
         f"{sum(step.seconds > 0 for step in outcome.steps)} drives; every verification followed a path of its own "
-        "through the compensator. Errors are without the constant offset of each path."
+        "through the compensator after a sweep over the whole range, which resets the memory. Errors are absolute, "
+        "measured - desired; what counts is the latest verification."
     )
-    page.table(("", "error before and after", *outcome.errors), _errors(outcome), None, "Mean and maximum error.")
+    page.table(
+        ("", "error before and after", *outcome.errors),
+        _errors(outcome),
+        None,
+        "Mean and maximum error; mean without the constant part.",
+    )
     for axis, error in outcome.errors.items():
         found = outcome.diagnosis.axes[axis]
         page.heading(f"Axis {axis}", axis)
@@ -41,6 +47,8 @@ def page_of(outcome: Outcome) -> Page:
         page.tiles({
             "verified error, mean": nm(error.mean),
             "of the stroke": f"{error.mean / error.stroke:.3%}",
+            "of it constant": nm(error.offset),
+            "mean without it": nm(error.rest),
             "maximum": nm(error.maximum),
             "target": nm(error.goal),
             "repeatability, rms": nm(found.repeatability_rms),
@@ -66,7 +74,7 @@ def _errors(outcome: Outcome) -> list[list[str]]:
             step.name,
             "hysteresis alone" if number == 0 else "with the causes found",
             *(
-                f"{nm(error.mean)} ({error.mean / error.stroke:.3%}), {nm(error.maximum)}"
+                f"{nm(error.mean)} ({error.mean / error.stroke:.3%}), {nm(error.maximum)}; {nm(error.rest)}"
                 for error in step.errors.values()
             ),
         ]

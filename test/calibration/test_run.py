@@ -1,14 +1,18 @@
 """A whole calibration on simulated stages, without ROS."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from calibration.stages import SimulatedRecorder, settings, stage_of
+from strategies import FAMILY_CASE, axis_model
 
-from slpi_ros.calibration.run import Recording, aligned, calibrate
+from slpi_ros.calibration.run import Recording, aligned, calibrate, tracking_error, why, with_present_zero
+from slpi_ros.effects.creep import Creep
 from slpi_ros.errors import IdentificationError, RecordError, SlpiError
 from slpi_ros.io.record import Record
+from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.calibration import write_files
 from slpi_ros.simulation.character import Character
 
@@ -100,6 +104,48 @@ def test_transport_between_command_and_reading_is_not_an_error_of_the_stage():
     assert np.abs(error).max() < 5e-9
 
 
+def error_of(stage_error, goal=20e-9):
+    """What is told of a path on which the stage is off by `stage_error` (m, by sample)."""
+    t = np.arange(stage_error.size) / 200.0
+    desired = 1e-5 + 5e-6 * np.sin(t)
+    record = Record(np.round(t * 1e9).astype(np.int64), {"x": t}, {"x": desired + stage_error})
+    return tracking_error(Recording(record, {"x": desired}), "x", MODEL, goal)
+
+
+MODEL = StageModel({"x": replace(axis_model(FAMILY_CASE), displacement_range=(0.0, 20e-6))})
+
+
+def test_errors_are_absolute_and_the_latest_verification_counts():
+    scatter = np.random.default_rng(0).normal(0.0, 8e-9, 4000)
+    first, moved = error_of(scatter), error_of(scatter + 60e-9)
+    assert first.met and not moved.met
+    assert moved.mean == pytest.approx(60e-9, rel=0.01)
+    assert (moved.offset, moved.rest) == (pytest.approx(60e-9, rel=0.01), pytest.approx(first.rest, rel=1e-6))
+    diagnosis = SimpleNamespace(axes={"x": SimpleNamespace(effects=())})
+    said = why([{"x": first}, {"x": moved}], diagnosis, "the time budget is spent")
+    risen = f"{first.mean * 1e9:.3g} to {moved.mean * 1e9:.3g} nm"
+    assert said.startswith("target not met") and risen in said and "~/set_zero" in said
+    assert why([{"x": moved}, {"x": first}], diagnosis, "").startswith("target met")
+
+
+def test_the_zero_of_a_model_is_that_of_the_last_record():
+    creep = Creep((0.5, 20.0), (0.02, 0.03))
+    model = StageModel({"x": replace(MODEL.axes["x"], effects=(creep,))})
+    t = np.arange(4000) / 200.0
+    v = 50.0 - 50.0 * np.cos(t)
+    stamps = np.round(t * 1e9).astype(np.int64)
+    seen = model.simulate(np.append(t, t + 120.0), {"x": np.append(v, v)})["x"]
+    records = [
+        Record(stamps, {"x": v}, {"x": seen[:4000]}),
+        Record(stamps + 120 * 10**9, {"x": v}, {"x": seen[4000:] + 0.3e-6}),
+    ]
+    axis = with_present_zero(model, records).axes["x"]
+    assert axis.start.displacement - model.axes["x"].start.displacement == pytest.approx(0.3e-6, abs=1e-12)
+    # The same motion, elsewhere.
+    moved = axis.simulate(t, v) - model.axes["x"].simulate(t, v)
+    np.testing.assert_allclose(moved, 0.3e-6, rtol=0, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_a_hidden_cause_is_named_and_undone(tmp_path):
     recorder, steps = SimulatedRecorder(stage_of(Character(creep=0.015))), []
@@ -116,7 +162,7 @@ def test_a_hidden_cause_is_named_and_undone(tmp_path):
     model = outcome.model.axes["x"]
     memory = model.memory("end")
     assert memory.displacement == pytest.approx(model.simulate(last.t, last.voltage["x"])[-1], abs=0.5e-6)
-    assert [progress.step for progress in steps] == list(range(1, len(outcome.steps) + 1))
+    assert list(dict.fromkeys(progress.step for progress in steps)) == list(range(1, len(outcome.steps) + 1))
     write_files(tmp_path, outcome)
     assert {path.name for path in tmp_path.iterdir()} == {"model.json", "report.html", "diagnosis"}
     page = (tmp_path / "report.html").read_text()

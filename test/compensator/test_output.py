@@ -12,6 +12,7 @@ from strategies import FAMILY_CASE, axis_model
 from benchmarks.episodes import Episode, Ratios, Wire
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.persistence import MemoryFile, SavedAxis
+from slpi_ros.compensator.ramps import Safety
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import ModelError
@@ -225,6 +226,22 @@ def test_a_single_set_point_settles_although_the_stage_lags_and_creeps():
     stage.run(60.0)
     assert len(stage.given) <= 61
     assert stage.axis.holding
+
+
+def test_a_timeout_holds_the_voltage_and_not_the_displacement():
+    """Without commands nobody may be there: no voltage follows the creep of the stage, or its sensor."""
+    stage = Stage(model=SETTLING, limits=replace(LIMITS, slew=1000.0))
+    stage.send(0.6 * TOP)
+    stage.run(0.5)
+    assert stage.axis.holding and len(set(stage.given[-20:])) == 20
+    assert stage.made.watch(Safety(0.4, False, False, (0.0,), 50.0), stage.now_ns)
+    stage.given.clear()
+    stage.run(5.0)
+    assert not stage.given and not stage.axis.holding
+    stage.send(0.6 * TOP)
+    stage.run(4.0)
+    assert stage.axis.holding
+    stage.check()
 
 
 @pytest.mark.parametrize(("interval_ms", "begin_ms"), [(1, 20), (5, 20), (10, 30), (50, 150)])

@@ -10,6 +10,7 @@ rclpy = pytest.importorskip("rclpy")
 from nodes.compensator_client import SECOND_NS, Client, compensator  # noqa: E402
 from nodes.ros_helpers import RELIABLE, stage_model  # noqa: E402
 from nodes.test_compensator_trajectory import trajectory  # noqa: E402
+from std_msgs.msg import Float64MultiArray  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
@@ -133,3 +134,12 @@ def test_on_timeout_changed_in_the_silence_counts_at_once(x_file):
         assert client.graph.set_parameters(client.name, command_timeout=60.0) == ""
         client.ask(["x"], [5e-6])
         wait_for_message(client, "compensating")
+
+
+def test_another_publisher_of_the_voltages_is_named(x_file):
+    with compensator(model_file=x_file) as client:
+        client.connect()
+        other = client.graph.publisher(Float64MultiArray, "/voltage_command", RELIABLE)
+        said = wait_for_message(client, "also publishes voltage_command")
+        assert client.graph.node.get_name() in said
+        client.graph.node.destroy_publisher(other)

@@ -1,5 +1,6 @@
 """The memory at the start, over DDS: what is assumed is said once, a reset comes first where wanted."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from nodes.compensator_client import Client, compensator  # noqa: E402
 from nodes.ros_helpers import stage_model, values_of  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
 
 from slpi_ros.model.document import save_model  # noqa: E402
 from slpi_ros.model.stage_model import StageModel  # noqa: E402
@@ -98,3 +100,27 @@ def test_a_reset_at_the_start_that_leaves_the_memory_assumed_is_not_silent(x_fil
         )
         warned = [line for line in client.node.stderr.splitlines() if "~/reset_memory" in line]
         assert len(warned) == 1 and "WARN" in warned[0] and values_of(status)["x.memory_doubt"] in warned[0]
+
+
+def test_after_a_reset_the_zero_is_set_and_not_another_reset_advised(x_file, tmp_path):
+    memory = tmp_path / "memory.json"
+    told = {"reset_on_start": True, "reset_rate": 400.0, "reset_cycles": 2, "memory_file": str(memory)}
+    with compensator(model_file=x_file, **told) as client:
+        client.connect()
+        client.report(memory="known")
+        refused = client.graph.call(Trigger, f"{client.name}/set_zero", Trigger.Request())
+        assert not refused.success and "no measured_displacement" in refused.message
+        client.ask(["x"], [5e-6])
+        client.wait_for_rest(client.answers[-1][0])
+        measure(client, 5.3e-6)
+        status = client.graph.wait_for_status(
+            f"{client.name}: compensator", lambda status: "off its model" in status.message, "the moved zero"
+        )
+        assert "~/set_zero" in status.message and "reset the memory" not in status.message
+        assert values_of(status)["x.zero_from"] == "reset"
+        answer = client.graph.call(Trigger, f"{client.name}/set_zero", Trigger.Request())
+        assert answer.success and "+0.3000" in answer.message
+        _, values = client.report(**{"x.zero_from": "sensor"})
+        assert float(values["x.zero_moved_nm"]) == pytest.approx(300.0, abs=1.0)
+        saved = json.loads(memory.read_text())["axes"]["x"]["zero"]
+        assert saved["from"] == "sensor" and saved["offset_m"] == pytest.approx(0.3e-6, abs=1e-9)

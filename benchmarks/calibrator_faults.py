@@ -33,7 +33,7 @@ def start(folder: Path, resume: bool = False) -> subprocess.Popen[str]:
         "output": folder, "resume": str(resume).lower(),
     }  # fmt: skip
     given = [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
-    command = [sys.executable, "-m", "slpi_ros.nodes.calibrator", "--ros-args", *given]
+    command = [sys.executable, "-m", "slpi_ros.nodes.start", "calibrator", "--ros-args", *given]
     return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
 
 

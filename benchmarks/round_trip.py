@@ -79,7 +79,9 @@ def compensator(
         given = {"axes": list(AXES), "model_file": str(path), "executor": executor, **parameters}
         options = [part for name, value in given.items() for part in ("-p", f"{name}:={json.dumps(value)}")]
         options += [part for rule in remap for part in ("-r", rule)]
-        with node(namespace, "-m", "slpi_ros.nodes.compensator", "--ros-args", *options, python=python) as process:
+        with node(
+            namespace, "-m", "slpi_ros.nodes.start", "compensator", "--ros-args", *options, python=python
+        ) as process:
             yield process
 
 

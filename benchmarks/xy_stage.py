@@ -101,7 +101,7 @@ def simulator(**parameters: object) -> Iterator[XyStage]:
     """Run the simulated stage on the simulated clock."""
     given = {"axes": list(AXES), "use_sim_time": True, **parameters}
     options = [part for name, value in given.items() for part in ("-p", f"{name}:={value}".replace("'", '"'))]
-    with node("bench", "-m", "slpi_ros.nodes.stage_simulator", "--ros-args", *options):
+    with node("bench", "-m", "slpi_ros.nodes.start", "stage_simulator", "--ros-args", *options):
         stage = XyStage()
         try:
             yield stage

@@ -58,7 +58,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name at its first use."""
     if name == "fleet":
         return import_module(f"{__name__}.fleet")
     if name not in _MODULES:
@@ -70,5 +69,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the public names."""
     return sorted({*globals(), *__all__})

@@ -24,7 +24,6 @@ class CalibrationSettings:
     seed: int = 0  # of the random parts of the drives
 
     def __post_init__(self) -> None:
-        """Validate the settings."""
         if not self.axes or not len(self.axes) == len(self.limits) == len(self.rest):
             raise UsageError(f"calibration: axes {list(self.axes)}; give each its limits and its rest voltage")
         for axis, limits, rest in zip(self.axes, self.limits, self.rest, strict=True):

@@ -24,7 +24,6 @@ class PidGains:
     derivative_filter: float = 0.0  # s, time constant of its low-pass filter; 0: none
 
     def __post_init__(self) -> None:
-        """Refuse negative and non-finite gains."""
         for field in fields(self):
             value = getattr(self, field.name)
             if not (isfinite(value) and value >= 0.0):

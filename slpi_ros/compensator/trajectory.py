@@ -60,7 +60,6 @@ class Trajectory:
         return cls(tuple(names), times.astype(np.int64, copy=False), places, start_ns)
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return self.time_from_start_ns.size
 
     def check_reach(self, accepted: Mapping[str, tuple[float, float]]) -> None:

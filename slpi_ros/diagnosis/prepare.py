@@ -81,7 +81,6 @@ class Evidence:
     older_moves: bool = False  # creep may also continue from moves long before a record
 
     def __post_init__(self) -> None:
-        """Give an empty `beside` the shape (N, 0)."""
         if not self.beside.size:
             object.__setattr__(self, "beside", np.empty((self.t.size, 0)))
 

@@ -515,7 +515,6 @@ def _summary(records: Sequence[RecordVerification], resolution: float) -> AxisVe
 
 
 def _thinned(record: RecordVerification, most: int) -> IntArray:
-    """Return the indices of about `most` evaluated samples."""
     at = np.flatnonzero(record.judged)
     return at[:: max(1, round(at.size / most))]
 

@@ -170,7 +170,6 @@ class EffectBase(Protocol):
     resembles_when_old: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        """Validate the parameters; ModelError if one is invalid."""
         require_facts(self)
 
     @classmethod

@@ -88,7 +88,6 @@ class Creep(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters, including invertibility."""
         super().__post_init__()
         require(
             self,

@@ -46,7 +46,6 @@ class CrossCoupling(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the gains."""
         super().__post_init__()
         least = sum(map(abs, self.gains.values())) < 0.9
         require(self, ("gains", least, "less than 0.9 in sum, to tell the axes apart"))

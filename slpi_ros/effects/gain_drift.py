@@ -72,7 +72,6 @@ class GainDrift(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the knots."""
         super().__post_init__()
         rising = self.times == (0.0,) or all(a < b for a, b in zip((0.0, *self.times), self.times, strict=False))
         require(

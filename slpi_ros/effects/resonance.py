@@ -240,7 +240,6 @@ class Resonance(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the modes."""
         super().__post_init__()
         require(self, ("modes", self.rest >= 0, "of gains that are at most 1 in sum"))
 

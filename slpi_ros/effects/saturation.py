@@ -49,7 +49,6 @@ class Saturation(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the limits."""
         super().__post_init__()
         require(
             self,

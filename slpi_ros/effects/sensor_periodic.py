@@ -71,7 +71,6 @@ class SensorPeriodic(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the parameters, including invertibility."""
         super().__post_init__()
         require(self, ("amplitude", self.amplitude * 2 * pi < 0.99 * self.period, "less than period / 2 pi"))
 

@@ -53,7 +53,6 @@ class ThermalDrift(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the knots."""
         super().__post_init__()
         rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
         require(

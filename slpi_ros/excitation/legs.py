@@ -38,7 +38,6 @@ class DriveSpec:
     slew_limit: float = 0.0
 
     def __post_init__(self) -> None:
-        """Validate the parameters."""
         if not -math.inf < self.low < self.high < math.inf:
             raise UsageError(f"drive: limits {self.low} V and {self.high} V; the first must be the lower one")
         if max(-self.low, self.high) > MOST_VOLTAGE:

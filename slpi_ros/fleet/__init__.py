@@ -9,7 +9,6 @@ __all__ = ["run"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import `run` at its first use."""
     if name != "run":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from slpi_ros.fleet.cluster import run

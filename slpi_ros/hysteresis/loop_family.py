@@ -32,7 +32,6 @@ class LoopFamily:
     branches: Branches = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Validate the arrays and compute the knots of the branches from all vertices."""
         for name in ("grid", "everett", "rise"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         n = self.grid.size

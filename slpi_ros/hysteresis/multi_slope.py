@@ -77,7 +77,6 @@ class MultiSlope:
     _bends: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Validate the parameters and store the operators of positive weight and their breakpoints."""
         for name in ("thresholds", "weights"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         r, w = self.thresholds, self.weights
@@ -159,7 +158,6 @@ class AmplitudeScaled:
     peak_displacements: FloatArray  # m, (m,), ``X_p``, positive, strictly increasing
 
     def __post_init__(self) -> None:
-        """Validate the peaks."""
         for name in ("peak_voltages", "peak_displacements"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         v, x = self.peak_voltages, self.peak_displacements

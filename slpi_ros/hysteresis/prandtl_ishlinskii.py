@@ -24,7 +24,6 @@ class PrandtlIshlinskii:
     _first: Curve = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Validate the parameters and compute the shapes of the branches and of the first rise."""
         for name in ("thresholds", "weights"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         r, w = self.thresholds, self.weights

@@ -187,7 +187,6 @@ class SeparatedLoops:
     dead_band: float = 0.0  # V; smaller reversals are measurement noise
 
     def __post_init__(self) -> None:
-        """Validate the loops."""
         if not self.dead_band >= 0.0:
             raise ModelError(f"published SLPI: dead band of {self.dead_band} V; give 0 or more")
         if not any(loop.level == 0 for loop in self.loops):

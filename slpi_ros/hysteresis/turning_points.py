@@ -107,7 +107,6 @@ class Memory:
         self._enter_branch()
 
     def _turn_to(self, direction: int) -> None:
-        """Push the current point as a reversal if the direction changes."""
         if direction == self._direction:
             return
         if self._direction:

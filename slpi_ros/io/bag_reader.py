@@ -104,7 +104,6 @@ class Bag:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        """Open the files and list their topics."""
         with ExitStack() as stack:
             for source in self._sources:
                 with translated(source):
@@ -114,7 +113,6 @@ class Bag:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the files and remove those that were decompressed."""
         self._stack.close()
 
     def _open(self, source: Path, stack: ExitStack) -> None:

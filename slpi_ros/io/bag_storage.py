@@ -221,7 +221,6 @@ class _McapFile:
             yield _gather(np.frombuffer(records, np.uint8), offsets, self._channels)
 
     def _unpack(self, start: int, length: int) -> bytes:
-        """Return the records in a chunk."""
         records = _records_of_chunk(self._read(start, length))
         self._left -= len(records)
         if self._left < 0:

@@ -108,13 +108,11 @@ class BagWriter:
         shutil.rmtree(self.partial, ignore_errors=True)
 
     def __enter__(self) -> Self:
-        """Return the open writer."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Complete the bag, or discard it after an exception."""
         if error is not None:
             self.discard()
             return

@@ -103,7 +103,6 @@ class Record:
     axes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check that every axis has both signals, one value for each stamp."""
         if len(self.voltage) > MOST_AXES:
             raise RecordError(f"{self.source}: {len(self.voltage)} axes, more than {MOST_AXES}; choose some of them")
         if set(self.voltage) != set(self.displacement) or not self.voltage:
@@ -138,7 +137,6 @@ class Record:
         return replace(self, time_ns=self.time_ns[rows], voltage=voltage, displacement=displacement)
 
     def __len__(self) -> int:
-        """Return the number of samples."""
         return int(self.time_ns.size)
 
     def require_axis(self, axis: str) -> None:

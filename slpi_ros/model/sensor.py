@@ -48,7 +48,6 @@ class Sensor:
                 raise UsageError(f"sensor {field.name} is {value} s; give a time from 0 to {LONGEST:g} s")
 
     def __bool__(self) -> bool:
-        """Return whether the readings are late at all."""
         return bool(self.delay or self.lag)
 
     def describe(self) -> str:

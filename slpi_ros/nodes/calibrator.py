@@ -1,7 +1,6 @@
 """Node ``calibrator``: drives an unknown stage and carries out what `slpi_ros.calibration.run` decides."""
 
 import math
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,9 +23,8 @@ from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.messages import encode_joint_states
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
-from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, run
+from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop
 from slpi_ros.nodes.guarded_drive import GuardedDrive
-from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 from slpi_ros.reports.calibration import PAGE
 
@@ -443,14 +441,3 @@ def _free(path: Path) -> Path:
     while free.exists():
         number, free = number + 1, path.with_name(f"{path.name}_{number}")
     return free
-
-
-def main() -> int:
-    """Run the node; return the exit code of the process: 0 target met, 1 not met or interrupted, 2 wrong usage."""
-    if help_asked("calibrator", Calibrator, DECLARATIONS):
-        return 0
-    return run(Calibrator)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -28,8 +28,8 @@ from std_srvs.srv import Trigger
 
 from slpi_ros.errors import SlpiError, UsageError, shown
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.nodes import start
-from slpi_ros.nodes.start import SIGNALS, Stop
+from slpi_ros.nodes import stop
+from slpi_ros.nodes.stop import SIGNALS, Stop
 
 COMMANDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 # Late subscribers receive the last message.
@@ -222,7 +222,7 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
     # The ROS context stays valid until the node's ``destroy_node`` has returned, so that the node may still publish in
     # that method. A node with an attribute `executor_kind` chooses its executor itself.
     global _stop
-    _stop = start.of_process or Stop()
+    _stop = stop.of_process or Stop()
     with _signals_to(_stop.on_signal):
         try:
             # A signal may have arrived during the imports.

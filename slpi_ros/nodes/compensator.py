@@ -1,7 +1,6 @@
 """Node ``compensator``: an adapter that decodes messages, calls the `Controller`, and publishes what it returns."""
 
 import math
-import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -42,11 +41,9 @@ from slpi_ros.nodes.common import (
     ask_for_priority,
     keep_freed_memory,
     refuse_impossible_transitions,
-    run,
 )
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings
-from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.jobs import Read, Reading
 from slpi_ros.nodes.parameters import Parameters
 
@@ -768,14 +765,3 @@ def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayL
     times = [point.time_from_start.sec * SECOND_NS + point.time_from_start.nanosec for point in points]
     positions = [point.positions.tolist() for point in points]
     return stamp.sec * SECOND_NS + stamp.nanosec, message.joint_names, times, positions
-
-
-def main() -> int:
-    """Run the node; return the exit code of the process."""
-    if help_asked("compensator", Compensator, DECLARATIONS):
-        return 0
-    return run(Compensator)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,6 @@
 """Node ``exciter``: excites a stage for identification."""
 
 import math
-import sys
 import time
 from array import array
 from collections.abc import Sequence
@@ -18,9 +17,8 @@ from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite, slew_limits
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.common import COMMANDS, request_stop, run
+from slpi_ros.nodes.common import COMMANDS, request_stop
 from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
-from slpi_ros.nodes.help import help_asked
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 
 VOLTAGE = (-10_000.0, 10_000.0)
@@ -370,14 +368,3 @@ def trajectory_of(playback: Playback) -> JointTrajectory:
 def _duration(seconds: float) -> DurationMsg:
     whole_seconds, nanoseconds = divmod(round(seconds * SECOND_NS), SECOND_NS)
     return DurationMsg(sec=whole_seconds, nanosec=nanoseconds)
-
-
-def main() -> int:
-    """Run the node; return the exit code of the process: 0 when the excitation is complete or was stopped."""
-    if help_asked("exciter", Exciter, DECLARATIONS):
-        return 0
-    return run(Exciter)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

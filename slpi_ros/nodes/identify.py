@@ -2,7 +2,6 @@
 
 import math
 import os
-import sys
 import tempfile
 import time
 from collections import deque
@@ -23,8 +22,7 @@ from slpi_ros.io.outputs import allow_document
 from slpi_ros.model.document import parse_model, save_model
 from slpi_ros.model.sensor import LONGEST
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, run
-from slpi_ros.nodes.help import help_asked
+from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health
 from slpi_ros.nodes.jobs import (
     DiagnosisOutcome,
     DiagnosisRequest,
@@ -221,7 +219,6 @@ class DiagnosisService:
         return self._temporary
 
     def _poll_job(self) -> None:
-        """Check whether the diagnosis is complete."""
         outcome = self._job.outcome() if self._job else None
         if not self._job or not outcome:
             return
@@ -391,7 +388,6 @@ class Identify(Node):
             self._job = None
 
     def _poll_job(self) -> None:
-        """Check whether the identification is complete, once a model in use would have been heard of."""
         waited = time.monotonic() - self._begun
         others = not self._in_use and self.count_publishers("stage_model") > 1
         if waited < (LATCHED_WITHIN if others else DISCOVERY):
@@ -408,7 +404,6 @@ class Identify(Node):
             self._start_next()
 
     def _write(self, model: StageModel, output: str) -> None:
-        """Write a model to the output file, if any."""
         try:
             if output:
                 allow_document(output, "model")
@@ -514,14 +509,3 @@ def described(model: StageModel) -> str:
             f"of {(high - low) * 1e6:.3g} µm from {quality.samples} samples"
         )
     return f"identified {'; '.join(axes)}"
-
-
-def main() -> int:
-    """Run the node; return the exit code of the process."""
-    if help_asked("identify", Identify, DECLARATIONS):
-        return 0
-    return run(Identify)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

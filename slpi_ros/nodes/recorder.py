@@ -1,7 +1,6 @@
 """Node ``recorder``: records topics into a bag without rosbag2."""
 
 import importlib
-import sys
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -13,8 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_writer import STORAGES, BagWriter
 from slpi_ros.io.messages import JOINT_STATE
-from slpi_ros.nodes.common import request_stop, run
-from slpi_ros.nodes.help import help_asked
+from slpi_ros.nodes.common import request_stop
 from slpi_ros.nodes.parameters import Declaration, Parameters, validated
 
 # Queue length for bursts during slow disk writes.
@@ -165,14 +163,3 @@ def _message_class(topic: str, msgtype: str) -> Any:
         raise RecordError(
             f"recorder: {topic} is {msgtype}, which is not installed; source its workspace or omit the topic"
         ) from error
-
-
-def main() -> int:
-    """Run the node; return the exit code of the process."""
-    if help_asked("recorder", Recorder, DECLARATIONS):
-        return 0
-    return run(Recorder)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

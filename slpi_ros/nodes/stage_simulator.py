@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-import sys
 import time
 from array import array
 from collections.abc import Sequence
@@ -18,8 +17,7 @@ from std_msgs.msg import Float64MultiArray
 
 from slpi_ros.errors import UsageError
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.nodes.common import COMMANDS, run
-from slpi_ros.nodes.help import help_asked
+from slpi_ros.nodes.common import COMMANDS
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 from slpi_ros.simulation.character import Character
 from slpi_ros.simulation.stage import Stage, p11_stage
@@ -229,14 +227,3 @@ def _limits(stage: Stage, low: float, high: float) -> tuple[float, float]:
             f"give the lower one first, both within {lowest} to {highest} V"
         )
     return low, high
-
-
-def main() -> int:
-    """Run the node; return the exit code of the process."""
-    if help_asked("stage_simulator", StageSimulator, DECLARATIONS):
-        return 0
-    return run(StageSimulator)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,51 +7,32 @@ import threading
 import warnings
 from importlib import import_module
 
+from slpi_ros.nodes import stop
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from slpi_ros.errors import SlpiError
 
-# Ctrl-C often arrives twice (terminal and launcher), so only the third signal interrupts an orderly shutdown.
-PATIENT_SIGNALS = 2
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-class Stop:
-    """Stop request for the running node, with the number of received signals and the error that is the reason."""
-
-    def __init__(self) -> None:
-        self.requested, self.signals = False, 0
-        self.failure: SlpiError | None = None
-
-    def on_signal(self, *_: object) -> None:
-        """Request an orderly shutdown, also while the node is being created."""
-        self.requested = True
-        self.signals += 1
-        if self.signals > PATIENT_SIGNALS:
-            raise KeyboardInterrupt
-
-
-# Stop request of this process, if it was started as an executable of the package.
-of_process: Stop | None = None
-
-
-def _executable(name: str) -> "Callable[[], int]":
+def _executable(name: str, node: str) -> "Callable[[], int]":
     def main() -> int:
-        global of_process
-        of_process = Stop()
+        stop.of_process = stop.Stop()
         # Python allows signal handlers in the main thread only. They stay until the process has ended.
         if threading.current_thread() is threading.main_thread():
-            for number in SIGNALS:
-                signal.signal(number, of_process.on_signal)
+            for number in stop.SIGNALS:
+                signal.signal(number, stop.of_process.on_signal)
         from slpi_ros.errors import DependencyError, dependencies_needed, shown
 
         # Like a line of the node's log, without the line of code that warns.
         warnings.formatwarning = lambda message, *_: f"[WARN] {shown(str(message))}\n"
         try:
             with dependencies_needed():
-                return int(import_module(f"slpi_ros.nodes.{name}").main())
+                from slpi_ros.nodes.common import run
+                from slpi_ros.nodes.help import help_asked
+
+                module = import_module(f"slpi_ros.nodes.{name}")
+                program = getattr(module, node)
+                return 0 if help_asked(name, program, module.DECLARATIONS) else run(program)
         except KeyboardInterrupt:
             return 0
         except DependencyError as error:
@@ -62,13 +43,12 @@ def _executable(name: str) -> "Callable[[], int]":
     return main
 
 
-calibrator = _executable("calibrator")
-compensator = _executable("compensator")
-exciter = _executable("exciter")
-identify = _executable("identify")
-recorder = _executable("recorder")
-stage_simulator = _executable("stage_simulator")
+calibrator = _executable("calibrator", "Calibrator")
+compensator = _executable("compensator", "Compensator")
+exciter = _executable("exciter", "Exciter")
+identify = _executable("identify", "Identify")
+recorder = _executable("recorder", "Recorder")
+stage_simulator = _executable("stage_simulator", "StageSimulator")
 
 if __name__ == "__main__":
-    # The handlers have to be those of the module that the nodes import.
-    sys.exit(getattr(import_module("slpi_ros.nodes.start"), sys.argv[1])())
+    sys.exit(globals()[sys.argv[1]]())

@@ -118,7 +118,6 @@ def _show_left(page: Page, name: str, found: AxisDiagnosis) -> None:
 
 
 def _show_records(page: Page, found: AxisDiagnosis) -> None:
-    """Add a table of errors by record if there are several records."""
     if len(found.records) > 1:
         page.section("Errors by record")
         rows = [
@@ -223,7 +222,6 @@ def _steps(found: AxisDiagnosis) -> tuple[list[list[str]], int, str]:
 
 
 def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
-    """Add the charts of one axis."""
     traces = found.traces
     t, v, y = traces.t, traces.voltage, traces.measured
     page.section("Measured - model")

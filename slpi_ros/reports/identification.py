@@ -134,7 +134,6 @@ def _findings(record: Record, name: str, start: float | None, stop: float | None
 
 
 def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> None:
-    """Add the table and the chart of held-out errors."""
     page.section("Held-out errors")
     floor = held_out.repeatability
     groups = {

@@ -179,7 +179,6 @@ class Page:
 
 
 def _text(text: str) -> str:
-    """Return a text as HTML."""
     return html.escape(shown(text, _LONGEST_TEXT))
 
 

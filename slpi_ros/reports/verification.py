@@ -246,7 +246,6 @@ def _parts_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[s
 
 
 def _show_record(page: Page, name: str, record: RecordVerification) -> None:
-    """Add the charts of one record."""
     t, v, y = record.t, record.v, record.measured
     page.section(record.error.name)
     if record.tracking:

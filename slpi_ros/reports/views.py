@@ -372,7 +372,6 @@ def _add(
     parts: Sequence[Series],
     means: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
 ) -> None:
-    """Add the dots of curves, with means of curves and parts on top."""
     for curve in curves:
         kept = thin_cloud(x, curve.values)
         chart.dots(panel, curve.name, x[kept], curve.values[kept], curve.colour, faint=True)

@@ -104,7 +104,6 @@ class SimulatedAxis:
         return -math.expm1(-(t - self._start) / self.character.drift_time)
 
     def _amplified(self, t: float, dt: float, v: float) -> float:
-        """Return the voltage (V) at the piezo."""
         if self.character.delay:
             v = self._delayed(t, v)
         if self._lag:

@@ -42,7 +42,6 @@ class Character:
     hum_amplitude: float = _figure(0.0, "Amplitude of the hum, metres.", 0.0, 1e-4)
 
     def __post_init__(self) -> None:
-        """Validate the parameters."""
         for item in fields(self):
             value, (low, high) = getattr(self, item.name), item.metadata["between"]
             if not low <= value <= high:

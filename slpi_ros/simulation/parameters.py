@@ -39,7 +39,6 @@ class AxisParameters:
     offset: float = 0.0  # m, sensor reading at rest
 
     def __post_init__(self) -> None:
-        """Validate the parameters."""
         for item in fields(self):
             value = getattr(self, item.name)
             if not math.isfinite(value):

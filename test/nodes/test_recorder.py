@@ -31,7 +31,7 @@ class Recording:
 
     def __init__(self, *arguments: str, **parameters) -> None:
         given = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
-        command = [sys.executable, "-m", "slpi_ros.nodes.recorder", "--ros-args", *given, *arguments]
+        command = [sys.executable, "-m", "slpi_ros.nodes.start", "recorder", "--ros-args", *given, *arguments]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     def wait_until(self, done: Callable[[], bool]) -> None:

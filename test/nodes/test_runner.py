@@ -10,7 +10,7 @@ rclpy = pytest.importorskip("rclpy")
 
 from slpi_ros.errors import UsageError  # noqa: E402
 from slpi_ros.nodes.common import make_executor  # noqa: E402
-from slpi_ros.nodes.start import PATIENT_SIGNALS  # noqa: E402
+from slpi_ros.nodes.stop import PATIENT_SIGNALS  # noqa: E402
 
 PATIENCE_S = 60.0
 

@@ -27,7 +27,7 @@ PATIENCE_S = 30.0
 
 def start(**parameters) -> subprocess.Popen[str]:
     arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
-    command = [sys.executable, "-m", "slpi_ros.nodes.stage_simulator", "--ros-args", *arguments]
+    command = [sys.executable, "-m", "slpi_ros.nodes.start", "stage_simulator", "--ros-args", *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

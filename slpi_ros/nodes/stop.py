@@ -1,0 +1,30 @@
+"""Request to stop the node of this process, by a signal or by an error."""
+
+import signal
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from slpi_ros.errors import SlpiError
+
+# Ctrl-C often arrives twice (terminal and launcher), so only the third signal interrupts an orderly shutdown.
+PATIENT_SIGNALS = 2
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stop:
+    """Stop request for the running node, with the number of received signals and the error that is the reason."""
+
+    def __init__(self) -> None:
+        self.requested, self.signals = False, 0
+        self.failure: SlpiError | None = None
+
+    def on_signal(self, *_: object) -> None:
+        """Request an orderly shutdown, also while the node is being created."""
+        self.requested = True
+        self.signals += 1
+        if self.signals > PATIENT_SIGNALS:
+            raise KeyboardInterrupt
+
+
+# Stop request of this process, if it was started as an executable of the package.
+of_process: Stop | None = None

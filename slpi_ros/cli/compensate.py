@@ -80,11 +80,7 @@ def _run(options: Namespace) -> Result:
             "first_jump_V": jump, "held": int(held.sum()), "slew_limited": limited,
             "voltage_range_V": [float(v.min()), float(v.max())],
         }  # fmt: skip
-    return Result(
-        lines,
-        document,
-        command_line("slpi", "simulate", options.model, options.output, "-o", "REACHED.csv"),
-    )
+    return Result(lines, document, command_line("slpi", "simulate", options.model, options.output, "-o", "REACHED.csv"))
 
 
 COMMAND = Command(

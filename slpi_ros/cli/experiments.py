@@ -28,8 +28,5 @@ def _run(options: Namespace) -> Result:
 
 
 COMMAND = Command(
-    "reproduce the tables and figures of the two papers",
-    "slpi experiments -o experiments",
-    _add_options,
-    _run,
+    "reproduce the tables and figures of the two papers", "slpi experiments -o experiments", _add_options, _run
 )

@@ -61,9 +61,4 @@ def _run(options: Namespace) -> Result:
     )
 
 
-COMMAND = Command(
-    "turn a table of measured data into a bag",
-    "slpi import data.csv -o calibration",
-    _add_options,
-    _run,
-)
+COMMAND = Command("turn a table of measured data into a bag", "slpi import data.csv -o calibration", _add_options, _run)

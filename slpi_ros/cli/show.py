@@ -25,9 +25,4 @@ def _run(options: Namespace) -> Result:
     )
 
 
-COMMAND = Command(
-    "print the contents of a model",
-    "slpi show model.json",
-    _add_options,
-    _run,
-)
+COMMAND = Command("print the contents of a model", "slpi show model.json", _add_options, _run)

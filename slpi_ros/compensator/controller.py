@@ -549,12 +549,7 @@ class Controller:
         self._start_ramps([Ramp([voltage], rate) for voltage in voltages], OperatingMode.RAMPING, now_ns)
 
     def reset_memory(
-        self,
-        cycles: int,
-        rate: float,
-        finals: Sequence[float],
-        now_ns: int,
-        spans: Sequence[tuple[float, float]] = (),
+        self, cycles: int, rate: float, finals: Sequence[float], now_ns: int, spans: Sequence[tuple[float, float]] = ()
     ) -> None:
         """Start the decaying oscillation that resets the memory, to `finals` (V), within `spans` (V; the limits)."""
         self._begin_output(now_ns)

@@ -174,11 +174,7 @@ class Evidence:
 
 
 def evidence_of(
-    records: Sequence[Record],
-    axis: str,
-    model: AxisModel | None,
-    start: float | None = None,
-    stop: float | None = None,
+    records: Sequence[Record], axis: str, model: AxisModel | None, start: float | None = None, stop: float | None = None
 ) -> Evidence:
     """Return the data of one axis from records, with the hysteresis basis of `model`, by default a loop family."""
     read = [_readings(record, axis, start, stop) for record in records]

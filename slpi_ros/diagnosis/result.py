@@ -11,15 +11,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.fingerprint import HINTS, Left, Signals, fingerprint
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import Evidence, one_speed
-from slpi_ros.diagnosis.selection import (
-    BIAS,
-    LEVEL,
-    NOT_CLOSING,
-    Named,
-    Selection,
-    chance_of_gain,
-    held_out_error,
-)
+from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, chance_of_gain, held_out_error
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
 from slpi_ros.excitation.effects import for_effect, separating

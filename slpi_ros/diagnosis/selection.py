@@ -529,7 +529,4 @@ def _bent(now: Explanation) -> FloatArray:
     return np.column_stack([x**2, x**3]) * float(np.ptp(now.h))
 
 
-STRUCTURES: Mapping[str, Callable[[Explanation], FloatArray]] = {
-    NOT_CLOSING: _do_not_close,
-    LEVEL: _bent,
-}
+STRUCTURES: Mapping[str, Callable[[Explanation], FloatArray]] = {NOT_CLOSING: _do_not_close, LEVEL: _bent}

@@ -18,12 +18,7 @@ from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.diagnosis.tracking import ErrorPart, Tracking, track
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
-from slpi_ros.identification.cross_validation import (
-    level_classes,
-    loop_levels,
-    region_classes,
-    speed_classes,
-)
+from slpi_ros.identification.cross_validation import level_classes, loop_levels, region_classes, speed_classes
 from slpi_ros.identification.free_run import AS_WELL, Match, match, starts_at_end
 from slpi_ros.identification.repeatability import repeatability_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples

@@ -58,66 +58,24 @@ class Task:
 
 
 def run(
-    sources: Sequence[_Path],
-    output: _Path | None = None,
+    sources: Sequence[_Path],  # bags, folders of bags and CSV lists, see `slpi_ros.fleet.sources.find_bags`
+    output: _Path | None = None,  # folder of the results, at the same path on all machines; default: a temporary one
     *,
-    client: "Client | None" = None,
-    scheduler: str | None = None,
-    workers: int | None = None,
-    models: _Path | None = None,
-    since: str | None = None,
-    diagnose: bool = True,
-    watch: bool = False,
+    client: "Client | None" = None,  # cluster, which stays open; default: that at `scheduler`, else a local one
+    scheduler: str | None = None,  # address of a running scheduler, such as ``tcp://host:8786``
+    workers: int | None = None,  # processes of the local cluster; default: one per core
+    models: _Path | None = None,  # folder of model documents that are the references of their stages
+    since: str | None = None,  # only bags that begin at or after this date, ISO 8601, UTC
+    diagnose: bool = True,  # the causes of errors that no change of gain, width or zero explains
+    watch: bool = False,  # continue with bags that are completed later, until interrupted
     topic: str = "stage_state",
-    told: Callable[[str], None] | None = None,
-    finished: Callable[[Results], None] | None = None,
+    told: Callable[[str], None] | None = None,  # receives sentences about the cluster
+    finished: Callable[[Results], None] | None = None,  # called whenever the table has been written
 ) -> "pd.DataFrame":
-    """Process the bags of many stages: quality, reference models, changes and their causes.
-
-    The first usable bag of a stage gives its reference model, unless `models` holds one; every other bag of the stage
-    is compared with it. The rows do not depend on the number of workers. A run that was interrupted is continued with
-    the same `output`, and bags that are new or changed are added.
-
-    Parameters
-    ----------
-    sources : sequence of path
-        Bags, folders of bags and CSV lists; see `slpi_ros.fleet.sources.find_bags`.
-    output : path, optional
-        Folder of the results; default: a temporary folder, and nothing but the returned table is kept. Workers read
-        the bags and write models there, so both must be at the same path on every machine of the cluster.
-    client : distributed.Client, optional
-        Cluster to be used; it stays open. Default: the cluster at `scheduler`, else a local one.
-    scheduler : str, optional
-        Address of a running scheduler, such as ``tcp://host:8786``.
-    workers : int, optional
-        Number of processes of the local cluster; default: one per core.
-    models : path, optional
-        Folder of model documents that are the references of their stages.
-    since : str, optional
-        Only bags that begin at or after this date, ISO 8601, UTC.
-    diagnose : bool
-        Whether the causes of errors that no change of gain, width or zero explains are diagnosed. Default True.
-    watch : bool
-        Whether to continue with bags that are completed later, until interrupted. Default False.
-    topic : str
-        Topic with voltage and displacement.
-    told : callable, optional
-        Receives sentences about the cluster.
-    finished : callable, optional
-        Called with the results whenever the table has been written; for example to write pages.
-
-    Returns
-    -------
-    pandas.DataFrame
-        One row for each axis of each bag; columns as in ``results.parquet``, see ``msg_schemas/README.md``.
-
-    Raises
-    ------
-    UsageError
-        If the options contradict each other, or `scheduler` is no address.
-    SlpiError
-        If the sources, the folder or the cluster cannot be used.
-    """
+    """Process the bags of many stages; return a row for each axis of each bag, see ``msg_schemas/README.md``."""
+    # The first usable bag of a stage gives its reference model, unless `models` holds one; every other bag of the stage
+    # is compared with it. The rows do not depend on the number of workers. A run that was interrupted is continued with
+    # the same `output`, and bags that are new or changed are added.
     with dependencies_needed():
         for name in ("distributed", "pyarrow", "pandas"):
             import_module(name)

@@ -95,7 +95,7 @@ def describe_fleet(rows: Sequence[Row]) -> list[str]:
     count = {health: sum(one.health == health for one in stages) for health in _HEALTH}
     lines = [
         f"bags: {len({row.bag for row in rows})}, stages: {len({one.stage for one in stages})}; axes "
-        + ", ".join(f"{health}: {number}" for health, number in count.items()),
+        + ", ".join(f"{health}: {number}" for health, number in count.items())
     ]
     for one in sorted(stages, key=_order):
         told = list(_told(one))

@@ -327,12 +327,7 @@ def _mean_size(error: FloatArray) -> float:
 
 
 def _changes(
-    axis: AxisModel,
-    samples: Samples,
-    t: FloatArray,
-    predicted: FloatArray,
-    stretch: IntArray,
-    known: Mask,
+    axis: AxisModel, samples: Samples, t: FloatArray, predicted: FloatArray, stretch: IntArray, known: Mask
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """Return changes of gain and width, their standard deviations, and the rms errors (m) before and after the fit."""
     if np.count_nonzero(known) < FEWEST:

@@ -94,11 +94,7 @@ def read_message(data: bytes, msgtype: str) -> Message:
 
 
 def encode_joint_states(
-    stamp_ns: IntArray,
-    position: FloatArray,
-    effort: FloatArray,
-    names: tuple[str, ...],
-    frame_id: str = "",
+    stamp_ns: IntArray, position: FloatArray, effort: FloatArray, names: tuple[str, ...], frame_id: str = ""
 ) -> list[bytes]:
     """Return one serialised message for each header stamp (ns), shape (N,); positions (m) and voltages (V), (N, K)."""
     if not names:

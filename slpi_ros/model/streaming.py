@@ -49,11 +49,7 @@ class StreamingInverse:
     # compensator gives it that of its output, on the steady clock.
 
     def __init__(
-        self,
-        memory: Memory,
-        displacement_range: tuple[float, float],
-        limits: Limits,
-        effects: tuple[Effect, ...] = (),
+        self, memory: Memory, displacement_range: tuple[float, float], limits: Limits, effects: tuple[Effect, ...] = ()
     ) -> None:
         chain = Chain.of(effects)
         self.memory, self._chain, self._clipped = memory, chain, chain.clipped

@@ -285,10 +285,7 @@ class Identify(Node):
         self._watching = self.create_timer(WATCH_PERIOD, self._poll_bags, clock=steady)
         self.create_service(Trigger, "~/identify", self._on_trigger)
         self._diagnosis = DiagnosisService(
-            self,
-            lambda: self._identified,
-            lambda: self._parameter_set.settings.diagnosis_directory,
-            self._report,
+            self, lambda: self._identified, lambda: self._parameter_set.settings.diagnosis_directory, self._report
         )
         self._settings = self._parameter_set.settings
         self._parameter_set.follow(self._on_change)

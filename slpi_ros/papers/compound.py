@@ -271,8 +271,7 @@ def _feedforward(studies: Mapping[str, AxisStudy]) -> Exhibit:
         ),
         pictures=(
             Picture(
-                followed(studies[first].feedforward, "", None),
-                f"Axis {first}: displacement and error by the sensor.",
+                followed(studies[first].feedforward, "", None), f"Axis {first}: displacement and error by the sensor."
             ),
         ),
     )

@@ -30,11 +30,7 @@ class Case:
 
 CASES = (
     Case("afm_double_sine_x", (0.0, 0.5), {"second half": (0.5, 1.0)}),
-    Case(
-        "picma_1hz_decay_grow",
-        (2.0, 25.0),
-        {"25-37 s": (25.0, 37.0), "38-71 s, driven otherwise": (38.0, 71.0)},
-    ),
+    Case("picma_1hz_decay_grow", (2.0, 25.0), {"25-37 s": (25.0, 37.0), "38-71 s, driven otherwise": (38.0, 71.0)}),
 )
 
 
@@ -66,10 +62,7 @@ def score(folder: Path, case: Case, kind: str) -> Scores:
         model = identify(record, kind, start=start, stop=stop).axes["x"]
     except SlpiError as error:
         return Scores(kind, (), str(error))
-    return Scores(
-        kind,
-        tuple(_rms(model, record, seconds(a), seconds(b)) for a, b in case.predicted.values()),
-    )
+    return Scores(kind, tuple(_rms(model, record, seconds(a), seconds(b)) for a, b in case.predicted.values()))
 
 
 def _rms(model: AxisModel, record: Record, start: float, stop: float) -> float:

@@ -332,10 +332,7 @@ def _fits(study: Study) -> Exhibit:
         ),
         pictures=(
             Picture(fits(study.fastest, curves[MPI], MPI), "Settled cycles and the MPI model of each."),
-            Picture(
-                fit_errors(study.fastest, curves),
-                "Model - measured; the first half of the cycle is the rise.",
-            ),
+            Picture(fit_errors(study.fastest, curves), "Model - measured; the first half of the cycle is the rise."),
         ),
     )
 

@@ -195,13 +195,7 @@ def classical_model(v: FloatArray, y: FloatArray) -> PrandtlIshlinskii:
     thresholds = default_thresholds(float(np.ptp(v)))
     everything = np.ones(v.size, dtype=bool)
     fit = fit_plays(
-        v - v[0],
-        y - y[0],
-        everything,
-        thresholds,
-        None,
-        through_zero=True,
-        iterations=least_iterations(v.size, v.size),
+        v - v[0], y - y[0], everything, thresholds, None, through_zero=True, iterations=least_iterations(v.size, v.size)
     )
     return PrandtlIshlinskii(thresholds, fit.weights)
 

@@ -74,10 +74,7 @@ def _severity(found: AxisDiagnosis) -> Severity:
 
 
 def _figures(found: AxisDiagnosis) -> dict[str, str]:
-    figures = {
-        "error of the given model, rms": nm(found.given_rms),
-        "its hysteresis refitted": nm(found.before_rms),
-    }
+    figures = {"error of the given model, rms": nm(found.given_rms), "its hysteresis refitted": nm(found.before_rms)}
     if found.effects:
         figures["with the identified effects"] = nm(found.after_rms)
         if found.before_rms > 0.0:

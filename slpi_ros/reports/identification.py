@@ -136,11 +136,7 @@ def _findings(record: Record, name: str, start: float | None, stop: float | None
 def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> None:
     page.section("Held-out errors")
     floor = held_out.repeatability
-    groups = {
-        "by loop level": held_out.by_level,
-        "by region": held_out.by_region,
-        "by speed": held_out.by_speed,
-    }
+    groups = {"by loop level": held_out.by_level, "by region": held_out.by_region, "by speed": held_out.by_speed}
     rows: list[Sequence[str] | str] = [_row(held_out.overall, floor.rms)]
     for what, parts in groups.items():
         rows += [what, *(_row(part, floor.rms) for part in parts)]

@@ -114,9 +114,7 @@ class DriveWatch:
     # the displacements at each voltage, bounds the rest of the run: a displacement has to be near those seen at the
     # same voltage before (by 35 % of their range, so that hysteresis, creep and drift fit in), and to follow the
     # voltage. Of the time between two calls at most 0.05 s count: a process that was held up does not take what it has
-    # not read yet for silence. `timeout` (s) is the longest time without a valid state, and that the reported voltages
-    # may be late.
-
+    # not read yet for silence. Reported voltages may be late by `timeout` (s), the longest time without a valid state.
     def __init__(
         self, axes: Sequence[str], limits: Sequence[Limits], timeout: float, *, simulated: bool = False
     ) -> None:

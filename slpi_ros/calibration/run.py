@@ -6,9 +6,8 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
@@ -395,7 +394,7 @@ def tracking_error(recording: Recording, axis: str, model: StageModel, goal: flo
 
 
 def aligned(
-    record: Record, sent_ns: NDArray[np.int64], commands: Mapping[str, FloatArray], desired: Mapping[str, FloatArray]
+    record: Record, sent_ns: IntArray, commands: Mapping[str, FloatArray], desired: Mapping[str, FloatArray]
 ) -> Recording:
     """Return a recording whose desired displacements belong to the applied voltages."""
     # Commands take some time to the stage and readings some time back. The delay between commanded and applied voltages

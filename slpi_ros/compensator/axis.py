@@ -41,7 +41,6 @@ class Axis:
 
     # A loaded model cannot relax the limits. The memory of the feedforward `stream` follows the setpoint, not the
     # corrected voltage, so that sensor noise causes no reversals.
-
     stream: StreamingInverse  # feedforward; available once a model is loaded
     _applied: StreamingInverse
     _residuals: ResidualWindow

@@ -62,7 +62,6 @@ class Controller:
     # `advance` executes what is due without a message: trajectories, what the limits held back, holds, ramps, the reset
     # of the memory. The first voltage starts from where the amplifiers are (`locate`), and their reports are held
     # against what was output (`report`).
-
     def __init__(
         self,
         axes: Sequence[str],
@@ -141,8 +140,7 @@ class Controller:
         last_voltages: Mapping[str, float] | None = None,
     ) -> None:
         """Replace the model in use, or raise and keep the old one; the voltages are unchanged."""
-        # Only the first model uses what was saved; `last_voltages` (V) are of axes whose saved state is of another
-        # model.
+        # Only the first model uses what was saved; `last_voltages` (V) are of axes saved with another model.
         if self._hardware_id and model.hardware_id and model.hardware_id != self._hardware_id:
             raise UsageError(
                 f"the model has hardware id '{model.hardware_id}', this stage has '{self._hardware_id}'; "

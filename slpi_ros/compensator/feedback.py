@@ -34,15 +34,13 @@ class Feedback:
     """Feedforward plus PID of one axis: ``v = correct(t, desired, measured, feedforward)``; initially disabled."""
 
     # Enabling, disabling and retuning are bumpless: an offset cancels the step of the correction and then decays with
-    # the time constant `release_time` (s; inf: never), so that the error at the moment of enabling is corrected
-    # completely.
+    # the time constant `release_time` (s), so that the error at the moment of enabling is corrected completely.
     #
     # Windup is avoided by conditional integration: the integral grows only as far as the voltage can follow. Unlike
     # back-calculation, this keeps the integral while the voltage is slew limited on the way to a distant feedforward.
     #
     # The error refers to the setpoint at the time of the measurement, not to the present one, and for a sensor with a
     # known delay or lag to the setpoint as that sensor would tell it, see `slpi_ros.model.sensor.Sensed`.
-
     def __init__(
         self,
         gains: PidGains,
@@ -268,7 +266,6 @@ class ResidualWindow:
 
     # Because the stage responds with a delay, the residual is the signed distance of a measurement from the interval
     # between the model displacements of the last two samples; at rest it is measured - model.
-
     __slots__ = ("_before", "_expected", "_next", "_residuals", "_samples")
 
     def __init__(self, expected: float) -> None:

@@ -75,7 +75,6 @@ class LastVoltages:
     # Two entries with checksums are written alternately, so one of them is intact after a crash of the process. The
     # data is not flushed to the disk: it survives the end of the process, but may be lost at a power failure. `mark` is
     # the identifier (32 bits) of the saved memory that the entries belong to, and may be changed at any time.
-
     def __init__(self, path: str | os.PathLike[str], mark: int) -> None:
         self._path, self.mark, self._number = _beside(path), mark, 0
         try:

@@ -8,14 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.validation import RejectedError, require_names
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import PERIOD, Limits, RateLimiter
 from slpi_ros.model.streaming import StreamingInverse, refusal
-
-TimeArray = NDArray[np.int64]
 
 # Upper limit of valid times; the sum of two times does not overflow int64.
 LATEST_NS = 2**62
@@ -28,7 +26,7 @@ class Trajectory:
     """Desired displacements of some axes at given times, validated by `Trajectory.of`."""
 
     names: tuple[str, ...]
-    time_from_start_ns: TimeArray  # (N,), strictly increasing
+    time_from_start_ns: IntArray  # (N,), strictly increasing
     positions: FloatArray  # m, (N, names)
     start_ns: int  # 0: at once; may be negative if the clock counts from the start of the machine
     cut: int = 0  # earlier points discarded because their time had passed
@@ -120,12 +118,11 @@ class _Track:
     """Points (m, (N, names)) of one trajectory for all axes with the same delay, executed in order from `first`."""
 
     # Only one track of each trajectory is `counted` by `TrajectoryExecutor.remaining`.
-
     def __init__(
         self,
         names: tuple[str, ...],
         positions: FloatArray,
-        deadlines_ns: TimeArray,
+        deadlines_ns: IntArray,
         first: int,
         counted: bool,
         begin_ns: int,
@@ -212,9 +209,7 @@ class TrajectoryExecutor:
     # Points that are further apart than the output period are interpolated. A new trajectory replaces the current
     # points as in joint_trajectory_controller: at once, or, if it starts in the future, from its start on. Any number
     # of trajectories may be pending. All times are nanoseconds on the same clock, which the caller chooses. `place`
-    # returns the present displacement (m) of an axis, from which the first point is approached; by default an axis
-    # stays until then.
-
+    # returns the displacement (m) of an axis, from which the first point is approached; else an axis stays until then.
     def __init__(self, period: float = PERIOD, place: Callable[[str], float] | None = None) -> None:
         self.period, self._place = period, place
         self.skipped = 0  # points, because a later one was already due
@@ -258,8 +253,7 @@ class TrajectoryExecutor:
 
     def start(self, trajectory: Trajectory, now_ns: int, delays: Mapping[str, float] | None = None) -> None:
         """Start a trajectory at once, or when its first point is due; RejectedError if all points are in the past."""
-        # `delays` (s) advance the deadlines of an axis; of the points with deadlines in the past the last one is
-        # executed.
+        # `delays` (s) advance the deadlines of an axis; of the points in the past the last one is executed.
         useful = trajectory.useful_at(now_ns)
         due = useful.time_from_start_ns + (trajectory.start_ns or now_ns)
         shifts = {name: round((delays or {}).get(name, 0.0) * SECOND_NS) for name in useful.names}

@@ -70,7 +70,6 @@ class Stamps:
 
     # A stamp that is older than the last one by at most `jump_ns` is late. If it is older by more than this, the clock
     # was set back, and the elapsed time restarts.
-
     __slots__ = ("_last_ns", "_restarted", "jump_ns")
 
     def __init__(self, jump_ns: int = SECOND_NS) -> None:

@@ -81,9 +81,7 @@ class Score:
 class Joint:
     """Normal equations of the hysteresis of one axis, to which columns of effects can be added."""
 
-    # The voltage `u` (V, (N,)) drives the hysteresis. The mask `predictable` is reused from `like`, equations of the
-    # same records.
-
+    # The voltage `u` (V, (N,)) drives the hysteresis. `like` are equations of the same records.
     def __init__(self, evidence: Evidence, u: FloatArray, like: "Joint | None" = None) -> None:
         if like and len(evidence.parts) > 1:
             self.predictable = like.predictable
@@ -180,9 +178,8 @@ class Joint:
 
     def score(self, signals: Sequence["Columns"], *, positive: int = 0, starting: Sequence[int] = ()) -> Score:
         """Return the held-out errors of a joint fit of hysteresis and all other columns to the very first column."""
-        # The gains of the last `positive` columns are non-negative. The columns `starting`, indices without counting
-        # the first one, describe the state before a record; together with an offset, they are fitted to a held-out
-        # record itself.
+        # The gains of the last `positive` columns are non-negative. The columns `starting` (the first not counted)
+        # describe the state before a record; with an offset, they are fitted to a held-out record itself.
         at = self.grouped(np.column_stack([one.at for one in signals]))
         projected = [np.column_stack(parts) for parts in zip(*(one.projected for one in signals), strict=True)]
         products = [own.T @ own for own in at]
@@ -375,9 +372,7 @@ class Explanation:
     # The equations of `like`, a fit to the same evidence, are reused if the same voltage `u` (V) drives the hysteresis.
     # `h` is the displacement of the hysteresis, `added` the contribution of the effects on the displacement and of the
     # reversible path parallel to the hysteresis, and `settling` the relaxation in each record from moves before it,
-    # with the columns `beside` of the evidence. `began` (m, (k,)) holds its amplitudes, record by record, by effect
-    # name.
-
+    # with the columns `beside` of the evidence. `began` (m, (k,)) holds its amplitudes, record by record, by effect.
     joint: Joint
     h: FloatArray
     added: FloatArray

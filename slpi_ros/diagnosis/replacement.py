@@ -25,8 +25,7 @@ FOREIGN = 0.1
 
 def doubt_about(model: StageModel, in_use: StageModel, records: Sequence[Record] = ()) -> str:
     """Return the reason not to replace the model in use, "" if there is none: axis, what, value and limit."""
-    # The new `model` has all axes of the one `in_use`, which is also judged on `records`, those of the new model;
-    # default: none, and no such judgement.
+    # The new `model` has all axes of the one `in_use`, which is also judged on `records`, those of the new model.
     for name, old in in_use.axes.items():
         reason = (
             _covers_less(model.axes[name], old)

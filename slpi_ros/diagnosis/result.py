@@ -106,7 +106,6 @@ class AxisDiagnosis:
 
     # `before_rms` and `after_rms` are of the refitted hysteresis without and with effects, on held-out blocks or, if
     # there are several records, on held-out records.
-
     verdict: str  # `NAMED`, `PARTLY_NAMED`, `AMBIGUOUS`, `UNEXPLAINED` or `NOTHING_FOUND`
     summary: str  # a few sentences
     noise_rms: float  # m, sensor noise: the white part of the residual
@@ -176,7 +175,6 @@ class Given:
 
     # `hysteresis_rms` and `refitted_rms` are on samples to which the initial history only adds a constant; with the
     # identified effects if the error is then lower.
-
     rms: float  # of the model as it is, without the offset of each record
     hysteresis_rms: float  # of its hysteresis
     refitted_rms: float  # of a refitted one

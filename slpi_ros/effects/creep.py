@@ -54,9 +54,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class Creep(EffectBase):
     """Parallel relaxations, ``y = h + sum_k g_k z_k``, ``tau_k dz_k/dt = (h - h_0) - z_k``, at first in equilibrium."""
 
-    # ``h_0``, the `origin`, is the displacement to which creep adds nothing; in a fit, where there is none, the first
-    # one of each record.
-
+    # ``h_0``, the `origin`, is where creep adds nothing; in a fit, where there is none, the first one of each record.
     name: ClassVar[str] = "creep"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
@@ -248,8 +246,7 @@ class StreamingCreep(StreamingBase):
 
     def resume(self, other: "StreamingCreep", x: float) -> None:
         """Take over the state of another model's creep at the input `x` (m)."""
-        # Relaxations with a time constant that `other` also has continue from its state; all others start in
-        # equilibrium.
+        # Relaxations with a time constant that `other` has, too, continue; all others start in equilibrium.
         self.start(x)
         known = dict(zip(other._creep.time_constants, other._states, strict=True))
         self._states = [self._input + known.get(tau, other._input) - other._input for tau in self._creep.time_constants]

@@ -43,7 +43,6 @@ class GainDrift(EffectBase):
     # ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
     # record; after it the sensitivity stays at its last value, see `lasting`. The factor scales hysteresis, creep and
     # resonance, and acts before the cross coupling, so that other axes receive the scaled motion.
-
     name: ClassVar[str] = "gain_drift"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"

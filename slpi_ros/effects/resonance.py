@@ -41,7 +41,6 @@ class Exact(StreamingMode):
     """Inverse of a mode with a zero near it: the ratio of their polynomials, with static gain 1, as a filter."""
 
     # It is a weighted sum of input, position and velocity of the zero, a mode that the desired displacement drives.
-
     def __init__(self, mode: Mode, zero: Mode) -> None:
         super().__init__(zero)
         self._zero = zero
@@ -68,7 +67,6 @@ class Unringing:
 
     # The sum of the taps is 1. Two zeros are at the poles of the mode, and one more compensates the remaining delay but
     # `known` (s).
-
     def __init__(self, mode: Mode, known: float) -> None:
         self._mode, self._late = mode, mode.lag - known
         self._spacing = self._shortest = SPACING / mode.omega

@@ -28,8 +28,7 @@ def calibration(spec: DriveSpec, rng: np.random.Generator) -> Path:
     """Cover the Preisach plane uniformly, at several speeds and with holds, from the low end and back to it."""
     # A sweep over the whole range comes first, to set a known hysteresis state. Reversal curves follow in random order,
     # rising from minima and falling from maxima over the whole range, so that drift is not correlated with voltage;
-    # then nested loops. A longer duration gives more of each. `rng` draws order and reversals, each within its part of
-    # the range.
+    # then nested loops. A longer duration gives more of each.
     seed = int(rng.integers(2**63))
 
     def planned(levels: int) -> Path:

@@ -166,7 +166,6 @@ class Playback:
     """Playback of a drive sample by sample, within its limits; with `repeat` it restarts at the end until stopped."""
 
     # After `stop` it is `stopping` while the axes return to their rest voltages.
-
     def __init__(self, drive: Drive, *, repeat: bool = False) -> None:
         self.drive, self.stopping = drive, False
         self._repeat = repeat

@@ -4,9 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.effects.excitation import FEWEST_STEPS, STEEPEST
 from slpi_ros.errors import UsageError
 
@@ -93,7 +92,7 @@ class Path:
         wanted = np.array([leg.seconds * spec.rate for leg in self.legs])
         return np.asarray(np.maximum(wanted, self.fewest_steps(spec)), dtype=np.float64)
 
-    def fewest_steps(self, spec: DriveSpec) -> NDArray[np.int64]:
+    def fewest_steps(self, spec: DriveSpec) -> IntArray:
         """Return the smallest number of steps of each leg, shape (n,)."""
         spans = np.diff(self._turns).tolist()
         # A slew limit near zero would ask for more steps than an integer holds.
@@ -126,7 +125,7 @@ class Path:
         return np.array([self.start, *(leg.to for leg in self.legs)])
 
 
-def _shared_out(steps: int, weights: FloatArray) -> NDArray[np.int64]:
+def _shared_out(steps: int, weights: FloatArray) -> IntArray:
     """Distribute whole steps in proportion to weights; return the cumulative sums, shape (len(weights),)."""
     # Equal shares if all weights are zero.
     total = np.cumsum(weights + 1e-9)

@@ -42,7 +42,6 @@ class Results:
     """The folder of the results, created if missing, locked against other runs while it is open."""
 
     # The rows depend on `options`; a folder with results of others is refused.
-
     def __init__(self, folder: str | os.PathLike[str], options: Mapping[str, Any]) -> None:
         self.folder, self.state = Path(os.path.realpath(folder)), State()
         make_folder(self.folder, TABLE, JOURNAL, LOCK)

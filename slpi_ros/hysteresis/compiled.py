@@ -251,8 +251,7 @@ def moved(
     """Move a memory to a voltage (V; `coordinate` 0) or displacement (m; 1); return False if it cannot be reached."""
     # It does what `Memory.forward` and `Memory.inverse` do. `at`, shape (4,), is modified in place: direction, depth of
     # the stack, index of the knot after the present point (0: `ends` and `knots` are not those of the present branch),
-    # and 1 once the branch or its piece may have changed. The others are as in `through`; `point` may lie outside the
-    # limits.
+    # and 1 once the branch or its piece may have changed. `point` may lie outside the limits; else as in `through`.
     one, out, walk = np.empty(1), np.empty(1), np.empty((3, 0), dtype=np.int64)
     ways = 1 if coordinate == 0 or lower <= point[0] <= upper else 2
     for way in range(ways):

@@ -65,7 +65,6 @@ class MultiSlope:
     #
     # There is no linear term: a branch is flat from its reversal until the first operator moves, except at the ends of
     # the range. The inverse exists for every displacement, but its voltage jumps across the flat part.
-
     origin: float  # V, lowest of the range, where ``u = 0``
     amplitude: float  # V, highest of the range, relative to the origin, ``V_p``
     thresholds: FloatArray  # V, (n,), ``0 <= r_1 < r_2 < ...``
@@ -187,7 +186,6 @@ class KnownPath:
     # A cycle starts at the low end, at the end point of the previous cycle. Every call starts from the initial point. A
     # voltage path is divided into cycles where it returns to the origin, a displacement path where it returns to the
     # displacement at the origin, with the same relative tolerance; both divisions agree except close to the tolerance.
-
     model: AmplitudeScaled
     start_voltage: float
     start_displacement: float

@@ -15,7 +15,6 @@ class PrandtlIshlinskii:
 
     # At rest every operator is in the middle of its play and moves after ``r_i``. In a primed memory it is at the end
     # of its play, as after a long fall, and moves up after ``2 r_i``.
-
     thresholds: FloatArray  # V, (n,), ``0 <= r_1 < r_2 < ...``
     weights: FloatArray  # m/V, (n,); no cumulative sum is negative
     symmetric_rest: bool = field(default=True, init=False)

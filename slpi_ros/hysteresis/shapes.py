@@ -16,7 +16,6 @@ class Curve(NamedTuple):
     """A branch shape ``F`` as knots (V, m), increasing from ``u[0] = f[0] = 0``; the last `END` beyond the others."""
 
     # The knots are stored as lists for a fast scalar search and as an array, shape (2, k).
-
     u: list[float]
     f: list[float]
     knots: FloatArray
@@ -33,7 +32,6 @@ class Branches(NamedTuple):
 
     # A branch is interpolated between vertices or composed of operators. Row k of `knots`, `change` and `last` is for
     # branches that start above vertex k - 1, up to vertex k.
-
     vertices: FloatArray = np.empty((2, 0))  # V, (2, n), ascending
     knots: FloatArray = np.empty((2, 0, 2, 0))  # V and m, (2, n + 1, 2, m), from vertex k
     change: FloatArray = np.empty((2, 0, 2, 0))  # their derivative with respect to the start's distance (V) below k

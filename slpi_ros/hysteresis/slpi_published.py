@@ -153,9 +153,7 @@ class SingleLoop:
     #
     # With a `run_in` (V) of None the play operators start at rest, as published; an inner loop then misses its vertex
     # by ``sum w_i r_i``. With 0 they start primed and move after ``2 r``, as after a reversal; the loop closes. If
-    # positive, they are primed this far below the vertex and driven up to it, for an outer loop with an initial
-    # history.
-
+    # positive, they are primed this far below the vertex and driven up to it, for an outer loop with a history.
     level: int
     direction: int
     vertex: tuple[float, float]  # start of the loop

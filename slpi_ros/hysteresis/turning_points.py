@@ -47,7 +47,6 @@ class Memory:
     """Reversal memory of one axis, driven by voltage (`forward`) or by displacement (`inverse`)."""
 
     # The initial point was reached, if `primed`, by a long fall, which erased the memory, else without previous motion.
-
     __slots__ = (
         *("_shape", "_rest", "_far", "_turns", "_turn_curves", "_direction", "_v", "_y"),
         # current branch: origin, curve, closing point, and the range within which samples need no stack update
@@ -211,8 +210,7 @@ class Memory:
         """Move to the voltage ``u`` at which displacement plus ``gain w`` is `y` (m); return ``w`` or raise."""
         # Here ``w = asinh(d / scale)`` for the change ``d`` (V) of ``u``; see `slpi_ros.hysteresis.rate_law`. The
         # applied voltage ``u + threshold w`` stays within `lower` and `upper` (V): where they hold it back, ``u``
-        # follows it by the law. `gain` is in metres, `threshold` and `scale`, more than 0, in volts; `guess` is of the
-        # magnitude of ``w``.
+        # follows it by the law. `gain` is in metres, `threshold` and `scale` (more than 0) are in volts.
         if not abs(y - self._rest[1]) < self._far[1]:
             raise UsageError(f"displacement {y} m is out of range; leave such samples out")
         start, s = self._v, 1 if y > self._y else -1

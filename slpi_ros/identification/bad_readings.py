@@ -76,8 +76,7 @@ class Repeats:
 
 def frozen(y: FloatArray, v: FloatArray, gain: float, noise_rms: float, step: float) -> Repeats:
     """Return the runs of equal displacements (m) that indicate a frozen sensor; noise (rms) and resolution in m."""
-    # Either the voltage changed so much that the displacement must have moved, or a run of this length is improbable
-    # given the noise.
+    # The voltage changed so much that the displacement must have moved, or such a run is improbable given the noise.
     repeats = Repeats.within(y)
     moved = repeats.spans(v)
     due = LEAST_GAIN * gain * moved > 3.0 * step + 6.0 * noise_rms
@@ -366,8 +365,7 @@ class Mixed(NamedTuple):
 def mixed_readings(y: FloatArray, v: FloatArray) -> Mixed:
     """Find the readings of a displacement (m, (N,)) that are early, late or a mixture of two neighbouring values."""
     # Such a reading lies between its true value and that of a neighbour: a data link has delivered an old value or
-    # parts of two values. Unlike noise and outliers, all deviate towards the next reading, or all towards the preceding
-    # one.
+    # parts of two. Unlike noise and outliers, all deviate towards the next reading, or all towards the last one.
     off, way = _beside_lines(y[:ENOUGH], v[:ENOUGH])
     clear = np.abs(way) * _MIXED_NOISE > median_rms(off[way != 0.0]) if way.any() else way != 0.0
     count = int(np.count_nonzero(clear))

@@ -147,8 +147,7 @@ def free_run(
     of_record: bool,
 ) -> FreeRun:
     """Return the best free run of a model from the initial states `starts` over a record, shape (N,), s, V and m."""
-    # The error is that of the samples `used`, the offset that of the samples `known`, to which the initial state only
-    # adds a constant.
+    # The error is that of the samples `used`, the offset that of those `known`: the state only adds a constant to them.
     errors = [y - replace(axis, start=start).simulate(t, v, others, of_record=of_record) for start in starts]
     spread = [float(np.std(error[known])) for error in errors]
     as_well = [error for error, own in zip(errors, spread, strict=True) if own <= AS_WELL * min(spread)]
@@ -299,8 +298,7 @@ def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
 
 def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> IntArray:
     """Return the stretch number of each sample, shape (N,); in a stretch the initial history adds only a constant."""
-    # `apart` (m, (N,)) is the range of the displacements over all candidate histories; changes below `tolerance` (m)
-    # are ignored.
+    # `apart` (m, (N,)) is the range of the displacements over all histories; changes below `tolerance` are ignored.
     extends = np.zeros(v.size, dtype=bool)
     for extreme in (np.maximum.accumulate(v), np.minimum.accumulate(v)):
         extends[1:] |= extreme[1:] != extreme[:-1]

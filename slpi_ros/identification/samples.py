@@ -41,7 +41,6 @@ class Samples:
 
     # The first `history` samples form an assumed initial history, and before them the voltage falls from far above,
     # which erases the hysteresis memory; 0: the axis starts at rest.
-
     v: FloatArray  # V, measurement noise removed, also where not fitted
     y: FloatArray  # m, finite where fitted
     fitted: Mask
@@ -169,8 +168,7 @@ def select_thinned(
     record: Record, axis: str, start: float | None, stop: float | None, most: int
 ) -> tuple[Samples, IntArray]:
     """Return what `thinned` returns for the samples of `select_samples`, and their indices in the record."""
-    # A record longer than `WINDOW` is examined in windows, which need little memory: noise, resolution and outliers are
-    # those of each window.
+    # A record longer than `WINDOW` is examined in windows, which need little memory, each with noise of its own.
     if len(record) <= WINDOW:
         samples = select_samples(record, axis, start, stop)
         kept = samples.thinning(most)

@@ -19,7 +19,6 @@ class ErrorMetrics:
     # and 0.2949 µm (feedforward and PID). Its unit is µm, and it exceeds the mean absolute error, as an rms must. A
     # mean square cannot exceed the product of maximum and mean absolute error, but the values in Table 2 from 20 to 100
     # V, in Table 4 at 20 and 40 V, and 0.1201 do. The value at 120 V matches R² = 0.9996 (Table 3) only as an rms.
-
     maximum: float
     mean: float  # of the absolute errors
     root_mean_square: float

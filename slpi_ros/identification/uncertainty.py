@@ -33,7 +33,6 @@ class CurveUncertainty:
 
     # Computed from a thinned record, and therefore an upper bound for long records. The uncertainty of regions that no
     # sample visits is not included: there the roughness penalty determines the curves.
-
     axis: str
     kind: str
     resamples: int  # bootstrap fits

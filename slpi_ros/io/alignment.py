@@ -8,12 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.io.record import Record
-
-TimeArray = NDArray[np.int64]
 
 # Longest gap, in median periods, across which values are interpolated.
 _GAP = 10.0
@@ -25,8 +23,8 @@ _AXES = ("x", "y", "z")
 class Signals:
     """Decoded messages of one topic; (N,) each."""
 
-    logged: NDArray[np.int64]  # ns, ascending: recording times
-    stamp: NDArray[np.int64] | None  # ns, of the headers; None if no message is stamped
+    logged: IntArray  # ns, ascending: recording times
+    stamp: IntArray | None  # ns, of the headers; None if no message is stamped
     frame_id: str  # the first that is not empty
     fields: Mapping[str, Mapping[str, FloatArray]]  # ``position``, ``effort``, ``data`` or ``vector``; NaN: not given
     named: bool  # the message type names the columns, otherwise they are ``0``, ``1``, ...
@@ -39,33 +37,21 @@ class Signals:
 
 @dataclass(frozen=True)
 class SeparateTopics:
-    """Names and interpretation of separate topics for voltage and displacement, instead of ``stage_state``.
+    """Names and interpretation of separate topics for voltage and displacement, instead of ``stage_state``."""
 
-    Each topic may be of type ``sensor_msgs/JointState``, ``std_msgs/Float64``, ``std_msgs/Float64MultiArray`` or
-    ``geometry_msgs/Vector3Stamped``, in volts and metres. In a JointState, the displacement is ``position``; the
-    voltage is ``effort``, or ``position`` if ``effort`` is empty or zero. Axes are matched by name if both topics name
-    them; columns without names are assigned in the order of the axes, and a single voltage drives all axes.
-
-    Times are the header stamps if both topics have them and they overlap, otherwise the recording times of both
-    topics. Samples exist only in the time interval that both topics cover.
-
-    Parameters
-    ----------
-    voltage, displacement : str
-        Topic names; the leading slash and the namespace may be omitted if the name is unambiguous.
-    clock : {"displacement", "voltage"}
-        Signal whose messages become samples. With "displacement", the voltage is resampled at the times of the
-        displacement; a voltage reversal between two displacements becomes an additional sample with displacement NaN.
-        With "voltage", the displacement is interpolated linearly.
-    held : bool
-        True for a commanded voltage, which is held until the next message; with the clock "voltage", each sample then
-        lies midway between its message and the next one. False for a measured voltage, which is interpolated linearly.
-        There is no interpolation across gaps of more than ten periods; the values there are NaN.
-    """
-
-    voltage: str
+    # Each topic may be of type ``sensor_msgs/JointState``, ``std_msgs/Float64``, ``std_msgs/Float64MultiArray`` or
+    # ``geometry_msgs/Vector3Stamped``, in volts and metres. In a JointState, the displacement is ``position``; the
+    # voltage is ``effort``, or ``position`` if ``effort`` is empty or zero. Axes match by name if both topics name
+    # them; columns without names are assigned in the order of the axes, and a single voltage drives all axes.
+    # Times are the header stamps if both topics have them and they overlap, otherwise the recording times of both
+    # topics. There are samples only in the time that both cover, and no interpolation across gaps of ten periods.
+    voltage: str  # name; slash and namespace may be omitted if the name is unambiguous
     displacement: str
+    # The signal whose messages become samples. At the times of the displacement, a voltage reversal between two of them
+    # becomes an additional sample with displacement NaN; at those of the voltage, the displacement is interpolated.
     clock: Literal["displacement", "voltage"] = "displacement"
+    # A commanded voltage is held until the next message; with the clock "voltage", each sample then lies midway between
+    # its message and the next one. A measured one is interpolated.
     held: bool = True
 
 
@@ -73,7 +59,7 @@ class SeparateTopics:
 class _Series:
     """The columns of one signal, each of shape (n,), and their times."""
 
-    time: TimeArray
+    time: IntArray
     columns: Mapping[str, FloatArray]
 
 
@@ -139,7 +125,7 @@ def _naming(signals: Signals, topic: str, axes: Sequence[str]) -> list[str]:
 
 def _times(
     voltage: Signals, displacement: Signals, topics: SeparateTopics, where: str
-) -> tuple[TimeArray, TimeArray, list[str]]:
+) -> tuple[IntArray, IntArray, list[str]]:
     """Return the times of both topics on the same clock, and notes for the record."""
     if voltage.stamp is not None and displacement.stamp is not None:
         if _overlap(voltage.stamp, displacement.stamp):
@@ -160,18 +146,18 @@ def _times(
     return voltage.logged, displacement.logged, [note]
 
 
-def _overlap(one: TimeArray, other: TimeArray) -> bool:
+def _overlap(one: IntArray, other: IntArray) -> bool:
     return bool(max(one.min(), other.min()) < min(one.max(), other.max()))
 
 
-def _require_order(time: TimeArray, what: str) -> None:
+def _require_order(time: IntArray, what: str) -> None:
     back = np.flatnonzero(np.diff(time) < 0)
     if back.size:
         seconds = (time[back[0]] - time[back[0] + 1]) / SECOND_NS
         raise RecordError(f"{what} run backwards by {seconds:.6g} s at message {back[0] + 1}; record anew")
 
 
-_Aligned = tuple[TimeArray, dict[str, FloatArray], dict[str, FloatArray]]
+_Aligned = tuple[IntArray, dict[str, FloatArray], dict[str, FloatArray]]
 
 
 def _on_displacement(voltage: _Series, displacement: _Series, held: bool) -> _Aligned:
@@ -222,7 +208,7 @@ def _on_voltage(voltage: _Series, displacement: _Series, held: bool) -> _Aligned
     )
 
 
-def _between(time: TimeArray, known_at: TimeArray, values: FloatArray) -> FloatArray:
+def _between(time: IntArray, known_at: IntArray, values: FloatArray) -> FloatArray:
     """Interpolate linearly; the result is NaN within long gaps."""
     start = known_at[0]
     result = np.interp((time - start).astype(np.float64), (known_at - start).astype(np.float64), values)

@@ -220,7 +220,6 @@ class BagWatch:
     #
     # Bags that are complete from the beginning are not reported, except the newest one. An incomplete bag that has not
     # grown for `patience` (s) counts as abandoned, but is still watched.
-
     def __init__(self, folder: str | os.PathLike[str], patience: float = PATIENCE) -> None:
         self.folder, self.patience = Path(folder), patience
         self.abandoned: tuple[Path, ...] = ()

@@ -30,7 +30,6 @@ class BagWriter:
     # An incomplete bag is in ``.NAME.partial`` next to the final `path`, so a folder at the final path is always a
     # complete bag. ``write`` writes to `topic` by default, of type ``sensor_msgs/JointState``; None if all are added
     # with ``add_topic``. With `replace`, a folder at this path is deleted once the new bag is complete.
-
     def __init__(
         self,
         path: str | os.PathLike[str],

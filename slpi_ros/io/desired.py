@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.alignment import Signals, assigned
 from slpi_ros.io.bag_files import SUFFIXES, locate
@@ -16,8 +15,6 @@ from slpi_ros.io.bag_reader import Bag
 from slpi_ros.io.messages import JOINT_TRAJECTORY, MESSAGE_TYPES, TrajectoryArrays, decode_trajectory
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import read_table
-
-TimeArray = NDArray[np.int64]
 
 # Topics of desired displacements; a trajectory is followed before single messages.
 DESIRED, TRAJECTORY = "desired_displacement", "desired_trajectory"
@@ -28,11 +25,11 @@ class DesiredPath:
     """Desired displacements of one axis; a later path replaces an earlier one."""
 
     axis: str
-    time_ns: TimeArray  # (N,), ascending
+    time_ns: IntArray  # (N,), ascending
     y: FloatArray  # m, (N,); NaN: as before
     linear: bool  # between the points of a trajectory; else each is held until the next one
 
-    def at(self, time_ns: TimeArray) -> FloatArray:
+    def at(self, time_ns: IntArray) -> FloatArray:
         """Return the displacements (m) at some times (ns), both (M,); NaN where this path gives none."""
         if self.linear:
             origin = self.time_ns[0]
@@ -97,7 +94,7 @@ def read_path(path: str | os.PathLike[str], axes: Sequence[str] = ()) -> tuple[F
     return (time_ns - time_ns[0]) * 1e-9, {axis: y[known] for axis, y in columns.items()}
 
 
-def at_times(paths: Sequence[DesiredPath], time_ns: TimeArray) -> dict[str, FloatArray]:
+def at_times(paths: Sequence[DesiredPath], time_ns: IntArray) -> dict[str, FloatArray]:
     """Return the desired displacements (m) by axis, (N,), at some times (ns), NaN where there are none."""
     sampled: dict[str, FloatArray] = {}
     for each in paths:

@@ -375,7 +375,6 @@ class _Matrix:
 
     # A matrix is a sequence of words of 8 bytes: its own type, then type and content of its flags, shape, name, real
     # and imaginary data. The content of a short part is in the word of its type.
-
     def __init__(self, order: str) -> None:
         self._order = order
         self._words, self._begun, self._skipped, self._parts, self._expected = 0, b"", 0, 0, 0

@@ -35,12 +35,6 @@ def import_table(
     # vectors are the columns. A column name may contain a unit; without, units are seconds, volts and
     # `displacement_unit`, by default micrometres. Empty cells and ``nan`` become NaN. If the first time is negative,
     # all times are shifted such that the record begins at 0.
-    #
-    # By default `time` is ``time_s``, else the first column with a unit whose name begins with "time" or is ``t``, else
-    # the first one whose name begins with "time"; `voltage`, one column for all axes or one for each, those whose names
-    # begin with "voltage" or contain a unit of voltage; `displacement`, one column for each axis, those whose names
-    # begin with "displacement", else "position", else ``<axis>_m`` (or another unit) if there is ``<axis>_V``, else x,
-    # y and z with a unit; `axes` are from the names of the displacement columns, ``x`` if they contain none.
     options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
     return import_with_summary(path, options)[0]
 

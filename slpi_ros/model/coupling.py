@@ -14,7 +14,6 @@ class Coupling:
     """Linear coupling of all axes: the observed motions are ``(I + G) m``, with ``m`` the motions without coupling."""
 
     # ``gains[x][y]`` is the displacement of x per metre of y; axes that are not in the mapping have no coupling.
-
     def __init__(self, gains: Mapping[str, Mapping[str, float]]) -> None:
         self._gains = {
             name: {other: gain for other, gain in row.items() if other in gains and other != name and gain}

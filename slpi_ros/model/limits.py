@@ -51,7 +51,6 @@ class RateLimiter:
     # distance to stop at the voltage limits and at the goal; a step after a pause starts from rest and counts one
     # output period. `voltage` (V) is the last output, or found at the amplifier, `rate` (V/s) that of the last step,
     # `period` in seconds.
-
     __slots__ = ("_changed_ns", "_goal", "_limits", "_pending", "period", "rate", "voltage")
 
     def __init__(self, limits: Limits, period: float = PERIOD, voltage: float = 0.0) -> None:

@@ -93,7 +93,6 @@ class StreamingSensor:
     # A delay cannot be undone when the reading comes, and undoing a lag would amplify the noise of each reading. So, if
     # the sensor is `late`, the reading is compared with what it would be for the setpoint, or for the model: with a
     # `Sensed` signal.
-
     def __init__(self, timing: Sensor, effects: tuple[Effect, ...]) -> None:
         self.timing, self.late = timing, bool(timing)
         self._effects = [streaming for effect in effects if (streaming := effect.streaming())]
@@ -117,7 +116,6 @@ class Sensed:
     # If the stage is where the displacement is, at first at `displacement` (m), `at` is what `StreamingSensor.correct`
     # makes of the reading, while it moves too: with ``S`` the periodic error and ``L`` the lag, the reading is ``L S
     # x``, and both are ``S^-1 L S x``.
-
     __slots__ = ("_before", "_delay_ns", "_lag_ns", "_samples", "_sensor")
 
     def __init__(self, sensor: StreamingSensor, displacement: float) -> None:

@@ -47,7 +47,6 @@ class StreamingInverse:
     # record are ignored. Displacements in the range `accepted` (m), wider than the identified one, are accepted. `pace`
     # limits voltage, slew rate and acceleration; alone, in the time of the samples, of which at most `MAX_DT` counts. A
     # compensator gives it that of its output, on the steady clock.
-
     def __init__(
         self, memory: Memory, displacement_range: tuple[float, float], limits: Limits, effects: tuple[Effect, ...] = ()
     ) -> None:
@@ -416,7 +415,6 @@ class StageStream:
     """Causal compensation of several axes: ``{axis: v} = step(t, {axis: y})``."""
 
     # `origins` (m) are the displacements from which the motion of each axis is measured for cross-coupling.
-
     def __init__(
         self, streams: Mapping[str, StreamingInverse], coupling: Coupling, origins: Mapping[str, float]
     ) -> None:

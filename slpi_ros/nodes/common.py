@@ -175,7 +175,6 @@ class HasDeadlines(Protocol):
 
     # A timer that is reset often does not serve: if the events executor is late, each reset lets it call every timer
     # that is due once more, which moves the next calls of all of them by a period each.
-
     def seconds_to_deadline(self) -> float:
         """Return the time (s) until the next call of `meet_deadline`; infinite if there is no deadline."""
 

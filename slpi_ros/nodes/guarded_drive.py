@@ -35,7 +35,6 @@ class GuardedDrive:
     # is called at `rate` (Hz). `timeout` (s) is the longest time without a valid state during a drive. `on_state` is
     # called with each serialized state and its time on the clock of the node. The name of the node begins messages of
     # errors.
-
     def __init__(
         self,
         node: Node,

@@ -143,7 +143,6 @@ class DiagnosisService:
 
     # The diagnosis only writes files, in `folder` ("": a temporary one); it does not change the published model.
     # `identified` returns the request for that model and its bags; `report` is called at start and end of a diagnosis.
-
     def __init__(
         self,
         node: Node,

@@ -30,7 +30,6 @@ class WorkerProcess(Generic[Request, Outcome]):
 
     # `outcome` is a dataclass of plain values, created with only `error` set, which names `what` was done, if the
     # process ends without a result.
-
     def __init__(
         self, work: Callable[[Request], Outcome], request: Request, outcome: Callable[..., Outcome], what: str
     ) -> None:

@@ -22,7 +22,6 @@ class Case:
     """The parts of the record ``<name>.csv`` that are fitted and predicted."""
 
     # Each part is its start and its end (s); values up to 1 are shares of the record.
-
     name: str
     fitted: tuple[float, float]
     predicted: Mapping[str, tuple[float, float]]

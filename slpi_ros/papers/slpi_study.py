@@ -92,7 +92,6 @@ class Study:
 
     # `at_rest` and `closing` are the published model with play operators that start at rest in every loop, and primed,
     # so that loops close.
-
     turns: tuple[float, ...]
     separation: Separation  # voltage and displacement, separated into loops
     classical: PrandtlIshlinskii

@@ -121,7 +121,6 @@ class Chart:
 
     # Panels in a row share the vertical axis, panels in a column the horizontal one, if they show the same quantity, so
     # that they zoom together.
-
     panels: Sequence[Panel]
     arrangement: Literal["row", "column"] = "row"
     height: int = 420  # pixels

@@ -22,7 +22,6 @@ class SimulatedAxis:
     """One axis: hysteresis and noise of its parameters, all else of its character; `seed` is that of the noise."""
 
     # Voltage and displacement are linear between samples; the first sample after `rest` has no duration.
-
     def __init__(self, parameters: AxisParameters | None = None, seed: int = 0, character: Character = PLAIN) -> None:
         self.parameters, self.character = parameters or AxisParameters(), character
         self._hysteresis = PreisachHysteresis(self.parameters)

@@ -9,7 +9,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.settings import CHECK, VERIFICATION, CalibrationSettings
 from slpi_ros.compensator.controller import Controller
-from slpi_ros.errors import UsageError
+from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.excitation.drives import SLEW_USED, SWEEP, Drive, excite
 from slpi_ros.excitation.legs import DriveSpec, Path
 from slpi_ros.io.messages import SECOND_NS
@@ -23,8 +23,9 @@ CHECK_MOVE = 0.1
 INNER, SPEEDS = (0.04, 0.94), (0.15, 0.8)
 # Steepest slope of the inverse relative to its mean slope, for the speed of a path under a slew limit.
 STEEPEST_INVERSE = 2.5
-# Duration of the sweep before a verification and of the return after it, seconds, if the slew limit allows it.
-SWEEP_SECONDS, RETURN_SECONDS = 4.0, 1.0
+# Durations of the sweep before a verification, of the way to a given path and of the return, if the slew limit allows
+# them, and of the rest at the end of a given path, seconds.
+SWEEP_SECONDS, RETURN_SECONDS, REST_SECONDS = 4.0, 1.0, 0.2
 # Time to wait for a goal that the limiter has not reached at the end of a drive, as a share of the drive; share of the
 # voltage range within which it is reached.
 PATIENCE, CLOSE = 1.0, 1e-6
@@ -106,10 +107,11 @@ def compensated(
     controller.configure()
     controller.activate(FIRST_STAMP)
     rng = np.random.default_rng([settings.seed, seed, 99])
-    paths = [
-        _path(settings, model, place, axis.stream.uncoupled_displacement, rng)
-        for place, axis in enumerate(controller.axes)
-    ]
+    begins = [axis.stream.uncoupled_displacement for axis in controller.axes]
+    if settings.path:
+        paths = [_given_path(settings, model, place, begin) for place, begin in enumerate(begins)]
+    else:
+        paths = [_path(settings, model, place, begin, rng) for place, begin in enumerate(begins)]
     longest = max(path.size for path in paths)
     paths = [np.pad(path, (0, longest - path.size), mode="edge") for path in paths]
     rows = np.empty((longest, len(paths)))
@@ -121,7 +123,8 @@ def compensated(
     voltage = dict(zip(settings.axes, np.concatenate([swept, rows, back]).T, strict=True))
     gap = np.full(len(swept), np.nan), np.full(len(back), np.nan)
     wanted = {axis: np.concatenate([gap[0], y, gap[1]]) for axis, y in zip(settings.axes, paths, strict=True)}
-    why = "A path that no record holds, through the compensator: what the model is worth."
+    path = "The desired path" if settings.path else "A path that no record holds"
+    why = f"{path}, through the compensator: what the model is worth."
     drive = _drive(settings, voltage, why, limited=False)
     return drive, {axis: np.pad(y, (0, drive.t.size - y.size), constant_values=np.nan) for axis, y in wanted.items()}
 
@@ -135,6 +138,24 @@ def driven_so_far(records: Sequence[Record]) -> tuple[FloatArray, dict[str, Floa
         axis: np.concatenate([record.voltage[axis][own] for record, own in zip(records, known, strict=True)])
         for axis in records[0].voltage
     }
+
+
+def _given_path(settings: CalibrationSettings, model: StageModel, place: int, begin: float) -> FloatArray:
+    """Return the desired displacements, (N,), metres, of the path that is to be covered, and the way to it."""
+    name, limits = settings.axes[place], settings.limits[place]
+    if name not in settings.path:
+        return np.array([begin])
+    wanted, axis = settings.path[name], model.axis(name)
+    try:
+        axis.require_reachable(wanted)
+    except UnreachableError as error:
+        raise UnreachableError(f"desired_path: axis '{name}', {error}") from None
+    span = abs(float(wanted[0]) - begin) / float(np.ptp(axis.displacement_range))
+    steps = round(max(RETURN_SECONDS, _quickest(limits, STEEPEST_INVERSE * span)) * settings.rate)
+    way = (1.0 - np.cos(np.pi * np.arange(1, steps) / steps)) / 2.0
+    # At rest at the end, as the return begins there.
+    end = np.full(round(REST_SECONDS * settings.rate), wanted[-1])
+    return np.concatenate([begin + (wanted[0] - begin) * way, wanted, end])
 
 
 def _path(

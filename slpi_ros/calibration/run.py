@@ -11,7 +11,7 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
-from slpi_ros.calibration.settings import CALIBRATION, VERIFICATION, CalibrationSettings
+from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
 from slpi_ros.diagnosis.result import Diagnosis
 from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.errors import RecordError
@@ -195,7 +195,7 @@ class _Calibration:
     @property
     def _left(self) -> float:
         """Time (s) left for drives before the last verification."""
-        verification = max((step.seconds for step in self._steps if step.errors), default=VERIFICATION)
+        verification = max((step.seconds for step in self._steps if step.errors), default=self._settings.verification)
         return self._settings.budget - self._used - verification
 
     @property

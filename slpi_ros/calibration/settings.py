@@ -1,8 +1,10 @@
 """Settings of a calibration: the axes, their limits, the budget and the target."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
 from slpi_ros.model.limits import Limits
 
@@ -22,6 +24,8 @@ class CalibrationSettings:
     target: float = 0.0  # m, mean error on a path not used for the model; 0: `floors` times the repeatability floor
     floors: float = 3.0
     seed: int = 0  # of the random parts of the drives
+    # m, (N,), by axis at `rate`: the path that is to be covered, and on which models are verified; none: random ones
+    path: Mapping[str, FloatArray] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         if not self.axes or not len(self.axes) == len(self.limits) == len(self.rest):
@@ -47,7 +51,12 @@ class CalibrationSettings:
     @property
     def least(self) -> float:
         """Shortest time (s) in which a model can be identified and verified."""
-        return len(self.axes) * (CALIBRATION + CHECK) + 2 * VERIFICATION
+        return len(self.axes) * (CALIBRATION + CHECK) + 2 * self.verification
+
+    @property
+    def verification(self) -> float:
+        """Time (s) of the path of a verification."""
+        return max((y.size / self.rate for y in self.path.values()), default=VERIFICATION)
 
     def goal(self, floor_rms: float) -> float:
         """Return the target (m) of an axis whose repeatability floor is `floor_rms` (m)."""

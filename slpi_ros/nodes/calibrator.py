@@ -13,6 +13,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.run import Progress
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.errors import RecordError, SlpiError, UsageError
@@ -20,6 +21,7 @@ from slpi_ros.excitation.drives import slew_limits
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_files import partial_path
 from slpi_ros.io.bag_writer import BagWriter
+from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import encode_joint_states
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
@@ -69,6 +71,12 @@ DECLARATIONS = (
         "times_the_floor", 3.0, "Target in multiples of the repeatability floor, if target is 0.",
         read_only=True, between=(0.1, 1e6), number=True,
     ),
+    Declaration(
+        "desired_path", "",
+        "Table (time_s, AXIS_m) or bag with the path that the records must cover, and on which models are verified; at "
+        "its rate, range and turns. Empty: random paths. Give a rate at which the path can be sampled.",
+        read_only=True,
+    ),
     Declaration("output", "", "Folder for bags, model, diagnosis and page; required.", read_only=True),
     Declaration(
         "resume", False, "Whether to go on with the complete bags that output holds already.", read_only=True
@@ -93,6 +101,8 @@ MOST_PERIODS = 2.0
 # of the diagnostics and of messages while it waits; time for the delivery of the last message; longest wait for a state
 # at rest; seconds.
 TAIL, HOLD_PERIOD, REPORT_PERIOD, LOG_PERIOD, DELIVERY, LATEST = 0.3, 0.1, 1.0, 5.0, Duration(seconds=1.0), 2.0
+# A path may lose this share of its range when it is sampled.
+MOST_LOST = 0.05
 RESUME = "what was recorded is kept, go on with resume:=true"
 
 
@@ -141,7 +151,25 @@ def settings_of(values: Values) -> CalibrationSettings:
         target=checked["target"] * 1e-6,
         floors=checked["times_the_floor"],
         seed=checked["seed"],
+        path=_path_of(checked["desired_path"], axes, checked["rate"]) if checked["desired_path"] else {},
     )
+
+
+def _path_of(source: str, axes: tuple[str, ...], rate: float) -> dict[str, FloatArray]:
+    """Return the desired displacements (m) of a path by axis, (N,), at a rate (Hz); UsageError if they are none."""
+    t, columns = read_path(source, axes)
+    even, path = np.arange(int(t[-1] * rate) + 1) / rate, {}
+    for axis, y in columns.items():
+        if axis not in axes:
+            raise UsageError(f"desired_path: {source} holds axis '{axis}', the stage has {', '.join(axes)}; rename it")
+        path[axis] = np.interp(even, t, y)
+        lost = float(np.abs(np.interp(t, even, path[axis]) - y).max())
+        if lost > MOST_LOST * float(np.ptp(y)):
+            raise UsageError(
+                f"desired_path: {source}: axis '{axis}' loses {lost * 1e6:.3g} µm at {rate:g} samples per second; "
+                "raise the parameter rate, or give a smooth path"
+            )
+    return path
 
 
 class Calibrator(Node):

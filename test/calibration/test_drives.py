@@ -1,12 +1,14 @@
 """The drives of a calibration stay within all limits, and begin and end at rest."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibration.stages import SimulatedRecorder, settings, stage_of
 
 from slpi_ros.calibration.drives import checking, compensated, exciting
 from slpi_ros.calibration.run import Request
-from slpi_ros.errors import UsageError
+from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.excitation.drives import DRIVES
 from slpi_ros.identification.fit import identify
 from slpi_ros.model.limits import Limits
@@ -53,6 +55,29 @@ def test_the_verification_goes_through_the_compensator_within_its_limits(limits)
         assert np.abs(error - np.median(error)).mean() < 2e-3 * np.ptp(record.displacement[axis])
     other = compensated(chosen, model, 8)[1]["x"]
     assert not np.allclose(np.nan_to_num(other)[: drive.t.size], np.nan_to_num(desired["x"])[: other.size], atol=1e-7)
+
+
+@pytest.mark.parametrize("limits", LIMITS)
+def test_a_given_path_is_driven_as_it_is(limits):
+    chosen = settings("xy", limits=(LIMITS[limits],) * 2, rest=(10.0, 0.0))
+    recorder = SimulatedRecorder(stage_of(Character(), Character(), noise_rms=1e-9))
+    calibration = exciting(chosen, "calibration", 80.0, chosen.axes, 1)
+    model = identify(recorder(Request("calibration", calibration, {})).record)
+    low, high = model.axes["x"].displacement_range
+    t = np.arange(600) / chosen.rate
+    y = low + (high - low) * (0.5 + 0.05 * np.sin(2.0 * np.pi * t))
+    own = replace(chosen, path={"x": y})
+    assert own.verification == pytest.approx(3.0) and own.least < chosen.least
+    drive, desired = compensated(own, model, 7)
+    require_within(drive, chosen)
+    windows = np.lib.stride_tricks.sliding_window_view(desired["x"], y.size)
+    assert (windows == y).all(axis=1).any()
+    assert np.nanmax(desired["y"]) == np.nanmin(desired["y"])
+    record = recorder(Request("verification", drive, desired)).record
+    error = (record.displacement["x"] - desired["x"])[np.isfinite(desired["x"])]
+    assert np.abs(error).max() < 0.01 * (high - low)
+    with pytest.raises(UnreachableError, match="desired_path: axis 'x'"):
+        compensated(replace(chosen, path={"x": y + (high - low)}), model, 7)
 
 
 @pytest.mark.parametrize(

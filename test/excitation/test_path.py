@@ -1,14 +1,21 @@
 """The drive that covers a path."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from calibration.stages import stage_of
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from slpi_ros.excitation.drives import excite
+from slpi_ros.excitation.drives import Drive, excite
 from slpi_ros.excitation.path import with_path
 from slpi_ros.hysteresis.reversals import reversals
+from slpi_ros.identification.fit import identify
+from slpi_ros.io.record import Record
 from slpi_ros.model.coverage import fastest
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.simulation.character import Character
 
 RATE = 100.0
 
@@ -70,3 +77,33 @@ def test_axes_move_one_after_the_other():
     alone = with_path(base, {"y": v})
     assert (alone.voltage["x"][base.t.size :] == base.voltage["x"][-1]).all() and alone.axes == ("x", "y")
     assert drive.specs["x"].duration == pytest.approx(drive.t[-1])
+
+
+def test_a_model_of_such_a_record_follows_the_path_better():
+    def recorded(drive: Drive) -> Record:
+        """Record a stage whose loops widen with the rate, the same one each time."""
+        stage = stage_of(Character(rate_dependence=2.0))
+        t, v = (1000.0 + drive.t).tolist(), drive.voltage["x"]
+        y = np.array([stage.measure(stage.step(at, [each]))[0] for at, each in zip(t, v.tolist(), strict=True)])
+        return Record(np.rint(drive.t * 1e9).astype(np.int64), {"x": v}, {"x": y})
+
+    rate = 200.0
+    limits = {"voltage_min": 0.0, "voltage_max": 100.0, "rate": rate}
+    base = excite(duration=30.0, seed=1, **limits)
+    first = identify(recorded(base))
+    t = np.arange(0.0, 6.0, 1 / rate)
+    y = 10e-6 + 1.5e-6 * np.sin(2 * np.pi * 8.0 * t) * np.minimum(t, 1.0)
+    better = identify(recorded(with_path(base, {"x": first.compensate(t, y)})))
+
+    def error(model: StageModel) -> float:
+        """Return the rms error (m) along the path, after a sweep and a way to its begin."""
+        sweep = excite(duration=4.0, drive="sweep", **limits).voltage["x"]
+        step = model.stream("x", start_memory="wiped")
+        for v in sweep.tolist():
+            step.drive(v, 1 / rate)
+        way = np.concatenate([np.linspace(step.uncoupled_displacement, y[0], 200), y])
+        v = np.concatenate([sweep, [step(k / rate, each) for k, each in enumerate(way.tolist())]])
+        path = recorded(replace(base, t=np.arange(v.size) / rate, voltage={"x": v})).displacement["x"][-y.size :]
+        return float(np.sqrt(np.mean((path - y) ** 2)))
+
+    assert error(better) < 0.6 * error(first)

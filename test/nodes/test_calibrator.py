@@ -16,8 +16,11 @@ from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from benchmarks.faulty_stage import FAULTS, FaultyStage  # noqa: E402
+from slpi_ros.errors import UsageError  # noqa: E402
 from slpi_ros.io.bag_reader import read_bag  # noqa: E402
+from slpi_ros.io.tables import write_table  # noqa: E402
 from slpi_ros.model.document import parse_model  # noqa: E402
+from slpi_ros.nodes.calibrator import DECLARATIONS, settings_of  # noqa: E402
 
 LOW, HIGH, SLEW, RATE, REST = -10.0, 90.0, 300.0, 100.0, 5.0
 PARAMETERS = {
@@ -240,6 +243,19 @@ def test_parameters_with_which_it_cannot_start(tmp_path, changed, complaint):
 
 
 @pytest.mark.ros
+def test_a_desired_path_is_sampled_at_the_rate(tmp_path):
+    t = np.arange(1001) / 1000.0
+    write_table(tmp_path / "path.csv", t, {"x": 1e-6 * np.sin(2 * np.pi * 4.0 * t)}, "m")
+    values = {entry.name: entry.default for entry in DECLARATIONS} | {
+        "voltage_min": 0.0, "voltage_max": 100.0, "output": "out", "desired_path": str(tmp_path / "path.csv"),
+    }  # fmt: skip
+    path = settings_of(values).path["x"]
+    assert path == pytest.approx(1e-6 * np.sin(2 * np.pi * 4.0 * np.arange(201) / 200.0), abs=1e-12)
+    for wrong in ({"rate": 10.0}, {"axes": ["y"]}):
+        with pytest.raises(UsageError, match="desired_path"):
+            settings_of(values | wrong)
+
+
 def test_a_folder_in_use_is_not_touched(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with started("calibrator", {**PARAMETERS, "output": str(tmp_path)}) as node:

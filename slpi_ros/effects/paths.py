@@ -273,7 +273,6 @@ def inverse_path(
     lag, command, beside = np.array([point[0], point[0]]), point[0], 0.0
     # As `StreamingRateDependence`: applied voltage, last three ``w``, last desired displacement.
     rate = np.array([point[0], 0.0, 0.0, 0.0, np.nan])
-    one_dt, one_h, one_v, one_y = np.empty(1), np.empty(1), np.empty(1), np.empty(1)
     for n in range(dt.size):
         counted = min(dt[n], longest)
         if n == 0 or dt[n] > longest:
@@ -297,14 +296,13 @@ def inverse_path(
         v_0, y_0, s_0, depth_0, rate_0 = point[0], point[1], at[0], at[1], rate[0]
         at[3] = 0
         if has_rate:
-            one_dt[0], one_h[0] = dt[n], h
             done, turned, deep = engine.through_law(
-                one_dt, one_h, laws.rate, lower, upper, one_v, one_y, rate, float(at[0]), point, turns, at[1], *shape
+                dt[n], h, laws.rate, lower, upper, rate, float(at[0]), point, turns, at[1], *shape
             )
             at[0], at[1], at[2], at[3] = int(turned), deep, 0, 1
-            if done < 1:
+            if not done:
                 return n
-            v, beside = one_v[0], laws.rate[2] * (one_v[0] - point[0])
+            v, beside = rate[0], laws.rate[2] * (rate[0] - point[0])
         else:
             straight = engine.along(h, 1, lower, upper, point, at, ends, knots)
             if not straight and not engine.moved(h, 1, lower, upper, point, turns, at, ends, knots, *shape):

@@ -298,13 +298,11 @@ def felt(t: FloatArray, v: FloatArray, threshold: float, onset_rate: float, lead
 
 @compiled
 def through_law(
-    dt: FloatArray,
-    h: FloatArray,
+    dt: float,
+    h: float,
     law: FloatArray,
     lower: float,
     upper: float,
-    out: FloatArray,
-    reached: FloatArray,
     state: FloatArray,
     direction: float,
     point: FloatArray,
@@ -314,110 +312,101 @@ def through_law(
     symmetric_rest: bool,
     first: FloatArray,
     branches: Branches,
-) -> tuple[int, float, int]:
-    """Compensate the rate law and the hysteresis along a path, as `StreamingRateDependence.inverse` at each sample.
-
-    Return the number of samples evaluated (less than N if the model cannot reach the next one), the direction and the
-    depth. `dt` (s, shape (N,)) is the time from the sample before, and `h` (m, shape (N,)) the desired displacement of
-    hysteresis and reversible part. `law` holds threshold (V), onset rate (V/s) and reversible gain (m/V). The outputs,
-    shape (N,), are the applied voltages within the limits, `out` (V), and the displacements that they give, `reached`
-    (m). `state`, shape (5,), is modified in place: applied voltage (V), magnitudes of ``w`` of the last three samples,
-    and the last `h` (NaN: none). `turns` has the shape (2, depth + 2 N + 2); all other arguments are as in `through`.
-    """
+) -> tuple[bool, float, int]:
+    """Compensate the rate law and the hysteresis for one sample, as `StreamingRateDependence.inverse` does."""
+    # Return whether the model can reach the sample, the direction and the depth. `dt` (s) is the time from the sample
+    # before, and `h` (m) the desired displacement of hysteresis and reversible part. `law` holds threshold (V), onset
+    # rate (V/s) and reversible gain (m/V). `state`, shape (5,), is modified in place: applied voltage (V), within the
+    # limits, magnitudes of ``w`` of the last three samples, and the last `h` (NaN: none). All other arguments are as in
+    # `through`.
     threshold, onset_rate, reversible = law[0], law[1], law[2]
     s, shape = direction, (rest, symmetric_rest, first, branches)
     one, other, walk = np.empty(1), np.empty(1), np.empty((3, 0), dtype=np.int64)
-    ends, knots, known, knot = np.empty((2, 2)), room(first, branches), False, 0
+    ends, knots, knot = np.empty((2, 2)), room(first, branches), 0
     # Start of the branch, first knot of its present piece, end (V) and inverse slope (V/m; 0 if flat) of the piece.
     v_begin, y_begin, u_knot, f_knot, end_piece, rise = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     u, y, closes = point[0], point[1], False
     v, w, w_before, w_earlier, last = state
-    for n in range(h.size):
-        scale, u0, y0, s_0, depth_0 = onset_rate * dt[n], u, y, s, depth
-        lead = v - u0
-        if not scale > 0.0 and h[n] == last:
-            out[n], reached[n] = v, y + reversible * lead
-            continue
-        last = h[n]
-        gain = reversible * threshold if scale > 0.0 else 0.0
-        target = h[n] if scale > 0.0 else h[n] - reversible * lead
-        turn = 1.0 if target > y0 else -1.0
-        limit = upper if turn > 0.0 else lower
-        if not scale > 0.0:
-            limit -= lead
-        guess, w_kept = 3.0 * w_before - 2.0 * w_earlier, w
-        if scale > 0.0:
-            w_earlier, w_before, w = w_before, w, 0.0
-        if target != y0 and turn * (limit - u0) > 0.0:
-            # The smallest step enters the branch.
-            enter, known, next_piece = not known or turn != s, True, False
-            step = np.nextafter(u0, turn * inf)
-            while True:
-                if enter:
-                    point[0], point[1], one[0] = u, y, step
-                    done, s, depth, knot = through(
-                        one, 0, lower, upper, other, s, point, turns, depth, walk, ends, knots, *shape
-                    )
-                    if not done:
-                        return n, s, depth
-                    u, y = point[0], point[1]
-                    if step == limit:
-                        known = False
-                        w = asinh(abs(limit - u0) / scale) if scale > 0.0 else 0.0
-                        break
-                if enter or next_piece:
-                    height = knots[1, knot] - knots[1, knot - 1]
-                    rise = (knots[0, knot] - knots[0, knot - 1]) / height if height > 0.0 else 0.0
-                    v_begin, y_begin, u_knot, f_knot = ends[0, 0], ends[1, 0], knots[0, knot - 1], knots[1, knot - 1]
-                    end_piece = v_begin + s * knots[0, knot]
-                    closes = s * (ends[0, 1] - end_piece) <= 0.0
-                    if closes:
-                        end_piece = ends[0, 1]
-                above = s * (target - y_begin) - f_knot
-                v_line = v_begin + s * (u_knot + above * rise)
-                if rise == 0.0:
-                    # On a flat piece only the reversible part moves; without it the piece is passed.
-                    w = max(above, 0.0) / gain if gain > 0.0 else LARGEST
-                    v_line = u0 + s * (scale * sinh(min(w, LARGEST))) if w < LARGEST else s * inf
-                elif scale > 0.0:
-                    goal = max(s * (v_line - u0), 0.0)
-                    w = guess = solved(scale, rise * gain, goal, guess)
-                    v_line = u0 + s * (goal - rise * gain * w)
-                end = limit if s * (limit - end_piece) < 0.0 else end_piece
-                if s * (end - v_line) > 0.0:
-                    u, y = v_line, target - s * (gain * w)
-                    break
-                if end == limit:
-                    enter, step = True, limit
-                elif closes or knots[0, knot] >= END:
-                    # A rounding error must not leave it on the branch that ends here.
-                    enter, step = True, np.nextafter(end, turn * inf)
-                else:
-                    enter, next_piece, knot = False, True, knot + 1
-        wanted = u + threshold * (w if turn > 0.0 else -w) if scale > 0.0 else u + lead
-        before, v = v, min(max(wanted, lower), upper)
-        kept = v == wanted
-        if not kept:
-            # A limit holds the voltage back: the memory follows what is applied.
-            point[0], point[1], s, depth, known = u0, y0, s_0, depth_0, False
-            if scale > 0.0:
-                way, u = v - u0, u0
-                if way != 0.0:
-                    w = solved(scale, threshold, abs(way), 0.0)
-                    u = followed(threshold, v, u, w)
-            else:
-                u = u0 + (v - before)
-            if u != u0:
-                one[0] = u
+    scale, u0, y0, s_0, depth_0 = onset_rate * dt, u, y, s, depth
+    lead = v - u0
+    if not scale > 0.0 and h == last:
+        return True, s, depth
+    gain = reversible * threshold if scale > 0.0 else 0.0
+    target = h if scale > 0.0 else h - reversible * lead
+    turn = 1.0 if target > y0 else -1.0
+    limit = upper if turn > 0.0 else lower
+    if not scale > 0.0:
+        limit -= lead
+    guess, w_kept = 3.0 * w_before - 2.0 * w_earlier, w
+    if scale > 0.0:
+        w_earlier, w_before, w = w_before, w, 0.0
+    if target != y0 and turn * (limit - u0) > 0.0:
+        # The smallest step enters the branch.
+        enter, next_piece = True, False
+        step = np.nextafter(u0, turn * inf)
+        while True:
+            if enter:
+                point[0], point[1], one[0] = u, y, step
                 done, s, depth, knot = through(
                     one, 0, lower, upper, other, s, point, turns, depth, walk, ends, knots, *shape
                 )
                 if not done:
-                    return n, s, depth
-            u, y = point[0], point[1]
-        if not scale > 0.0:
-            w = w_kept
-        out[n], reached[n] = v, y + reversible * (v - u)
+                    return False, s, depth
+                u, y = point[0], point[1]
+                if step == limit:
+                    w = asinh(abs(limit - u0) / scale) if scale > 0.0 else 0.0
+                    break
+            if enter or next_piece:
+                height = knots[1, knot] - knots[1, knot - 1]
+                rise = (knots[0, knot] - knots[0, knot - 1]) / height if height > 0.0 else 0.0
+                v_begin, y_begin, u_knot, f_knot = ends[0, 0], ends[1, 0], knots[0, knot - 1], knots[1, knot - 1]
+                end_piece = v_begin + s * knots[0, knot]
+                closes = s * (ends[0, 1] - end_piece) <= 0.0
+                if closes:
+                    end_piece = ends[0, 1]
+            above = s * (target - y_begin) - f_knot
+            v_line = v_begin + s * (u_knot + above * rise)
+            if rise == 0.0:
+                # On a flat piece only the reversible part moves; without it the piece is passed.
+                w = max(above, 0.0) / gain if gain > 0.0 else LARGEST
+                v_line = u0 + s * (scale * sinh(min(w, LARGEST))) if w < LARGEST else s * inf
+            elif scale > 0.0:
+                goal = max(s * (v_line - u0), 0.0)
+                w = guess = solved(scale, rise * gain, goal, guess)
+                v_line = u0 + s * (goal - rise * gain * w)
+            end = limit if s * (limit - end_piece) < 0.0 else end_piece
+            if s * (end - v_line) > 0.0:
+                u, y = v_line, target - s * (gain * w)
+                break
+            if end == limit:
+                enter, step = True, limit
+            elif closes or knots[0, knot] >= END:
+                # A rounding error must not leave it on the branch that ends here.
+                enter, step = True, np.nextafter(end, turn * inf)
+            else:
+                enter, next_piece, knot = False, True, knot + 1
+    wanted = u + threshold * (w if turn > 0.0 else -w) if scale > 0.0 else u + lead
+    before, v = v, min(max(wanted, lower), upper)
+    if v != wanted:
+        # A limit holds the voltage back: the memory follows what is applied.
+        point[0], point[1], s, depth = u0, y0, s_0, depth_0
+        if scale > 0.0:
+            way, u = v - u0, u0
+            if way != 0.0:
+                w = solved(scale, threshold, abs(way), 0.0)
+                u = followed(threshold, v, u, w)
+        else:
+            u = u0 + (v - before)
+        if u != u0:
+            one[0] = u
+            done, s, depth, knot = through(
+                one, 0, lower, upper, other, s, point, turns, depth, walk, ends, knots, *shape
+            )
+            if not done:
+                return False, s, depth
+        u, y = point[0], point[1]
+    if not scale > 0.0:
+        w = w_kept
     point[0], point[1] = u, y
-    state[:] = v, w, w_before, w_earlier, last
-    return h.size, s, depth
+    state[:] = v, w, w_before, w_earlier, h
+    return True, s, depth

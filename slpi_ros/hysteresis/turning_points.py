@@ -313,24 +313,6 @@ class Memory:
             (self.inverse if coordinate else self.forward)(float(x[done]))
         return out
 
-    def inverse_of_law_array(
-        self, dt: FloatArray, h: FloatArray, law: FloatArray, limits: tuple[float, float]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the voltages (V) before a rate law, and the displacements (m) that they reach, shape (N,) each."""
-        # `slpi_ros.hysteresis.compiled.through_law` describes the arguments. The memory itself does not move.
-        from slpi_ros.hysteresis.compiled import through_law
-
-        v, reached = np.empty_like(h), np.empty_like(h)
-        direction, point, turns, depth = self.arrays(2 * h.size + 2)
-        state = np.array([self._v, 0.0, 0.0, 0.0, np.nan])
-        done, _, _ = through_law(
-            *(dt, h, law, float(limits[0]), float(limits[1]), v, reached, state, direction, point, turns, depth),
-            *self.shape_arrays(),
-        )
-        if done < h.size:
-            raise UsageError(f"displacement {h[done]} m cannot be reached by this model; leave such samples out")
-        return v, reached
-
     def arrays(self, more: int) -> tuple[float, FloatArray, FloatArray, int]:
         """Return direction, current point, stack with room for `more` reversals, and depth, for the compiled engine."""
         turns = np.empty((2, self.depth + more))

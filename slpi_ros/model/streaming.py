@@ -207,9 +207,6 @@ class StreamingInverse:
             from slpi_ros.effects.paths import Laws, inverse_path
 
             h, dt, voltages = y - coupled, np.diff(t, prepend=t[:1]), (float(limits.lower), float(limits.upper))
-            if self._direct:
-                v, reached = self.memory.inverse_of_law_array(dt, h, laws["rate"], voltages)
-                return v, self._beyond(v, h - reached)
             direction, point, turns, depth = self.memory.arrays(4 * y.size + 4)
             done = inverse_path(
                 *(dt, h, *voltages, MAX_DT, (self._rounding, ROUNDING), self.memory.far, Laws(**laws), v, held),

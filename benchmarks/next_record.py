@@ -4,7 +4,7 @@ advised: the diagnosis of a record with one drive frequency is `ambiguous`; the 
 recorded on the same stage, and both records are diagnosed together. pairs: two effects, two records with one drive
 frequency each; the gain that the diagnosis states for effects common to all records is compared with the reduction of
 the free-run error on a third record at another frequency.
-Every record has its own initial history, zero offset, hum phase and drift.
+Every record has its own initial state, zero offset, hum phase and drift.
 """
 
 import os

@@ -2,7 +2,7 @@
 
 Some records of an actuator are fitted: a classical Prandtl-Ishlinskii model, a loop family, and the loop family
 extended by the diagnosed effects. All three are judged on its other records: free-run error without the constant offset
-of the record, rms in % of its range, from the best of the same initial histories for all three. A row is marked
+of the record, rms in % of its range, from the best of the same initial states for all three. A row is marked
 
 - ``HARM``: with causes the error is more than 1.05 times that of the loop family without;
 - ``PI``: the error of the loop family is more than 1.05 times that of the classical model.
@@ -94,7 +94,7 @@ def _named(effects: Sequence[NamedEffect]) -> str:
 
 
 def _errors(models: dict[str, slpi_ros.StageModel], record: Record, axis: str) -> dict[str, float]:
-    """Return the free-run error (% of range) of each model, from the best of the same initial histories."""
+    """Return the free-run error (% of range) of each model, from the best of the same initial states."""
     own = {kind: model.axes[axis] for kind, model in models.items()}
     samples = select_samples(record, axis, None, None)
     # Before the record the actuator may also have moved over the whole range of the fitted ones.

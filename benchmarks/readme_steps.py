@@ -220,7 +220,7 @@ def as_written(user: Readme, seed: int) -> tuple[slpi_ros.StageModel, FloatArray
 
 def next_day(user: Readme, seed: int, model: slpi_ros.StageModel) -> tuple[FloatArray, list[str]]:
     """Restart the stage one day later, and the compensator with ``reset_on_start``; return errors and warnings."""
-    stage = user.stage(seed, f"-p initial_history:='{[round(v, 6) for v in user.turns]}'")
+    stage = user.stage(seed, f"-p initial_state:='{[round(v, 6) for v in user.turns]}'")
     compensator = user.compensator("-p reset_on_start:=true")
     user.memory = ""
     user.until(lambda: user.memory == "known", "the reset")
@@ -232,7 +232,7 @@ def next_day(user: Readme, seed: int, model: slpi_ros.StageModel) -> tuple[Float
 
 def moved(user: Readme, seed: int, model: slpi_ros.StageModel, history: str, to: float) -> None:
     """Print the errors of a stage that was driven through `history` (V) to `to` (V) before the compensator measures."""
-    stage = user.stage(seed, f"-p initial_history:='{history}'")
+    stage = user.stage(seed, f"-p initial_state:='{history}'")
     voltages = user.node.create_publisher(Float64MultiArray, "/voltage_command", 100)
     user.until(voltages.get_subscription_count, "the stage")
     user.spin(SETTLE_S)

@@ -41,7 +41,7 @@ def measured_folder() -> Path | None:
 
 
 def free_run(model: AxisModel, record: Record, axis: str, others: Collection[tuple[float, ...]] = frozenset()) -> float:
-    """Return the error, % of the stroke, for the best of the possible initial histories (such as never moved).
+    """Return the error, % of the stroke, for the best of the possible initial states (such as never moved).
 
     Parameters
     ----------
@@ -49,11 +49,11 @@ def free_run(model: AxisModel, record: Record, axis: str, others: Collection[tup
     record : Record
     axis : str
     others : collection of tuple of float, volts
-        Further initial histories, such as those of the models that this one is compared with. Default: none.
+        Further initial states, such as those of the models that this one is compared with. Default: none.
     """
     v, y = record.voltage[axis], record.displacement[axis]
     known = np.isfinite(y)
-    # Creep and rate law that continue from before a record are specific to the record, like its initial history.
+    # Creep and rate law that continue from before a record are specific to the record, like its initial state.
     settled = replace(model, effects=tuple(_settled(one) for one in model.effects))
     errors = [
         replace(each, start=Start(float(v[0]), 0.0, history)).simulate(record.t, v)[known] - y[known]

@@ -1,4 +1,4 @@
-"""Records of one stage with different initial histories: a change must be reported if, and only if, there is one.
+"""Records of one stage with different initial states: a change must be reported if, and only if, there is one.
 
 A stage is identified, then recorded again for a few seconds, each time after other voltages: unchanged, with another
 gain, and with another zero offset.

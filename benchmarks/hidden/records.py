@@ -164,7 +164,7 @@ def calibration_of(hidden: Hidden, duration: float = 40.0, rate: float = 500.0) 
 def again(
     hidden: Hidden, number: int, voltage: dict[str, FloatArray], rate: float, *, from_rest: bool = False
 ) -> Hidden:
-    """Return another record of the same stage: other voltages, another initial history, another zero offset.
+    """Return another record of the same stage: other voltages, another initial state, another zero offset.
 
     Drift of zero and sensitivity follow another course, and hum has another phase; all else is as in `hidden`.
 

@@ -148,8 +148,8 @@ class _Calibration:
         # Record of the check.
         self._first: Record | None = None
         self._drives: list[tuple[str, Sequence[str]]] = []
-        # Repeatability floor of each axis, metres, best known so far: what a diagnosis explains is no noise.
-        self._floors: dict[str, float] = {}
+        # Repeatability of each axis, metres, best known so far: what a diagnosis explains is no noise.
+        self._repeatability: dict[str, float] = {}
         # Model and errors of each verification.
         self._verified: list[tuple[StageModel, dict[str, TrackingError]]] = []
         self._diagnosing = DIAGNOSING
@@ -178,7 +178,7 @@ class _Calibration:
             # No diagnosis makes the constant part smaller.
             if all(error.rest <= error.goal for error in self._verify(diagnosis.extended).values()):
                 break
-        goals = {axis: settings.goal(floor) for axis, floor in self._floors.items()}
+        goals = {axis: settings.goal(rms) for axis, rms in self._repeatability.items()}
 
         def excess(verified: tuple[StageModel, dict[str, TrackingError]]) -> float:
             return max(error.rest / goals[axis] for axis, error in verified[1].items())
@@ -246,10 +246,10 @@ class _Calibration:
     def _identify(self) -> StageModel:
         self._begin("identifying the hysteresis")
         model = identify(IdentifyRequest(Source(records=self._records))).model
-        self._floors = {name: axis.quality.floor_rms for name, axis in model.axes.items()}
+        self._repeatability = {name: axis.quality.floor_rms for name, axis in model.axes.items()}
         said = "; ".join(
             f"axis {name}: held-out error {axis.quality.held_out_rms * 1e9:.3g} nm rms, "
-            f"repeatability floor {axis.quality.floor_rms * 1e9:.3g} nm"
+            f"repeatability {axis.quality.floor_rms * 1e9:.3g} nm"
             for name, axis in model.axes.items()
         )
         self._steps.append(Step("identify", 0.0, "a first model, of hysteresis alone", said))
@@ -276,7 +276,7 @@ class _Calibration:
         with listening(tell):
             diagnosis = _diagnosed(self._records, first)
         self._diagnosing = (time.monotonic() - begun) / (count * len(self._settings.axes))
-        self._floors = {name: found.repeatability_rms for name, found in diagnosis.axes.items()}
+        self._repeatability = {name: found.repeatability_rms for name, found in diagnosis.axes.items()}
         finding = "; ".join(f"axis {name}: {found.summary}" for name, found in diagnosis.axes.items())
         self._steps.append(
             Step("diagnose", 0.0, f"causes of the error, judged on each of {count} records held out in turn", finding)
@@ -288,7 +288,7 @@ class _Calibration:
         drive, desired = compensated(self._settings, model, len(self._steps), self._records)
         recording = self._recorded(VERIFICATION_DRIVE, drive, desired)
         errors = {
-            axis: tracking_error(recording, axis, model, self._settings.goal(self._floors[axis]))
+            axis: tracking_error(recording, axis, model, self._settings.goal(self._repeatability[axis]))
             for axis in self._settings.axes
         }
         finding = "; ".join(f"axis {axis}: {error.told()}" for axis, error in errors.items())
@@ -311,7 +311,7 @@ def _diagnosed(records: Sequence[Record], model: StageModel) -> Diagnosis:
 
 def _from_first_move(record: Record, axis: str) -> Record:
     """Return the record from shortly before the first move of an axis on."""
-    # A long rest before tells nothing of the hysteresis, but keeps the initial history open while other axes couple in.
+    # A long rest before tells nothing of the hysteresis, but keeps the initial state open while other axes couple in.
     v = record.voltage[axis]
     first = int(np.flatnonzero(np.abs(v - v[0]) > 0.0)[0])
     begin = max(int(np.searchsorted(record.t, record.t[first] - REST_BEFORE)), 0)

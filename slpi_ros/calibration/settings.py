@@ -21,8 +21,8 @@ class CalibrationSettings:
     rest: tuple[float, ...]  # V, before and after every drive
     rate: float  # samples per second
     budget: float  # s, the largest sum of the durations of all drives
-    target: float = 0.0  # m, mean error on a path not used for the model; 0: `floors` times the repeatability floor
-    floors: float = 3.0
+    target: float = 0.0  # m, mean error on a path not used for the model; 0: `times_repeatability` the repeatability
+    times_repeatability: float = 3.0
     seed: int = 0  # of the random parts of the drives
     # m, (N,), by axis at `rate`: the path that is to be covered, and on which models are verified; none: random ones
     path: Mapping[str, FloatArray] = field(default_factory=dict, compare=False)
@@ -41,8 +41,10 @@ class CalibrationSettings:
                     f"calibration: axis '{axis}' rests at {rest:g} V, outside {limits.lower:g} to {limits.upper:g} V; "
                     "move it inside first"
                 )
-        if not (0.0 <= self.target < math.inf and 0.0 < self.floors < math.inf):
-            raise UsageError(f"calibration: target {self.target:g} m, {self.floors:g} floors; give positive ones")
+        if not (0.0 <= self.target < math.inf and 0.0 < self.times_repeatability < math.inf):
+            raise UsageError(
+                f"calibration: target {self.target:g} m, {self.times_repeatability:g} times the rms; give positive ones"
+            )
         if self.budget < self.least:
             raise UsageError(
                 f"calibration: a budget of {self.budget:g} s; give at least {self.least:g} s for these axes"
@@ -59,5 +61,5 @@ class CalibrationSettings:
         return max((y.size / self.rate for y in self.path.values()), default=VERIFICATION)
 
     def goal(self, floor_rms: float) -> float:
-        """Return the target (m) of an axis whose repeatability floor is `floor_rms` (m)."""
-        return self.target or self.floors * floor_rms
+        """Return the target (m) of an axis whose repeatability is `floor_rms` (m)."""
+        return self.target or self.times_repeatability * floor_rms

@@ -26,7 +26,7 @@ def _add_options(command: ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--start-memory", choices=START_MEMORIES, default=START_MEMORIES[0],
-        help="initial history of the stage: as at the end of the identified record (default), as at its start, "
+        help="initial state of the stage: as at the end of the identified record (default), as at its start, "
         "or reset by a decaying oscillation",
     )  # fmt: skip
 

@@ -22,10 +22,10 @@ from slpi_ros.model.limits import MAX_DT, PERIOD, Limits, RateLimiter
 from slpi_ros.model.sensor import Sensed, StreamingSensor
 from slpi_ros.model.streaming import StreamingInverse
 
-# An initial history matches the first measurements if its error is at most this fraction of the identified displacement
+# An initial state matches the first measurements if its error is at most this fraction of the identified displacement
 # range, or this multiple of the held-out error: more than overnight drift, less than the error of a wrong history.
 FIT_SHARE, FIT_SIGMAS = 0.005, 4.0
-# The median of this many measurements of at most this age decides on the initial history.
+# The median of this many measurements of at most this age decides on the initial state.
 FIRST_READINGS, FIRST_AGE_NS = 5, SECOND_NS // 5
 # Most measurements for the offset of an axis.
 OFFSETS = 50
@@ -410,7 +410,7 @@ class Axis:
             self._close_loop()
 
     def choose_memory(self, now_ns: int) -> None:
-        """Choose the initial history that matches the first measurements; the voltage is unchanged."""
+        """Choose the initial state that matches the first measurements; the voltage is unchanged."""
         # The assumed one is kept unless another one matches better by more than the noise, and without enough recent
         # measurements that agree.
         recent = [y for t, y in self._first_readings if now_ns - t <= FIRST_AGE_NS]
@@ -434,7 +434,7 @@ class Axis:
         if errors[best] > allowed:
             tried = ", ".join(f"{name} {error * 1e6:.4g} µm" for name, error in errors.items())
             self.confidence = MemoryConfidence(
-                doubt=f"the measurement matches no initial history of the model (errors: {tried}); call ~/reset_memory",
+                doubt=f"the measurement matches no initial state of the model (errors: {tried}); call ~/reset_memory",
                 contradicted=True,
             )
         elif errors[assumed] > errors[best] + noise:

@@ -16,8 +16,8 @@ def take_over(
     axis: AxisModel, limits: Limits, reversal_voltages: Sequence[float] = (), start_memory: StartMemory = "end"
 ) -> StreamingInverse:
     """Return the streaming inverse of a new model, with its memory in the present hysteresis state of the axis."""
-    # The `reversal_voltages` (V), oldest first, then the present one, are replayed on the initial history "start";
-    # without them the initial history is `start_memory`, see `AxisModel.initial`.
+    # The `reversal_voltages` (V), oldest first, then the present one, are replayed on the initial state "start";
+    # without them the initial state is `start_memory`, see `AxisModel.initial`.
     if not axis.causal:
         raise UsageError(
             f"kind '{axis.kind}' needs the complete path in advance, but the compensator works sample by sample; "

@@ -31,7 +31,7 @@ class MemoryConfidence:
     state: str = ASSUMED
     doubt: str = ""  # why `ASSUMED`; "" if only because it has not been verified
     spanned: tuple[float, float] = (0.0, 0.0)  # V, of the reset
-    contradicted: bool = False  # by a measured displacement, for every initial history of the model
+    contradicted: bool = False  # by a measured displacement, for every initial state of the model
 
     def over(self, identified: tuple[float, float]) -> "MemoryConfidence":
         """Return the confidence on a voltage range (V): a reset does not erase reversals outside its span."""
@@ -40,7 +40,7 @@ class MemoryConfidence:
         if self.state not in (KNOWN, RESTORED) or (low <= lowest + margin and highest - margin <= high):
             return self
         doubt = (
-            f"wiped from {low:.6g} to {high:.6g} V only, while the model was identified from {lowest:.6g} to "
+            f"reset from {low:.6g} to {high:.6g} V only, while the model was identified from {lowest:.6g} to "
             f"{highest:.6g} V; reset it within wider voltage limits, or identify within these"
         )
         return replace(self, state=ASSUMED, doubt=doubt)

@@ -52,7 +52,7 @@ def diagnose(
     Parameters
     ----------
     record : Record or sequence of Record
-        Records of one stage. Hysteresis and effects are common to all records; initial history, offset, drift and hum
+        Records of one stage. Hysteresis and effects are common to all records; initial state, offset, drift and lines
         are fitted to each record. Each of several records is held out once.
     model : StageModel
         Model of the same stage. The known delay and lag of its sensor are taken out of the readings first.
@@ -116,7 +116,7 @@ def _diagnose_axis(
     report_progress(f"axis {axis}: fitting the hysteresis")
     evidence = evidence_of(records, axis, model, start, stop)
     same = len(records) == 1 and model.quality.source == records[0].source
-    # Effects that belong to one record (drift, hum, the knots of a gain drift) do not apply to another.
+    # Effects that belong to one record (drift, lines, the knots of a gain drift) do not apply to another.
     shared = [effect for effect in model.effects if same or not is_own(effect)]
     base = Explanation(evidence, shared)
     known = [effect for effect in shared if effect.in_phase(seen(base))]
@@ -282,8 +282,8 @@ def _starts(model: AxisModel, part: Part) -> list[Start]:
 
 
 def _known(part: Part) -> Mask:
-    """Return the mask of used samples to which the initial history only adds a constant; all used ones if too few."""
-    known = part.used & part.wiped
+    """Return the mask of used samples to which the initial state only adds a constant; all used ones if too few."""
+    known = part.used & part.after_reset
     return known if np.count_nonzero(known) >= FEWEST else part.used
 
 

@@ -13,8 +13,8 @@ from slpi_ros.effects.base import (
     Effect,
     EffectBase,
     EffectContext,
-    FitView,
-    ResidualView,
+    FitContext,
+    ResidualContext,
     Side,
     Signal,
     usual_step,
@@ -28,7 +28,7 @@ LARGEST_STEP, LARGEST_LOG_STEP = 0.7, 2.0
 
 @dataclass(frozen=True)
 class EachRecord(EffectBase):
-    """An effect with separate parameters in each record, such as drift or hum: its `parts`."""
+    """An effect with separate parameters in each record, such as drift or lines: its `parts`."""
 
     parts: tuple[Effect, ...]
     side: ClassVar[Side] = "record"
@@ -57,7 +57,7 @@ class EachRecord(EffectBase):
         records = zip(self.parts, around.split(signal), around.records, strict=True)
         return np.concatenate([part.invert(own, record) for part, own, record in records])
 
-    def plausible(self, view: FitView) -> bool:
+    def plausible(self, view: FitContext) -> bool:
         """Return whether the parameters of each record are plausible."""
         return all(part.plausible(view) for part in self.parts)
 
@@ -75,7 +75,7 @@ class EachRecord(EffectBase):
         return "; ".join(f"record {k}: {part.describe()}" for k, part in enumerate(self.parts, 1))
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate | Effect]:
+    def fit(cls, left: ResidualContext) -> Iterator[Candidate | Effect]:
         """Yield nothing: candidates come from the effect of each record."""
         yield from ()
 

@@ -128,7 +128,7 @@ class Joint:
 
     @cached_property
     def predictable(self) -> Mask:
-        """Mask of the samples, shape (N,), that the other records can predict for any initial history."""
+        """Mask of the samples, shape (N,), that the other records can predict for any initial state."""
         whole = self.everything.gram()
         found = np.zeros(self.evidence.t.size, dtype=bool)
         for k, samples in enumerate(self.evidence.slices):
@@ -332,7 +332,7 @@ def _judged(problem: Problem) -> Mask:
 
 def _predicted(own: Rows, known: Mask, rest: FloatArray, factor: Factor, size: int, every: int) -> Mask:
     """Return the mask of the rows of a record, shape (n,), that the other records can predict."""
-    # The record has the rows `own`; to those where `known`, shape (n,), the initial history only adds a constant.
+    # The record has the rows `own`; to those where `known`, shape (n,), the initial state only adds a constant.
     # `rest`, shape (p, p), are the normal equations of the other records, and `factor` is their factor with the
     # penalty; after the first `size` parameters, of the hysteresis, follow the displacements at rest. The prediction
     # variance is computed at every `every`-th row.
@@ -455,11 +455,11 @@ class Explanation:
         """Context passed to the effects."""
         return self.evidence.around
 
-    def of_record(self, k: int) -> "RecordLeft":
+    def of_record(self, k: int) -> "RecordResidual":
         """Return the signals and the residual of record `k`."""
         rows, around = self.evidence.slices[k], self.around.records[k]
         t, u, h, y, residual = (x[rows] for x in (self.t, self.u, self.h, self.y, self.residual))
-        return RecordLeft(t, u, h, y, self.used[rows], residual, around)
+        return RecordResidual(t, u, h, y, self.used[rows], residual, around)
 
     def _behind(self, effects: Sequence[Effect], h: FloatArray) -> FloatArray:
         """Return the displacement, shape (N,), metres, after effects have been applied to the hysteresis output `h`."""
@@ -645,8 +645,8 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class RecordLeft:
-    """Signals and residual of one record as a `slpi_ros.effects.base.ResidualView`, for effects of this record only."""
+class RecordResidual:
+    """Signals and residual of one record as a `slpi_ros.effects.base.ResidualContext`."""
 
     t: FloatArray
     u: FloatArray

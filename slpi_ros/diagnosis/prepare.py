@@ -63,7 +63,7 @@ class Part:
     y: FloatArray  # m
     used: Mask  # in the fit; outliers, drop-outs and an unknown start only drive the hysteresis
     seen: Mask  # valid displacement within the selected time
-    wiped: Mask  # both ends of the voltage range visited: `history` only adds a constant
+    after_reset: Mask  # both ends of the voltage range visited: `history` only adds a constant
     history: tuple[float, ...]  # V, as in `slpi_ros.model.axis_model.Start`
     others: Mapping[str, FloatArray]  # m, of the other axes from the start of the record
     digit: float  # m, resolution of the readings, 0: continuous
@@ -122,7 +122,7 @@ class Evidence:
 
     @cached_property
     def rows(self) -> IntArray:
-        """Indices of the rows of the problem that are samples, without those of initial histories, shape (N,)."""
+        """Indices of the rows of the problem that are samples, without those of initial states, shape (N,)."""
         leads = np.cumsum([len(part.history) for part in self.parts])
         rows: IntArray = np.arange(self.t.size) + np.repeat(leads, [part.t.size for part in self.parts])
         return rows
@@ -151,7 +151,7 @@ class Evidence:
         return whole
 
     def samples(self, u: FloatArray) -> list[Samples]:
-        """Return the samples of each record, after its initial history, for the voltage `u`, shape (N,), volts."""
+        """Return the samples of each record, after its initial state, for the voltage `u`, shape (N,), volts."""
         low, high = self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf)
         return [
             Samples(np.clip(u[rows], low, high), part.y, part.used).after(part.history)
@@ -192,7 +192,7 @@ def evidence_of(
             y=samples.y,
             used=samples.fitted & ~_at_limit(samples),
             seen=samples.fitted,
-            wiped=samples.wiped,
+            after_reset=samples.after_reset,
             history=beginning.history,
             others=others,
             digit=digit(samples.y[samples.fitted]),
@@ -202,7 +202,7 @@ def evidence_of(
     evidence = Evidence(parts, basis, _smoothness(started, basis))
     residual = _residual(evidence)
     trusted = [
-        _trusted(part, residual[rows], samples, only_wiped=beginning.only_wiped)
+        _trusted(part, residual[rows], samples, only_after_reset=beginning.only_after_reset)
         for part, rows, (_, samples, _), beginning in zip(parts, evidence.slices, read, beginnings, strict=True)
     ]
     return replace(evidence, parts=tuple(trusted))
@@ -227,14 +227,14 @@ def _readings(
     return t[chosen], samples, {name: y[chosen] for name, y in others.items()}
 
 
-def _trusted(part: Part, residual: FloatArray, samples: Samples, *, only_wiped: bool) -> Part:
+def _trusted(part: Part, residual: FloatArray, samples: Samples, *, only_after_reset: bool) -> Part:
     """Return the data of a record without bad samples, as seen in the residual, shape (N,), of hysteresis alone."""
     path = part.y - residual
     samples = samples.without_mixed(path).without_outliers(path)
     used = part.used & samples.fitted
     used = used & ~_outliers(residual, used)
-    if only_wiped or _beginning_disagrees(residual, used, part.wiped):
-        used = used & part.wiped
+    if only_after_reset or _beginning_disagrees(residual, used, part.after_reset):
+        used = used & part.after_reset
     known = samples.mixed + np.count_nonzero(samples.fitted)
     return replace(part, used=used, seen=samples.fitted, mixed=samples.mixed / known)
 
@@ -257,9 +257,9 @@ def _at_limit(samples: Samples) -> Mask:
     return limited
 
 
-def _beginning_disagrees(residual: FloatArray, used: Mask, wiped: Mask) -> bool:
+def _beginning_disagrees(residual: FloatArray, used: Mask, after_reset: Mask) -> bool:
     """Return whether residuals before the reset of the hysteresis state are much larger than those after it."""
-    before, after = residual[used & ~wiped], residual[used & wiped]
+    before, after = residual[used & ~after_reset], residual[used & after_reset]
     if not before.size or after.size < ENOUGH_WIPED * (before.size + after.size):
         return False
     return bool(np.sqrt(np.mean(before**2)) > DISAGREES * np.sqrt(np.mean(after**2)))

@@ -11,7 +11,7 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency, one_speed
-from slpi_ros.effects.base import FEW_SAMPLES, Candidate, Effect, FitView, usual_step
+from slpi_ros.effects.base import FEW_SAMPLES, Candidate, Effect, FitContext, usual_step
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
@@ -103,14 +103,14 @@ class Contender:
         return counts(now.held_out, self.score, own=is_own(self.effect), least=least)
 
 
-def seen(now: Explanation) -> FitView:
+def seen(now: Explanation) -> FitContext:
     """Return a joint fit as the plausibility of an effect may see it."""
     evidence = now.evidence
 
     def drives() -> list[tuple[float, float]]:
         return [(drive_frequency(evidence.of_record(k)), float(part.t[-1])) for k, part in enumerate(evidence.parts)]
 
-    return FitView(
+    return FitContext(
         *(now.t, evidence.v, now.u, now.h, now.y, now.used, evidence.rounding, now.effects),
         excited_frequency=lambda: excited_frequency(evidence),
         drives=drives,
@@ -119,7 +119,7 @@ def seen(now: Explanation) -> FitView:
 
 
 def is_own(effect: Effect | type[Any]) -> bool:
-    """Return whether an effect, or each of its kind, has separate parameters in each record, such as drift or hum."""
+    """Return whether an effect, or each of its kind, has separate parameters in each record, such as drift or lines."""
     return effect.side == "record" or effect.sharing == "separate"
 
 

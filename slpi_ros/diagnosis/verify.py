@@ -422,10 +422,10 @@ def _spread(found: Match, first: int = 0) -> float:
     return float(np.nanstd(residual)) if np.count_nonzero(np.isfinite(residual)) >= FEWEST else np.inf
 
 
-def _default_limit(axis: AxisModel, floor: float) -> float:
+def _default_limit(axis: AxisModel, repeatability: float) -> float:
     """Return the default limit of the rms error (m) for a repeatability (m)."""
     low, high = axis.displacement_range
-    return max(TIMES_REPEATABILITY * floor, RESOLUTION * (high - low))
+    return max(TIMES_REPEATABILITY * repeatability, RESOLUTION * (high - low))
 
 
 def _judge(
@@ -434,7 +434,7 @@ def _judge(
     samples, judged, found = run.samples, run.judged, run.found
     t, v, y = run.t[judged], samples.v[judged], samples.y[judged]
     # What the model explains, such as the motion of another axis, is no noise.
-    floor = min(
+    repeats = min(
         repeatability_of(t, v, y), repeatability_of(t, v, y, y - run.simulated[judged]), key=lambda one: one.rms
     )
     low, high = axis.voltage_range
@@ -449,7 +449,7 @@ def _judge(
         rest=ErrorPart.of(source, rest),
         offset=run.offset,
         offset_uncertainty=found.offset_uncertainty,
-        limit=_default_limit(axis, floor.rms) if tolerance is None else tolerance,
+        limit=_default_limit(axis, repeats.rms) if tolerance is None else tolerance,
         absolute=tolerance is not None and not without_offset,
         samples=run.samples_in_span,
         known_from=None if estimated else float(run.t[judged][0]),
@@ -457,8 +457,8 @@ def _judge(
         history=found.start.history,
         moving=ErrorPart.of("moving", (rest + run.constant)[~stands]) if both else None,
         standing=ErrorPart.of("standing", (rest + run.constant)[stands]) if both else None,
-        repeatability_rms=floor.rms,
-        repeatability_source=floor.source,
+        repeatability_rms=repeats.rms,
+        repeatability_source=repeats.source,
         zero_moved=bool(abs(run.offset) > found.offset_uncertainty),
         gain=found.gain_change,
         width=found.width_change,

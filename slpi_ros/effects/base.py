@@ -182,13 +182,13 @@ class EffectBase(Protocol):
         """Return parameters and uncertainty of a document of version 1 as in the present one; ModelError if retired."""
         return given, spread
 
-    def plausible(self, view: "FitView") -> bool:
+    def plausible(self, context: "FitContext") -> bool:
         """Return whether the parameters are plausible, so that the effect does not imitate another cause."""
         # Where others shift in time, too, a short shift may be the hold of commands between samples.
-        others = any(other.time_shift != "none" and other.name != self.name for other in view.effects)
-        return self.time_shift != "only" or not others or abs(self.slow_shift) > HELD * view.step
+        others = any(other.time_shift != "none" and other.name != self.name for other in context.effects)
+        return self.time_shift != "only" or not others or abs(self.slow_shift) > HELD * context.step
 
-    def in_phase(self, view: "FitView") -> bool:
+    def in_phase(self, context: "FitContext") -> bool:
         """Return whether one set of parameters can hold for all records of a fit, and for others."""
         return True
 
@@ -320,7 +320,7 @@ class Effect(EffectBase, Protocol):
         """Return the input signal for an output signal, shape (N,), volts or metres."""
 
     @classmethod
-    def fit(cls, left: "ResidualView") -> "Iterator[Candidate | Effect]":
+    def fit(cls, context: "ResidualContext") -> "Iterator[Candidate | Effect]":
         """Yield candidates for a fit: forms that are linear in their gains, or effects with fixed parameters."""
 
     def describe(self) -> str:
@@ -350,7 +350,7 @@ class Candidate:
     group: int = 0
 
 
-class ResidualView(Protocol):
+class ResidualContext(Protocol):
     """The hysteresis and effects identified so far, and the residual of a record of N samples."""
 
     @property
@@ -390,7 +390,7 @@ class ResidualView(Protocol):
 
 
 @dataclass(frozen=True)
-class FitView:
+class FitContext:
     """A fit and its records as the plausibility of an effect may see them; signals of all records, shape (N,)."""
 
     # Time from the start of each record (s), applied and felt voltage (V), displacement of the hysteresis and measured
@@ -455,16 +455,16 @@ def strongest_lines(
     return found
 
 
-def rhythms(left: ResidualView, count: int, lowest: float) -> list[float]:
+def rhythms(context: ResidualContext, count: int, lowest: float) -> list[float]:
     """Return the strongest frequencies (Hz) in the residual, at or above `lowest` (Hz)."""
     from scipy.fft import next_fast_len
 
-    dt, around = usual_step(left.t), left.around
+    dt, around = usual_step(context.t), context.around
     size = 4 * next_fast_len(round(longest(around) / dt) + 1)
     frequency = np.fft.rfftfreq(size, dt)
     power = np.zeros(frequency.size)
-    residual = np.where(left.used, left.residual, 0.0)
-    for t, own in zip(around.split(left.t), around.split(residual), strict=True):
+    residual = np.where(context.used, context.residual, 0.0)
+    for t, own in zip(around.split(context.t), around.split(residual), strict=True):
         grid = np.arange(t[0], t[-1], dt)
         power += np.abs(np.fft.rfft(np.interp(grid, t, own) * np.hanning(grid.size), size)) ** 2
     power[frequency < lowest] = 0.0

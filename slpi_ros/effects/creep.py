@@ -13,7 +13,7 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    ResidualView,
+    ResidualContext,
     Side,
     Signal,
     StreamingBase,
@@ -112,28 +112,28 @@ class Creep(EffectBase):
         return signal + crept
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield single relaxations from fast to slow, and combinations of several."""
-        step, most = usual_step(left.t), longest(left.around)
+        step, most = usual_step(context.t), longest(context.around)
         shortest = max(10 * step, FASTEST)
         if shortest < 0.5 * most:
             single = [np.array([tau]) for tau in np.geomspace(shortest, 0.5 * most, SINGLE)]
             several = [np.geomspace(shortest, share * most, count) for count, share in SEVERAL]
             for taus in (*single, *several):
-                starting = _settling(taus.tolist(), left.around, left.used)
-                columns = np.column_stack([starting, *cls._creeping(taus, left)])
+                starting = _settling(taus.tolist(), context.around, context.used)
+                columns = np.column_stack([starting, *cls._creeping(taus, context)])
                 yield Candidate(columns, partial(cls._each, taus), taus.size, starting.shape[1])
         for slow in LAW_TO:
             first, last = max(FASTEST, LAW_SAMPLES * step), slow * most
             if last > 10 * first:
                 taus = np.geomspace(first, last, max(LAW_FEWEST, 1 + round(LAW_PER_DECADE * np.log10(last / first))))
-                starting = _settling(taus.tolist(), left.around, left.used)
-                columns = np.column_stack([starting, np.sum(cls._creeping(taus, left), axis=0)])
+                starting = _settling(taus.tolist(), context.around, context.used)
+                columns = np.column_stack([starting, np.sum(cls._creeping(taus, context), axis=0)])
                 yield Candidate(columns, partial(cls._law, taus), 1, starting.shape[1])
 
     @classmethod
-    def _creeping(cls, taus: FloatArray, left: ResidualView) -> list[FloatArray]:
-        return [cls((tau,), (1.0,)).apply(left.h, left.around) - left.h for tau in taus.tolist()]
+    def _creeping(cls, taus: FloatArray, context: ResidualContext) -> list[FloatArray]:
+        return [cls((tau,), (1.0,)).apply(context.h, context.around) - context.h for tau in taus.tolist()]
 
     @classmethod
     def _law(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, ResidualView, Side, Signal
+from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, ResidualContext, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining
 from slpi_ros.effects.parameters import Fit, parameter, require
 
@@ -64,10 +64,10 @@ class CrossCoupling(EffectBase):
         return sum(known, np.zeros_like(signal))
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield a candidate with the motion of all other axes."""
-        if left.others:
-            yield Candidate(np.column_stack(list(left.others.values())), partial(cls._of, tuple(left.others)))
+        if context.others:
+            yield Candidate(np.column_stack(list(context.others.values())), partial(cls._of, tuple(context.others)))
 
     @classmethod
     def _of(cls, axes: tuple[str, ...], gains: FloatArray) -> "CrossCoupling":

@@ -12,7 +12,7 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    ResidualView,
+    ResidualContext,
     Side,
     Signal,
     TimeShift,
@@ -60,11 +60,11 @@ class Delay(EffectBase):
         return np.interp(around.t + self.seconds, around.t, signal) if signal.size else signal.copy()
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield delays of both signs, from a fraction of a sampling interval to several intervals."""
-        dt = usual_step(left.t)
+        dt = usual_step(context.t)
         for seconds in (-4.0 * dt, 0.5 * dt, 2.0 * dt, 8.0 * dt):
-            column = left.respond(cls(seconds).apply(left.u, left.around)) - left.h
+            column = context.respond(cls(seconds).apply(context.u, context.around)) - context.h
             yield Candidate(column[:, None], partial(cls._times, seconds))
 
     @classmethod

@@ -12,8 +12,8 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    FitView,
-    ResidualView,
+    FitContext,
+    ResidualContext,
     Sharing,
     Side,
     Signal,
@@ -79,10 +79,10 @@ class GainDrift(EffectBase):
             ("gains", len(self.gains) == len(self.times), "one for each time"),
         )
 
-    def plausible(self, view: FitView) -> bool:
+    def plausible(self, context: FitContext) -> bool:
         """Return whether it is small and slow, with an origin near the measured displacements."""
-        y = view.y[view.used]
-        near = float(y.min()) - ORIGIN * view.motion <= self.origin <= float(y.max()) + ORIGIN * view.motion
+        y = context.y[context.used]
+        near = float(y.min()) - ORIGIN * context.motion <= self.origin <= float(y.max()) + ORIGIN * context.motion
         return near and max(map(abs, self.gains)) <= LARGEST and self.times[-1] >= TAKES
 
     def factor(self, t: FloatArray) -> FloatArray:
@@ -105,21 +105,21 @@ class GainDrift(EffectBase):
         return self.origin + (signal - self.origin) / self.factor(around.t)
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield a straight line, and piecewise linear curves with uniform knots and additional early knots."""
         # Displacement shifts at the same knots are fitted with the gains; their ratio gives the origin.
-        t, end = left.t - left.t[0], float(left.t[-1] - left.t[0])
-        travel = np.cumsum(np.abs(np.diff(left.u, prepend=left.u[0])) * left.used)
-        first = float(max(np.interp(2.0 * np.ptp(left.u), travel, t), t[left.used][:FEWEST][-1]))
+        t, end = context.t - context.t[0], float(context.t[-1] - context.t[0])
+        travel = np.cumsum(np.abs(np.diff(context.u, prepend=context.u[0])) * context.used)
+        first = float(max(np.interp(2.0 * np.ptp(context.u), travel, t), t[context.used][:FEWEST][-1]))
         curves = [np.array([end])]
         for count in UNIFORM:
             knots = np.linspace(0.0, end, count + 1)[1:]
             early = int(np.ceil(PER_DECADE * np.log10(knots[0] / first))) if 0.0 < first < knots[0] else 0
             curves.append(np.append(np.geomspace(first, knots[0], early, endpoint=False), knots))
-        low, high = float(left.h.min()), float(left.h.max())
+        low, high = float(context.h.min()), float(context.h.max())
         for times in curves:
             hats = np.column_stack([np.interp(t, (0.0, *times), (0.0, *row)) for row in np.eye(times.size)])
-            columns = np.column_stack([hats * (left.h - low)[:, None], hats * (high - low)])
+            columns = np.column_stack([hats * (context.h - low)[:, None], hats * (high - low)])
             yield Candidate(columns, partial(cls._through, times, low, high))
 
     @classmethod

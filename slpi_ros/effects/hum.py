@@ -1,4 +1,4 @@
-"""Hum: mains interference or another disturbance that is periodic in time."""
+"""Line interference or vibration: a signal that is periodic in time."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -13,8 +13,8 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    FitView,
-    ResidualView,
+    FitContext,
+    ResidualContext,
     Side,
     Signal,
     amplitude_and_phase,
@@ -40,7 +40,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class Line:
-    """One line of hum: frequency (Hz), amplitude (m), and phase (rad) at the record's start."""
+    """One line: frequency (Hz), amplitude (m), and phase (rad) at the record's start."""
 
     frequency: float = parameter(
         "Hz", "frequency", 0, 1e7, above=True, fit=Fit("relative", lambda _, of: 1e-3 / of.duration, 1e-3)
@@ -73,22 +73,22 @@ class Hum(EffectBase):
         """Return the only line as a list."""
         return as_list("lines", given, spread)
 
-    def plausible(self, view: FitView) -> bool:
+    def plausible(self, context: FitContext) -> bool:
         """Return whether no line is a low harmonic of the single drive frequency of any record, within resolution."""
         return not any(
             drive
             and round(line.frequency / drive) <= MOST_HARMONICS
             and abs(line.frequency - round(line.frequency / drive) * drive) < 2.0 / duration
             for line in self.lines
-            for drive, duration in view.drives()
+            for drive, duration in context.drives()
         )
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement with hum, shape (N,), metres."""
+        """Return the displacement with the lines, shape (N,), metres."""
         return signal + self.wave(around.t)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement without hum, shape (N,), metres."""
+        """Return the displacement without the lines, shape (N,), metres."""
         return signal - self.wave(around.t)
 
     def wave(self, t: FloatArray) -> FloatArray:
@@ -97,10 +97,10 @@ class Hum(EffectBase):
         return sum(waves, np.zeros_like(t))
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield single lines at the strongest frequencies of the residual."""
-        for frequency in rhythms(left, PEAKS, SLOWEST):
-            yield Candidate(wave(2 * np.pi * frequency * left.t), partial(cls._at, frequency))
+        for frequency in rhythms(context, PEAKS, SLOWEST):
+            yield Candidate(wave(2 * np.pi * frequency * context.t), partial(cls._at, frequency))
 
     @classmethod
     def _at(cls, frequency: float, gains: FloatArray) -> "Hum":
@@ -109,4 +109,4 @@ class Hum(EffectBase):
     def describe(self) -> str:
         """Describe amplitude and frequency of each line."""
         parts = (f"{line.amplitude * 1e9:.3g} nm at {line.frequency:.4g} Hz" for line in self.lines)
-        return f"the measured displacement contains hum of {', '.join(parts)}"
+        return f"line interference or vibration of {', '.join(parts)}"

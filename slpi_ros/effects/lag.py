@@ -13,7 +13,7 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    ResidualView,
+    ResidualContext,
     Side,
     Signal,
     StreamingBase,
@@ -66,11 +66,11 @@ class Lag(EffectBase):
         return lagged - around.step(signal) * np.exp(-around.since / self.time_constant)
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield lags from a fraction of a sampling interval to many intervals."""
         for samples in (0.5, 2.0, 8.0, 32.0):
-            tau = samples * usual_step(left.t)
-            column = left.respond(cls(tau).apply(left.u, left.around)) - left.h
+            tau = samples * usual_step(context.t)
+            column = context.respond(cls(tau).apply(context.u, context.around)) - context.h
             yield Candidate(column[:, None], partial(cls._times, tau))
 
     @classmethod

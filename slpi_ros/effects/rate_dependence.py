@@ -14,7 +14,7 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    ResidualView,
+    ResidualContext,
     Side,
     Signal,
     StreamingBase,
@@ -160,16 +160,16 @@ class RateDependence(EffectBase):
         return np.concatenate(whole)
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield laws over a grid of thresholds and onset rates, with a free reversible gain."""
-        rate, span = float(np.sqrt(np.mean(np.gradient(left.u, left.t) ** 2))), float(np.ptp(left.u))
-        holds = [_hold(t, u, y, span) for t, u, y in _records(left)]
+        rate, span = float(np.sqrt(np.mean(np.gradient(context.u, context.t) ** 2))), float(np.ptp(context.u))
+        holds = [_hold(t, u, y, span) for t, u, y in _records(context)]
         for group, onsets in enumerate(ONSETS):
             for share, onset in product(THRESHOLDS, onsets):
                 one = cls(share * span, onset * rate)
                 one = replace(one, initial=tuple(copysign(one.after(AGE * abs(hold)), hold) for hold in holds))
-                u = one.apply(left.u, left.around)
-                columns = np.column_stack([left.respond(u) - left.h, left.u - u])
+                u = one.apply(context.u, context.around)
+                columns = np.column_stack([context.respond(u) - context.h, context.u - u])
                 yield Candidate(columns, partial(cls._grown, one), positive=2, group=group)
 
     @staticmethod
@@ -268,8 +268,8 @@ class StreamingRateDependence(StreamingBase):
         self._wish, self._w, self._before, self._earlier = None, 0.0, 0.0, 0.0
 
 
-def _records(left: ResidualView) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
-    yield from zip(*(left.around.split(signal) for signal in (left.t, left.u, left.y)), strict=True)
+def _records(context: ResidualContext) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+    yield from zip(*(context.around.split(signal) for signal in (context.t, context.u, context.y)), strict=True)
 
 
 def _hold(t: FloatArray, u: FloatArray, y: FloatArray, span: float) -> float:

@@ -15,8 +15,8 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    FitView,
-    ResidualView,
+    FitContext,
+    ResidualContext,
     Side,
     Signal,
     StreamingBase,
@@ -251,9 +251,9 @@ class Resonance(EffectBase):
         """Return new parameters with gains that are at most 1 in sum."""
         return {"modes": _within(changed["modes"])}
 
-    def plausible(self, view: FitView) -> bool:
+    def plausible(self, context: FitContext) -> bool:
         """Return whether no mode far above the excited frequencies, damped, just shifts in time or is hysteresis."""
-        highest = RINGS * view.excited_frequency()
+        highest = RINGS * context.excited_frequency()
         return all(mode.frequency <= highest or mode.damping <= SHARP for mode in self.modes)
 
     @property
@@ -288,14 +288,14 @@ class Resonance(EffectBase):
         return sorted(found, key=lambda factor: isinstance(factor, Exact))
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield single modes at the strongest frequencies of the residual, and on a logarithmic grid."""
-        highest = HIGHEST / usual_step(left.t)
-        found = [frequency for frequency in rhythms(left, LINES, LOWEST) if frequency < highest]
+        highest = HIGHEST / usual_step(context.t)
+        found = [frequency for frequency in rhythms(context, LINES, LOWEST) if frequency < highest]
         for frequency in (*found, *np.geomspace(min(2 * LOWEST, highest), highest, 10).tolist()):
             for damping in DAMPINGS:
                 mode = Mode(frequency, damping)
-                column = cls((mode,)).apply(left.h, left.around) - left.h
+                column = cls((mode,)).apply(context.h, context.around) - context.h
                 yield Candidate(column[:, None], partial(cls._if_seen, mode), positive=1)
 
     @classmethod

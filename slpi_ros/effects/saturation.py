@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
-from slpi_ros.effects.base import EffectBase, EffectContext, FitView, ResidualView, Side, Signal
+from slpi_ros.effects.base import EffectBase, EffectContext, FitContext, ResidualContext, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
 
@@ -65,10 +65,10 @@ class Saturation(EffectBase):
         return np.clip(signal, self.lower, self.upper)
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator["Saturation"]:
+    def fit(cls, context: ResidualContext) -> Iterator["Saturation"]:
         """Yield limits beyond which the displacement remains constant while the voltage changes."""
-        low, width = float(left.u.min()), float(np.ptp(left.u)) / BINS
-        middle, dv, dy = outward_steps(left.u, left.y, left.used)
+        low, width = float(context.u.min()), float(np.ptp(context.u)) / BINS
+        middle, dv, dy = outward_steps(context.u, context.y, context.used)
         place = np.clip(((middle - low) / width).astype(np.int64), 0, BINS - 1)
         moved = np.bincount(place, dv**2, BINS)
         gain = np.bincount(place, dv * dy, BINS) / np.maximum(moved, 1e-300)
@@ -80,9 +80,9 @@ class Saturation(EffectBase):
             for shift in np.linspace(-1.0, 1.0, 9).tolist():
                 yield cls(lower + shift * width, upper - shift * width)
 
-    def plausible(self, view: FitView) -> bool:
+    def plausible(self, context: FitContext) -> bool:
         """Return whether the stage stands still while the voltage changes beyond the limits."""
-        middle, dv, dy = outward_steps(view.v, view.y, view.used)
+        middle, dv, dy = outward_steps(context.v, context.y, context.used)
         inside = (middle > self.lower) & (middle < self.upper)
         usual = float(dv[inside] @ dy[inside] / max(float(dv[inside] @ dv[inside]), 1e-300))
         for beyond in (middle >= self.upper, middle <= self.lower):

@@ -13,8 +13,8 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    FitView,
-    ResidualView,
+    FitContext,
+    ResidualContext,
     Sharing,
     Side,
     Signal,
@@ -58,7 +58,7 @@ class SensorPeriodic(EffectBase):
     sharing: ClassVar[Sharing] = "either"
     excitation: ClassVar[Excitation] = Excitation(
         "Slow ramps of constant speed over the whole range, at two speeds: an error of the sensor has the same "
-        "period in displacement at both speeds, hum the same in time, and hysteresis is smooth.",
+        "period in displacement at both speeds, line interference the same in time, and hysteresis is smooth.",
         _draw,
     )
 
@@ -74,14 +74,14 @@ class SensorPeriodic(EffectBase):
         super().__post_init__()
         require(self, ("amplitude", self.amplitude * 2 * pi < 0.99 * self.period, "less than period / 2 pi"))
 
-    def plausible(self, view: FitView) -> bool:
+    def plausible(self, context: FitContext) -> bool:
         """Return whether the period is longer than that of rounding."""
-        return bool(self.period > ROUNDING_PERIOD * view.rounding)
+        return bool(self.period > ROUNDING_PERIOD * context.rounding)
 
-    def in_phase(self, view: FitView) -> bool:
+    def in_phase(self, context: FitContext) -> bool:
         """Return whether the phase is the same in all records."""
         # If the zeros of the records differ, so may those of other records, and the phase there is unknown.
-        return float(np.ptp(view.zeros())) <= IN_PHASE * self.period
+        return float(np.ptp(context.zeros())) <= IN_PHASE * self.period
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the sensor reading, shape (N,), metres."""
@@ -102,13 +102,13 @@ class SensorPeriodic(EffectBase):
         return x
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield the strongest spectral lines of the residual as a function of the displacement."""
         # Displacement seen by the sensor, which includes the other effects.
-        seen = left.y - left.residual
+        seen = context.y - context.residual
         width = float(np.ptp(seen)) / BINS
-        place = ((seen[left.used] - float(seen.min())) / width).astype(np.int64)
-        power = np.abs(np.fft.rfft(np.bincount(place, left.residual[left.used], 4 * BINS)[: 4 * BINS])) ** 2
+        place = ((seen[context.used] - float(seen.min())) / width).astype(np.int64)
+        power = np.abs(np.fft.rfft(np.bincount(place, context.residual[context.used], 4 * BINS)[: 4 * BINS])) ** 2
         lines = np.fft.rfftfreq(4 * BINS, width)
         power[(lines < 1 / LONGEST) | (lines > 1 / SHORTEST)] = 0.0
         for line in strongest_lines(power, lines, LINES, width=6):

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FitView, ResidualView, Side, Signal
+from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FitContext, ResidualContext, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
 
@@ -61,10 +61,10 @@ class ThermalDrift(EffectBase):
             ("values", len(self.values) == len(self.times), "one for each time"),
         )
 
-    def plausible(self, view: FitView) -> bool:
+    def plausible(self, context: FitContext) -> bool:
         """Return whether it is slow."""
         pairs = zip(np.diff(self.values).tolist(), np.diff(self.times).tolist(), strict=True)
-        return self.times[-1] >= TAKES and all(abs(dy) <= RATE * view.motion * dt for dy, dt in pairs)
+        return self.times[-1] >= TAKES and all(abs(dy) <= RATE * context.motion * dt for dy, dt in pairs)
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with drift, shape (N,), metres."""
@@ -75,12 +75,12 @@ class ThermalDrift(EffectBase):
         return signal - np.interp(around.t, self.times, self.values)
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield piecewise linear curves with an increasing number of knots."""
         for knots in KNOTS:
-            times = np.linspace(left.t[0], left.t[-1], knots)
+            times = np.linspace(context.t[0], context.t[-1], knots)
             # A constant is part of the displacement at rest.
-            hats = np.column_stack([np.interp(left.t, times, row) for row in np.eye(knots)[1:]])
+            hats = np.column_stack([np.interp(context.t, times, row) for row in np.eye(knots)[1:]])
             yield Candidate(hats, partial(cls._through, times))
 
     @classmethod

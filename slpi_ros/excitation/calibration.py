@@ -43,7 +43,7 @@ def calibration(spec: DriveSpec, rng: np.random.Generator) -> Path:
 
 
 def sweep(spec: DriveSpec) -> Path:
-    """Return one sweep over the whole range, up and down, which removes the initial history."""
+    """Return one sweep over the whole range, up and down, which removes the initial state."""
     plan = _Plan(spec, np.random.default_rng(0))
     plan.sweep()
     return plan.path
@@ -61,7 +61,7 @@ class _Plan:
         self._rest()
 
     def of(self, levels: int) -> Path:
-        # The fall removes the initial history; the first rise from rest occurs only once.
+        # The fall removes the initial state; the first rise from rest occurs only once.
         self._rise_and_fall()
         self._move(1.0, FAST)
         for minimum in self._spread(levels):

@@ -13,7 +13,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.identification.drive import smallest_turn
 from slpi_ros.identification.fit import FITS, fit_of
-from slpi_ros.identification.free_run import InitialHistoryWarning
+from slpi_ros.identification.free_run import InitialStateWarning
 from slpi_ros.identification.repeatability import Repeatability, repeatability_of
 from slpi_ros.identification.samples import Samples, select_thinned
 from slpi_ros.identification.signal_statistics import noise
@@ -66,8 +66,8 @@ class CrossValidationReport:
         """Return the held-out errors as a text table, in nanometres."""
         head = f"{'held-out error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}{'classical PI':>14}"
         parts = (self.overall, *self.by_level, *self.by_region, *self.by_speed)
-        floor = f"{'repeatability':<33}{self.repeatability.rms * 1e9:9.1f}   from {self.repeatability.source}"
-        return [head, *(part.line() for part in parts), floor]
+        last = f"{'repeatability':<33}{self.repeatability.rms * 1e9:9.1f}   from {self.repeatability.source}"
+        return [head, *(part.line() for part in parts), last]
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def cross_validate(
     samples = [part.samples for part in parts]
     with threadpool_limits(1), warnings.catch_warnings():
         # The fit of the whole record has already issued this warning.
-        warnings.simplefilter("ignore", InitialHistoryWarning)
+        warnings.simplefilter("ignore", InitialStateWarning)
         error = fit(samples).held_out
         classical = error if kind == CLASSICAL else _classical(samples)
     left_out = np.isfinite(error)
@@ -110,7 +110,7 @@ def cross_validate(
     v = np.concatenate([part.samples.v for part in parts])[left_out]
 
     ends = np.cumsum([part.t.size for part in parts])[:-1]
-    floors = sorted(map(_floor, parts, np.split(left_out, ends)), key=lambda floor: floor.rms)
+    repeats = sorted(map(_repeatability, parts, np.split(left_out, ends)), key=lambda one: one.rms)
 
     def cut(classes: Iterator[tuple[str, Mask]]) -> tuple[Slice, ...]:
         return tuple(_slice(name, error[chosen], classical[chosen]) for name, chosen in classes if chosen.any())
@@ -118,7 +118,7 @@ def cross_validate(
     return CrossValidationReport(
         axis=axis,
         kind=kind,
-        repeatability=floors[len(floors) // 2],
+        repeatability=repeats[len(repeats) // 2],
         overall=_slice("all", error, classical),
         by_level=cut(level_classes(level)),
         by_region=cut(region_classes(v)),
@@ -138,7 +138,7 @@ def _classical(samples: Sequence[Samples]) -> FloatArray:
         return np.full(sum(part.v.size for part in samples), np.nan)
 
 
-def _floor(part: _Part, judged: Mask) -> Repeatability:
+def _repeatability(part: _Part, judged: Mask) -> Repeatability:
     return repeatability_of(part.t, part.samples.v, np.where(judged, part.samples.y, np.nan))
 
 

@@ -50,7 +50,7 @@ def identify(
     ----------
     record : Record or sequence of Record
         Voltage before `start` updates the hysteresis state, but displacement before `start` is not fitted. Several
-        records share the hysteresis; each has its own initial history and displacement at rest. The model stores the
+        records share the hysteresis; each has its own initial state and displacement at rest. The model stores the
         initial state of the first record given and the final state of the latest record. Kinds ``slpi``, ``pi`` and
         ``mpi`` accept several records.
     kind : str

@@ -21,8 +21,8 @@ DISAGREES = 3.0
 MISLEADING = 1.1
 
 
-class InitialHistoryWarning(UserWarning):
-    """The first samples of a record do not agree with the rest for any initial history."""
+class InitialStateWarning(UserWarning):
+    """The first samples of a record do not agree with the rest for any initial state."""
 
 
 class Fit(Protocol):
@@ -36,7 +36,7 @@ class Fit(Protocol):
 
 
 def histories(samples: Samples) -> list[tuple[float, ...]]:
-    """Return the candidate initial histories (V): none (rest), a long fall, a long rise, a decaying oscillation."""
+    """Return the candidate initial states (V): none (rest), a long fall, a long rise, a decaying oscillation."""
     v0, low, high = float(samples.v[0]), float(samples.v.min()), float(samples.v.max())
     shrink = 1.0 - np.arange(1, MIDDLE_LOOPS) / MIDDLE_LOOPS
     decay = np.column_stack([v0 + (high - v0) * shrink, v0 - (v0 - low) * shrink])
@@ -45,50 +45,52 @@ def histories(samples: Samples) -> list[tuple[float, ...]]:
 
 
 @dataclass(frozen=True)
-class InitialHistory:
+class InitialState:
     """Initial `history` (V) that a fit assumes for a record, as in `slpi_ros.model.axis_model.Start`."""
 
     history: tuple[float, ...]
-    only_wiped: bool  # samples before the reset of the state are excluded: no history explains them
+    only_after_reset: bool  # samples before the reset of the state are excluded: no history explains them
 
     def of(self, samples: Samples) -> Samples:
-        """Return the samples to be fitted, preceded by the voltages of the initial history."""
-        return (samples.only(samples.wiped) if self.only_wiped else samples).after(self.history)
+        """Return the samples to be fitted, preceded by the voltages of the initial state."""
+        return (samples.only(samples.after_reset) if self.only_after_reset else samples).after(self.history)
 
 
-def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> InitialHistory:
-    """Choose the initial history with the lowest error of the fits that `pose` makes to samples without one."""
-    wiped = samples.fitted & samples.wiped
-    enough = np.count_nonzero(wiped) >= FEWEST and samples.mostly_wiped
+def choose_start(samples: Samples, pose: Callable[[Samples], Fit]) -> InitialState:
+    """Choose the initial state with the lowest error of the fits that `pose` makes to samples without one."""
+    after_reset = samples.fitted & samples.after_reset
+    enough = np.count_nonzero(after_reset) >= FEWEST and samples.mostly_after_reset
     candidates = histories(samples)
     residuals = [_residual(pose(samples.after(history)), samples) for history in candidates]
     rms = [np.sqrt(np.mean(residual[samples.fitted] ** 2)) for residual in residuals]
     best = int(np.argmin(rms))
     if rms[best] > SMALLER_ERROR * rms[0]:
         best = 0
-    unseen = not np.any(samples.fitted & ~samples.wiped)
+    unseen = not np.any(samples.fitted & ~samples.after_reset)
     if unseen:
         best = len(candidates) - 1
     history = candidates[best]
-    only_wiped = False
+    only_after_reset = False
     if enough and not unseen:
-        alone = _residual(pose(samples.only(samples.wiped).after(candidates[-1])), samples)
-        if np.sqrt(np.mean(residuals[best][wiped] ** 2)) > MISLEADING * np.sqrt(np.mean(alone[wiped] ** 2)):
-            only_wiped = True
+        alone = _residual(pose(samples.only(samples.after_reset).after(candidates[-1])), samples)
+        if np.sqrt(np.mean(residuals[best][after_reset] ** 2)) > MISLEADING * np.sqrt(np.mean(alone[after_reset] ** 2)):
+            only_after_reset = True
             history = history or candidates[-1]
-    return InitialHistory(history, only_wiped)
+    return InitialState(history, only_after_reset)
 
 
-def warn_of_rest(samples: Sequence[Samples], beginnings: Sequence[InitialHistory]) -> None:
-    """Issue InitialHistoryWarning with the number of samples that are excluded because no history explains them."""
+def warn_of_rest(samples: Sequence[Samples], beginnings: Sequence[InitialState]) -> None:
+    """Issue InitialStateWarning with the number of samples that are excluded because no history explains them."""
     pairs = zip(samples, beginnings, strict=True)
-    excluded = sum(np.count_nonzero(part.fitted & ~part.wiped) for part, beginning in pairs if beginning.only_wiped)
+    excluded = sum(
+        np.count_nonzero(part.fitted & ~part.after_reset) for part, beginning in pairs if beginning.only_after_reset
+    )
     if excluded:
         count = sum(np.count_nonzero(part.fitted) for part in samples)
         warnings.warn(
             f"{excluded} of {count} samples are left out: before the voltage has gone over its whole range, they agree "
-            "with the rest for no initial history; `slpi diagnose` tests for other causes",
-            InitialHistoryWarning,
+            "with the rest for no initial state; `slpi diagnose` tests for other causes",
+            InitialStateWarning,
             stacklevel=3,
         )
 
@@ -102,13 +104,13 @@ def warn_of_initial_history(before: FloatArray, after: FloatArray) -> None:
                 f"{before.size} of {before.size + after.size} samples, before the voltage has gone over its whole "
                 f"range, have an error of {first:.3g} nm rms, the others {rest:.3g} nm; the former do not count in "
                 "the held-out error; `slpi diagnose` tests for effects other than hysteresis",
-                InitialHistoryWarning,
+                InitialStateWarning,
                 stacklevel=3,
             )
 
 
 def _residual(fit: Fit, samples: Samples) -> FloatArray:
-    """Return the errors of a fit on `samples`, shape (N,), without those of the initial history."""
+    """Return the errors of a fit on `samples`, shape (N,), without those of the initial state."""
     return fit.reweighted().residual()[-samples.v.size :]
 
 
@@ -194,7 +196,7 @@ LEVELS = 201
 
 @dataclass(frozen=True)
 class Match:
-    """Comparison of a model with a record of unknown initial history."""
+    """Comparison of a model with a record of unknown initial state."""
 
     start: Start  # with the lowest error; its displacement includes the offset of the record
     offset: float  # m, zero of the record minus that of the model
@@ -221,7 +223,7 @@ class Match:
 
     @property
     def zero_moved(self) -> bool:
-        """Whether the zero has moved by more than the initial history and the uncertainty explain."""
+        """Whether the zero has moved by more than the initial state and the uncertainty explain."""
         return abs(self.offset) > self.offset_uncertainty
 
 
@@ -292,12 +294,12 @@ def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
     ways.append([low, *decay.tolist()])
     starts = [axis.after(np.array(way)) for way in ways]
     # Within the visited range, a stage at rest behaves like one whose hysteresis state was reset.
-    wiped = [replace(start, from_rest=False) for start in starts]
-    return [*wiped, axis.after(np.array([v])), axis.after(np.array([v]), "end")]
+    after_reset = [replace(start, from_rest=False) for start in starts]
+    return [*after_reset, axis.after(np.array([v])), axis.after(np.array([v]), "end")]
 
 
 def _stretches(v: FloatArray, apart: FloatArray, tolerance: float) -> IntArray:
-    """Return the stretch number of each sample, shape (N,); in a stretch the initial history adds only a constant."""
+    """Return the stretch number of each sample, shape (N,); in a stretch the initial state adds only a constant."""
     # `apart` (m, (N,)) is the range of the displacements over all histories; changes below `tolerance` are ignored.
     extends = np.zeros(v.size, dtype=bool)
     for extreme in (np.maximum.accumulate(v), np.minimum.accumulate(v)):

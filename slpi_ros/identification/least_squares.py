@@ -82,7 +82,7 @@ def solve_free(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     return solution
 
 
-# Roughness weight for the detection of outliers and the comparison of initial histories.
+# Roughness weight for the detection of outliers and the comparison of initial states.
 FIRST_SMOOTHNESS = 0.1
 FOLDS, BLOCKS_OF_FOLD = 5, 8
 # Errors beyond this many (robust) standard deviations count linearly, not squared (Huber).

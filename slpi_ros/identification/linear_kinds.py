@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
-from slpi_ros.identification.free_run import InitialHistory, choose_start, warn_of_initial_history, warn_of_rest
+from slpi_ros.identification.free_run import InitialState, choose_start, warn_of_initial_history, warn_of_rest
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Fitted, Problem
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.published_kinds import MultiSlopeBasis
@@ -17,7 +17,7 @@ from slpi_ros.model.axis_model import Start
 VERTICES = (21, 31, 41)
 SMOOTHNESS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PLAY_OPERATORS = 30
-# Numbers of samples to which a long record is thinned: for the choice of initial history, grid and smoothness, and for
+# Numbers of samples to which a long record is thinned: for the choice of initial state, grid and smoothness, and for
 # the final fit. More samples cost time and memory without changing the result.
 SELECTION_SAMPLES, FIT_SAMPLES = 100_000, 300_000
 # Factor on these numbers for play operators: every sample moves every operator, and there are few parameters.
@@ -50,7 +50,7 @@ def fit_multi_slope(samples: Sequence[Samples]) -> Fitted:
     """Fit the MPI model for the amplitude of the records, from rest, by unweighted least squares as published."""
     samples = [part.thinned(round(PLAYS_SHARE * FIT_SAMPLES / len(samples))) for part in samples]
     problem = Problem.pose(samples, MultiSlopeBasis.over(*_voltage_range(samples)))
-    return _solved(samples, problem, FIRST_SMOOTHNESS, [InitialHistory((), only_wiped=False)] * len(samples))
+    return _solved(samples, problem, FIRST_SMOOTHNESS, [InitialState((), only_after_reset=False)] * len(samples))
 
 
 def _voltage_range(samples: Sequence[Samples]) -> tuple[float, float]:
@@ -83,19 +83,19 @@ def fit_linear(
 
 @dataclass(frozen=True)
 class Choice:
-    """Problem (of thinned records), roughness weight and initial histories with the lowest held-out error."""
+    """Problem (of thinned records), roughness weight and initial states with the lowest held-out error."""
 
     problem: Problem
     smoothness: float
-    beginnings: Sequence[InitialHistory]
+    beginnings: Sequence[InitialState]
 
 
 def choose(
     samples: Sequence[Samples], bases: Sequence[Basis], smoothness: Sequence[float], *, share: float = 1.0
 ) -> Choice:
-    """Choose initial history, basis and roughness weight; parameters and errors as in `fit_linear`."""
+    """Choose initial state, basis and roughness weight; parameters and errors as in `fit_linear`."""
     thin = [part.thinned(round(share * SELECTION_SAMPLES / len(samples))) for part in samples]
-    report_progress("choosing the initial history")
+    report_progress("choosing the initial state")
     beginnings = [choose_start(part, lambda candidate: Problem.pose([candidate], bases[0])) for part in thin]
     thin = [beginning.of(part) for beginning, part in zip(beginnings, thin, strict=True)]
     candidates = []
@@ -110,9 +110,9 @@ def choose(
 
 
 def _solved(
-    samples: Sequence[Samples], problem: Problem, smoothness: float, beginnings: Sequence[InitialHistory]
+    samples: Sequence[Samples], problem: Problem, smoothness: float, beginnings: Sequence[InitialState]
 ) -> Fitted:
-    """Solve a problem whose samples begin with the initial history; return the result without that history."""
+    """Solve a problem whose samples begin with the initial state; return the result without that history."""
     report_progress(f"fit to {problem.count} samples")
     x = problem.solve(smoothness)
     predicted = np.split(problem.design.predict(x) * problem.scale, np.cumsum([part.v.size for part in samples])[:-1])

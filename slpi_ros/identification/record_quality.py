@@ -71,8 +71,8 @@ class DriveQuality:
     speeds: tuple[float, ...]  # V/s, of runs with about equal voltage change, as in `Runs`
     speed_range: tuple[float, float]  # V/s, of the slowest and the fastest run
     holds: tuple[float, ...]  # s
-    begins_at_end: bool  # at an end of its voltage range: the initial history is known
-    wiped: float | None  # s, by when both ends were visited, which resets the hysteresis state
+    begins_at_end: bool  # at an end of its voltage range: the initial state is known
+    after_reset: float | None  # s, by when both ends were visited, which resets the hysteresis state
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def assess(record: Record, axis: str, *, start: float | None = None, stop: float
         If no fit is possible: too few samples, unordered stamps, no motion, or wrong units.
     """
     samples, at = select_thinned(record, axis, start, stop, WINDOW if len(record) <= WINDOW else _DRIVE_SAMPLES)
-    wiped = np.flatnonzero(samples.wiped)[:1]
+    after_reset = np.flatnonzero(samples.after_reset)[:1]
     first, until = bounds(record, start, stop)
     stamps, v, y = record.time_ns, record.voltage[axis], record.displacement[axis]
     clocks, voltages, displacements = [], [], []
@@ -132,7 +132,7 @@ def assess(record: Record, axis: str, *, start: float | None = None, stop: float
         clock=_whole_clock(clocks),
         voltage=voltage,
         displacement=_whole_signal(displacements),
-        drive=_drive(when, samples.v, at, voltage, float(when[wiped[0]]) if wiped.size else None),
+        drive=_drive(when, samples.v, at, voltage, float(when[after_reset[0]]) if after_reset.size else None),
         notes=record.notes,
     )
 
@@ -252,7 +252,9 @@ def _signal(
     )
 
 
-def _drive(t: FloatArray, v: FloatArray, at: IntArray, voltage: SignalQuality, wiped: float | None) -> DriveQuality:
+def _drive(
+    t: FloatArray, v: FloatArray, at: IntArray, voltage: SignalQuality, after_reset: float | None
+) -> DriveQuality:
     """Return the properties of a voltage, shape (N,), at samples `at` of a record."""
     runs = drive.Runs.of(t, v, drive.smallest_turn(v, voltage.noise))
     near = NEAR_END * np.ptp(v)
@@ -264,7 +266,7 @@ def _drive(t: FloatArray, v: FloatArray, at: IntArray, voltage: SignalQuality, w
         speed_range=runs.speed_range,
         holds=tuple(drive.holds(t, v, drive.hold_band(v, voltage.noise, voltage.digit)).tolist()),
         begins_at_end=bool(min(v[0] - v.min(), v.max() - v[0]) <= near),
-        wiped=wiped,
+        after_reset=after_reset,
     )
 
 
@@ -422,9 +424,11 @@ def _memory(drive: DriveQuality) -> Finding:
     if drive.begins_at_end:
         return Finding("ok", "memory known: the record begins at an end of its voltage range")
     remedy = "begin with a move over the whole range"
-    if drive.wiped is None:
+    if drive.after_reset is None:
         return Finding("warn", f"memory unknown: the voltage never goes over its whole range; {remedy}")
-    return Finding("warn", f"memory unknown until {drive.wiped:.4g} s, where both ends have been visited; {remedy}")
+    return Finding(
+        "warn", f"memory unknown until {drive.after_reset:.4g} s, where both ends have been visited; {remedy}"
+    )
 
 
 def _speeds_and_holds(drive: DriveQuality) -> str:

@@ -155,7 +155,7 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
         samples = _within(samples, float(basis.grid[0]), float(basis.grid[-1]))
     recorded, samples = samples.v, samples.thinned(FIT_SAMPLES)
     found = match(old, samples)
-    # Fit only samples independent of the initial history, unless these are too few.
+    # Fit only samples independent of the initial state, unless these are too few.
     settled = samples.only(found.known & (np.arange(samples.v.size) >= found.known_from))
     samples = settled if np.count_nonzero(settled.fitted) >= FEWEST else samples.only(found.known)
     history = found.start.history

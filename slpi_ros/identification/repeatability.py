@@ -39,7 +39,7 @@ def repeatability_of(t: FloatArray, v: FloatArray, y: FloatArray, residual: Floa
     """Estimate the repeatability of a record: noise and all other differences between repetitions of a motion."""
     # Estimated from repeated moves between the same reversals if there are enough; else from holds; else from the
     # sample-to-sample noise. Slow and smooth differences (drift, creep) do not count. Neither do outliers. The residual
-    # of a model (m) replaces `y` (m, NaN where unknown), so that drift and hum described by the model do not count.
+    # of a model (m) replaces `y` (m, NaN where unknown), so that drift and lines it describes do not count.
     signal = y if residual is None else residual
     usable = np.isfinite(v) & np.isfinite(signal)
     t, v, y, signal = t[usable], v[usable], y[usable], signal[usable]

@@ -39,7 +39,7 @@ NEAR_END = 0.02
 class Samples:
     """Samples of one axis, in time order, with a finite voltage; arrays have shape (N,)."""
 
-    # The first `history` samples form an assumed initial history, and before them the voltage falls from far above,
+    # The first `history` samples form an assumed initial state, and before them the voltage falls from far above,
     # which erases the hysteresis memory; 0: the axis starts at rest.
     v: FloatArray  # V, measurement noise removed, also where not fitted
     y: FloatArray  # m, finite where fitted
@@ -50,11 +50,11 @@ class Samples:
 
     @property
     def primed(self) -> bool:
-        """Whether the samples begin with an assumed initial history, and so with a fall from far above."""
+        """Whether the samples begin with an assumed initial state, and so with a fall from far above."""
         return self.history > 0
 
     def after(self, history: tuple[float, ...]) -> "Samples":
-        """Return the samples preceded by the voltages (V) of an initial history."""
+        """Return the samples preceded by the voltages (V) of an initial state."""
         before = np.array(history)
         return replace(
             self,
@@ -124,7 +124,7 @@ class Samples:
         return float(v[1] - v[0]), float(y[1] - y[0])
 
     @property
-    def wiped(self) -> Mask:
+    def after_reset(self) -> Mask:
         """Mask of the samples after visits to both ends of the voltage range, which reset the state, shape (N,)."""
         low, high = self.v.min(), self.v.max()
         margin = NEAR_END * (high - low)
@@ -134,17 +134,17 @@ class Samples:
         return np.concatenate([np.zeros(self.history, dtype=bool), seen_low & seen_high])
 
     @property
-    def mostly_wiped(self) -> bool:
-        """Whether at least half of the voltage travel of the fitted samples follows the hysteresis reset (`wiped`)."""
+    def mostly_after_reset(self) -> bool:
+        """Whether at least half of the voltage travel of the fitted samples follows the hysteresis reset."""
         own = self.v[self.history :]
         way = np.abs(np.diff(own, prepend=own[0])) * self.fitted[self.history :]
-        return bool(way @ self.wiped[self.history :] >= 0.5 * way.sum())
+        return bool(way @ self.after_reset[self.history :] >= 0.5 * way.sum())
 
     @property
     def judged(self) -> Mask:
         """Mask of the samples that can be held out, (N,)."""
-        # Those before the reset of the hysteresis state depend on the initial history: not if `mostly_wiped`.
-        return self.fitted & self.wiped if self.mostly_wiped else self.fitted
+        # Those before the reset of the hysteresis state depend on the initial state: not if `mostly_after_reset`.
+        return self.fitted & self.after_reset if self.mostly_after_reset else self.fitted
 
 
 def select_samples(record: Record, axis: str, start: float | None, stop: float | None) -> Samples:

@@ -1,4 +1,4 @@
-"""Model of one axis: hysteresis model, effects, initial history, and fit quality."""
+"""Model of one axis: hysteresis model, effects, initial state, and fit quality."""
 
 import warnings
 from collections.abc import Mapping
@@ -72,7 +72,7 @@ class AxisModel:
     kind : str
         Name of the hysteresis model.
     start : Start
-        Initial history of the record.
+        Initial state of the record.
     voltage_range : (float, float), volts
     displacement_range : (float, float), metres
         Ranges covered by the record. `compensate` returns only voltages within the voltage range.
@@ -106,7 +106,7 @@ class AxisModel:
         return not isinstance(self.hysteresis, PathModel)
 
     def initial(self, start_memory: StartMemory) -> Start:
-        """Return the initial history named by `start_memory`; UsageError if there is none of that name.
+        """Return the initial state named by `start_memory`; UsageError if there is none of that name.
 
         ``end``: state at the end of the record, or at its start if the end is unknown; ``start``: state at the start of
         the record; ``wiped``, only for a causal model: state after a decaying oscillation over the identified voltage
@@ -123,7 +123,7 @@ class AxisModel:
         raise UsageError(f"start_memory is '{start_memory}'; give one of {', '.join(START_MEMORIES)}")
 
     def memory(self, start_memory: StartMemory = "end") -> Memory:
-        """Return a new memory with the initial history `start_memory`; UsageError if the model is not causal."""
+        """Return a new memory with the initial state `start_memory`; UsageError if the model is not causal."""
         if isinstance(self.hysteresis, PathModel):
             raise UsageError(
                 f"kind '{self.kind}' needs the complete path in advance and does not allow streaming; "
@@ -271,7 +271,7 @@ class AxisModel:
         """Return the voltage to bring the stage to `y`, shape (N,), metres, and where it is held at a limit.
 
         Effects of the sensor and of the record are not inverted. Other axes are at rest. Time `t`, shape (N,), seconds,
-        is ignored without effects. The initial history is `initial(start_memory)`. UnreachableError if a displacement
+        is ignored without effects. The initial state is `initial(start_memory)`. UnreachableError if a displacement
         lies far outside the identified range, UsageError if one is not finite.
         """
         self.require_reachable(y)

@@ -48,9 +48,9 @@ class StageModel:
         return self.axes[name]
 
     def simulate(self, t: ArrayLike, v: Signal) -> Any:
-        """Return what the sensors will say for a voltage signal, free-run from the initial history of the record.
+        """Return what the sensors will say for a voltage signal, free-run from the initial state of the record.
 
-        Effects of the stage and of its sensors act; drift and hum of the record do not. SlpiError if axes, lengths or
+        Effects of the stage and of its sensors act; drift and lines of the record do not. SlpiError if axes, lengths or
         values are not consistent.
 
         Parameters
@@ -75,7 +75,7 @@ class StageModel:
         return seen if isinstance(v, Mapping) else next(iter(seen.values()))
 
     def compensate(self, t: ArrayLike, y: Signal, start_memory: StartMemory = "end") -> Any:
-        """Return the voltage for a desired displacement of the stage, from an assumed initial history.
+        """Return the voltage for a desired displacement of the stage, from an assumed initial state.
 
         Only effects of the stage are inverted. Without effects of sensor and record, this is the inverse of `simulate`.
         UnreachableError if a displacement lies far outside the identified range; other SlpiErrors as `simulate`.
@@ -87,7 +87,7 @@ class StageModel:
         y : array_like, shape (N,), or mapping of axis name to array_like, shape (N,), metres
             Where the stage shall be.
         start_memory : str
-            Assumed initial history, `AxisModel.initial`: ``end`` (default) or ``start`` of the record, or ``wiped``.
+            Assumed initial state, `AxisModel.initial`: ``end`` (default) or ``start`` of the record, or ``wiped``.
 
         Returns
         -------

@@ -64,11 +64,11 @@ DECLARATIONS = (
         read_only=True, between=(1.0, 86_400.0), number=True,
     ),
     Declaration(
-        "target", 0.0, "Largest mean error on a path not in the records, micrometres; 0: times_the_floor.",
+        "target", 0.0, "Largest mean error on a path not in the records, micrometres; 0: times_repeatability.",
         read_only=True, between=(0.0, 1e6), number=True,
     ),
     Declaration(
-        "times_the_floor", 3.0, "Target in multiples of the repeatability floor, if target is 0.",
+        "times_repeatability", 3.0, "Target in multiples of the repeatability, if target is 0.",
         read_only=True, between=(0.1, 1e6), number=True,
     ),
     Declaration(
@@ -149,7 +149,7 @@ def settings_of(values: Values) -> CalibrationSettings:
         rate=checked["rate"],
         budget=checked["budget"] * len(axes),
         target=checked["target"] * 1e-6,
-        floors=checked["times_the_floor"],
+        times_repeatability=checked["times_repeatability"],
         seed=checked["seed"],
         path=_path_of(checked["desired_path"], axes, checked["rate"]) if checked["desired_path"] else {},
     )

@@ -554,7 +554,7 @@ class Compensator(LifecycleNode):
         for axis, fault in controller.watch_sensors(values["feedback_fault_time"], now_ns):
             self.get_logger().error(
                 f"axis '{axis.name}': feedback is off, the sensor is {fault.kind}: {fault.reason}; the model goes on "
-                "alone; mend the sensor, then set feedback to true again"
+                "alone; repair the sensor, then set feedback to true again"
             )
             self._report()
         if values["rearm"] and controller.rearm(now_ns):

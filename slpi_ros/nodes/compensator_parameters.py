@@ -125,7 +125,7 @@ DECLARATIONS = (
     # Memory
     text(
         "start_memory", "end",
-        "Initial history: that at the end of the model's record, at the start of the record, or after a reset (end, "
+        "Initial state: that at the end of the model's record, at the start of the record, or after a reset (end, "
         "start or wiped). A memory_file takes precedence.",
         *START_MEMORIES,
     ),

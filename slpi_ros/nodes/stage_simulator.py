@@ -49,7 +49,7 @@ DECLARATIONS = (
         "voltage_max", 100.0, "Upper limit of the amplifier, volts.", read_only=True, between=VOLTAGE, number=True
     ),
     Declaration(
-        "initial_history", [0.0],
+        "initial_state", [0.0],
         "Voltages applied to all axes one day before the start, followed by 0 V, to reproduce an earlier state.",
         read_only=True, number=True,
     ),
@@ -103,7 +103,7 @@ class StageSimulator(Node):
         axes, preset, seed = list(values["axes"]), values["preset"], values["seed"]
         self._stage, identity = _make_stage(values)
         self._low, self._high = _limits(self._stage, values["voltage_min"], values["voltage_max"])
-        history = self._initial_history(values["initial_history"])
+        history = self._initial_history(values["initial_state"])
         self._state = JointState(name=axes)
         self._state.header.frame_id = values["hardware_id"] or f"simulated-{preset or seed}{identity}"
         for axis, one in self._stage.axes.items():
@@ -183,7 +183,7 @@ class StageSimulator(Node):
         history = list(given) if isinstance(given, Sequence | array) and not isinstance(given, str) else [math.nan]
         if not all(self._low <= v <= self._high for v in history):
             raise UsageError(
-                f"stage_simulator: initial_history is {given!r}; give voltages within {self._low} to {self._high} V"
+                f"stage_simulator: initial_state is {given!r}; give voltages within {self._low} to {self._high} V"
             )
         return history
 

@@ -80,11 +80,11 @@ def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None)
     """Return a sentence on the held-out error, and its severity."""
     quality = axis.quality
     error, floor = quality.held_out_rms, quality.floor_rms
-    noise, floor_is = "the sensor noise", f"the sensor noise is {nm(floor)} rms"
+    noise, told = "the sensor noise", f"the sensor noise is {nm(floor)} rms"
     beside = ""
     if held_out is not None:
         error, floor = held_out.overall.rms, held_out.repeatability.rms
-        noise, floor_is = "the floor", f"the repeatability is {nm(floor)} rms"
+        noise, told = "the repeatability", f"the repeatability is {nm(floor)} rms"
         if np.isfinite(held_out.overall.classical_rms) and held_out.kind != CLASSICAL:
             beside = f" Classical PI: {nm(held_out.overall.classical_rms)}."
     share = f"{error / _stroke(axis):.3%}" if _stroke(axis) > 0.0 else "?"
@@ -92,8 +92,8 @@ def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None)
     if not floor > 0.0:
         return f"{said}; the record has no noise for comparison.{beside}", "warn"
     if error <= ABOVE_NOISE * floor:
-        return f"{said}; {floor_is}, so the error is close to the noise.{beside}", "good"
-    said = f"{said}; {floor_is}, and the error is {error / floor:.1f} times {noise}."
+        return f"{said}; {told}, so the error is close to the noise.{beside}", "good"
+    said = f"{said}; {told}, and the error is {error / floor:.1f} times {noise}."
     if error <= _MORE_THAN_NOISE * floor:
         return said + beside, "warn"
     return f"{said} 'slpi diagnose' finds the cause.{beside}", "bad"
@@ -141,7 +141,7 @@ def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> No
     for what, parts in groups.items():
         rows += [what, *(_row(part, floor.rms) for part in parts)]
     page.table(
-        ("", "samples", "rms (nm)", "times the floor", "maximum (nm)", "classical PI, rms (nm)", "PI / model"),
+        ("", "samples", "rms (nm)", "times the repeatability", "maximum (nm)", "classical PI, rms (nm)", "PI / model"),
         rows,
         best=0,
         caption="Free-run held-out errors; the classical PI model on the same blocks. "
@@ -174,5 +174,5 @@ def _part(t: FloatArray, fitted: Mask) -> str:
     return (
         f"Fitted: the samples from {first:.6g} s to {last:.6g} s, of {t[0]:.6g} s to {t[-1]:.6g} s. The others are "
         f"drawn as '{views.UNUSED}'; figures, histograms and maps exclude these. The voltage before the part that "
-        "was fitted still determines the initial history."
+        "was fitted still determines the initial state."
     )

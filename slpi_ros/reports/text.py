@@ -72,7 +72,7 @@ def describe_axis(axis: AxisModel, *, details: bool = True) -> list[str]:
     """Return a text summary of one axis; without `details` the most important lines only."""
     quality, start, end = axis.quality, axis.start, axis.end
     (v_low, v_high), (y_low, y_high) = axis.voltage_range, axis.displacement_range
-    began = "a memory assumed wiped" if start.history else "rest"
+    began = "a memory assumed as after a reset" if start.history else "rest"
     stroke = y_high - y_low
     more = [
         f"memory at the start of the record: {began}, at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} µm",
@@ -107,7 +107,7 @@ def describe_start(model: StageModel, axes: Iterable[str], start_memory: StartMe
     for name in axes:
         axis = model.axes[name]
         start = axis.initial(start_memory)
-        known = {"end": "end of the record", "start": "start of the record", "wiped": "memory wiped"}[start_memory]
+        known = {"end": "end of the record", "start": "start of the record", "wiped": "after a reset"}[start_memory]
         if start_memory == "end" and axis.end is None:
             known = "start of the record, as the model does not contain the end"
         told.append(f"axis {name} at {start.voltage:.4g} V, {start.displacement * 1e6:.4g} µm ({known})")
@@ -130,7 +130,7 @@ def describe_change(axis: str, change: "AxisChange") -> list[str]:
     else:
         verdict = f"no change beyond repeatability; the loops are the same within {same:.2%}"
     if change.match.known_from:
-        verdict += "; the initial history of the new record is unknown and was not evaluated"
+        verdict += "; the initial state of the new record is unknown and was not evaluated"
     return [
         f"axis {axis}: {verdict}: the old model's error on the new record is {nm(change.error_before)} rms, "
         f"repeatability {nm(change.repeatability)}",

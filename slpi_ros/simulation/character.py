@@ -38,8 +38,8 @@ class Character:
     drift_time: float = _figure(120.0, "Time constant of both drifts, seconds.", 1e-3, 1e6)
     sensor_period: float = _figure(316e-9, "Period of the sensor's periodic error, metres.", 1e-9, 1e-3)
     sensor_amplitude: float = _figure(0.0, "Amplitude of the sensor's periodic error, metres.", 0.0, 1e-4)
-    hum_frequency: float = _figure(50.0, "Frequency of the hum, hertz.", 1e-3, 1e4)
-    hum_amplitude: float = _figure(0.0, "Amplitude of the hum, metres.", 0.0, 1e-4)
+    hum_frequency: float = _figure(50.0, "Frequency of the line interference, hertz.", 1e-3, 1e4)
+    hum_amplitude: float = _figure(0.0, "Amplitude of the line interference, metres.", 0.0, 1e-4)
 
     def __post_init__(self) -> None:
         for item in fields(self):

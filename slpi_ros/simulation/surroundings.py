@@ -1,4 +1,4 @@
-"""What acts on the reading of a stage besides its motion: mains hum, the error of an interferometer, and noise."""
+"""What acts on the reading of a stage besides its motion: a line, the error of an interferometer, and noise."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -20,7 +20,7 @@ def records(measured_data):
 
 
 def error(model, record):
-    """Return the free-run error, % of the stroke, without its constant, from the initial history that suits."""
+    """Return the free-run error, % of the stroke, without its constant, from the initial state that suits."""
     (axis,) = record.axes
     v, y = record.voltage[axis], record.displacement[axis]
     own = model.axes[axis]

@@ -13,9 +13,9 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
-    FitView,
+    FitContext,
     FloatArray,
-    ResidualView,
+    ResidualContext,
     Side,
     Signal,
     StreamingBase,
@@ -61,11 +61,11 @@ class SupplySag(EffectBase):
         return signal - self.gain * np.abs(_speed(signal, around.t))
 
     @classmethod
-    def fit(cls, left: ResidualView) -> Iterator[Candidate]:
+    def fit(cls, left: ResidualContext) -> Iterator[Candidate]:
         column = cls(1.0).apply(left.h, left.around) - left.h
         yield Candidate(column[:, None], lambda gains: cls(float(gains[0])))
 
-    def plausible(self, view: FitView) -> bool:
+    def plausible(self, view: FitContext) -> bool:
         fastest = float(np.percentile(np.abs(_speed(view.h, view.t)), 99))
         return abs(self.gain) * fastest <= LARGEST * view.motion
 

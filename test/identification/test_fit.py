@@ -102,9 +102,9 @@ def test_a_record_that_starts_in_mid_loop_is_understood(recorded):
     assert not record.voltage["x"][late][0] < 5.0
     cut = record_of(record.t[late], record.voltage["x"][late], record.displacement["x"][late])
     found = slpi_ros.identify(cut)
-    wiped = cut.t > 6.0
+    after_reset = cut.t > 6.0
     error = found.simulate(cut.t, cut.voltage["x"]) - cut.displacement["x"]
-    assert rms(error[wiped]) < 12e-9
+    assert rms(error[after_reset]) < 12e-9
 
 
 def test_voltage_before_the_start_still_moves_the_memory(recorded):

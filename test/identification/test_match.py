@@ -38,7 +38,7 @@ def of(model, record):
 
 HISTORIES = ([], [100.0, 0.0], [100.0], [70.0, 20.0, 60.0, 30.0], [0.0, 100.0, 40.0, 90.0])
 WHOLE = calibration_drive(0.0, 100.0, duration=8.0, rate=200.0, seed=5)[1]
-# About the middle of the range, with a growing amplitude: the initial history matters almost to the end.
+# About the middle of the range, with a growing amplitude: the initial state matters almost to the end.
 GROWING = 50.0 + 40.0 * np.linspace(0.0, 1.0, 1600) * np.sin(np.arange(1600) * 0.02)
 
 
@@ -49,7 +49,7 @@ def test_a_stage_that_did_not_change_is_never_said_to_have(model, before, v):
     found = of(model, record)
     assert not found.gain_changed and not found.width_changed and not found.zero_moved
     assert not refit(model, record)[1]["x"].drifted
-    # The best initial history gives the record's displacement where it is known.
+    # The best initial state gives the record's displacement where it is known.
     assert found.rms < 2e-8
     assert found.known_from < v.size
 

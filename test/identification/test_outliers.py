@@ -10,7 +10,7 @@ import slpi_ros
 from slpi_ros.diagnosis.prepare import evidence_of
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.bad_readings import far_outliers, outliers_by_model
-from slpi_ros.identification.free_run import InitialHistoryWarning
+from slpi_ros.identification.free_run import InitialStateWarning
 from slpi_ros.identification.record_quality import assess
 from slpi_ros.identification.samples import select_samples
 from slpi_ros.simulation.axis import SimulatedAxis
@@ -237,7 +237,7 @@ def test_digits_of_a_record_without_noise_are_no_outliers(rate):
 
 def test_outliers_at_the_beginning_are_no_wrong_history(clean):
     with warnings.catch_warnings():
-        warnings.simplefilter("error", InitialHistoryWarning)
+        warnings.simplefilter("error", InitialStateWarning)
         slpi_ros.identify(spoiled(clean, "displacement", np.array([3, 20, 40, 41, 60, 61, 62, 80]), 3e-7))
 
 

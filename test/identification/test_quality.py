@@ -249,7 +249,7 @@ def test_memory():
     assert not drive.begins_at_end
     rest = v[middle:]
     low, high = (np.flatnonzero(end)[0] for end in (rest <= rest.min() + 2, rest >= rest.max() - 2))
-    assert drive.wiped == pytest.approx(t[max(low, high)], abs=0.01)
+    assert drive.after_reset == pytest.approx(t[max(low, high)], abs=0.01)
 
 
 # --- Words
@@ -320,7 +320,7 @@ def test_findings_on_measured_records(measured_data):
     assert piezo.displacement.noise == pytest.approx(0.047e-6, rel=0.1)
     assert piezo.drive.holds == pytest.approx([3.26], abs=0.1)
     assert len(piezo.drive.speeds) == 1
-    assert piezo.drive.wiped == pytest.approx(4.06, abs=0.05)
+    assert piezo.drive.after_reset == pytest.approx(4.06, abs=0.05)
     assert not piezo.drive.begins_at_end
     for name in ("picma_1hz_major", "picma_1hz_decay_grow"):
         picma = of(name)

@@ -70,7 +70,7 @@ def test_the_new_model_is_a_whole_document(model):
     new, _ = refit(model, record_of(t, v, stage(SEED).run(t, v)[1]))
     again = parse_model(format_model(new), "test")
     np.testing.assert_array_equal(again.axes["x"].simulate(t, v), new.axes["x"].simulate(t, v))
-    # The first rise, before the initial history is forgotten, is not fitted.
+    # The first rise, before the initial state is forgotten, is not fitted.
     assert 0 < again.axes["x"].quality.samples - model.axes["x"].quality.samples <= v.size
     assert again.axes["x"].voltage_range == model.axes["x"].voltage_range
 

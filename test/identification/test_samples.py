@@ -13,7 +13,7 @@ import slpi_ros
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.identification import linear_kinds as linear
-from slpi_ros.identification.free_run import InitialHistoryWarning
+from slpi_ros.identification.free_run import InitialStateWarning
 from slpi_ros.identification.samples import Samples, select_samples
 
 paths = st.lists(st.integers(0, 8), min_size=1, max_size=80).map(lambda values: np.array(values, dtype=np.float64))
@@ -94,11 +94,11 @@ def test_what_has_nothing_to_do_with_the_voltage_has_no_wrong_sign(seed):
 
 def test_a_beginning_that_disagrees_is_told():
     record, _ = calibration(seed=1)
-    first = np.arange(len(record)) < np.flatnonzero(select_samples(record, "x", None, None).wiped)[0]
+    first = np.arange(len(record)) < np.flatnonzero(select_samples(record, "x", None, None).after_reset)[0]
     # Another axis moves as long as this one has not gone over its range, and couples into it.
     disturbed = record.displacement["x"] + np.where(first, 4e-7 * np.sin(9.0 * record.t), 0.0)
-    with pytest.warns(InitialHistoryWarning, match="slpi diagnose"):
+    with pytest.warns(InitialStateWarning, match="slpi diagnose"):
         slpi_ros.identify(replace(record, displacement={"x": disturbed}))
     with warnings.catch_warnings():
-        warnings.simplefilter("error", InitialHistoryWarning)
+        warnings.simplefilter("error", InitialStateWarning)
         slpi_ros.identify(record)

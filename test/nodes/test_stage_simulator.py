@@ -117,7 +117,7 @@ def test_every_command_is_answered_in_order_with_what_the_stage_does():
 
 def test_a_restart_finds_the_stage_as_it_was_left():
     history, commands = [60.0, 20.0, 80.0], [[30.0], [50.0], [10.0]]
-    with simulator(noise_rms=0.0, seed=3, initial_history=history) as (bench, process):
+    with simulator(noise_rms=0.0, seed=3, initial_state=history) as (bench, process):
         bench.connect(process, axes=1)
         for command in commands:
             bench.send(*command)

@@ -249,7 +249,7 @@ class _Calibration:
         self._repeatability = {name: axis.quality.floor_rms for name, axis in model.axes.items()}
         said = "; ".join(
             f"axis {name}: held-out error {axis.quality.held_out_rms * 1e9:.3g} nm rms, "
-            f"repeatability {axis.quality.floor_rms * 1e9:.3g} nm"
+            f"sensor noise {axis.quality.floor_rms * 1e9:.3g} nm"
             for name, axis in model.axes.items()
         )
         self._steps.append(Step("identify", 0.0, "a first model, of hysteresis alone", said))

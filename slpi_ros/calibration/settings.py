@@ -60,6 +60,6 @@ class CalibrationSettings:
         """Time (s) of the path of a verification."""
         return max((y.size / self.rate for y in self.path.values()), default=VERIFICATION)
 
-    def goal(self, floor_rms: float) -> float:
-        """Return the target (m) of an axis whose repeatability is `floor_rms` (m)."""
-        return self.target or self.times_repeatability * floor_rms
+    def goal(self, repeatability_rms: float) -> float:
+        """Return the target (m) of an axis whose repeatability is `repeatability_rms` (m)."""
+        return self.target or self.times_repeatability * repeatability_rms

@@ -1,5 +1,6 @@
 """Exceptions of the package, all derived from `SlpiError`, the form of text shown to people, and missing packages."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
@@ -39,6 +40,14 @@ def shown(text: object, most: int = LONGEST_SHOWN) -> str:
         return line
     # Text that is not UTF-8 reaches Python as lone surrogates, which are not printable either.
     return _cut("".join(c if c.isprintable() or c == "\N{NO-BREAK SPACE}" else _escaped(c) for c in line), most)
+
+
+def length(metres: float) -> str:
+    """Return a length with three digits in nm, µm or mm as text; "none" if it is not finite."""
+    if not math.isfinite(metres):
+        return "none"
+    scale, unit = next((one for one in ((1e9, "nm"), (1e6, "µm")) if abs(metres) * one[0] < 999.5), (1e3, "mm"))
+    return f"{metres * scale:.3g} {unit}"
 
 
 def _cut(line: str, most: int) -> str:

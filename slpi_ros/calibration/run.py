@@ -14,7 +14,7 @@ from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
 from slpi_ros.diagnosis.result import Diagnosis
 from slpi_ros.effects.base import Effect, EffectContext
-from slpi_ros.errors import RecordError
+from slpi_ros.errors import RecordError, length
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.drives import SWEEP, Drive
 from slpi_ros.identification.progress import listening
@@ -248,8 +248,8 @@ class _Calibration:
         model = identify(IdentifyRequest(Source(records=self._records))).model
         self._repeatability = {name: axis.quality.floor_rms for name, axis in model.axes.items()}
         said = "; ".join(
-            f"axis {name}: held-out error {axis.quality.held_out_rms * 1e9:.3g} nm rms, "
-            f"sensor noise {axis.quality.floor_rms * 1e9:.3g} nm"
+            f"axis {name}: held-out error {length(axis.quality.held_out_rms)} rms, "
+            f"sensor noise {length(axis.quality.floor_rms)}"
             for name, axis in model.axes.items()
         )
         self._steps.append(Step("identify", 0.0, "a first model, of hysteresis alone", said))

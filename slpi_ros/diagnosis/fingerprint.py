@@ -12,6 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.errors import length
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.drive import smallest_turn
 from slpi_ros.identification.signal_statistics import noise
@@ -176,14 +177,14 @@ def _evidence(name: str, unit: str, share: float, x: FloatArray, fitted: FloatAr
     low, high = int(np.argmin(fitted)), int(np.argmax(fitted))
     of = {"direction": "voltage"}.get(name, name)
     return (
-        f"{share:.0%} of the mean square goes with the {name}: from {1e9 * fitted[low]:+.3g} nm at "
-        f"{_quantity(x[low], unit)} to {1e9 * fitted[high]:+.3g} nm at {_quantity(x[high], unit)} of {of}; "
+        f"{share:.0%} of the mean square goes with the {name}: from {length(fitted[low])} at "
+        f"{_quantity(x[low], unit)} to {length(fitted[high])} at {_quantity(x[high], unit)} of {of}; "
         f"{HINTS[name]}"
     )
 
 
 def _quantity(value: float, unit: str) -> str:
-    return f"{1e6 * value:.3g} µm" if unit == "m" else f"{value:.3g} {unit}".rstrip()
+    return length(value) if unit == "m" else f"{value:.3g} {unit}".rstrip()
 
 
 def _curve(x: FloatArray, fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -203,7 +204,7 @@ def _of_lines(records: Sequence[Signals]) -> Iterator[Left]:
         if not lines:
             continue
         gains = np.linalg.lstsq(own, left, rcond=None)[0].reshape(-1, 2)
-        told += [f"{f:.4g} Hz ({1e9 * np.hypot(*gain):.3g} nm)" for f, gain in zip(lines, gains, strict=True)]
+        told += [f"{f:.4g} Hz ({length(float(np.hypot(*gain)))})" for f, gain in zip(lines, gains, strict=True)]
     name = "lines of the spectrum"
     yield Left(
         name, share, f"{share:.0%} of the mean square is in lines at {', '.join(told[:MOST_LINES])}; {HINTS[name]}"
@@ -273,7 +274,7 @@ def _of_jumps(records: Sequence[Signals]) -> Iterator[Left]:
         ((float(record.t[k]), size) for record, jumps in zip(records, found, strict=True) for k, size in jumps),
         key=lambda jump: -abs(jump[1]),
     )
-    told = ", ".join(f"{1e9 * size:+.3g} nm at {at:.4g} s" for at, size in largest[:MOST_JUMPS])
+    told = ", ".join(f"{length(size)} at {at:.4g} s" for at, size in largest[:MOST_JUMPS])
     yield Left("jumps", share, f"{share:.0%} of the mean square is in jumps: {told}; {HINTS['jumps']}")
 
 

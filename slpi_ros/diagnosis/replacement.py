@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from slpi_ros.diagnosis.verify import verify
-from slpi_ros.errors import SlpiError
+from slpi_ros.errors import SlpiError, length
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.stage_model import StageModel
@@ -74,7 +74,7 @@ def _is_another(new: AxisModel, old: AxisModel) -> str:
 
 def _predicts_worse(error: float, before: float, in_use: StageModel, name: str, records: Sequence[Record]) -> str:
     """Compare the held-out error (m) of a new model with the model in use, whose own is `before` (m)."""
-    said = f"held-out error {error * 1e9:.3g} nm rms"
+    said = f"held-out error {length(error)} rms"
     if error > MUCH_WORSE * before:
         limit = MUCH_WORSE * before
         return f"{said}, that of the model in use {before * 1e9:.3g} nm; at most {limit * 1e9:.3g} nm are allowed"

@@ -14,6 +14,7 @@ from slpi_ros.diagnosis.prepare import Evidence, one_speed
 from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, chance_of_gain, held_out_error
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
+from slpi_ros.errors import length
 from slpi_ros.excitation.effects import for_effect, separating
 from slpi_ros.identification.repeatability import Repeatability
 from slpi_ros.model.axis_model import ABOVE_NOISE
@@ -257,18 +258,16 @@ def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEf
 
 def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) -> str:
     sentence = effect.describe()
-    before, after, end = (
-        1e9 * held_out_error(score, own=named.own) for score in (named.before, named.after, in_the_end)
-    )
+    before, after, end = (held_out_error(score, own=named.own) for score in (named.before, named.after, in_the_end))
     on = "records" if named.after.records.size and not named.own else "blocks"
     gained = (
-        f"with it the error on held-out {on} falls from {before:.3g} to {after:.3g} nm rms "
+        f"with it the error on held-out {on} falls from {length(before)} to {length(after)} rms "
         f"(p = {chance:.2g}: the probability that chance gains as much)"
     )
     if not named.runner_up:
         return f"{sentence}; {gained}, and no other effect comes near"
     other, rms = named.runner_up
-    instead = f"with {other} in its place {rms * 1e9:.3g} nm are left in the end, not {end:.3g}"
+    instead = f"with {other} in its place {length(rms)} are left in the end, not {length(end)}"
     return f"{sentence}; {gained}; {instead}"
 
 
@@ -301,19 +300,19 @@ def _stale(given: Given, selection: Selection) -> bool:
 
 
 def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
-    error, anew = given.rms * 1e9, before_rms * 1e9
+    error, anew = length(given.rms), length(before_rms)
     moved = ""
     if given.zero_moved is not None:
-        moved = f"The zero has moved by {given.zero_moved * 1e6:+.3g} µm. "
+        moved = f"The zero has moved by {length(given.zero_moved)}. "
     if _stale(given, selection):
         return (
-            f"The given model is off by {error:.3g} nm rms, one fitted to the record by {anew:.3g} nm: the stage has "
+            f"The given model is off by {error} rms, one fitted to the record by {anew}: the stage has "
             f"changed since, its gain by {100 * given.gain:+.2g} %. {moved}"
         )
     if moved:
         same = 100.0 * max(abs(given.gain), given.hysteresis_rms / given.motion)
         return f"{moved}The loops are the same within {same:.1g} %. "
-    return f"The given model is off by {error:.3g} nm rms on this record. " if BIAS in selection.structures else ""
+    return f"The given model is off by {error} rms on this record. " if BIAS in selection.structures else ""
 
 
 def _not_in_model(now: Explanation, left_out: Sequence[str], dropped: Sequence[str]) -> str:
@@ -336,8 +335,8 @@ def _mixed(evidence: Evidence) -> str:
 def _summary(
     verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float, before_rms: float
 ) -> str:
-    before, after = before_rms * 1e9, selection.now.held_out.rms_of_records * 1e9
-    left = f"{after:.3g} nm rms are left, the sensor noise is {noise_rms * 1e9:.3g} nm"
+    after = selection.now.held_out.rms_of_records
+    left = f"{length(after)} rms are left, the sensor noise is {length(noise_rms)}"
     found = ", then ".join(
         f"{named.name}, which reduces {'the rest' if place else 'the error'} by {named.gain_percent:.0f} %"
         for place, named in enumerate(effects)
@@ -353,7 +352,7 @@ def _summary(
     if verdict == AMBIGUOUS:
         open_ones = (named for named in effects if named.alternatives)
         others = "".join(f" The record cannot tell {one.name} from {', '.join(one.alternatives)}." for one in open_ones)
-    return f"{structure}Found: {found}.{others} The held-out error falls from {before:.3g} nm; {left}."
+    return f"{structure}Found: {found}.{others} The held-out error falls from {length(before_rms)}; {left}."
 
 
 def _cannot_tell(driven_alike: Sequence[str]) -> str:

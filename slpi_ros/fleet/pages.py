@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from slpi_ros.errors import length
 from slpi_ros.fleet.bags import REFUSED, Row, plain_name
 from slpi_ros.fleet.cluster import run
 from slpi_ros.fleet.results import TABLE, Results
@@ -23,7 +24,6 @@ from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.schemas import format_document
 from slpi_ros.reports.chart import CAUSES, COLOURS, MEASURED, NOISE, Chart, Panel, Quantity
 from slpi_ros.reports.page import Page, Severity
-from slpi_ros.reports.text import nm
 
 PAGE, DOCUMENT = "index.html", "fleet.json"
 # Order of the stages on the page, colour of their health, and what is to be done.
@@ -214,7 +214,7 @@ def _cells(row: Row) -> list[str]:
     ]
     causes = ", ".join(str(cause["name"]) for cause in row.causes) or row.diagnosis.replace("_", " ")
     like = [f"of stage {row.like_stage}"] if row.like_stage else []
-    refitted = [f"refitted: {nm(row.refitted_rms_m)}"] if row.refitted_rms_m is not None else []
+    refitted = [f"refitted: {length(row.refitted_rms_m)}"] if row.refitted_rms_m is not None else []
     notes = "; ".join([*like, *refitted, *([row.error] if row.error else []), *row.findings])
     return [_date(row.date_ns), row.verdict, *number, causes, row.bag, notes]
 

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from slpi_ros.errors import IdentificationError, SlpiError, UsageError
+from slpi_ros.errors import IdentificationError, SlpiError, UsageError, length
 from slpi_ros.identification.least_squares import Fitted
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES, fit_family, fit_multi_slope, fit_plays
 from slpi_ros.identification.progress import report_progress
@@ -169,6 +169,6 @@ def _require_sense(fitted: Fitted) -> None:
     spread = float(np.std(fitted.y))
     if not fitted.held_out_rms <= SENSELESS * spread:
         raise IdentificationError(
-            f"the voltage does not explain the displacement: held-out error {fitted.held_out_rms * 1e9:.4g} nm rms, "
-            f"displacement {spread * 1e9:.4g} nm rms; check that both signals belong to this axis and have one clock"
+            f"the voltage does not explain the displacement: held-out error {length(fitted.held_out_rms)} rms, "
+            f"displacement {length(spread)} rms; check that both signals belong to this axis and have one clock"
         )

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
+from slpi_ros.errors import length
 from slpi_ros.identification.samples import FEWEST, Samples
 from slpi_ros.model.axis_model import AxisModel, Start
 
@@ -98,11 +99,11 @@ def warn_of_rest(samples: Sequence[Samples], beginnings: Sequence[InitialState])
 def warn_of_initial_history(before: FloatArray, after: FloatArray) -> None:
     """Warn if the errors (m) before the reset of the hysteresis state are much larger than those after it."""
     if before.size and after.size:
-        first, rest = (float(np.sqrt(np.mean(errors**2))) * 1e9 for errors in (before, after))
+        first, rest = (float(np.sqrt(np.mean(errors**2))) for errors in (before, after))
         if first > DISAGREES * rest:
             warnings.warn(
                 f"{before.size} of {before.size + after.size} samples, before the voltage has gone over its whole "
-                f"range, have an error of {first:.3g} nm rms, the others {rest:.3g} nm; the former do not count in "
+                f"range, have an error of {length(first)} rms, the others {length(rest)}; the former do not count in "
                 "the held-out error; `slpi diagnose` tests for effects other than hysteresis",
                 InitialStateWarning,
                 stacklevel=3,

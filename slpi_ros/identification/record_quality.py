@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from slpi_ros.arrays import FloatArray, IntArray
-from slpi_ros.errors import IdentificationError
+from slpi_ros.errors import IdentificationError, length
 from slpi_ros.identification import bad_readings, drive, signal_statistics
 from slpi_ros.identification.drive import SPEED_FACTOR
 from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, WINDOW, bounds, select_thinned, windows
@@ -351,13 +351,13 @@ def _clock_findings(clock: ClockQuality) -> Iterator[Finding]:
 
 
 def _displacement(y: SignalQuality) -> Iterator[Finding]:
-    noise = f"{y.noise * 1e9:.3g} nm rms" if y.noise else "below its digits"
+    scatter = f"{length(y.noise)} rms" if y.noise else "below its digits"
     yield _warn_if(
         y.noise > _NOISY_DISPLACEMENT * y.range,
-        f"displacement from {y.low * 1e6:.5g} to {y.high * 1e6:.5g} µm, noise {noise}",
+        f"displacement from {y.low * 1e6:.5g} to {y.high * 1e6:.5g} µm, scatter of successive readings {scatter}",
         "a large part of the range; go the same way several times",
     )
-    digits = f"displacement in steps of {y.digit * 1e9:.3g} nm"
+    digits = f"displacement in steps of {length(y.digit)}"
     if y.digit > max(_USELESS_DIGIT * y.range, 2.0 * y.noise):
         yield Finding("stop", f"{digits}: too coarse for a loop; set the sensor to a smaller range")
     elif y.digit > 0.1 * y.noise:

@@ -3,12 +3,13 @@
 from pathlib import Path
 
 from slpi_ros.calibration.run import Outcome
+from slpi_ros.errors import length
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.model.document import save_model
 from slpi_ros.reports import diagnosis as diagnosis_files
 from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, DISPLACEMENT, TIME, Chart, Panel, Quantity, thin_line
 from slpi_ros.reports.page import Page
-from slpi_ros.reports.text import describe_model, nm
+from slpi_ros.reports.text import describe_model
 
 # The model, the page, and the folder with the files of the last diagnosis.
 MODEL, PAGE, DIAGNOSIS = "model.json", "report.html", "diagnosis"
@@ -45,13 +46,13 @@ def page_of(outcome: Outcome) -> Page:
         page.heading(f"Axis {axis}", axis)
         page.verdict(axis, found.summary, "good" if error.met else "warn", found.verdict)
         page.tiles({
-            "verified error, mean": nm(error.mean),
+            "verified error, mean": length(error.mean),
             "of the stroke": f"{error.mean / error.stroke:.3%}",
-            "of it constant": nm(error.offset),
-            "mean without it": nm(error.rest),
-            "maximum": nm(error.maximum),
-            "target": nm(error.goal),
-            "repeatability, rms": nm(found.repeatability_rms),
+            "of it constant": length(error.offset),
+            "mean without it": length(error.rest),
+            "maximum": length(error.maximum),
+            "target": length(error.goal),
+            "repeatability, rms": length(found.repeatability_rms),
         })  # fmt: skip
         page.definitions({named.name: named.evidence for named in found.effects})
         page.chart(
@@ -74,7 +75,7 @@ def _errors(outcome: Outcome) -> list[list[str]]:
             step.name,
             "hysteresis alone" if number == 0 else "with the causes found",
             *(
-                f"{nm(error.mean)} ({error.mean / error.stroke:.3%}), {nm(error.maximum)}; {nm(error.rest)}"
+                f"{length(error.mean)} ({error.mean / error.stroke:.3%}), {length(error.maximum)}; {length(error.rest)}"
                 for error in step.errors.values()
             ),
         ]

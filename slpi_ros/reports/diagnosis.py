@@ -17,14 +17,14 @@ from slpi_ros.diagnosis.result import (
     Traces,
 )
 from slpi_ros.effects.registry import to_document
-from slpi_ros.errors import SlpiError
+from slpi_ros.errors import SlpiError, length
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import format_document
 from slpi_ros.model.document import format_model
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, DISPLACEMENT, ERROR, NOISE, Chart, Panel, Quantity
 from slpi_ros.reports.page import Page, Severity, Share
-from slpi_ros.reports.text import above_noise, nm
+from slpi_ros.reports.text import above_noise
 from slpi_ros.reports.views import Motion, Series
 
 # Relative difference of equal errors.
@@ -74,12 +74,18 @@ def _severity(found: AxisDiagnosis) -> Severity:
 
 
 def _figures(found: AxisDiagnosis) -> dict[str, str]:
-    figures = {"error of the given model, rms": nm(found.given_rms), "its hysteresis refitted": nm(found.before_rms)}
+    figures = {
+        "error of the given model, rms": length(found.given_rms),
+        "its hysteresis refitted": length(found.before_rms),
+    }
     if found.effects:
-        figures["with the identified effects"] = nm(found.after_rms)
+        figures["with the identified effects"] = length(found.after_rms)
         if found.before_rms > 0.0:
             figures["reduction by the effects"] = f"{1.0 - found.after_rms / found.before_rms:.0%}"
-    return figures | {"sensor noise, rms": nm(found.noise_rms), "repeatability, rms": nm(found.repeatability_rms)}
+    return figures | {
+        "sensor noise, rms": length(found.noise_rms),
+        "repeatability, rms": length(found.repeatability_rms),
+    }
 
 
 def _show_causes(page: Page, found: AxisDiagnosis) -> None:
@@ -121,8 +127,8 @@ def _show_records(page: Page, found: AxisDiagnosis) -> None:
             [
                 each.source,
                 f"{each.offset * 1e6:+.3g}",
-                *(nm(rms) for rms in (each.before_rms, each.after_rms)),
-                "-" if each.left_out_rms is None else nm(each.left_out_rms),
+                *(length(rms) for rms in (each.before_rms, each.after_rms)),
+                "-" if each.left_out_rms is None else length(each.left_out_rms),
             ]
             for each in found.records
         ]

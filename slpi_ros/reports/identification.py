@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
-from slpi_ros.errors import SlpiError
+from slpi_ros.errors import SlpiError, length
 from slpi_ros.identification.cross_validation import CLASSICAL, CrossValidationReport, Slice
 from slpi_ros.identification.record_quality import Finding, assess, findings
 from slpi_ros.io.record import Record
@@ -15,7 +15,7 @@ from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE
 from slpi_ros.reports.page import Page, Severity
-from slpi_ros.reports.text import describe_axis, nm
+from slpi_ros.reports.text import describe_axis
 from slpi_ros.reports.views import Series
 
 # From held-out errors of this multiple of the noise on, diagnosis is advised.
@@ -80,15 +80,15 @@ def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None)
     """Return a sentence on the held-out error, and its severity."""
     quality = axis.quality
     error, floor = quality.held_out_rms, quality.floor_rms
-    noise, told = "the sensor noise", f"the sensor noise is {nm(floor)} rms"
+    noise, told = "the sensor noise", f"the sensor noise is {length(floor)} rms"
     beside = ""
     if held_out is not None:
         error, floor = held_out.overall.rms, held_out.repeatability.rms
-        noise, told = "the repeatability", f"the repeatability is {nm(floor)} rms"
+        noise, told = "the repeatability", f"the repeatability is {length(floor)} rms"
         if np.isfinite(held_out.overall.classical_rms) and held_out.kind != CLASSICAL:
-            beside = f" Classical PI: {nm(held_out.overall.classical_rms)}."
+            beside = f" Classical PI: {length(held_out.overall.classical_rms)}."
     share = f"{error / _stroke(axis):.3%}" if _stroke(axis) > 0.0 else "?"
-    said = f"Axis {name}: the held-out error is {nm(error)} rms ({share} of the stroke)"
+    said = f"Axis {name}: the held-out error is {length(error)} rms ({share} of the stroke)"
     if not floor > 0.0:
         return f"{said}; the record has no noise for comparison.{beside}", "warn"
     if error <= ABOVE_NOISE * floor:
@@ -103,18 +103,18 @@ def _figures(axis: AxisModel, held_out: CrossValidationReport | None) -> dict[st
     quality = axis.quality
     if held_out:
         figures = {
-            "held-out error, rms": nm(held_out.overall.rms),
-            "repeatability, rms": nm(held_out.repeatability.rms),
-            "classical PI held-out, rms": nm(held_out.overall.classical_rms),
+            "held-out error, rms": length(held_out.overall.rms),
+            "repeatability, rms": length(held_out.repeatability.rms),
+            "classical PI held-out, rms": length(held_out.overall.classical_rms),
         }
     else:
         figures = {
-            "held-out error, rms": nm(quality.held_out_rms),
-            "sensor noise, rms": nm(quality.floor_rms),
+            "held-out error, rms": length(quality.held_out_rms),
+            "sensor noise, rms": length(quality.floor_rms),
             "samples fitted": f"{quality.samples:,}",
         }
     return figures | {
-        "maximum error of the fit": nm(quality.maximum),
+        "maximum error of the fit": length(quality.maximum),
         "stroke": f"{_stroke(axis) * 1e6:.4g} µm",
         "model covered": f"{quality.covered:.0%}",
     }
@@ -145,7 +145,7 @@ def _show_held_out(page: Page, name: str, held_out: CrossValidationReport) -> No
         rows,
         best=0,
         caption="Free-run held-out errors; the classical PI model on the same blocks. "
-        f"Repeatability: {nm(floor.rms)} rms, {floor.source}.",
+        f"Repeatability: {length(floor.rms)} rms, {floor.source}.",
     )
     curves = [Series(held_out.kind, -held_out.error, AFTER)]
     if held_out.kind != CLASSICAL and np.isfinite(held_out.classical).any():

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slpi_ros.errors import length
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
@@ -15,11 +16,6 @@ from slpi_ros.model.stage_model import StageModel
 
 if TYPE_CHECKING:
     from slpi_ros.identification.refit import AxisChange
-
-
-def nm(metres: float) -> str:
-    """Return a length as text in nanometres; "none" if it is not finite."""
-    return f"{metres * 1e9:.1f} nm" if np.isfinite(metres) else "none"
 
 
 def verdict(limits: Mapping[str, str], good: str = "at the sensor noise") -> str:
@@ -35,7 +31,7 @@ def above_noise(rms: float, noise: float, stroke: float) -> str:
     if rms <= max(ABOVE_NOISE * noise, RESOLUTION * stroke):
         return ""
     times = f"{rms / noise:.1f} times the sensor noise" if noise > 0.0 else "without any noise"
-    return f"an error of {nm(rms)} rms, {times}"
+    return f"an error of {length(rms)} rms, {times}"
 
 
 def model_limits(model: StageModel) -> dict[str, str]:
@@ -80,15 +76,15 @@ def describe_axis(axis: AxisModel, *, details: bool = True) -> list[str]:
         f"with {len(end.history)} reversals"
         if end
         else "memory at the end of the record: unknown",
-        f"error on the record: {nm(quality.rms)} rms ({quality.rms / stroke:.3%} of the displacement range), "
-        f"{nm(quality.maximum)} at most",
+        f"error on the record: {length(quality.rms)} rms ({quality.rms / stroke:.3%} of the displacement range), "
+        f"{length(quality.maximum)} at most",
         f"from {quality.samples} samples of {quality.source}",
     ]
     return [
         f"{axis.kind} ({DESCRIPTIONS[axis.kind]}), {_parts(axis.hysteresis)}",
         f"identified from {v_low:.4g} to {v_high:.4g} V, {y_low * 1e6:.4g} to {y_high * 1e6:.4g} µm{_rate(axis)} "
         f"({quality.covered:.0%} model covered)",
-        f"held-out error: {nm(quality.held_out_rms)} rms; sensor noise {nm(quality.floor_rms)} rms",
+        f"held-out error: {length(quality.held_out_rms)} rms; sensor noise {length(quality.floor_rms)} rms",
         *(more if details else ()),
         *(f"{effect.name}: {effect.describe()}" for effect in axis.effects),
         *(() if axis.effects else ("effects: none",)),
@@ -132,10 +128,10 @@ def describe_change(axis: str, change: "AxisChange") -> list[str]:
     if change.match.known_from:
         verdict += "; the initial state of the new record is unknown and was not evaluated"
     return [
-        f"axis {axis}: {verdict}: the old model's error on the new record is {nm(change.error_before)} rms, "
-        f"repeatability {nm(change.repeatability)}",
-        f"axis {axis}: gain {change.gain:+.2%}, branches moved by up to {nm(change.largest)}; "
-        f"error on the new record now {nm(change.error_after)} rms",
+        f"axis {axis}: {verdict}: the old model's error on the new record is {length(change.error_before)} rms, "
+        f"repeatability {length(change.repeatability)}",
+        f"axis {axis}: gain {change.gain:+.2%}, branches moved by up to {length(change.largest)}; "
+        f"error on the new record now {length(change.error_after)} rms",
     ]
 
 

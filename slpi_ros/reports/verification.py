@@ -17,6 +17,7 @@ from slpi_ros.diagnosis.verify import (
     RecordVerification,
     Verification,
 )
+from slpi_ros.errors import length
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import format_document
 from slpi_ros.model.axis_model import ABOVE_NOISE
@@ -36,7 +37,6 @@ from slpi_ros.reports.chart import (
 )
 from slpi_ros.reports.chart import CAUSES as COLOURS
 from slpi_ros.reports.page import Page, Severity, Share
-from slpi_ros.reports.text import nm
 
 FILES = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
@@ -76,7 +76,7 @@ def verification_limits(found: Verification) -> dict[str, str]:
             worst = axis.worst
             noisy = worst.rest.rms <= ABOVE_NOISE * worst.repeatability_rms
             model = "unproved" if axis.verdict == UNPROVED else "the noise of the record" if noisy else "the model"
-            limits[name] = f"{model}, {nm(worst.judged_error)} rms where {nm(worst.limit)} are allowed"
+            limits[name] = f"{model}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed"
         elif tracked:
             worst_path = max(tracked, key=lambda tracking: tracking.error.rms)
             if worst_path.error.rms > axis.worst.limit:
@@ -124,8 +124,8 @@ def _summary(name: str, axis: AxisVerification) -> str:
 def _why_unproved(record: RecordVerification) -> str:
     if record.rest.rms <= record.limit:
         return (
-            f"The initial state is unknown, which alone can be {nm(record.offset_uncertainty)}: begin a record at an "
-            "end of the voltage range, say the initial state with --start-memory, or judge --without-offset."
+            f"The initial state is unknown, which alone can be {length(record.offset_uncertainty)}: begin a record "
+            "at an end of the voltage range, say the initial state with --start-memory, or judge --without-offset."
         )
     return "The initial state is unknown for most of the record: begin it at an end of the voltage range."
 
@@ -134,9 +134,9 @@ def _error(record: RecordVerification) -> str:
     error = record.error
     limit = "" if record.absolute else ", for the rest"
     return (
-        f"measured - model is {nm(error.rms)} rms, {nm(error.maximum)} at most; of it constant "
-        f"{_um(record.constant)} µm, the rest {nm(record.rest.rms)} rms (limit {nm(record.limit)}{limit}; "
-        f"repeatability {nm(record.repeatability_rms)}); {_judged_share(record)}"
+        f"measured - model is {length(error.rms)} rms, {length(error.maximum)} at most; of it constant "
+        f"{_um(record.constant)} µm, the rest {length(record.rest.rms)} rms (limit {length(record.limit)}{limit}; "
+        f"repeatability {length(record.repeatability_rms)}); {_judged_share(record)}"
     )
 
 
@@ -158,9 +158,11 @@ def _notes(record: RecordVerification) -> list[str]:
     else:
         notes = [f"the initial state is known from {record.known_from:.4g} s on, but for a constant"]
     if not record.begins_known:
-        notes.append(f"the unknown initial state makes the constant uncertain by {nm(record.offset_uncertainty)}")
+        notes.append(f"the unknown initial state makes the constant uncertain by {length(record.offset_uncertainty)}")
     if record.moving and record.standing:
-        notes.append(f"while the voltage moves {nm(record.moving.rms)} rms, while it stands {nm(record.standing.rms)}")
+        notes.append(
+            f"while the voltage moves {length(record.moving.rms)} rms, while it stands {length(record.standing.rms)}"
+        )
     if record.corrected:
         notes.append(f"errors are those of the stage; taken out of the readings of its sensor: {record.corrected}")
     if record.zero_moved:
@@ -178,7 +180,7 @@ def _tracking_notes(tracking: Tracking) -> list[str]:
     told = sorted(tracking.shares.items(), key=lambda item: -item[1])
     shares = [f"{cause} {share:.0%}" for cause, share in told if abs(share) >= _SMALLEST_SHARE]
     notes = [
-        f"measured - desired is {nm(error.rms)} rms, {nm(error.maximum)} at most; shares of the mean square: "
+        f"measured - desired is {length(error.rms)} rms, {length(error.maximum)} at most; shares of the mean square: "
         f"{', '.join(shares) or 'nothing'}",
         f"largest contribution, {tracking.blame}: {CAUSES[tracking.blame]}",
     ]
@@ -190,16 +192,16 @@ def _tracking_notes(tracking: Tracking) -> list[str]:
 def _figures(axis: AxisVerification) -> dict[str, str]:
     worst = axis.worst
     figures = {
-        "measured - model, rms": nm(axis.overall.rms),
-        "at most": nm(axis.overall.maximum),
-        "without its constant part, rms": nm(axis.rest.rms),
-        f"limit of the {'rms' if worst.absolute else 'rms without the constant'}": nm(worst.limit),
-        "repeatability, rms": nm(worst.repeatability_rms),
+        "measured - model, rms": length(axis.overall.rms),
+        "at most": length(axis.overall.maximum),
+        "without its constant part, rms": length(axis.rest.rms),
+        f"limit of the {'rms' if worst.absolute else 'rms without the constant'}": length(worst.limit),
+        "repeatability, rms": length(worst.repeatability_rms),
         "samples judged": f"{min(record.share for record in axis.records):.0%}",
-        "held-out error of the model": nm(axis.resolution),
+        "held-out error of the model": length(axis.resolution),
     }
     tracked = [record.tracking.error.rms for record in axis.records if record.tracking]
-    return figures | ({"measured - desired, rms": nm(max(tracked))} if tracked else {})
+    return figures | ({"measured - desired, rms": length(max(tracked))} if tracked else {})
 
 
 def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[str]], None, str]:
@@ -221,7 +223,7 @@ def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence
     caption = (
         f"Measured - model, free-run. The limit holds for the {held_to}: the tolerance, else {TIMES_REPEATABILITY:g} "
         "times the repeatability, but at least 0.02 % of the stroke. Repeatability: "
-        f"{nm(axis.records[0].repeatability_rms)}, {axis.records[0].repeatability_source}."
+        f"{length(axis.records[0].repeatability_rms)}, {axis.records[0].repeatability_source}."
     )
     return header, rows, None, caption
 
@@ -241,7 +243,7 @@ def _parts_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[s
         ("", "samples", "rms (nm)", "times the repeatability", "maximum (nm)"),
         rows,
         0,
-        f"All records; but for the first row without the constant of each record; repeatability {nm(floor)}.",
+        f"All records; but for the first row without the constant of each record; repeatability {length(floor)}.",
     )
 
 

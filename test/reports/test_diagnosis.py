@@ -186,6 +186,6 @@ def test_each_record_has_its_row(tmp_path):
         RecordOutcome("second bag", 40e-9, 180e-9, 11.5e-9, None),
     )
     text = write(tmp_path, {"x": found(records=records)}).read_text(encoding="utf-8")
-    cells = ["first bag", "-0.93", "210.0 nm", "12.5 nm", "17.5 nm", "second bag", "+0.04", "180.0 nm", "11.5 nm", "-"]
+    cells = ["first bag", "-0.93", "210 nm", "12.5 nm", "17.5 nm", "second bag", "+0.04", "180 nm", "11.5 nm", "-"]
     rows = [f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in (cells[:5], cells[5:])]
     assert "".join(rows) in text

@@ -1,1 +1,1 @@
-"""Models of the eleven effects other than hysteresis; each implements the `Effect` protocol."""
+"""Models of the effects other than hysteresis; each implements the `Effect` protocol."""

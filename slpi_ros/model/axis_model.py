@@ -43,7 +43,7 @@ class Start:
     from_rest: bool = False  # never moved before `history`; False: a long fall, which erased the memory, led there
 
 
-# An error up to this multiple of the repeatability counts as noise.
+# An error up to this multiple of the sensor noise counts as noise.
 ABOVE_NOISE = 1.5
 # Best accuracy of a hysteresis model without noise, as a share of the displacement range.
 RESOLUTION = 2e-4

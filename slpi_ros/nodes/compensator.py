@@ -74,7 +74,7 @@ class Compensator(LifecycleNode):
 
     Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement``, ``stage_state`` and
     ``stage_model``, publishes ``voltage_command``, ``tracking_error`` and ``/diagnostics``, provides the services
-    ``~/reset_memory`` and ``~/arm``.
+    ``~/reset_memory``, ``~/set_zero`` and ``~/arm``.
     Message types, units and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
     """
 

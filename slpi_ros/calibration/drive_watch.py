@@ -42,7 +42,7 @@ ENDS = 0.2
 SAME, SAME_MOVE = 10, 0.05
 # Slopes relative to the known one: of a frozen reading, and of one whose sign has changed. Multiple of its standard
 # error by which a slope is known, and time (s) for which a slope shows a fault.
-FROZEN, FLIPPED, KNOWN_ERRORS, SUSPECT = 0.05, -0.25, 8.0, 0.1
+FROZEN, FLIPPED, KNOWN_ERRORS, PERSISTS = 0.05, -0.25, 8.0, 0.1
 # Smallest standard error of a slope that counts, m/V.
 TINY = 1e-18
 KEPT = 4096
@@ -67,8 +67,8 @@ class _Relation:
     readings: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=KEPT))
     outside: int = 0
     outside_since: float = 0.0
-    suspect: str = ""
-    suspect_since: float = 0.0
+    candidate: str = ""
+    candidate_since: float = 0.0
     judged: float = 0.0
 
     @property
@@ -145,7 +145,7 @@ class DriveWatch:
             amplifier.begin(v, self._now_ns)
         self._stamp_bad = self._same = 0
         for relation in self._relations:
-            relation.outside, relation.suspect = 0, ""
+            relation.outside, relation.candidate = 0, ""
             relation.readings.clear()
 
     def end(self) -> None:
@@ -327,23 +327,23 @@ class DriveWatch:
         if not relation.slope:
             self._learn_slope(axis, relation, t, v, y)
             return
-        suspect = ""
+        candidate = ""
         first = relation.window(v, t, (limits.lower, limits.upper), MOVE)
         if first >= 0:
             slope, error = _slope(v[first:], y[first:], np.sign(relation.slope))
             if slope < FLIPPED * abs(relation.slope) and slope < -4.0 * error:
-                suspect = "flipped"
+                candidate = "flipped"
         first = relation.window(v, t, inner, MOVE)
-        if not suspect and first >= 0:
+        if not candidate and first >= 0:
             slope, error = _slope(v[first:], y[first:], np.sign(relation.slope))
             if slope < FROZEN * abs(relation.slope) and error < 0.1 * abs(relation.slope):
-                suspect = "frozen"
-        if not suspect or suspect != relation.suspect:
-            relation.suspect, relation.suspect_since = suspect, self._now
-        if suspect and self._now - relation.suspect_since >= SUSPECT:
+                candidate = "frozen"
+        if not candidate or candidate != relation.candidate:
+            relation.candidate, relation.candidate_since = candidate, self._now
+        if candidate and self._now - relation.candidate_since >= PERSISTS:
             moved = f"{np.ptp(y[first:]) * 1e6:.3g} µm while the voltage moved by {np.ptp(v[first:]):.3g} V"
             known = f"{relation.slope * 1e6:.3g} µm/V before in this run"
-            if suspect == "frozen":
+            if candidate == "frozen":
                 self._found(f"axis '{axis}' does not follow any more: {moved}, {known}; check the sensor")
             else:
                 found = f"{slope * np.sign(relation.slope) * 1e6:.3g} µm/V"

@@ -10,7 +10,7 @@ from slpi_ros.compensator.amplifier import BAND_NS, Amplifier
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
 from slpi_ros.compensator.model_swap import continue_from, require_near, take_over, turning_voltages, voltage_history
 from slpi_ros.compensator.path_watch import PathWatch
-from slpi_ros.compensator.persistence import RESETTING, MemoryConfidence, Zero
+from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED, MemoryConfidence, SavedAxis, Zero
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
 from slpi_ros.compensator.statistics import TrackingStatistics
@@ -27,6 +27,8 @@ from slpi_ros.model.streaming import StreamingInverse
 FIT_SHARE, FIT_SIGMAS = 0.005, 4.0
 # The median of this many measurements of at most this age decides on the initial state.
 FIRST_READINGS, FIRST_AGE_NS = 5, SECOND_NS // 5
+# Decimals of saved distances (m).
+KEPT_DIGITS = 10
 # Most measurements for the offset of an axis.
 OFFSETS = 50
 # A hold begins after this many intervals between samples, and after times between these.
@@ -114,6 +116,15 @@ class Axis:
         """Voltages (V) of the remembered reversals, oldest first, followed by the present voltage."""
         turns = voltage_history(self._applied if self._feedback else self.stream)
         return turns if turns[-1] == self.voltage else (*turns, self.voltage)
+
+    def saved(self, now_ns: int) -> SavedAxis:
+        """Return what is to be kept over a restart."""
+        stream = self._applied if self._feedback else self.stream
+        relaxing = stream.relaxing(max((now_ns - self.given_ns) * 1e-9, 0.0))
+        # Rounded, so that a stage at rest is saved once.
+        rounded = {name: tuple(round(each, KEPT_DIGITS) for each in distances) for name, distances in relaxing.items()}
+        certain = self.confidence.state in (KNOWN, RESTORED)
+        return SavedAxis(self.reversal_voltages, certain, zero=self.zero, relaxing=rounded)
 
     @property
     def in_motion(self) -> bool:

@@ -152,9 +152,12 @@ class Controller:
         for axis in self.axes:
             one = model.axis(axis.name)
             try:
-                prepared.append((axis, one, axis.prepare(one, turns.get(axis.name), start_memory)))
+                stream = axis.prepare(one, turns.get(axis.name), start_memory)
             except SlpiError as error:
                 raise type(error)(f"axis '{axis.name}': {error}") from None
+            if saved:
+                stream.relax_from(saved[axis.name].relaxing, saved[axis.name].age)
+            prepared.append((axis, one, stream))
         for axis, one, stream in prepared:
             first = not axis.driven
             if first:

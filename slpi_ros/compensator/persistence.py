@@ -5,9 +5,10 @@ import json
 import os
 import stat
 import struct
+import time
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -133,6 +134,9 @@ class SavedAxis:
     certain: bool  # whether the memory was reset or restored when it was saved
     doubt: str = ""  # why the saved state may be incomplete; not written to the file
     zero: Zero = Zero()
+    # Distances (m) of slow effects from equilibrium, by their names, `age` (s) ago.
+    relaxing: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    age: float = field(default=0.0, compare=False)
 
     def confidence(self, identified: tuple[float, float]) -> MemoryConfidence:
         """Return the confidence in the restored memory for a model identified on the voltage range `identified` (V)."""
@@ -179,11 +183,13 @@ def save_memory(memory: SavedMemory, path: str | os.PathLike[str]) -> int:
         "schema": SCHEMA,
         "model": memory.model,
         "complete": memory.complete,
+        "saved_at_s": time.time(),
         "axes": {
             name: {
                 "went_through_V": list(axis.reversal_voltages),
                 "certain": axis.certain,
                 "zero": {"from": axis.zero.source, "offset_m": axis.zero.offset, "at": axis.zero.at},
+                "relaxing_m": axis.relaxing,
             }
             for name, axis in memory.axes.items()
         },
@@ -208,8 +214,15 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
         validate(document, "saved_memory", str(path))
     except RecursionError:
         raise ModelError(f"{path}: no saved memory: nested too deeply; it is ignored") from None
+    age = max(time.time() - document.get("saved_at_s", 0.0), 0.0)
     axes = {
-        name: SavedAxis(tuple(map(float, axis["went_through_V"])), axis["certain"], zero=_zero(axis.get("zero")))
+        name: SavedAxis(
+            tuple(map(float, axis["went_through_V"])),
+            axis["certain"],
+            zero=_zero(axis.get("zero")),
+            relaxing={effect: tuple(map(float, each)) for effect, each in axis.get("relaxing_m", {}).items()},
+            age=age,
+        )
         for name, axis in document["axes"].items()
     }
     if not document["complete"]:

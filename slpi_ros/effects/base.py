@@ -114,6 +114,13 @@ class Streaming(Protocol):
 class StreamingEffect(Streaming, Protocol):
     """Streaming evaluation of an effect on the voltage or on the displacement."""
 
+    @property
+    def relaxing(self) -> tuple[float, ...]:
+        """Distances from equilibrium (m) that outlast a restart of the process; of most effects none."""
+
+    def relax_from(self, distances: Sequence[float]) -> None:
+        """Continue from distances as `relaxing` returned them; others are ignored."""
+
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the input, or a stable approximation, for the output `wanted` after `dt` (s); keep the state."""
 
@@ -131,6 +138,14 @@ class StreamingAround(Streaming, Protocol):
 
 class StreamingBase:
     """What streaming effects do unless they say otherwise: they have no state."""
+
+    @property
+    def relaxing(self) -> tuple[float, ...]:
+        """Return nothing."""
+        return ()
+
+    def relax_from(self, distances: Sequence[float]) -> None:
+        """Do nothing."""
 
     def start(self, x: float) -> None:
         """Do nothing."""

@@ -259,6 +259,16 @@ class StreamingCreep(StreamingBase):
         """Replace the state by one returned by `snapshot`."""
         self._origin, self._input, *self._states = state
 
+    @property
+    def relaxing(self) -> tuple[float, ...]:
+        """Distances (m) of the relaxations from equilibrium."""
+        return tuple(state - self._input for state in self._states)
+
+    def relax_from(self, distances: Sequence[float]) -> None:
+        """Continue from distances (m) from equilibrium, one for each relaxation; others are ignored."""
+        if len(distances) == len(self._states):
+            self._states = [self._input + distance for distance in distances]
+
     def _crept(self) -> float:
         """Return the part of the creep (m) that is independent of the motion in the present step."""
         crept = self._before * self._input

@@ -168,7 +168,7 @@ def likely_starts(axis: AxisModel, v: float, *others: tuple[float, ...]) -> list
     # Their displacements are such that after a sweep over the whole range all are alike.
     if not axis.causal:
         return [axis.start]
-    low, high = axis.voltage_range
+    low, high = axis.hysteresis_range
     ends = np.array([min(low, v), max(high, v)])
     usual = histories(Samples(np.append(v, ends), np.zeros(3), np.ones(3, dtype=bool)))
     swept = axis.memory("start").forward_array(ends)[-1]
@@ -279,14 +279,14 @@ def starts_at_end(axis: AxisModel, v: float) -> list[Start]:
         return []
     ends = [low, high, v] if v >= high - near else [high, low, v]
     rest = [axis.start] if not axis.start.history and abs(axis.start.voltage - v) <= near else []
-    return [replace(axis.after(np.array(ends)), from_rest=False), *rest]
+    return [replace(axis.after(np.clip(ends, *axis.hysteresis_range)), from_rest=False), *rest]
 
 
 def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
     """Return possible hysteresis states at the voltage `v` (V), including the two extreme states."""
     if not axis.causal:
         return [axis.start, axis.start]
-    low, high = axis.voltage_range
+    low, high = axis.hysteresis_range
     ways = [[low, high, v], [high, low, v]]
     ways += [[low, high, v + share * (low - v), v] for share in LAST_MOVES[1:-1]]
     ways += [[high, low, v + share * (high - v), v] for share in LAST_MOVES[1:-1]]

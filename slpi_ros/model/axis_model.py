@@ -118,7 +118,7 @@ class AxisModel:
             case "end":
                 return self.end or self.start
             case "wiped":
-                limits = Limits(*self.voltage_range)
+                limits = Limits(*self.hysteresis_range)
                 return self.after(np.array(decaying_turns(limits, limits.clip(0.0), WIPING_CYCLES)), "end")
         raise UsageError(f"start_memory is '{start_memory}'; give one of {', '.join(START_MEMORIES)}")
 

@@ -319,6 +319,18 @@ class StreamingInverse:
             y = streaming.forward(0.0, y)
         self._follow(0.0)
 
+    def relaxing(self, seconds: float) -> dict[str, tuple[float, ...]]:
+        """Return the distances (m) of slow effects from equilibrium, `seconds` after the last sample."""
+        later = self.copy()
+        later.wait(seconds)
+        return {name: distances for name, effect in later._behind.items() if (distances := effect.relaxing)}
+
+    def relax_from(self, distances: Mapping[str, tuple[float, ...]], seconds: float) -> None:
+        """Continue from distances as of `relaxing`, after `seconds` at the present voltage."""
+        for name in distances.keys() & self._behind.keys():
+            self._behind[name].relax_from(distances[name])
+        self.wait(seconds)
+
     def copy(self) -> "StreamingInverse":
         """Return an independent copy in the same state."""
         other = copy(self)

@@ -23,7 +23,7 @@ from slpi_ros.compensator.amplifier import Calibration
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.path_watch import PathWatch
-from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis, model_id
+from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, model_id
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import ModelError, SlpiError, shown
 from slpi_ros.io.cdr import multiarray_header
@@ -733,10 +733,8 @@ class Compensator(LifecycleNode):
         controller = self._controller
         if not self._keeps_memory or controller.model is None:
             return
-        axes = {
-            axis.name: SavedAxis(axis.reversal_voltages, axis.confidence.state in (KNOWN, RESTORED), zero=axis.zero)
-            for axis in controller.axes
-        }
+        now_ns = time.monotonic_ns()
+        axes = {axis.name: axis.saved(now_ns) for axis in controller.axes}
         try:
             self._memory_file.save(controller.identified, axes, complete)
         except SlpiError as error:

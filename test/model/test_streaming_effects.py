@@ -303,3 +303,9 @@ def test_a_voltage_beyond_the_saturation_moves_nothing():
     one, other = (with_effects(Saturation(upper=80.0)).stream() for _ in range(2))
     assert one.drive(100.0, DT) == other.drive(80.0, DT)
     assert one.drive(50.0, DT) == other.drive(50.0, DT)
+
+
+def test_a_reset_goes_no_further_than_the_saturation():
+    wiped = with_effects(Saturation(upper=80.0)).initial("wiped")
+    assert wiped == replace(X, voltage_range=(X.voltage_range[0], 80.0)).initial("wiped")
+    assert abs(wiped.displacement - X.initial("wiped").displacement) > 1e-3 * SPAN

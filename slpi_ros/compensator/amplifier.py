@@ -8,6 +8,7 @@ from statistics import median
 import numpy as np
 
 from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.limits import volts
 
 # A start is the median of this many reports, to this many, of at most this age; of a slow driver, after this time, the
 # latest one.
@@ -223,9 +224,9 @@ class Amplifier:
             # So far from the start on, and little: motion will tell.
             return
         self._outside = 0
-        there = f"{low:.4g} V was output" if high - low < 1e-6 else f"{low:.4g} to {high:.4g} V were output"
+        there = f"{volts(low)} V was output" if high - low < 1e-6 else f"{volts(low)} to {volts(high)} V were output"
         self.foreign = (
-            f"stage_state reports {reported:.4g} V (effort), but {there}: somebody else moves the stage, its driver "
+            f"stage_state reports {volts(reported)} V (effort), but {there}: somebody else moves the stage, its driver "
             "limits the voltage, or the report is wrong; find out which, then call ~/arm"
         )
 

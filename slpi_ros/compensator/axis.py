@@ -18,7 +18,7 @@ from slpi_ros.compensator.validation import Stamps, implausible
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import START_MEMORIES, AxisModel, StartMemory
-from slpi_ros.model.limits import MAX_DT, PERIOD, Limits, RateLimiter
+from slpi_ros.model.limits import MAX_DT, PERIOD, Limits, RateLimiter, volts
 from slpi_ros.model.sensor import Sensed, StreamingSensor
 from slpi_ros.model.streaming import StreamingInverse
 
@@ -180,7 +180,7 @@ class Axis:
             state = self.confidence.state
             if state != RESETTING:
                 self.confidence = MemoryConfidence(
-                    doubt=f"moved to {voltage:.4g} V by something else since its memory was known"
+                    doubt=f"moved to {volts(voltage)} V by something else since its memory was known"
                 )
         if voltage != self.output.voltage:
             self.output.start(voltage)

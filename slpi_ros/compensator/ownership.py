@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from slpi_ros.compensator.amplifier import MUTE_NS, STEADY_NS
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.validation import NOT_ARMED, STARTING, RejectedError
+from slpi_ros.model.limits import volts
 
 # Start voltages: as reported, or else as saved or recorded; as reported only; as saved or recorded; or a number (V).
 AUTO, MEASURED, SAVED = "auto", "measured", "saved"
@@ -80,7 +81,7 @@ class Ownership:
             )
         return axis.voltage, (
             f"nobody reports the voltage of the amplifier (effort of stage_state); it is taken to be at "
-            f"{axis.voltage:.4g} V: check that before you send anything, or set start_voltage"
+            f"{volts(axis.voltage)} V: check that before you send anything, or set start_voltage"
         )
 
     def begin_output(self, now_ns: int) -> None:

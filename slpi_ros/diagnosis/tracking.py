@@ -8,6 +8,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import RecordError
+from slpi_ros.model.coverage import rates
 
 # A delay is accepted if it reduces the difference between model and desired displacement by this factor.
 BETTER = 1.1
@@ -16,15 +17,16 @@ FEWEST_AT_LIMIT = 3
 # Longest delay that is searched for, in seconds and as a share of the record, and number of steps of the search.
 LONGEST_DELAY, DELAY_SHARE, DELAY_STEPS = 0.5, 0.05, 200
 
+# What each part of a tracking error is, and what helps.
 CAUSES = {
-    "zero": "the zero of the sensor has moved since the model was identified",
-    "memory": "the compensator started from another memory than the stage had",
-    "limits": "the voltage was at a limit",
-    "delay": "the displacement follows the desired one later",
-    "command": "the voltages are not those of this model: rate limits, feedback, a reset or another model",
-    "effects": "the stage does what the model does not hold; `slpi diagnose` names it",
-    "model": "the model's hysteresis is not that of the stage",
-    "noise": "noise of the sensor",
+    "zero": "the zero has moved since the model was identified: ~/set_zero, or feedback",
+    "memory": "the stage was in another state than the compensator assumed: ~/reset_memory",
+    "limits": "the voltage was at a limit: a smaller path",
+    "delay": "the stage is late: send the path as a trajectory, with the delay in the model",
+    "rate": "loops wider or narrower than those of the model, the faster the more: slpi diagnose on faster records",
+    "command": "the voltages are not those of this model: slew limit, feedback, a reset or another model",
+    "model": "the hysteresis and what else the model does not hold: slpi diagnose, slpi refit",
+    "noise": "sensor noise and what does not repeat",
 }
 
 
@@ -54,10 +56,15 @@ class Tracking:
     error: ErrorPart
     shares: Mapping[str, float]  # of each of `CAUSES` in the mean square error; sum 1, negative: counteracts others
     delay: float  # s, of the displacement behind the desired one
-    effects: tuple[str, ...]  # identified by a diagnosis of the record
     t: FloatArray  # s, (N,)
     desired: FloatArray  # m, (N,)
-    parts: Mapping[str, FloatArray]  # m, (N,), of each cause, with noise and effects in "model"
+    parts: Mapping[str, FloatArray]  # m, (N,), of each cause, with noise in "model"
+
+    @property
+    def rms(self) -> dict[str, float]:
+        """Error (m rms) of each cause, the largest first; the squares add up to that of the whole."""
+        found = {cause: self.error.rms * float(np.sqrt(max(share, 0.0))) for cause, share in self.shares.items()}
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     @property
     def blame(self) -> str:
@@ -73,7 +80,6 @@ class Tracking:
             "shares": dict(self.shares),
             "blame": self.blame,
             "delay_s": self.delay,
-            "effects": list(self.effects),
         }
 
 
@@ -88,19 +94,18 @@ def track(
     *,
     zero: float,
     noise_rms: float,
-    effects: tuple[tuple[str, ...], float],
 ) -> Tracking:
     """Decompose the tracking error, measured `y` - `desired`, by cause; all signals of shape (N,), s, V and m.
 
     ``m`` is the model from the initial state of the record, `estimated`, ``a`` the one from the initial state that the
     compensator seems to have assumed, one of `assumed`, and ``d`` the desired displacement, NaN where there was none
-    (``d'``: delayed as the stage is)::
+    (``d'``: later)::
 
         y - d = (y - zero - m) + zero + (m - a) + (a - d') + (d' - d)
-                 model, noise           memory    command    delay
+                 model, rate, noise      memory   command   delay
 
-    `effects` are the names of a diagnosis, and the share of the model's part that they explain. RecordError, which
-    names record and axis `where`, if there is no desired displacement.
+    Of the first part, what goes with the rate of the model is a delay of the stage, or a rate dependence. RecordError,
+    which names record and axis `where`, if there is no desired displacement.
     """
     at = np.isfinite(desired) & np.isfinite(y)
     if np.count_nonzero(at) < 2:
@@ -111,26 +116,26 @@ def track(
     late = np.interp(t - delay, t, d)
     command = begun - late
     limited = _at_limit(v, command)
+    residual = y - zero - estimated
+    behind, stage_late, by_rate = _with_rate(t, estimated, residual)
     parts = {
         "zero": np.full(t.size, zero),
         "memory": estimated - begun,
         "limits": np.where(limited, command, 0.0),
-        "delay": late - d,
+        "delay": late - d + stage_late,
+        "rate": by_rate,
         "command": np.where(limited, 0.0, command),
-        "model": y - zero - estimated,
+        "model": residual - stage_late - by_rate,
     }
     error = y - d
     total = float(error @ error)
     shares = {cause: float(part @ error) / total if total else 0.0 for cause, part in parts.items()}
-    names, explained = effects
     noise = min(noise_rms**2 * error.size / total if total else 0.0, max(shares["model"], 0.0))
-    by_effects = explained * max(shares["model"] - noise, 0.0)
-    shares |= {"model": shares["model"] - noise - by_effects, "effects": by_effects, "noise": noise}
+    shares |= {"model": shares["model"] - noise, "noise": noise}
     return Tracking(
         error=ErrorPart.of(where[0], error),
         shares={cause: shares[cause] for cause in CAUSES},
-        delay=delay,
-        effects=names,
+        delay=delay + behind,
         t=t,
         desired=d,
         parts=parts,
@@ -144,6 +149,34 @@ def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
     misses = [rms(model - np.interp(t - shift, t, desired)) for shift in shifts.tolist()]
     best = int(np.argmin(misses))
     return float(shifts[best]) if misses[best] < misses[0] / BETTER else 0.0
+
+
+def _with_rate(t: FloatArray, model: FloatArray, residual: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Return the delay (s) of the stage behind the model, and the residual (m), (N,), of this and of a rate dependence.
+
+    A delay adds what is proportional to the rate, a rate dependence what goes with its logarithm. Zero unless clearly
+    better than loops that are wider at every rate, which are an error of the hysteresis.
+    """
+    none = np.zeros(t.size)
+    speed = rates(t, model)
+    moving = speed > 0.0
+    if not moving.any():
+        return 0.0, none, none
+    rate = speed * np.sign(np.gradient(model))
+    log_rate = np.sign(rate) * np.log1p(speed / np.median(speed[moving]))
+    columns = [np.ones(t.size), np.sign(rate), rate, log_rate]
+    fits = []
+    for chosen in ((0, 1), (0, 1, 2), (0, 1, 3), (0, 1, 2, 3)):
+        matrix = np.column_stack([columns[each] for each in chosen])
+        found = dict(zip(chosen, np.linalg.lstsq(matrix, residual, rcond=None)[0].tolist(), strict=True))
+        delayed, by_rate = (found.get(each, 0.0) * columns[each] for each in (2, 3))
+        fits.append((rms(residual - matrix @ np.array(list(found.values()))), found.get(2, 0.0), delayed, by_rate))
+    best = fits[0]
+    for fit in fits[1:]:
+        # A stage cannot be ahead of its model.
+        if fit[1] <= 0.0 and fit[0] < best[0] / BETTER:
+            best = fit
+    return -best[1], best[2], best[3]
 
 
 def _at_limit(v: FloatArray, command: FloatArray) -> Mask:

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
-from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.diagnosis.tracking import ErrorPart, Tracking, track
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
@@ -81,6 +80,11 @@ class RecordVerification:
     def share(self) -> float:
         """Share of the judged samples in all samples."""
         return self.error.samples / self.samples
+
+    @property
+    def unusable(self) -> float:
+        """Share of the readings that cannot be judged, whatever the initial state is."""
+        return 1.0 - float(np.count_nonzero(np.isfinite(self.measured))) / self.samples
 
     @property
     def judged_error(self) -> float:
@@ -286,7 +290,7 @@ def verify(
                 tracking = track(
                     (record.source, name), run.t, one.v, one.measured, followed,
                     one.model - run.explained, run.assumed, zero=one.offset if one.zero_moved else 0.0,
-                    noise_rms=one.repeatability_rms, effects=_effects(one, record, model, name),
+                    noise_rms=one.repeatability_rms,
                 )  # fmt: skip
                 one = replace(one, tracking=tracking)
             found[name].append(one)
@@ -512,15 +516,3 @@ def _summary(records: Sequence[RecordVerification], resolution: float) -> AxisVe
 def _thinned(record: RecordVerification, most: int) -> IntArray:
     at = np.flatnonzero(record.judged)
     return at[:: max(1, round(at.size / most))]
-
-
-def _effects(one: RecordVerification, record: Record, model: StageModel, name: str) -> tuple[tuple[str, ...], float]:
-    """Return the effects that a diagnosis identifies, and their share of the residual; none if the error is small."""
-    if one.rest.rms <= _default_limit(model.axis(name), one.repeatability_rms):
-        return (), 0.0
-    try:
-        found = diagnose(record, model, axes=[name]).axes[name].effects
-    except SlpiError:
-        # With too little data for a diagnosis, the contribution of the model is still known.
-        return (), 0.0
-    return tuple(effect.name for effect in found), min(sum(max(one.share_of_residual, 0.0) for one in found), 1.0)

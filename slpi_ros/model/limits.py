@@ -218,3 +218,8 @@ def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:
         share = left / cycles
         turns += [final + share * above, final + share * below]
     return [*(limits.clip(v) for v in turns), final]
+
+
+def volts(*voltages: float) -> str:
+    """Return voltages (V) as text, to 10 microvolts: what rounding leaves of 0 V is 0."""
+    return ", ".join(f"{round(v, 5) + 0.0:.6g}" for v in voltages)

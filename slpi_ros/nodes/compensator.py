@@ -29,6 +29,7 @@ from slpi_ros.errors import ModelError, SlpiError, shown
 from slpi_ros.io.cdr import multiarray_header
 from slpi_ros.io.messages import SECOND_NS, JointStates, decode_trajectory
 from slpi_ros.model.document import load_model
+from slpi_ros.model.limits import volts
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import (
     COMMANDS,
@@ -334,9 +335,9 @@ class Compensator(LifecycleNode):
         controller = self._controller
         was_armed = controller.ownership.armed
         why = controller.arm(time.monotonic_ns())
-        volts = ", ".join(f"{v:.6g}" for v in controller.voltages)
+        at = volts(*controller.voltages)
         response.success = not why
-        response.message = why or (f"already armed, at {volts} V" if was_armed else f"armed at {volts} V")
+        response.message = why or (f"already armed, at {at} V" if was_armed else f"armed at {at} V")
         if not was_armed:
             self.get_logger().info(f"~/arm: {response.message}")
             self._tell_doubts()
@@ -558,7 +559,7 @@ class Compensator(LifecycleNode):
             )
             self._report()
         if values["rearm"] and controller.rearm(now_ns):
-            self.get_logger().warning(f"rearmed at {', '.join(f'{v:.6g}' for v in controller.voltages)} V")
+            self.get_logger().warning(f"rearmed at {volts(*controller.voltages)} V")
             self._report()
         self._publish_tracking_errors()
 
@@ -681,7 +682,9 @@ class Compensator(LifecycleNode):
         if axis.confidence.doubt or not axis.start_memory:
             return axis.confidence.doubt or "as before activation"
         where = {"end": "at the end of the record", "start": "at the start of the record", "wiped": "as after a reset"}
-        text = f"starts {where[axis.start_memory]}, at {axis.stream.voltage:.6g} V (start_memory {axis.start_memory})"
+        text = (
+            f"starts {where[axis.start_memory]}, at {volts(axis.stream.voltage)} V (start_memory {axis.start_memory})"
+        )
         if axis.start_memory == "end" and axis.model and axis.model.end is None:
             text += "; the model holds no end, its start is used"
         return text
@@ -714,7 +717,7 @@ class Compensator(LifecycleNode):
 
     def _answer_reset(self) -> None:
         """Send the response of the service ``~/reset_memory`` with the result of the reset."""
-        axes, voltages = self._controller.axes, ", ".join(f"{v:.6g}" for v in self._controller.voltages)
+        axes, voltages = self._controller.axes, volts(*self._controller.voltages)
         doubts = [f"axis '{axis.name}': {axis.confidence.doubt}" for axis in axes if axis.confidence.state != KNOWN]
         if any(axis.confidence.doubt == INTERRUPTED for axis in axes):
             said = "interrupted; the memory is assumed"

@@ -16,7 +16,7 @@ from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite, slew_limits
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.limits import Limits
+from slpi_ros.model.limits import Limits, volts
 from slpi_ros.nodes.common import COMMANDS, request_stop
 from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
@@ -331,8 +331,8 @@ class Exciter(Node):
             request_stop()
         elif now - self._begun > REPORT_PATIENCE:
             self.get_logger().warning(
-                f"stage_state reports {', '.join(f'{v:.6g}' for v in reported)} V, {REPORT_PATIENCE:g} s after the "
-                f"end at {', '.join(f'{v:.6g}' for v in self._rest)} V; a record that ends now does not hold the end"
+                f"stage_state reports {volts(*reported)} V, {REPORT_PATIENCE:g} s after the "
+                f"end at {volts(*self._rest)} V; a record that ends now does not hold the end"
             )
             request_stop()
 

@@ -9,6 +9,7 @@ from slpi_ros.diagnosis.tracking import CAUSES, ErrorPart, Tracking
 from slpi_ros.diagnosis.verify import (
     FAILED,
     FEW,
+    LEAST,
     MOST_KNOWN,
     PASSED,
     TIMES_REPEATABILITY,
@@ -36,14 +37,18 @@ from slpi_ros.reports.chart import (
     thin_line,
 )
 from slpi_ros.reports.chart import CAUSES as COLOURS
-from slpi_ros.reports.page import Page, Severity, Share
+from slpi_ros.reports.page import Page, Severity
 
 FILES = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
 COLOUR = {**dict(zip(CAUSES, (*COLOURS, AFTER), strict=False)), "model": BEFORE, "noise": NOISE}
 SEVERITY: dict[str, Severity] = {PASSED: "good", UNPROVED: "warn", FAILED: "bad"}
-# Smaller shares of the tracking error are not reported.
-_SMALLEST_SHARE = 0.01
+# Names of the parts of a tracking error; smaller ones than this share of its rms are not told.
+PARTS = {
+    "zero": "zero", "memory": "initial state", "limits": "voltage limits", "delay": "delay", "rate": "rate dependence",
+    "command": "other voltages than the model's", "model": "hysteresis", "noise": "sensor noise",
+}  # fmt: skip
+_SMALLEST_PART = 0.1
 
 
 def write_files(folder: Path, found: Verification) -> None:
@@ -80,7 +85,7 @@ def verification_limits(found: Verification) -> dict[str, str]:
         elif tracked:
             worst_path = max(tracked, key=lambda tracking: tracking.error.rms)
             if worst_path.error.rms > axis.worst.limit:
-                limits[name] = f"{worst_path.blame}, as the largest part of the tracking error"
+                limits[name] = f"the path, {length(worst_path.error.rms)} rms, most by {PARTS[worst_path.blame]}"
     return limits
 
 
@@ -122,7 +127,10 @@ def _summary(name: str, axis: AxisVerification) -> str:
 
 
 def _why_unproved(record: RecordVerification) -> str:
-    if record.rest.rms <= record.limit:
+    """Return why nothing is proved: readings that are no use, or the initial state, and what to do."""
+    if record.unusable >= 1.0 - LEAST:
+        return "Too few readings are left: check the sensor and its link, 'slpi doctor' tells what is wrong with them."
+    if record.share >= LEAST:
         return (
             f"The initial state is unknown, which alone can be {length(record.offset_uncertainty)}: begin a record "
             "at an end of the voltage range, say the initial state with --start-memory, or judge --without-offset."
@@ -145,7 +153,12 @@ def _judged_share(record: RecordVerification) -> str:
     said = f"{record.error.samples:,} of {record.samples:,} samples judged ({record.share:.0%})"
     if record.share >= MOST_KNOWN:
         return said
-    why = "" if record.known_from is None else f", as the initial state is unknown before {record.known_from:.4g} s"
+    if record.unusable > (1.0 - record.share) / 2:
+        why = f", as {record.unusable:.0%} of the readings are missing, stuck, late or outliers"
+    elif record.known_from is not None:
+        why = f", as the initial state is unknown before {record.known_from:.4g} s"
+    else:
+        why = ""
     return f"{'WARNING: only ' if record.share < FEW else ''}{said}{why}"
 
 
@@ -175,18 +188,24 @@ def _notes(record: RecordVerification) -> list[str]:
 
 
 def _tracking_notes(tracking: Tracking) -> list[str]:
-    """Return the tracking error of a compensated path and its causes."""
-    error = tracking.error
-    told = sorted(tracking.shares.items(), key=lambda item: -item[1])
-    shares = [f"{cause} {share:.0%}" for cause, share in told if abs(share) >= _SMALLEST_SHARE]
-    notes = [
-        f"measured - desired is {length(error.rms)} rms, {length(error.maximum)} at most; shares of the mean square: "
-        f"{', '.join(shares) or 'nothing'}",
-        f"largest contribution, {tracking.blame}: {CAUSES[tracking.blame]}",
+    """Return the tracking error of a compensated path, what it consists of, and what helps against the largest part."""
+    error, parts = tracking.error, tracking.rms
+    late = f" ({tracking.delay * 1e3:.3g} ms)" if tracking.delay else ""
+    told = [
+        f"{PARTS[cause]} {length(part)}{late if cause == 'delay' else ''}"
+        for cause, part in parts.items()
+        if _told(part, error)
     ]
-    notes += [f"the displacement lags by {tracking.delay * 1e3:.3g} ms"] if tracking.delay else []
-    notes += [f"effects: {', '.join(tracking.effects)}"] if tracking.effects else []
-    return notes
+    return [
+        f"path: measured - desired is {length(error.rms)} rms, {length(error.maximum)} at most; "
+        f"of it {', '.join(told)}",
+        f"path, largest part: {CAUSES[tracking.blame]}",
+    ]
+
+
+def _told(part: float, error: ErrorPart) -> bool:
+    """Return whether a part (m rms) of a tracking error is large enough to be told."""
+    return part > _SMALLEST_PART * error.rms
 
 
 def _figures(axis: AxisVerification) -> dict[str, str]:
@@ -258,11 +277,13 @@ def _show_record(page: Page, name: str, record: RecordVerification) -> None:
 def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
     """Add the causes of the error along a compensated path."""
     page.subsection("Measured - desired displacement")
-    shares = {cause: share for cause, share in tracking.shares.items() if share >= _SMALLEST_SHARE}
-    whole = sum(shares.values())
-    page.shares([Share(cause, share / whole, COLOUR[cause]) for cause, share in shares.items()])
-    page.definitions({cause: CAUSES[cause] for cause in shares})
-    page.lines(_tracking_notes(tracking))
+    told = {cause: part for cause, part in tracking.rms.items() if _told(part, tracking.error)}
+    page.lines(_tracking_notes(tracking)[:1])
+    page.table(
+        ("part of the error", "rms (nm)", "what it is, and what helps"),
+        [(PARTS[cause], f"{part * 1e9:.1f}", CAUSES[cause]) for cause, part in told.items()],
+        caption="Rms by which each part enters the whole; of parts that cancel, the smaller one is left out.",
+    )
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)
     error = np.sum(list(tracking.parts.values()), axis=0)
     t, desired = tracking.t, tracking.desired

@@ -197,7 +197,8 @@ NAMING_EFFECTS = {"effects", "simulation"}
 NAMED_ELSEWHERE = {
     "model/sensor.py": ({"delay", "lag"}, "the known timing of a sensor is the physics of these two"),
     "identification/record_quality.py": ({"creep", "delay", "lag"}, "what a drive lacks, in words"),
-    "diagnosis/tracking.py": ({"delay"}, "a cause of a tracking error"),
+    "diagnosis/tracking.py": ({"delay"}, "a part of a tracking error"),
+    "reports/verification.py": ({"delay"}, "the same, in words"),
 }
 
 

@@ -19,6 +19,7 @@ from benchmarks.hidden import hide
 from slpi_ros.cli import main
 from slpi_ros.diagnosis.result import AMBIGUOUS, AxisDiagnosis, Diagnosis, NamedEffect, RecordOutcome, Traces
 from slpi_ros.effects.lag import Lag
+from slpi_ros.errors import length
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
 
@@ -363,7 +364,7 @@ def test_the_page_of_an_identification_tells_errors_left_out_and_findings_of_the
     found = next(line for line in said.splitlines() if " samples in " in line).removeprefix("axis x: ok   ")
     assert code == 0 and found in page
     held_out = slpi_ros.load_model(tmp_path / "m.json").axes["x"].quality.held_out_rms
-    assert f"{held_out * 1e9:.1f} nm" in said and f"{held_out * 1e9:.1f} nm" in page
+    assert length(held_out) in said and length(held_out) in page
 
 
 def test_a_report_that_cannot_be_written_is_told_before_the_fit(slpi, folder, tmp_path, monkeypatch):

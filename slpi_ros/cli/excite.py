@@ -33,7 +33,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "--for-path", metavar="PATH",
         help="desired path whose range, rates and turns the record must cover: a table, as for slpi compensate, or a "
-        "bag with desired_trajectory or desired_displacement",
+        "bag with desired_trajectory or desired_displacement; default: none",
     )  # fmt: skip
     command.add_argument(
         "--model", metavar="MODEL.json",

@@ -133,7 +133,7 @@ class Answers:
         verdict, advice = ("ambiguous", advice) if alone else ("named", None)
         no = np.zeros(0)
         traces = Traces(no, no, no, no, no)
-        found = AxisDiagnosis(verdict, "", 1e-9, "", 1e-8, 1e-8, 6e-9, (effect,), advice, traces)
+        found = AxisDiagnosis(verdict, "", 1e-9, 1e-9, "", 1e-8, 1e-8, 6e-9, (effect,), advice, traces)
         # An effect that adds nothing to speak of.
         with_effect = {axis: replace(own, effects=(Creep((1.0,), (1e-9,)),)) for axis, own in model.axes.items()}
         return Diagnosis(dict.fromkeys(axes, found), model if alone else replace(model, axes=with_effect))

@@ -97,6 +97,6 @@ def test_a_reset_within_narrow_limits_says_that_it_knows_no_more(kept):
         client.ask(["x"], [3e-6])
         answer = client.graph.call(Trigger, f"{client.name}/reset_memory", Trigger.Request())
         assert not answer.success and "memory assumed" in answer.message and "\n" not in answer.message
-        assert "axis 'x': wiped from 20 to 40 V only" in answer.message and "0 to 100 V" in answer.message
+        assert "axis 'x': reset from 20 to 40 V only" in answer.message and "0 to 100 V" in answer.message
         status, values = client.report("the end", **{"state": "active", "memory": "assumed"})
-        client.graph.wait_for_status(f"{client.name}: compensator", lambda s: "wiped from 20 to 40" in s.message, "why")
+        client.graph.wait_for_status(f"{client.name}: compensator", lambda s: "reset from 20 to 40" in s.message, "why")

@@ -46,7 +46,7 @@ def test_without_a_driver_the_command_fails(capsys):
     said = capsys.readouterr()
     document = json.loads(said.out)
     assert code == 1 and not document["well"] and not said.err
-    assert any(check["level"] == "mend" and "/nowhere/stage_state" in check["text"] for check in document["checks"])
+    assert any(check["level"] == "failed" and "/nowhere/stage_state" in check["text"] for check in document["checks"])
 
 
 def test_a_name_that_ros_refuses_is_wrong_usage(capsys):

@@ -48,7 +48,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No verdict depends on the clock. CI draws the same examples every time; `make test-long` draws more of them.
 CI = bool(os.environ.get("CI"))
-EXAMPLES = int(os.environ.get("SLPI_EXAMPLES", "50"))
+EXAMPLES = int(os.environ.get("SLPI_EXAMPLES", "25"))
 hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize=CI, max_examples=EXAMPLES)
 hypothesis.settings.load_profile("slpi_ros")
 

@@ -1,8 +1,6 @@
-"""Uncertainty of a model's curves by a wild block bootstrap.
-
-Each resample changes the sign of whole blocks of errors at random, since neighbouring errors are correlated, and keeps
-all samples, as some parts occur only once in a record. The errors are held-out errors: those of a fit are too small.
-"""
+"""Uncertainty of a model's curves by a wild block bootstrap of the held-out errors; those of a fit are too small."""
+# Each resample changes the sign of whole blocks of errors at random, since neighbouring errors are correlated, and
+# keeps all samples, as some parts occur only once in a record.
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,8 +1,5 @@
-"""What the output of a command (``-o``) may replace: what slpi wrote before, and anything else only when asked to.
-
-Each check is made before the computation, so that a refusal costs no time. It returns remarks on what will be replaced
-although slpi did not write it. No check lets an output into a recording.
-"""
+"""What the output of a command (``-o``) may replace: what slpi wrote before, and anything else only when asked to."""
+# Each check is made before the computation, so that a refusal costs no time. No check lets an output into a recording.
 
 import os
 import re

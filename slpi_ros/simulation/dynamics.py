@@ -11,11 +11,9 @@ SHORTEST_STEP = 1e-12
 
 
 class Relaxation:
-    """First-order elements with a common input and individual time constants, ``tau_j dz_j/dt = u - z_j``.
+    """First-order elements with one input and time constants (s, (n,)), ``tau_j dz_j/dt = u - z_j``."""
 
-    The update is exact for steps of any length if the input is linear between samples (first-order hold).
-    `time_constants`, shape (n,), are in seconds and more than 0.
-    """
+    # The update is exact for steps of any length if the input is linear between samples (first-order hold).
 
     def __init__(self, time_constants: FloatArray) -> None:
         self._rate = 1.0 / time_constants
@@ -27,10 +25,8 @@ class Relaxation:
         self._state: FloatArray = np.zeros_like(self._rate)
 
     def step(self, duration: float, value: float) -> FloatArray:
-        """Advance by `duration` (s) with the input changing linearly to `value`; return the elements, shape (n,).
-
-        In less than `SHORTEST_STEP` the input jumps, and the elements are unchanged.
-        """
+        """Advance by `duration` (s) with the input changing linearly to `value`; return the elements, shape (n,)."""
+        # In less than `SHORTEST_STEP` the input jumps, and the elements are unchanged.
         if duration >= SHORTEST_STEP:
             x = duration * self._rate
             left = self._state - self._input
@@ -40,12 +36,10 @@ class Relaxation:
 
 
 class FlexureMode:
-    """A second-order mode, ``d2x/dt2 + 2 z w dx/dt + w^2 x = w^2 u``, with a static gain of 1.
+    """A second-order mode, ``d2x/dt2 + 2 z w dx/dt + w^2 x = w^2 u``, with ``w`` in rad/s and damping ``z``."""
 
-    The update is exact for steps of any length if the input is linear between samples (first-order hold): the response
-    to the ramp in steady state is known, and the deviation decays by the closed-form matrix exponential. `frequency`
-    (Hz) is ``w / 2 pi``, undamped; `damping` is the ratio ``z``, from 0 to below 1.
-    """
+    # The update is exact for steps of any length if the input is linear between samples (first-order hold): the
+    # response to the ramp in steady state is known, and the deviation decays by the closed-form matrix exponential.
 
     def __init__(self, frequency: float, damping: float) -> None:
         self._omega = 2 * math.pi * frequency
@@ -57,10 +51,7 @@ class FlexureMode:
         self._input = self._position = self._velocity = 0.0
 
     def step(self, duration: float, value: float) -> float:
-        """Advance by `duration` (s) with the input changing linearly to `value` (m); return the position (m).
-
-        In less than `SHORTEST_STEP` the input jumps, and the position is unchanged.
-        """
+        """Advance by `duration` (s) with the input changing linearly to `value` (m); return the position (m)."""
         if duration >= SHORTEST_STEP:
             slope = (value - self._input) / duration
             lag = 2 * self._damping * slope / self._omega
@@ -85,14 +76,11 @@ _ELEMENTS_PER_DECADE = 2
 
 
 class Creep:
-    """Logarithmic creep: parallel relaxations with logarithmically spaced time constants.
+    """Logarithmic creep, ``y = h + sum_j g_j z_j`` with ``tau_j dz_j/dt = h - z_j``, exact if ``h`` is linear."""
 
-    The displacement is ``y = h + sum_j g_j z_j`` with ``tau_j dz_j/dt = h - z_j``, exact if ``h`` is linear between
-    samples. All ``g_j`` (`gains`, shape (n,)) are equal, so that after a step of ``h`` the displacement grows by `gain`
-    times the step per decade of time between the time constants `shortest` and `longest` (s), after which the creep is
-    complete. `time_constants` (s, shape (n,)) are at least two per decade. Under a periodic input the peaks fall as
-    ``f^b``, with ``b`` near ``-gain / ln 10``.
-    """
+    # All ``g_j`` are equal, so that after a step of ``h`` the displacement grows by `gain` times the step per decade of
+    # time between the time constants `shortest` and `longest` (s). Under a periodic input the peaks fall as ``f^b``,
+    # with ``b`` near ``-gain / ln 10``.
 
     def __init__(self, gain: float, shortest: float, longest: float) -> None:
         decades = math.log10(longest / shortest)

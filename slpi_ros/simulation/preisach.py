@@ -68,10 +68,8 @@ class PowerLawMaterial:
         self._half_cell = (parameters.threshold_max - parameters.threshold_min) / parameters.levels / 2
 
     def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
-        """Return relay weights, integrated over cells with mean and distance (V) of the thresholds at the centre.
-
-        The density at the centre of a cell is inaccurate close to the origin, which determines small loops.
-        """
+        """Return relay weights, integrated over cells with mean and distance (V) of the thresholds at the centre."""
+        # The density at the centre of a cell is inaccurate close to the origin, which determines small loops.
         up, down = bias + width / 2, bias - width / 2
         up_low, up_high = up - self._half_cell, up + self._half_cell
         down_low, down_high = down - self._half_cell, down + self._half_cell
@@ -105,21 +103,13 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 class RelayTriangle:
-    """A weighted sum of relays that switch up at one threshold and down at a lower one.
+    """A weighted sum of relays that switch up at one threshold and down at a lower one (Mayergoyz, Eq. (1.1))."""
 
-    Row ``i`` and column ``j <= i`` of the state matrix hold a group of relays with up-thresholds uniformly distributed
-    from ``low + i h`` to ``low + (i + 1) h`` and down-thresholds ``(i - j) h`` below; the state is the share of the
-    group that is up. With discrete thresholds, the level spacing ``h`` would produce steps of tens of nanometres.
-
-    `low` and `high` (V) are the range of the thresholds and of the accepted voltages. ``density(bias, width)``, called
-    once with arrays of shape (levels, levels), returns the weights, in arbitrary units, of relays whose thresholds have
-    the mean ``bias`` (V) and the distance ``width`` (V). `output` is the weighted sum of the states, in the unit of
-    `density`; `voltage` (V) is that of the last step.
-
-    References
-    ----------
-    I. D. Mayergoyz, Mathematical Models of Hysteresis, Springer 1991, Eq. (1.1).
-    """
+    # Row ``i`` and column ``j <= i`` of the state matrix hold a group of relays with up-thresholds uniformly
+    # distributed from ``low + i h`` to ``low + (i + 1) h`` and down-thresholds ``(i - j) h`` below; the state is the
+    # share of the group that is up. With discrete thresholds, the level spacing ``h`` (V) would produce steps of tens
+    # of nanometres. ``density(bias, width)`` returns the weights of relays by mean and distance (V) of their
+    # thresholds, (levels, levels).
 
     def __init__(self, low: float, high: float, levels: int, density: Density) -> None:
         self._low, self._high = low, high
@@ -154,10 +144,7 @@ class RelayTriangle:
             raise UsageError(f"stage: {voltage} V is not within {self._low} to {self._high} V; clip it")
 
     def step(self, voltage: float) -> float:
-        """Apply a voltage (V); return the weighted sum of the states, in the unit of the density.
-
-        UsageError if the voltage is not a number within the threshold range.
-        """
+        """Apply a voltage (V); return the weighted sum of the states, in the unit of the density."""
         self.check(voltage)
         position = (voltage - self._low) / self._spacing
         if position > self._position:
@@ -187,17 +174,13 @@ class RelayTriangle:
 
 @dataclass(frozen=True)
 class LoopFigure:
-    """Displacements (m) that characterise a closed major loop.
+    """Displacements (m) that characterise a closed major loop."""
 
-    `start` is at the lower voltage before the first rise, `bottom` and `top` at the lower and the upper voltage of the
-    closed loop, `rising_middle` and `falling_middle` at the middle voltage on its rising and its falling branch.
-    """
-
-    start: float
-    bottom: float
-    top: float
-    rising_middle: float
-    falling_middle: float
+    start: float  # at the lower voltage before the first rise
+    bottom: float  # at the lower voltage
+    top: float  # at the upper voltage
+    rising_middle: float  # at the middle voltage
+    falling_middle: float  # at the middle voltage
 
     @property
     def stroke(self) -> float:
@@ -216,10 +199,7 @@ class LoopFigure:
 
 
 def measure_loop(respond: Callable[[float], float], low: float, high: float) -> LoopFigure:
-    """Drive two major loops from `low` to `high` (V); return the values of the second, which is closed.
-
-    `respond` maps a voltage (V) to the displacement (m), starting at rest at `low` or below.
-    """
+    """Drive two major loops from `low` to `high` (V) from rest; return the values of the second, closed one."""
     middle = (low + high) / 2
     start, _, bottom = respond(low), respond(high), respond(low)
     rising_middle, top, falling_middle = respond(middle), respond(high), respond(middle)

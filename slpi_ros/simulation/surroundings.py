@@ -23,17 +23,14 @@ class Hum:
 
 @dataclass(frozen=True)
 class Interferometer:
-    """An interferometer with imperfect quadrature signals.
+    """An interferometer with imperfect quadrature signals."""
 
-    `period` (m) is the displacement per fringe: half or a quarter of the wavelength. The first harmonic of the error is
-    ``amplitude sin(2 pi y / period + phase)``, with `amplitude` (m) less than ``period / 2 pi`` and `phase` (rad). With
-    the `form` ``offsets``, an uncorrected offset of both signals, the error has further harmonics; with ``sine`` it has
-    none.
-    """
+    # The first harmonic of the error is ``amplitude sin(2 pi y / period + phase)``. With the form ``offsets``, an
+    # uncorrected offset of both signals, it has further harmonics.
 
-    period: float
-    amplitude: float
-    phase: float = 0.0
+    period: float  # m, half or a quarter of the wavelength
+    amplitude: float  # m, less than ``period / 2 pi``
+    phase: float = 0.0  # rad
     form: Literal["offsets", "sine"] = "sine"
 
     def read(self, y: FloatArray) -> FloatArray:

@@ -40,6 +40,7 @@ def test_thermally_activated_relays_are_the_rate_law_on_a_record_of_another_spee
     assert error(diagnosis.extended, other) < 0.5 * error(model, other)
 
 
+@pytest.mark.long
 def test_a_duhem_stage_is_unexplained_and_not_extended():
     model, diagnosis = diagnosed(DuhemStage())
     found = diagnosis.axes["x"]

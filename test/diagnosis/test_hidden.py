@@ -53,6 +53,7 @@ def test_nothing_is_found_where_nothing_is(tmp_path):
     assert [axis.verdict for axis in found.axes.values()] == ["nothing_found"] * len(found.axes)
 
 
+@pytest.mark.long
 def test_loops_that_do_not_close_have_no_invented_cause(tmp_path):
     found = diagnosed(hide(2, base="bouc_wen", axes=1, samples=SAMPLES), tmp_path).axes["x"]
     assert found.verdict == "unexplained" and not found.effects
@@ -122,6 +123,7 @@ def test_a_size_that_cannot_be(monkeypatch):
         hide(0, ["sensor_periodic"], size=1000.0, samples=2_000)
 
 
+@pytest.mark.long
 def test_a_coercivity_that_grows_with_the_rate_is_found(tmp_path):
     """A play whose width follows a filtered rate is not the rate law, but near enough to be named and mostly undone."""
     hidden = hide(COERCIVE, ["rate_dependence"], size=LARGE, samples=SAMPLES)

@@ -121,6 +121,7 @@ def test_the_tracking_error_is_that_of_the_stage(first, prompt):
     assert tracking_error(Recording(record, {"x": y}), "x", prompt, 1e-8).rms > 1.3e-8
 
 
+@pytest.mark.long
 def test_refit_takes_the_sensor_out_of_the_new_record(other, known):
     t, v, x = other
     new, changes = slpi_ros.refit(known, record_of(t, v, said(t, x, seed=5)))

@@ -97,7 +97,7 @@ def without(smooth: bool) -> dict[str, np.ndarray]:
     return achieved(identified()[0], {name: stage(place) for place, name in enumerate(AXES)}, False, smooth)
 
 
-@pytest.mark.parametrize("smooth", [True, False], ids=["smooth", "corners"])
+@pytest.mark.parametrize("smooth", [pytest.param(True, marks=pytest.mark.long), False], ids=["smooth", "corners"])
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_known_is_compensated(case, smooth):
     effects, physical = CASES[case]

@@ -114,6 +114,7 @@ def test_a_moved_zero_is_no_change_of_the_loops(model):
     assert axis.records[0].offset == pytest.approx(-0.6e-6, rel=0.2)
 
 
+@pytest.mark.long
 def test_a_delay_at_one_speed_stays_open_and_out_of_the_model():
     one = record(1.5, late=0.04, seed=8)
     model = slpi_ros.identify(one)

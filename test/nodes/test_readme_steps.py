@@ -30,8 +30,9 @@ def test_the_page_has_each_step_once():
         assert sum(command.startswith(words) for command in readme_commands()) == 1
 
 
+@pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.parametrize("days", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.parametrize("days", [1, 2])
 def test_readme_leads_to_the_set_points_and_so_does_a_restart_on_the_next_day(user, days):
     model, errors, warnings = as_written(user, seed=2)
     assert model.hardware_id == "simulated-2"

@@ -19,7 +19,7 @@ LONGEST_DELAY, DELAY_SHARE, DELAY_STEPS = 0.5, 0.05, 200
 
 # What each part of a tracking error is, and what helps.
 CAUSES = {
-    "zero": "the zero has moved since the model was identified: ~/set_zero, or feedback",
+    "zero": "the zero has moved since the model was identified, or the path counts from another one: ~/set_zero",
     "memory": "the stage was in another state than the compensator assumed: ~/reset_memory",
     "limits": "the voltage was at a limit: a smaller path",
     "delay": "the stage is late: send the path as a trajectory, with the delay in the model",
@@ -65,6 +65,11 @@ class Tracking:
         """Error (m rms) of each cause, the largest first; the squares add up to that of the whole."""
         found = {cause: self.error.rms * float(np.sqrt(max(share, 0.0))) for cause, share in self.shares.items()}
         return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    @property
+    def rest_rms(self) -> float:
+        """Error without its part by the zero, m rms."""
+        return self.error.rms * float(np.sqrt(max(1.0 - self.shares["zero"], 0.0)))
 
     @property
     def blame(self) -> str:
@@ -116,20 +121,28 @@ def track(
     late = np.interp(t - delay, t, d)
     command = begun - late
     limited = _at_limit(v, command)
+    # Voltages for displacements that count from another zero, or feedback that takes a zero out.
+    shift = float(np.median(command))
+    shift = 0.0 if limited.any() or abs(shift) < float(np.std(command)) else shift
+    command = command - shift
     residual = y - zero - estimated
     behind, stage_late, by_rate = _with_rate(t, estimated, residual)
+    model = residual - stage_late - by_rate
+    # The median of the residual is zero, which is not that of the loops where the stage is late.
+    median = float(np.median(model) - np.median(residual))
     parts = {
-        "zero": np.full(t.size, zero),
+        "zero": np.full(t.size, zero + shift + median),
         "memory": estimated - begun,
         "limits": np.where(limited, command, 0.0),
         "delay": late - d + stage_late,
         "rate": by_rate,
         "command": np.where(limited, 0.0, command),
-        "model": residual - stage_late - by_rate,
+        "model": model - median,
     }
     error = y - d
-    total = float(error @ error)
-    shares = {cause: float(part @ error) / total if total else 0.0 for cause, part in parts.items()}
+    total, rest = float(error @ error), error - parts["zero"]
+    shares = {cause: float(part @ rest) / total if total else 0.0 for cause, part in parts.items()}
+    shares["zero"] = 1.0 - float(rest @ rest) / total if total else 0.0
     noise = min(noise_rms**2 * error.size / total if total else 0.0, max(shares["model"], 0.0))
     shares |= {"model": shares["model"] - noise, "noise": noise}
     return Tracking(
@@ -146,7 +159,7 @@ def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
     """Return the delay (s) of the model behind the desired displacement; 0 if no delay is clearly better."""
     longest = min(LONGEST_DELAY, DELAY_SHARE * float(t[-1] - t[0]))
     shifts = np.linspace(0.0, longest, DELAY_STEPS + 1)
-    misses = [rms(model - np.interp(t - shift, t, desired)) for shift in shifts.tolist()]
+    misses = [float(np.std(model - np.interp(t - shift, t, desired))) for shift in shifts.tolist()]
     best = int(np.argmin(misses))
     return float(shifts[best]) if misses[best] < misses[0] / BETTER else 0.0
 

@@ -287,9 +287,12 @@ def verify(
             one = _judge(run, axis, record.source, tolerance, without_offset=without_offset)
             if path is not None and name in path:
                 followed = path[name][np.isfinite(record.voltage[name])][: run.t.size]
+                # From a known state nothing but the zero adds a constant.
+                moved = one.offset if one.zero_moved else 0.0
+                zero, explained = (one.constant,) * 2 if one.begins_known else (moved, run.explained)
                 tracking = track(
                     (record.source, name), run.t, one.v, one.measured, followed,
-                    one.model - run.explained, run.assumed, zero=one.offset if one.zero_moved else 0.0,
+                    one.model - explained, run.assumed, zero=zero,
                     noise_rms=one.repeatability_rms,
                 )  # fmt: skip
                 one = replace(one, tracking=tracking)

@@ -43,7 +43,8 @@ FILES = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
 COLOUR = {**dict(zip(CAUSES, (*COLOURS, AFTER), strict=False)), "model": BEFORE, "noise": NOISE}
 SEVERITY: dict[str, Severity] = {PASSED: "good", UNPROVED: "warn", FAILED: "bad"}
-# Names of the parts of a tracking error; smaller ones than this share of its rms are not told.
+# Names of the parts of a tracking error; smaller ones than this share of the rms without the zero are
+# not told.
 PARTS = {
     "zero": "zero", "memory": "initial state", "limits": "voltage limits", "delay": "delay", "rate": "rate dependence",
     "command": "other voltages than the model's", "model": "hysteresis", "noise": "sensor noise",
@@ -103,9 +104,8 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
         told = [f"{axis.verdict}: " + _summary(name, axis).removeprefix(f"Axis {name}: ")]
         for record in axis.records:
             error = [_error(record)] if len(axis.records) > 1 else []
-            told += [f"{record.error.name}: {line}" for line in (*error, *_notes(record))]
-            if record.tracking:
-                told += [f"{record.error.name}: {line}" for line in _tracking_notes(record.tracking)]
+            followed = _tracking_notes(record.tracking) if record.tracking else []
+            told += [f"{record.error.name}: {line}" for line in (*error, *followed, *_notes(record))]
         parts = (axis.overall, axis.rest, *axis.by_level, *axis.by_speed, *axis.by_region) if details else ()
         told += [f"{'error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}"] if parts else []
         for part in parts:
@@ -189,23 +189,20 @@ def _notes(record: RecordVerification) -> list[str]:
 
 def _tracking_notes(tracking: Tracking) -> list[str]:
     """Return the tracking error of a compensated path, what it consists of, and what helps against the largest part."""
-    error, parts = tracking.error, tracking.rms
-    late = f" ({tracking.delay * 1e3:.3g} ms)" if tracking.delay else ""
+    error, late = tracking.error, f" ({tracking.delay * 1e3:.3g} ms)" if tracking.delay else ""
     told = [
-        f"{PARTS[cause]} {length(part)}{late if cause == 'delay' else ''}"
-        for cause, part in parts.items()
-        if _told(part, error)
+        f"{PARTS[cause]} {length(part)}{late if cause == 'delay' else ''}" for cause, part in _parts(tracking).items()
     ]
     return [
-        f"path: measured - desired is {length(error.rms)} rms, {length(error.maximum)} at most; "
-        f"of it {', '.join(told)}",
+        f"path: measured - desired is {length(error.rms)} rms, {length(error.maximum)} at most, without the zero "
+        f"{length(tracking.rest_rms)} rms; of it {', '.join(told)}",
         f"path, largest part: {CAUSES[tracking.blame]}",
     ]
 
 
-def _told(part: float, error: ErrorPart) -> bool:
-    """Return whether a part (m rms) of a tracking error is large enough to be told."""
-    return part > _SMALLEST_PART * error.rms
+def _parts(tracking: Tracking) -> dict[str, float]:
+    """Return the parts (m rms) of a tracking error that are large enough to be told."""
+    return {cause: part for cause, part in tracking.rms.items() if part > _SMALLEST_PART * tracking.rest_rms}
 
 
 def _figures(axis: AxisVerification) -> dict[str, str]:
@@ -277,11 +274,10 @@ def _show_record(page: Page, name: str, record: RecordVerification) -> None:
 def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
     """Add the causes of the error along a compensated path."""
     page.subsection("Measured - desired displacement")
-    told = {cause: part for cause, part in tracking.rms.items() if _told(part, tracking.error)}
     page.lines(_tracking_notes(tracking)[:1])
     page.table(
         ("part of the error", "rms (nm)", "what it is, and what helps"),
-        [(PARTS[cause], f"{part * 1e9:.1f}", CAUSES[cause]) for cause, part in told.items()],
+        [(PARTS[cause], f"{part * 1e9:.1f}", CAUSES[cause]) for cause, part in _parts(tracking).items()],
         caption="Rms by which each part enters the whole; of parts that cancel, the smaller one is left out.",
     )
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)

@@ -214,6 +214,33 @@ def test_what_is_left_of_a_compensated_path_is_blamed_on_its_cause(blame, cause,
         assert tracking.delay == pytest.approx(8 / RATE, rel=0.1)
 
 
+@pytest.mark.parametrize("shift", [0.0, 4e-7])
+def test_a_late_stage_is_told_from_its_hysteresis_and_zero(shift, model):
+    t, desired = path(model)
+    v = model.compensate(t, desired, start_memory="start")
+    y = after((), 0.0).run(t + 100.0, v)[1]
+    late = 3
+    y = np.concatenate([np.full(late, y[0]), y[:-late]])
+    tracking = judged(record_of(t, v, y), model, desired=[{"x": desired + shift}]).tracking
+    parts = tracking.rms
+    assert tracking.delay == pytest.approx(late / RATE, rel=0.1)
+    assert parts["delay"] == pytest.approx(rms(y - np.interp(t, t - late / RATE, y)), rel=0.15)
+    # A path that counts from another zero.
+    assert parts["zero"] == pytest.approx(shift, abs=0.2 * parts["delay"])
+    assert max(parts["model"], parts["rate"], parts["command"]) < 0.3 * parts["delay"]
+
+
+def test_what_goes_with_the_logarithm_of_the_rate_is_a_rate_dependence(model):
+    t, desired = path(model)
+    v = model.compensate(t, desired, start_memory="start")
+    speed = np.gradient(desired, t)
+    y = desired + 2e-8 * np.sign(speed) * np.log1p(np.abs(speed) / 1e-6)
+    tracking = judged(record_of(t, v, y), model, desired=[{"x": desired}]).tracking
+    assert tracking.shares["rate"] > 0.0 and tracking.delay == 0.0
+    assert tracking.shares["delay"] == pytest.approx(0.0, abs=1e-6)
+    assert tracking.shares["rate"] + tracking.shares["model"] > 0.9
+
+
 def test_parts_of_the_error_add_up(model):
     tracking = tracked(model, (100, 20, 80), (0.0, 70.0), 2, 1.0, 1e-7)
     error = np.sum(list(tracking.parts.values()), axis=0)

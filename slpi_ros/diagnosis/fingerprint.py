@@ -175,11 +175,9 @@ def _share(columns: Sequence[FloatArray], residual: Sequence[FloatArray]) -> tup
 
 def _evidence(name: str, unit: str, share: float, x: FloatArray, fitted: FloatArray) -> str:
     low, high = int(np.argmin(fitted)), int(np.argmax(fitted))
-    of = {"direction": "voltage"}.get(name, name)
     return (
         f"{share:.0%} of the mean square goes with the {name}: from {length(fitted[low])} at "
-        f"{_quantity(x[low], unit)} to {length(fitted[high])} at {_quantity(x[high], unit)} of {of}; "
-        f"{HINTS[name]}"
+        f"{_quantity(x[low], unit)} to {length(fitted[high])} at {_quantity(x[high], unit)}; {HINTS[name]}"
     )
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slpi_ros.diagnosis.fingerprint import Left
 from slpi_ros.diagnosis.result import (
     AMBIGUOUS,
     NAMED,
@@ -29,6 +30,8 @@ from slpi_ros.reports.views import Motion, Series
 
 # Relative difference of equal errors.
 _SAME = 0.01
+# The variable over a logarithmic axis.
+SINCE = Quantity("time since the last turn", "s", digits=".3~g", logarithmic=True)
 # Largest number of variables whose part of the residual is drawn.
 _MOST_DRAWN = 3
 
@@ -112,12 +115,19 @@ def _show_left(page: Page, name: str, found: AxisDiagnosis) -> None:
     drawn = [one for one in found.left if one.curve[0].size][:_MOST_DRAWN]
     if drawn:
         chart = Chart(
-            [Panel(DISPLACEMENT if one.unit == "m" else Quantity(one.variable, one.unit), ERROR) for one in drawn],
+            [Panel(_quantity(one), ERROR) for one in drawn],
             height=330,
         )
         for panel, one in enumerate(drawn):
-            chart.dots(panel, one.variable, *one.curve, BEFORE)
+            positive = one.curve[0] > 0.0 if one.variable == SINCE.name else np.isfinite(one.curve[0])
+            chart.dots(panel, one.variable, one.curve[0][positive], one.curve[1][positive], BEFORE)
         page.chart(f"{name}-left", chart, "Measured - model as predicted by each of these variables alone.")
+
+
+def _quantity(one: Left) -> Quantity:
+    if one.variable == SINCE.name:
+        return SINCE
+    return DISPLACEMENT if one.unit == "m" else Quantity(one.variable, one.unit)
 
 
 def _show_records(page: Page, found: AxisDiagnosis) -> None:

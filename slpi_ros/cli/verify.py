@@ -50,6 +50,7 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.reports.verification import (
         FILES,
         describe_verification,
+        little_judged,
         verification_good,
         verification_limits,
         write_files,
@@ -81,7 +82,7 @@ def _run(options: Namespace) -> Result:
         describe_verification(found, details=False),
         format_document(found.to_document(), "verification"),
         next_command,
-        verdict(verification_limits(found), verification_good(found)),
+        verdict(verification_limits(found), verification_good(found)) + little_judged(found),
         describe_verification(found),
         found.passed,
     )

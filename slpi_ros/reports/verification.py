@@ -97,6 +97,12 @@ def verification_good(found: Verification) -> str:
     return "at the repeatability of the record" if noise else "within its limit on every record"
 
 
+def little_judged(found: Verification) -> str:
+    """Return what share of the record with the least judged samples is judged, and why; "" if most are on each."""
+    least = min((record for axis in found.axes.values() for record in axis.records), key=lambda record: record.share)
+    return "" if least.share >= MOST_KNOWN else f"; {least.error.name}: {_judged_share(least)}"
+
+
 def describe_verification(found: Verification, *, details: bool = True) -> list[str]:
     """Return lines: for each axis the verdict and the notes of each record, in `details` errors (nm) by class."""
     lines = []

@@ -18,6 +18,7 @@ from slpi_ros.diagnosis.verify import UNPROVED
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.schemas import validate
+from slpi_ros.reports.verification import little_judged
 
 SEED, RATE = 2, 200.0
 # Voltages between which a stage was moved before a record; the last one leads to where the record begins.
@@ -94,6 +95,16 @@ def test_a_record_that_begins_at_an_end_of_the_range_is_judged_from_its_first_sa
     v[0] = 0.0
     one = judged(record_of(t, v, stage(SEED).run(t, v)[1]), model)
     assert one.begins_known and one.known_from == 0.0 and one.share > 0.95 and one.passed
+
+
+def test_few_judged_samples_are_told_beside_the_verdict(model):
+    record = unseen()
+    y = record.displacement["x"].copy()
+    y[: int(0.6 * y.size)] = np.nan
+    found = slpi_ros.verify(replace(record, displacement={"x": y}), model)
+    share = found.axes["x"].records[0].share
+    assert share < 0.5 and f"({share:.0%})" in little_judged(found)
+    assert little_judged(slpi_ros.verify(record, model)) == ""
 
 
 @pytest.mark.parametrize("span", [(2.0, None), (None, 9.0), (3.0, 8.0)])

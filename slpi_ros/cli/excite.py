@@ -76,7 +76,8 @@ def _run(options: Namespace) -> Result:
                 f"axis '{axis}': the path needs up to {wanted:.3g} V/s, the drive keeps to {slew:.3g} V/s; give a "
                 "first model (--model), a higher --slew, or a slower path"
             )
-        if v.min() < options.voltage_min or v.max() > options.voltage_max:
+        slack = 1e-6 * (options.voltage_max - options.voltage_min)
+        if v.min() < options.voltage_min - slack or v.max() > options.voltage_max + slack:
             options.remarks.append(f"axis '{axis}': the path needs {v.min():.4g} to {v.max():.4g} V, beyond the limits")
     write_table(options.output, drive.t, drive.voltage, "V")
     return Result(
@@ -90,6 +91,7 @@ def _path_of(options: Namespace) -> tuple[dict[str, "FloatArray"], float]:
     """Return the voltages (V) of the path by axis, (N,), and their sampling rate (Hz)."""
     import numpy as np
 
+    from slpi_ros.calibration.drive_watch import FARTHEST
     from slpi_ros.io.desired import read_path
     from slpi_ros.model.document import load_model
     from slpi_ros.model.stage_model import check_time
@@ -99,6 +101,9 @@ def _path_of(options: Namespace) -> tuple[dict[str, "FloatArray"], float]:
     steps = np.diff(check_time(t))
     if not desired or not steps.size or not t[-1] > 0.0:
         raise UsageError(f"{options.for_path}: no path of axis {', '.join(options.axis or ['x'])} over time; give one")
+    farthest = max(float(np.abs(y).max()) for y in desired.values())
+    if farthest > FARTHEST:
+        raise UsageError(f"{options.for_path}: a displacement of {farthest:.4g} m; give metres")
     rate = options.rate or max(RATE, 1.0 / float(np.median(steps[steps > 0.0])))
     if options.model:
         model = load_model(options.model)

@@ -4,6 +4,7 @@ import math
 import shlex
 from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
+from pathlib import Path
 
 from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
@@ -65,6 +66,12 @@ def _run(options: Namespace) -> Result:
     model = common.with_sensor(load_model(options.model), options)
     if options.output is not None:
         common.allow_folder(options, options.output, *FILES, inputs=[options.model])
+    known = {Path(bag).resolve() for axis in model.axes.values() for bag in axis.quality.source.split(", ")}
+    own = [
+        f"{bag}: the model was identified from this bag; an error on it proves nothing, record another one"
+        for bag in options.bags
+        if Path(bag).resolve() in known
+    ]
     with nullcontext() if options.output is None else output_folder(options.output, *FILES) as folder:
         request = VerifyRequest(
             source, model, tolerance, options.desired_topic, options.without_offset, options.start_memory
@@ -79,11 +86,11 @@ def _run(options: Namespace) -> Result:
             "slpi", "diagnose", *options.bags, "--model", options.model, "-o", "diagnosis", *common.same_record(options)
         )
     return Result(
-        describe_verification(found, details=False),
+        [*describe_verification(found, details=False), *own],
         format_document(found.to_document(), "verification"),
         next_command,
         verdict(verification_limits(found), verification_good(found)) + little_judged(found),
-        describe_verification(found),
+        [*describe_verification(found), *own],
         found.passed,
     )
 

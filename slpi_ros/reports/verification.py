@@ -112,6 +112,8 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
             error = [_error(record)] if len(axis.records) > 1 else []
             followed = _tracking_notes(record.tracking) if record.tracking else []
             told += [f"{record.error.name}: {line}" for line in (*error, *followed, *_notes(record))]
+        if not any(record.tracking for record in axis.records):
+            told.append("path: not judged, no bag holds desired_displacement or desired_trajectory")
         parts = (axis.overall, axis.rest, *axis.by_level, *axis.by_speed, *axis.by_region) if details else ()
         told += [f"{'error, nm':<24}{'samples':>9}{'rms':>9}{'max':>10}"] if parts else []
         for part in parts:

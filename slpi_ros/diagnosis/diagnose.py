@@ -291,7 +291,7 @@ def _given(model: AxisModel, runs: Sequence[FreeRun], selection: Selection) -> G
     """Compare the given model with the records; raise IdentificationError if it belongs to another stage."""
     evidence = selection.now.evidence
     motion = float(np.ptp(evidence.y[evidence.used]))
-    sources = model.quality.source.split(", ")
+    sources = model.quality.sources
     own = np.array([part.source in sources for part in evidence.parts])
     rms = rms_of(runs)
     if own.any() and not own.all():

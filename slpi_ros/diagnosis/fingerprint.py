@@ -12,10 +12,12 @@ import numpy as np
 import scipy.linalg
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.effects.base import wave
 from slpi_ros.errors import length
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.drive import smallest_turn
 from slpi_ros.identification.signal_statistics import noise
+from slpi_ros.model.coverage import slopes
 
 # Number of blocks of a record, of which every fifth is held out in turn.
 BLOCKS, FOLDS = 40, 5
@@ -75,8 +77,8 @@ class Left:
 
 def fingerprint(records: Sequence[Signals]) -> tuple[Left, ...]:
     """Return the measured variables that predict the residuals of records of one axis, the largest share first."""
-    thin = [_thinned(record) for record in records]
-    found = [*_of_variables(thin), *_of_lines(records), *_of_jumps(records)]
+    centred, thin = [_centred(record) for record in records], [_centred(_thinned(record)) for record in records]
+    found = [*_of_variables(thin), *_of_lines(centred), *_of_jumps(centred)]
     return tuple(sorted((one for one in found if one.share >= LEAST_SHARE), key=lambda one: -one.share))
 
 
@@ -85,8 +87,11 @@ def _thinned(record: Signals) -> Signals:
     return Signals(*(x[::every] for x in record))
 
 
+def _centred(record: Signals) -> Signals:
+    return record._replace(residual=record.residual - record.residual.mean())
+
+
 def _of_variables(records: Sequence[Signals]) -> Iterator[Left]:
-    residual = [record.residual - record.residual.mean() for record in records]
     values = [_variables(record) for record in records]
     up = np.concatenate([np.sign(one["rate"]) for one in values])
     for name, unit, branches in (
@@ -106,7 +111,7 @@ def _of_variables(records: Sequence[Signals]) -> Iterator[Left]:
         if name == "direction":
             # Only what rising and falling voltage differ by: the rest goes with the voltage.
             columns = columns[:, :KNOTS] - columns[:, KNOTS:]
-        share, fitted = _share([columns], residual)
+        share, fitted = _share(columns, records)
         if share >= LEAST_SHARE:
             yield Left(name, share, _evidence(name, unit, share, x, fitted), _curve(x, fitted), unit)
 
@@ -117,13 +122,13 @@ def _variables(record: Signals) -> dict[str, FloatArray]:
     ends = reversals(v, max(smallest_turn(v, noise(v, t)), 1e-9 * float(np.ptp(v)))) if v.size > 4 else np.array([0])
     last = ends[np.maximum(np.searchsorted(ends, np.arange(v.size), side="right") - 1, 0)]
     way = np.abs(np.diff(v[ends], append=v[-1]))[np.searchsorted(ends, last)]
-    rate = _slope(t, v)
+    rate = slopes(t, v)
     return {
         "time": t,
         "voltage": v,
         "displacement": record.y,
         "rate": rate,
-        "acceleration": _slope(t, rate),
+        "acceleration": slopes(t, rate),
         "time since the last turn": np.maximum(t - t[last], 0.0),
         "position in the loop": np.divide(np.abs(v - v[last]), way, out=np.zeros_like(v), where=way > 0.0).clip(
             0.0, 1.0
@@ -131,31 +136,17 @@ def _variables(record: Signals) -> dict[str, FloatArray]:
     }
 
 
-def _slope(t: FloatArray, x: FloatArray) -> FloatArray:
-    """Return the derivative of `x` from differences over a few samples, as voltages may be noisy."""
-    at = np.arange(t.size)
-    before, after = np.maximum(at - 2, 0), np.minimum(at + 2, t.size - 1)
-    step = t[after] - t[before]
-    return np.divide(x[after] - x[before], step, out=np.zeros(t.size), where=step > 0.0)
-
-
 def _hats(x: FloatArray, knots: int, *, even: bool) -> FloatArray:
     """Return the piecewise linear functions of `x`, shape (N, knots), at even knots or at quantiles."""
-    places = np.linspace(x.min(), x.max(), knots) if even else np.quantile(x, np.linspace(0.0, 1.0, knots))
-    places = np.unique(places)
-    columns = np.zeros((x.size, knots))
-    if places.size < 2:
-        return columns
-    k = np.clip(np.searchsorted(places, x, side="right") - 1, 0, places.size - 2)
-    share = np.clip((x - places[k]) / (places[k + 1] - places[k]), 0.0, 1.0)
-    columns[np.arange(x.size), k], columns[np.arange(x.size), k + 1] = 1.0 - share, share
-    return columns
+    places = np.unique(np.linspace(x.min(), x.max(), knots) if even else np.quantile(x, np.linspace(0.0, 1.0, knots)))
+    # Of equal quantiles one is a knot; the columns of the others are zero.
+    return np.column_stack([np.interp(x, places, row) for row in np.eye(knots, places.size)])
 
 
-def _share(columns: Sequence[FloatArray], residual: Sequence[FloatArray]) -> tuple[float, FloatArray]:
+def _share(matrix: FloatArray, records: Sequence[Signals]) -> tuple[float, FloatArray]:
     """Return the share of the mean square that columns predict on held-out blocks, and the fit to all samples (m)."""
-    matrix, y = np.vstack(columns), np.concatenate(residual)
-    fold = np.concatenate([np.arange(one.size) * BLOCKS // max(one.size, 1) % FOLDS for one in residual])
+    y = np.concatenate([record.residual for record in records])
+    fold = np.concatenate([np.arange(one.t.size) * BLOCKS // max(one.t.size, 1) % FOLDS for one in records])
     grams = [matrix[fold == k].T @ matrix[fold == k] for k in range(FOLDS)]
     products = [matrix[fold == k].T @ y[fold == k] for k in range(FOLDS)]
     whole, right = sum(grams), sum(products)
@@ -192,16 +183,18 @@ def _curve(x: FloatArray, fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _of_lines(records: Sequence[Signals]) -> Iterator[Left]:
     found = [_lines(record) for record in records]
-    residual = [record.residual - record.residual.mean() for record in records]
-    columns = [_waves(record.t, lines) for record, lines in zip(records, found, strict=True)]
-    if not sum(own.shape[1] for own in columns):
+    if not any(found):
         return
-    share, _ = _share([scipy.linalg.block_diag(*columns)], residual)
+    columns = [
+        np.column_stack([np.empty((record.t.size, 0)), *(wave(2.0 * np.pi * f * record.t) for f in lines)])
+        for record, lines in zip(records, found, strict=True)
+    ]
+    share, _ = _share(scipy.linalg.block_diag(*columns), records)
     told = []
-    for lines, own, left in zip(found, columns, residual, strict=True):
+    for lines, own, record in zip(found, columns, records, strict=True):
         if not lines:
             continue
-        gains = np.linalg.lstsq(own, left, rcond=None)[0].reshape(-1, 2)
+        gains = np.linalg.lstsq(own, record.residual, rcond=None)[0].reshape(-1, 2)
         told += [f"{f:.4g} Hz ({length(float(np.hypot(*gain)))})" for f, gain in zip(lines, gains, strict=True)]
     name = "lines of the spectrum"
     yield Left(
@@ -241,7 +234,6 @@ def _lines(record: Signals) -> list[float]:
 
 def _refined(t: FloatArray, x: FloatArray, frequency: float, bin_width: float) -> float:
     """Return the frequency (Hz) near `frequency` whose wave takes most of `x`."""
-    x = x - x.mean()
 
     def power(f: float) -> float:
         return float(np.abs(np.exp(-2j * np.pi * f * t) @ x))
@@ -253,21 +245,15 @@ def _refined(t: FloatArray, x: FloatArray, frequency: float, bin_width: float) -
     return frequency
 
 
-def _waves(t: FloatArray, frequencies: Sequence[float]) -> FloatArray:
-    waves = [wave(2.0 * np.pi * f * t) for f in frequencies for wave in (np.cos, np.sin)]
-    return np.column_stack([np.empty((t.size, 0)), *waves])
-
-
 def _of_jumps(records: Sequence[Signals]) -> Iterator[Left]:
     found = [_jumps(record) for record in records]
     if not any(found):
         return
-    residual = [record.residual - record.residual.mean() for record in records]
     columns = [
         np.column_stack([np.ones(record.t.size), *(np.arange(record.t.size) >= k for k, _ in jumps)])
         for record, jumps in zip(records, found, strict=True)
     ]
-    share, _ = _share([scipy.linalg.block_diag(*columns)], residual)
+    share, _ = _share(scipy.linalg.block_diag(*columns), records)
     largest = sorted(
         ((float(record.t[k]), size) for record, jumps in zip(records, found, strict=True) for k, size in jumps),
         key=lambda jump: -abs(jump[1]),
@@ -281,7 +267,7 @@ def _jumps(record: Signals) -> list[tuple[int, float]]:
     size = max(16, record.t.size // 200)
     if record.t.size < 4 * size:
         return []
-    left = record.residual - record.residual.mean()
+    left = record.residual
     found: list[tuple[int, float]] = []
     for _ in range(MOST_JUMPS):
         total = np.concatenate([[0.0], np.cumsum(left)])

@@ -62,6 +62,11 @@ class FitQuality:
     source: str
     fastest: float | None = None  # V/s, see `slpi_ros.model.coverage`; None: unknown, as in older documents
 
+    @property
+    def sources(self) -> list[str]:
+        """Names of the records."""
+        return self.source.split(", ")
+
 
 @dataclass(frozen=True)
 class AxisModel:

@@ -13,12 +13,17 @@ FAST_SHARE = 0.05
 FASTER, WIDER = 1.5, 0.02
 
 
-def rates(t: FloatArray, x: FloatArray) -> FloatArray:
-    """Return the magnitude of dx/dt, shape (N,), unit of `x` per second, by central differences over a few samples."""
+def slopes(t: FloatArray, x: FloatArray) -> FloatArray:
+    """Return dx/dt, shape (N,), unit of `x` per second, by central differences over a few samples."""
     at = np.arange(x.size)
     before, after = np.maximum(at - REACH, 0), np.minimum(at + REACH, x.size - 1)
     seconds = t[after] - t[before]
-    return np.divide(np.abs(x[after] - x[before]), seconds, out=np.zeros(x.size), where=seconds > 0.0)
+    return np.divide(x[after] - x[before], seconds, out=np.zeros(x.size), where=seconds > 0.0)
+
+
+def rates(t: FloatArray, x: FloatArray) -> FloatArray:
+    """Return the magnitude of dx/dt, shape (N,), unit of `x` per second; see `slopes`."""
+    return np.abs(slopes(t, x))
 
 
 def fastest(t: FloatArray, x: FloatArray) -> float:

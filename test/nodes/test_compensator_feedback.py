@@ -95,7 +95,8 @@ def test_the_tracking_error_is_published_for_each_axis(x_file):
 
 
 def test_without_measurements_the_feedback_holds_and_says_so(x_file):
-    with compensator(model_file=x_file, feedback=True, **GAINS) as client:
+    # The watch of the sensor would end the feedback before it is told that it holds, on a busy machine.
+    with compensator(model_file=x_file, feedback=True, feedback_fault_time=0, **GAINS) as client:
         client.connect()
         expected = stage_model().compensate(np.arange(50), np.array(PATH[:50]))
         assert client.follow(["x"], np.array(PATH[:50])[:, None])[:, 0] == pytest.approx(expected, abs=1e-9)

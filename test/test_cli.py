@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forked import completed
 from identification.records import calibration, stage
 from refusals import holds
 
@@ -23,8 +24,7 @@ pytestmark = pytest.mark.slow
 
 
 def slpi(*arguments):
-    command = [sys.executable, "-m", "slpi_ros.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+    return completed("slpi_ros.cli:main", [*map(str, arguments)])
 
 
 def assert_in_form(text):
@@ -168,7 +168,8 @@ def test_help_tells_every_command():
 
 
 def test_the_version_is_that_of_the_package():
-    told = slpi("--version")
+    command = [sys.executable, "-m", "slpi_ros.cli", "--version"]
+    told = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (told.returncode, told.stderr) == (0, "")
     assert told.stdout == f"slpi {re.search(r'version=.([0-9.]+)', SETUP.read_text())[1]}\n"
 

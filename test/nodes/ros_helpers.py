@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from forked import Forked
 from lifecycle_msgs.srv import GetState
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.context import Context
@@ -35,13 +36,20 @@ REPEAT_S = 5.0
 
 
 class NodeProcess:
-    """One node as a process in a session of its own."""
+    """One node as a process in a session of its own; `fresh`: not forked, but started as from a shell."""
 
-    def __init__(self, name: str, parameters: Mapping[str, object], arguments: Sequence[str]) -> None:
+    def __init__(self, name: str, parameters: Mapping[str, object], arguments: Sequence[str], fresh: bool = False):
         given = [part for key, value in parameters.items() for part in ("-p", f"{key}:={yaml_of(value)}")]
-        command = [sys.executable, "-m", "slpi_ros.nodes.start", name, "--ros-args", *given, *arguments]
-        self._stderr = tempfile.TemporaryFile("w+")  # noqa: SIM115
-        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=self._stderr, start_new_session=True)
+        words = ["--ros-args", *given, *arguments]
+        self._stderr = tempfile.NamedTemporaryFile("w+")  # noqa: SIM115
+        self.process: Forked | subprocess.Popen[bytes]
+        if fresh:
+            command = [sys.executable, "-m", "slpi_ros.nodes.start", name, *words]
+            self.process = subprocess.Popen(
+                command, stdout=subprocess.DEVNULL, stderr=self._stderr, start_new_session=True
+            )
+        else:
+            self.process = Forked(f"slpi_ros.nodes.start:{name}", words, errors=self._stderr.name)
 
     @property
     def stderr(self) -> str:
@@ -72,9 +80,11 @@ def yaml_of(value: object) -> str:
 
 
 @contextmanager
-def started(name: str, parameters: Mapping[str, object] | None = None, *arguments: str) -> Iterator[NodeProcess]:
+def started(
+    name: str, parameters: Mapping[str, object] | None = None, *arguments: str, fresh: bool = False
+) -> Iterator[NodeProcess]:
     """Start the node `name` of the package; kill it at the end."""
-    node = NodeProcess(name, parameters or {}, arguments)
+    node = NodeProcess(name, parameters or {}, arguments, fresh)
     try:
         yield node
     finally:

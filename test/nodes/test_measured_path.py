@@ -1,7 +1,5 @@
 """A measured record's desired path at its own pace, through the node and through the command line."""
 
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -9,6 +7,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
+from forked import completed  # noqa: E402
 from nodes.compensator_client import PERIOD_NS, START_NS, compensator  # noqa: E402
 
 import slpi_ros  # noqa: E402
@@ -34,8 +33,8 @@ def shifted(measured_data, tmp_path):
 def test_the_node_answers_at_200_hz_what_the_command_line_gives(shifted, samples):
     folder, desired = shifted
     desired = desired[:samples]
-    command = [sys.executable, "-m", "slpi_ros.cli", "compensate", folder / "model.json", folder / "desired.csv"]
-    subprocess.run([*command, "-o", folder / "voltage.csv"], check=True, capture_output=True)
+    command = ["compensate", folder / "model.json", folder / "desired.csv", "-o", folder / "voltage.csv"]
+    completed("slpi_ros.cli:main", [*map(str, command)]).check_returncode()
     expected = read_table(folder / "voltage.csv", "V")[1]["x"][:samples]
     with compensator(model_file=str(folder / "model.json")) as client:
         client.connect()

@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 
@@ -13,6 +11,7 @@ rclpy = pytest.importorskip("rclpy")
 
 from mcap.reader import make_reader  # noqa: E402
 from mcap_ros2.decoder import DecoderFactory  # noqa: E402
+from nodes.ros_helpers import PATIENCE_S, NodeProcess  # noqa: E402
 from rclpy.context import Context  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data  # noqa: E402
 from refusals import holds  # noqa: E402
@@ -23,7 +22,6 @@ from slpi_ros.io.bag_reader import read_bag  # noqa: E402
 
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-PATIENCE_S = 60.0
 
 
 class Recording:
@@ -31,23 +29,22 @@ class Recording:
 
     def __init__(self, *arguments: str, **parameters) -> None:
         given = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
-        command = [sys.executable, "-m", "slpi_ros.nodes.start", "recorder", "--ros-args", *given, *arguments]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.node = NodeProcess("recorder", {}, [*given, *arguments])
 
     def wait_until(self, done: Callable[[], bool]) -> None:
         deadline = time.monotonic() + PATIENCE_S
         while not done():
-            assert self.process.poll() is None, self.process.stderr.read()
+            assert self.node.process.poll() is None, self.node.stderr
             assert time.monotonic() < deadline
             time.sleep(0.01)
 
     def end(self, number: signal.Signals | None = None) -> tuple[int, str]:
         """Send a signal, if any; return exit code and what was said."""
         if number is not None:
-            self.process.send_signal(number)
-        _, errors = self.process.communicate(timeout=PATIENCE_S)
+            self.node.process.send_signal(number)
+        code, errors = self.node.wait(), self.node.stderr
         assert "Traceback" not in errors
-        return self.process.returncode, errors
+        return code, errors
 
 
 @pytest.fixture
@@ -61,8 +58,7 @@ def record():
 
     yield start
     for recording in started:
-        recording.process.kill()
-        recording.process.communicate()
+        recording.node.kill()
 
 
 @pytest.fixture

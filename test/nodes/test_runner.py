@@ -8,6 +8,8 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
+from nodes.ros_helpers import on_graph, started  # noqa: E402
+
 from slpi_ros.errors import UsageError  # noqa: E402
 from slpi_ros.nodes.common import make_executor  # noqa: E402
 from slpi_ros.nodes.stop import PATIENT_SIGNALS  # noqa: E402
@@ -175,3 +177,27 @@ def test_command_line_that_ros_refuses(arguments, says):
 def test_executor_that_does_not_exist():
     with pytest.raises(UsageError, match="events.*default"):
         make_executor("fast")
+
+
+LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0}
+# Parameters of each program, and its exit code if it is ended before it has done anything.
+PROGRAMS = {
+    "calibrator": (LIMITS, 1),
+    "compensator": ({}, 0),
+    "exciter": (LIMITS | {"rest_voltage": 0.0}, 0),
+    "identify": ({}, 0),
+    "recorder": ({}, 1),
+    "stage_simulator": ({}, 0),
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_each_program_starts_as_from_a_shell(name, tmp_path):
+    """Other tests start it by a fork."""
+    given, code = PROGRAMS[name]
+    output = {"output": str(tmp_path / "out")} if name in ("calibrator", "recorder") else {}
+    with on_graph() as graph, started(name, given | output, fresh=True) as node:
+        graph.tested = node
+        graph.spin_until(lambda: name in graph.node.get_node_names(), "the node")
+        assert node.stop() == code
+        assert "Traceback" not in node.stderr

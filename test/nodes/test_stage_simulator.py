@@ -2,8 +2,6 @@
 
 import math
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -12,6 +10,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
+from nodes.ros_helpers import PATIENCE_S, NodeProcess  # noqa: E402
 from rclpy.context import Context  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
@@ -22,13 +21,11 @@ from std_msgs.msg import Float64MultiArray  # noqa: E402
 from slpi_ros.simulation.stage import Stage  # noqa: E402
 
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-PATIENCE_S = 30.0
 
 
-def start(**parameters) -> subprocess.Popen[str]:
-    arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
-    command = [sys.executable, "-m", "slpi_ros.nodes.start", "stage_simulator", "--ros-args", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def start(**parameters) -> NodeProcess:
+    given = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
+    return NodeProcess("stage_simulator", {}, given)
 
 
 class Bench:
@@ -45,14 +42,14 @@ class Bench:
     def send(self, *voltages: float) -> None:
         self._commands.publish(Float64MultiArray(data=list(voltages)))
 
-    def spin_until(self, done: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    def spin_until(self, done: Callable[[], bool], process: NodeProcess) -> None:
         deadline = time.monotonic() + PATIENCE_S
         while not done():
-            assert process.poll() is None, f"the simulator has ended: {process.stderr.read()}"
+            assert process.process.poll() is None, f"the simulator has ended: {process.stderr}"
             assert time.monotonic() < deadline, f"nothing happened; {len(self.states)} states so far"
             self._executor.spin_once(timeout_sec=0.05)
 
-    def connect(self, process: subprocess.Popen[str], axes: int) -> None:
+    def connect(self, process: NodeProcess, axes: int) -> None:
         """Command rest until an answer comes: neither direction loses anything from then on."""
 
         self.spin_until(self._commands.get_subscription_count, process)
@@ -90,7 +87,6 @@ def simulator(**parameters):
         bench.close()
         rclpy.shutdown(context=context)
         process.kill()
-        process.communicate()
 
 
 def expected(seed, axes, commands):
@@ -147,12 +143,11 @@ def test_commands_that_are_none_are_ignored_and_counted():
             bench.send(*command)
         bench.spin_until(lambda: bool(bench.moved()), process)
         states = bench.moved()
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=PATIENCE_S)
+        assert process.stop(signal.SIGINT) == 0
+        said = process.stderr
     assert [list(state.effort) for state in states] == [[25.0]]
     assert [list(state.position) for state in states] == expected(0, ["x"], [[25.0]])
     assert "[]" in said and "Traceback" not in said
-    assert process.returncode == 0
 
 
 def test_a_stage_that_does_not_answer_publishes_on_its_own():
@@ -215,8 +210,8 @@ def test_a_character_is_drawn_from_the_seed_and_told_only_if_not_hidden():
         with simulator(noise_rms=0.0, seed=5, character=character, answer_commands=False) as (bench, process):
             bench.spin_until(lambda bench=bench: len(bench.states) >= 3, process)
             readings[character] = bench.states[0].header.frame_id
-            process.send_signal(signal.SIGINT)
-            _, told[character] = process.communicate(timeout=PATIENCE_S)
+            process.stop(signal.SIGINT)
+            told[character] = process.stderr
     assert readings == {"drawn": "simulated-5-drawn", "hidden": "simulated-5-hidden"}
     assert "Character(" in told["drawn"] and "Character(" not in told["hidden"]
 
@@ -251,6 +246,9 @@ def test_effects_are_given_by_parameters_and_change_the_hardware_id():
 )
 def test_parameters_of_which_no_stage_can_be_made(parameters, complaint):
     process = start(**parameters)
-    _, said = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 2
+    try:
+        assert process.wait() == 2
+        said = process.stderr
+    finally:
+        process.kill()
     assert complaint in said and "Traceback" not in said and len(said.splitlines()) == 1

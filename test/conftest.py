@@ -15,6 +15,8 @@ import pytest
 CHECKOUT = Path(__file__).resolve().parents[1]
 # Folders whose tests start nodes.
 STREAM = ("nodes", "documentation")
+# A folder whose files share what takes long to make.
+TOGETHER = "fleet"
 # Those that compute more than they wait, and need no core at any moment.
 COMPUTES = ("test_identify.py", "test_site.py")
 
@@ -66,7 +68,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")
     # The stream of nodes and the files with slow tests begin first; what is short fills the gaps at the end.
-    first = {item.path for item in items if item.get_closest_marker("slow")}
+    first = {item.path for item in items if item.get_closest_marker("slow") or item.path.parent.name == TOGETHER}
     items.sort(key=lambda item: (item.path.parent.name not in STREAM, item.path not in first))
 
 
@@ -81,6 +83,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     class ByFile(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file = Path(nodeid.partition("::")[0])
+            if file.parent.name == TOGETHER:
+                return TOGETHER
             return "nodes" if file.parent.name in STREAM and file.name not in COMPUTES else str(file)
 
     # As sorted above.

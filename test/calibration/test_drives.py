@@ -57,7 +57,9 @@ def test_the_verification_goes_through_the_compensator_within_its_limits(limits)
     assert not np.allclose(np.nan_to_num(other)[: drive.t.size], np.nan_to_num(desired["x"])[: other.size], atol=1e-7)
 
 
-@pytest.mark.parametrize("limits", LIMITS)
+@pytest.mark.parametrize(
+    "limits", ["sluggish", *(pytest.param(name, marks=pytest.mark.long) for name in ("usual", "slow"))]
+)
 def test_a_given_path_is_driven_as_it_is(limits):
     chosen = settings("xy", limits=(LIMITS[limits],) * 2, rest=(10.0, 0.0))
     recorder = SimulatedRecorder(stage_of(Character(), Character(), noise_rms=1e-9))

@@ -19,7 +19,13 @@ def hidden():
     return record, slpi_ros.identify(record)
 
 
-def test_causes_that_make_the_fitted_record_worse_are_dropped(hidden, monkeypatch):
+@pytest.fixture(scope="module")
+def sound(hidden):
+    (found,) = slpi_ros.diagnose(*hidden).axes.values()
+    return found
+
+
+def test_causes_that_make_the_fitted_record_worse_are_dropped(hidden, sound, monkeypatch):
     record, model = hidden
     extended = module._extended
 
@@ -33,7 +39,6 @@ def test_causes_that_make_the_fitted_record_worse_are_dropped(hidden, monkeypatc
     def drifting(origin):
         return GainDrift((0.0,), (0.2,), origin)
 
-    (sound,) = slpi_ros.diagnose(record, model).axes.values()
     assert "creep" in [one.name for one in sound.effects]
     monkeypatch.setattr(module, "_extended", spoiled)
     diagnosis = slpi_ros.diagnose(record, model)
@@ -45,10 +50,8 @@ def test_causes_that_make_the_fitted_record_worse_are_dropped(hidden, monkeypatc
     assert outcome.after_rms == outcome.before_rms
 
 
-def test_no_record_is_worse_with_the_extended_model(hidden):
-    record, model = hidden
-    (found,) = slpi_ros.diagnose(record, model).axes.values()
-    assert all(one.after_rms <= 1.05 * one.before_rms for one in found.records)
+def test_no_record_is_worse_with_the_extended_model(sound):
+    assert all(one.after_rms <= 1.05 * one.before_rms for one in sound.records)
 
 
 @pytest.mark.long

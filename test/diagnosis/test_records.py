@@ -54,7 +54,7 @@ def found(records, model):
     return diagnosis.axes["x"], diagnosis.extended.axes["x"]
 
 
-@pytest.mark.parametrize("before", [(100.0,), (60.0, 20.0, 45.0)])
+@pytest.mark.parametrize("before", [pytest.param((100.0,), marks=pytest.mark.long), (60.0, 20.0, 45.0)])
 def test_another_initial_history_is_no_change(model, before):
     axis, extended = found(record(1.5, before=before, seed=5), model)
     assert not axis.given.changed and axis.given.zero_moved is None
@@ -125,7 +125,7 @@ def test_a_delay_at_one_speed_stays_open_and_out_of_the_model():
         assert "delay" in (axis.effects[0].name, *axis.effects[0].alternatives)
 
 
-@pytest.mark.parametrize("digits", [60, 400])
+@pytest.mark.parametrize("digits", [60, pytest.param(400, marks=pytest.mark.long)])
 def test_a_coarse_sensor_is_no_cause(digits):
     one = record(1.5, seed=9, digit=15e-6 / digits)
     axis, extended = found(one, slpi_ros.identify(one))

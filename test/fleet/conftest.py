@@ -4,10 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from distributed import Client, LocalCluster
 
 from slpi_ros.excitation.drives import excite
+from slpi_ros.fleet.pages import report_fleet
+from slpi_ros.fleet.results import TABLE
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
 from slpi_ros.simulation.axis import SimulatedAxis
@@ -67,3 +70,12 @@ def client():
     options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": ":0"}
     with LocalCluster(**options) as cluster, Client(cluster, set_as_default=False) as own:
         yield own
+
+
+@pytest.fixture(scope="session")
+def done(fleet, client, tmp_path_factory):
+    """Return folder, lines and table of a run."""
+    folder = tmp_path_factory.mktemp("done")
+    lines, usable = report_fleet([str(fleet)], str(folder), client=client, diagnose=False)
+    assert usable
+    return folder, lines, pd.read_parquet(folder / TABLE)

@@ -22,9 +22,9 @@ from slpi_ros.fleet.results import JOURNAL, TABLE
 KILLS = tuple(map(int, os.environ.get("SLPI_FLEET_KILLS", "2,1,1").split(",")))
 
 
-@pytest.fixture(scope="module")
-def undisturbed(fleet, client):
-    return run([fleet], client=client, diagnose=False)
+@pytest.fixture
+def undisturbed(done):
+    return done[2]
 
 
 def start(fleet, output, address, *options):

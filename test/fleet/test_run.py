@@ -15,22 +15,13 @@ import slpi_ros
 from slpi_ros.cli import main
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.fleet import bags, cluster, run
-from slpi_ros.fleet.pages import DOCUMENT, PAGE, report_fleet
+from slpi_ros.fleet.pages import DOCUMENT, PAGE
 from slpi_ros.fleet.results import TABLE, Results
 from slpi_ros.fleet.sources import Bag, find_bags
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.schemas import validate
 
 DAY_NS = 86_400 * 10**9
-
-
-@pytest.fixture(scope="module")
-def done(fleet, client, tmp_path_factory):
-    """Return folder, lines and table of a run."""
-    folder = tmp_path_factory.mktemp("done")
-    lines, usable = report_fleet([str(fleet)], str(folder), client=client, diagnose=False)
-    assert usable
-    return folder, lines, pd.read_parquet(folder / TABLE)
 
 
 def by_name(table):
@@ -90,14 +81,14 @@ def test_a_second_run_has_nothing_to_do(done, fleet, client, monkeypatch):
     assert_frame_equal(again, done[2])
 
 
-def test_a_run_that_was_stopped_at_any_line_continues(done, fleet, client, tmp_path):
+@pytest.mark.parametrize("kept", [pytest.param(5, marks=pytest.mark.long), -2])
+def test_a_run_that_was_stopped_at_any_line_continues(done, fleet, client, tmp_path, kept):
     folder = tmp_path / "copy"
     shutil.copytree(done[0], folder)
     lines = (done[0] / "journal.jsonl").read_bytes().splitlines(keepends=True)
-    for kept in (5, len(lines) - 2):
-        (folder / "journal.jsonl").write_bytes(b"".join(lines[:kept]))
-        again = run([fleet], folder, client=client, diagnose=False)
-        assert_frame_equal(again.drop(columns="seconds"), done[2].drop(columns="seconds"))
+    (folder / "journal.jsonl").write_bytes(b"".join(lines[:kept]))
+    again = run([fleet], folder, client=client, diagnose=False)
+    assert_frame_equal(again.drop(columns="seconds"), done[2].drop(columns="seconds"))
 
 
 def test_new_and_changed_bags_are_added(stages, client, tmp_path):
@@ -138,7 +129,7 @@ def test_the_cause_of_an_error_that_is_no_change_is_named(stages, client, tmp_pa
 def test_a_bag_of_an_unknown_stage_stands_alone(stages, client, tmp_path):
     for day in (0, 1):
         stages.write(tmp_path, "a", day, name="")
-    assert list(run([tmp_path], client=client).verdict) == [bags.IDENTIFIED] * 2
+    assert list(run([tmp_path], client=client, diagnose=False).verdict) == [bags.IDENTIFIED] * 2
 
 
 def test_what_cannot_be_run(fleet, client, tmp_path):
@@ -168,7 +159,7 @@ def test_watch_takes_bags_as_they_are_completed(stages, client, tmp_path, monkey
     stages.write(tmp_path / "bags", "a", 0)
     monkeypatch.setattr(cluster, "find_bags", find)
     with pytest.raises(KeyboardInterrupt):
-        run([tmp_path / "bags"], tmp_path / "out", client=client, watch=True)
+        run([tmp_path / "bags"], tmp_path / "out", client=client, watch=True, diagnose=False)
     assert list(pd.read_parquet(tmp_path / "out" / TABLE).verdict) == [bags.IDENTIFIED, bags.PASSED]
 
 

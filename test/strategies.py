@@ -1,9 +1,8 @@
 """Hypothesis strategies: random hysteresis models of every kind, and random paths for them.
 
-``HYPOTHESIS_EXAMPLES=5000`` looks longer for counter-examples.
+``SLPI_EXAMPLES=5000`` looks longer for counter-examples.
 """
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,16 +21,12 @@ from slpi_ros.model.stage_model import StageModel
 FloatArray = NDArray[np.float64]
 
 # Drawing a model and a path takes a while; on a slow machine that is no mistake.
-EXAMPLES = int(os.environ.get("HYPOTHESIS_EXAMPLES", "100"))
 settings.register_profile(
-    "models",
-    settings.default,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
-    max_examples=EXAMPLES,
+    "models", settings.default, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
 )
 settings.load_profile("models")
 # For a property that runs several times: once for each way, start or kind.
-repeated = settings(max_examples=max(EXAMPLES // 2, 1))
+repeated = settings(max_examples=max(settings.default.max_examples // 2, 1))
 
 KINDS = ("pi", "slpi")
 # Displacement per volt: metres on a real stage, and micrometres, as the papers have it.

@@ -5,7 +5,7 @@ from math import inf
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model
 
@@ -271,7 +271,6 @@ def test_without_effects_and_feedback_nothing_follows_a_set_point_that_is_reache
 # Everything at once
 
 
-@settings(max_examples=60)
 @example(3002297)
 @example(3004729)
 @example(55207689)

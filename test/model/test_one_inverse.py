@@ -1,6 +1,6 @@
 """Whole paths and single samples have the same inverse, whatever the model, its start, the path and the stamps.
 
-``HYPOTHESIS_EXAMPLES=1000`` looks longer; ``--hypothesis-seed`` looks elsewhere.
+``SLPI_EXAMPLES=1000`` looks longer; ``--hypothesis-seed`` looks elsewhere.
 """
 
 from dataclasses import dataclass, replace

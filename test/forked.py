@@ -18,8 +18,6 @@ _FORKS = get_context("forkserver")
 _FORKS.set_forkserver_preload(
     ["forked", "slpi_ros", "slpi_ros.cli", *(f"slpi_ros.nodes.{name}" for name in (*NODES, "common", "help"))]
 )
-# The first start waits for all the imports.
-PATIENCE_S = 60.0
 
 
 def _run(program: str, arguments: list[str], environment: dict[str, str], folder: str, outputs: list[str]) -> None:
@@ -51,6 +49,11 @@ class Forked:
     def poll(self) -> int | None:
         """Return the exit code, or None while it runs."""
         return self._process.exitcode
+
+    @property
+    def returncode(self) -> int | None:
+        """The exit code, or None while it runs."""
+        return self.poll()
 
     def wait(self, timeout: float | None = None) -> int:
         """Return the exit code."""

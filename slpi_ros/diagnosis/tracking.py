@@ -24,7 +24,8 @@ CAUSES = {
     "limits": "the voltage was at a limit: a smaller path",
     "delay": "the stage is late: send the path as a trajectory, with the delay in the model",
     "rate": "loops wider or narrower than those of the model, the faster the more: slpi diagnose on faster records",
-    "command": "the voltages are not those of this model: slew limit, feedback, a reset or another model",
+    "command": "the voltages are not those of this model: slew limit, feedback, a reset, another model, or points of a "
+    "trajectory that were skipped, which the log of the compensator tells",
     "model": "the hysteresis and what else the model does not hold: slpi diagnose, slpi refit",
     "noise": "sensor noise and what does not repeat",
 }

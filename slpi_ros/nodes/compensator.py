@@ -521,6 +521,8 @@ class Compensator(LifecycleNode):
         if controller.mode is not before:
             if before is OperatingMode.RESETTING:
                 self._answer_reset()
+            if before is OperatingMode.TRAJECTORY and (skipped := self._reporter.skipped()):
+                self.get_logger().warning(skipped)
             self._report()
 
     def _other_publishers(self) -> list[str]:

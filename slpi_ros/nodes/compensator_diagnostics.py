@@ -56,6 +56,8 @@ class Reporter:
         """Start a new reporting period."""
         self._window, self._window_start = self._controller.counts.copy(), time.perf_counter()
         self._lost_before = self.lost
+        trajectory = self._controller.trajectory
+        self._skipped_before, self._crowded_before = trajectory.skipped, trajectory.crowded
         self._beyond_before = {axis.name for axis in self._controller.axes if axis.path.beyond}
         self.timing.restart()
         self.lateness.restart()
@@ -94,6 +96,22 @@ class Reporter:
             reaction = "go to the safe ones" if controller.mode is OperatingMode.RAMPING else "are the safe ones"
         yet = "" if watchdog.commanded else " yet"
         return f"no command{yet} for {watchdog.silence(time.monotonic_ns()):.3g} s; voltages {reaction}"
+
+    def skipped(self) -> str:
+        """Return how many points of a trajectory were skipped since the last periodic report, and why; "" if none."""
+        trajectory, late = self._controller.trajectory, self.lateness.report()
+        skipped, crowded = trajectory.skipped - self._skipped_before, trajectory.crowded - self._crowded_before
+        if not skipped:
+            return ""
+        said = f"{skipped} points of a trajectory skipped, as the next one was already due"
+        if 2 * crowded > skipped:
+            period = f"{trajectory.period * 1e3:.3g} ms"
+            return f"{said}: they are closer together than the output period of {period}; send points {period} apart"
+        delay = f", up to {late.latency[2] * 1e3:.3g} ms" if late else ""
+        return (
+            f"{said}: the computer was late{delay}, and the stage went straight on; end other programs, or set "
+            "realtime_priority"
+        )
 
     def _counters(self) -> dict[str, object]:
         counts = self._controller.counts
@@ -170,6 +188,8 @@ class Reporter:
         yield jumps > 0, WARN, f"the clock of the stamps was set back {jumps} times"
         points = counts.points_held - window.points_held
         yield points > 0, WARN, f"{points} points of a trajectory held at a voltage limit"
+        skipped = self.skipped()
+        yield skipped != "", WARN, skipped
         lost = self.lost - self._lost_before
         yield lost > 0, WARN, f"{lost} messages lost by the middleware; send fewer, or make its queue deeper"
         ownership = self._controller.ownership

@@ -82,6 +82,11 @@ def fingerprint(records: Sequence[Signals]) -> tuple[Left, ...]:
     return tuple(sorted((one for one in found if one.share >= LEAST_SHARE), key=lambda one: -one.share))
 
 
+def lines_of(record: Signals, least: float) -> Left | None:
+    """Return the lines of the spectrum of a residual; None if they hold no more than the share `least` of it."""
+    return next((found for found in _of_lines([_centred(record)]) if found.share > least), None)
+
+
 def _thinned(record: Signals) -> Signals:
     every = -(-record.t.size // ENOUGH)
     return Signals(*(x[::every] for x in record))

@@ -27,7 +27,7 @@ CAUSES = {
     "command": "the voltages are not those of this model: slew limit, feedback, a reset, another model, or points of a "
     "trajectory that were skipped, which the log of the compensator tells",
     "model": "the hysteresis and what else the model does not hold: slpi diagnose, slpi refit",
-    "noise": "sensor noise and what does not repeat",
+    "noise": "what does not repeat: sensor noise, vibration, line interference",
 }
 
 

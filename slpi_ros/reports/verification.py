@@ -47,9 +47,10 @@ SEVERITY: dict[str, Severity] = {PASSED: "good", UNPROVED: "warn", FAILED: "bad"
 # not told.
 PARTS = {
     "zero": "zero", "memory": "initial state", "limits": "voltage limits", "delay": "delay", "rate": "rate dependence",
-    "command": "other voltages than the model's", "model": "hysteresis", "noise": "sensor noise",
+    "command": "other voltages than the model's", "model": "hysteresis", "noise": "repeatability",
 }  # fmt: skip
 _SMALLEST_PART = 0.1
+LINES = "line interference or vibration"
 
 
 def write_files(folder: Path, found: Verification) -> None:
@@ -79,10 +80,9 @@ def verification_limits(found: Verification) -> dict[str, str]:
     for name, axis in found.axes.items():
         tracked = [record.tracking for record in axis.records if record.tracking]
         if not axis.passed:
-            worst = axis.worst
-            noisy = worst.rest.rms <= ABOVE_NOISE * worst.repeatability_rms
-            model = "unproved" if axis.verdict == UNPROVED else "the noise of the record" if noisy else "the model"
-            limits[name] = f"{model}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed"
+            worst, unproved = axis.worst, axis.verdict == UNPROVED
+            limit = "unproved" if unproved else _limiting(worst)
+            limits[name] = f"{limit}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed"
         elif tracked:
             worst_path = max(tracked, key=lambda tracking: tracking.error.rms)
             if worst_path.error.rms > axis.worst.limit:
@@ -90,11 +90,23 @@ def verification_limits(found: Verification) -> dict[str, str]:
     return limits
 
 
+def _limiting(record: RecordVerification) -> str:
+    """Return what makes most of the error of a record that fails."""
+    if record.absolute and record.constant**2 > record.error.rms**2 / 2:
+        return "the zero"
+    share = record.lines.share if record.lines else 0.0
+    if record.rest.rms * np.sqrt(1.0 - share) <= ABOVE_NOISE * record.repeatability_rms:
+        return LINES if record.lines else "the noise of the record"
+    return "the model"
+
+
 def verification_good(found: Verification) -> str:
     """Return how good a verified model is that nothing limits."""
     records = [record for axis in found.axes.values() for record in axis.records]
     noise = all(record.error.rms <= ABOVE_NOISE * record.repeatability_rms for record in records)
-    return "at the repeatability of the record" if noise else "within its limit on every record"
+    lines = max((record.lines.share for record in records if record.lines), default=0.0)
+    good = "at the repeatability of the record" if noise else "within its limit on every record"
+    return f"{good}{f'; {lines:.0%} of the mean square error is {LINES}' if lines else ''}"
 
 
 def little_judged(found: Verification) -> str:
@@ -184,6 +196,8 @@ def _notes(record: RecordVerification) -> list[str]:
         notes.append(
             f"while the voltage moves {length(record.moving.rms)} rms, while it stands {length(record.standing.rms)}"
         )
+    if record.lines:
+        notes.append(f"{LINES}: of the error without its constant part, {record.lines.evidence}")
     if record.corrected:
         notes.append(f"errors are those of the stage; taken out of the readings of its sensor: {record.corrected}")
     if record.zero_moved:

@@ -18,7 +18,12 @@ from slpi_ros.diagnosis.verify import UNPROVED
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.schemas import validate
-from slpi_ros.reports.verification import little_judged
+from slpi_ros.reports.verification import (
+    describe_verification,
+    little_judged,
+    verification_good,
+    verification_limits,
+)
 
 SEED, RATE = 2, 200.0
 # Voltages between which a stage was moved before a record; the last one leads to where the record begins.
@@ -75,7 +80,9 @@ def test_a_moved_zero_is_no_error_of_the_loops(offset, model):
 
 def test_a_tolerance_holds_for_the_absolute_error(model):
     record = unseen(offset=1.5e-7)
-    one = judged(record, model, tolerance=5e-8, start_memory="start")
+    found = slpi_ros.verify(record, model, tolerance=5e-8, start_memory="start")
+    assert verification_limits(found)["x"].startswith("the zero")
+    one = found.axes["x"].records[0]
     assert one.absolute and not one.passed and one.constant == pytest.approx(1.5e-7, rel=0.1)
     assert one.error.rms == pytest.approx(np.hypot(one.constant, one.rest.rms), rel=0.02)
     assert judged(record, model, tolerance=5e-8, start_memory="start", without_offset=True).passed
@@ -123,6 +130,23 @@ def test_moving_and_standing_are_told_apart(model):
     assert one.standing.rms < one.moving.rms
     assert one.standing.samples + one.moving.samples == one.error.samples
     assert one.standing.samples == pytest.approx(2400, abs=60)
+
+
+@pytest.mark.parametrize("amplitude", [3e-9, 4e-8])
+def test_line_interference_is_told_where_it_is_much_of_the_error(amplitude, model):
+    record = unseen()
+    y = record.displacement["x"] + amplitude * np.sin(2.0 * np.pi * 50.1 * record.t)
+    found = slpi_ros.verify(replace(record, displacement={"x": y}), model)
+    validate(found.to_document(), "verification", "test")
+    one, told = found.axes["x"].records[0], "\n".join(describe_verification(found))
+    if amplitude < one.repeatability_rms:
+        assert one.lines is None and "interference" not in told
+        return
+    assert one.lines.share == pytest.approx(0.5 * amplitude**2 / one.rest.rms**2, abs=0.05)
+    assert "50.1 Hz (40.1 nm)" in told and "interference" in verification_good(found)
+    # Of a record that fails for it, it is no error of the model.
+    failed = slpi_ros.verify(replace(record, displacement={"x": y}), model, tolerance=2e-8)
+    assert "interference" in verification_limits(failed)["x"]
 
 
 @pytest.mark.parametrize("gain", [0.99, 1.02])

@@ -365,7 +365,7 @@ class Calibrator(Node):
         found = None if lacking else self._guard.found()
         # A publisher that was killed is known for some seconds more.
         if self._guard.others and not late:
-            lacking = f"{self._guard.others} other publisher of {self._guard.publisher.topic_name}; stop it"
+            lacking = f"{self._guard.told_others()}; stop it"
         if found is not None and not self._guard.others:
             self._waiting = False
             try:

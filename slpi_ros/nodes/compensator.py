@@ -41,6 +41,7 @@ from slpi_ros.nodes.common import (
     as_rclpy_reads,
     ask_for_priority,
     keep_freed_memory,
+    publishers_beside,
     refuse_impossible_transitions,
 )
 from slpi_ros.nodes.compensator_diagnostics import Reporter
@@ -529,12 +530,7 @@ class Compensator(LifecycleNode):
         """Return the other nodes that publish the voltages."""
         if self._controller.mode is OperatingMode.UNCONFIGURED:
             return []
-        own = self.get_name(), self.get_namespace()
-        found = self.get_publishers_info_by_topic(self._publisher.topic_name)
-        names = [(each.node_name, each.node_namespace) for each in found]
-        if own in names:
-            names.remove(own)
-        return sorted(f"{namespace.rstrip('/')}/{name}" for name, namespace in names)
+        return publishers_beside(self, self._publisher.topic_name)
 
     def _on_period(self) -> None:
         self._reporter.others = self._other_publishers()

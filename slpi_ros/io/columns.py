@@ -139,9 +139,7 @@ def begins(name: str, quantity: ColumnQuantity) -> bool:
 
 def is_desired(name: str) -> bool:
     """Return whether the name of a column says that it holds desired displacements."""
-    foreign = any(begins(name, quantity) for quantity in (TIME, VOLTAGE))
-    unit = _split(name, DISPLACEMENT)[1]
-    return bool(_DESIRED.search(name)) and not foreign and (not unit or bool(DISPLACEMENT.unit(unit)))
+    return bool(_DESIRED.search(name)) and not any(begins(name, quantity) for quantity in (TIME, VOLTAGE))
 
 
 def _parse_desired(name: str, given_unit: str | None, source: str) -> Column:
@@ -229,7 +227,7 @@ class ColumnChoice:
     voltage: Mapping[str, Column]
     displacement: Mapping[str, Column]
     desired: Mapping[str, Column] = field(default_factory=dict)
-    left_out: tuple[Column, ...] = ()  # of desired displacements, of no axis
+    left_out: tuple[str, ...] = ()  # names of desired columns, each with the reason
 
     def columns(self) -> tuple[Column, ...]:
         """Return all columns."""
@@ -257,14 +255,20 @@ def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) ->
     driven = _one_for_each(moved, [parse_column(name, VOLTAGE, source=source) for name in driven_names], source)
     axes = _axis_names(moved, options.axes, source)
     taken = {time.name, *(column.name for column in (*moved, *driven))}
-    wanted_names = [match_column(name, names) for name in options.desired] or [
-        name for name in names if name not in taken and is_desired(name)
-    ]
+    wanted_names, left_out = [match_column(name, names) for name in options.desired], []
+    for name in () if wanted_names else names:
+        if name not in taken and is_desired(name):
+            unit = _split(name, DISPLACEMENT)[1]
+            if unit and not DISPLACEMENT.unit(unit):
+                left_out.append(f"'{name}': {unit} is no unit of displacement")
+            else:
+                wanted_names.append(name)
     wanted = [_parse_desired(name, given_unit, source) for name in wanted_names]
-    desired, left_out = _of_axes(wanted, moved, axes, source, named=bool(options.desired))
+    desired, of_none = _of_axes(wanted, moved, axes, source, named=bool(options.desired))
+    left_out += [f"'{column.name}': no axis '{column.axis}'" for column in of_none]
     _require_one_role(time, (*moved, *desired.values()), driven, source)
     return ColumnChoice(
-        time, dict(zip(axes, driven, strict=True)), dict(zip(axes, moved, strict=True)), desired, left_out
+        time, dict(zip(axes, driven, strict=True)), dict(zip(axes, moved, strict=True)), desired, tuple(left_out)
     )
 
 

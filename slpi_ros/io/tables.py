@@ -78,8 +78,8 @@ def _summary(record: Record, desired: Mapping[str, FloatArray], choice: ColumnCh
         displacement = _column_summary(choice.displacement[axis], record.displacement[axis] * 1e6, "µm")
         wanted = _column_summary(choice.desired[axis], desired[axis] * 1e6, "µm") if axis in desired else ""
         yield f"axis {axis}: {voltage}, {displacement}{', desired ' + wanted if wanted else ''}"
-    for column in choice.left_out:
-        yield f"column '{column.name}' left out: no axis '{column.axis}'; name desired displacements with --desired"
+    for reason in choice.left_out:
+        yield f"left out, column {reason}; name the columns of desired displacements in units of length (--desired)"
 
 
 def _column_summary(column: Column, values: FloatArray, unit: str) -> str:

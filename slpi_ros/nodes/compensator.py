@@ -450,6 +450,11 @@ class Compensator(LifecycleNode):
             self._too_fast = said
             self.get_logger().warning(f"trajectory {said}; send it more slowly, or raise slew_limit")
 
+    def _tell_late(self) -> None:
+        """Log that points of a trajectory were skipped, or late."""
+        if late := self._reporter.late():
+            self.get_logger().warning(late, throttle_duration_sec=LOG_PERIOD)
+
     def _reject(self, what: str, error: RejectedError) -> None:
         """Log and report the rejection of a message, which the controller has counted already."""
         self._reporter.last_rejection = str(error)
@@ -522,8 +527,8 @@ class Compensator(LifecycleNode):
         if controller.mode is not before:
             if before is OperatingMode.RESETTING:
                 self._answer_reset()
-            if before is OperatingMode.TRAJECTORY and (skipped := self._reporter.skipped()):
-                self.get_logger().warning(skipped)
+            if before is OperatingMode.TRAJECTORY:
+                self._tell_late()
             self._report()
 
     def _other_publishers(self) -> list[str]:
@@ -535,6 +540,7 @@ class Compensator(LifecycleNode):
     def _on_period(self) -> None:
         self._reporter.others = self._other_publishers()
         self._report()
+        self._tell_late()
         self._reporter.start_window()
         if self._controller.active:
             self._save_memory(complete=False)

@@ -18,6 +18,8 @@ from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 Problem = tuple[bool, bytes, str]
 # Residuals are a constant if their mean is this share of their rms.
 CONSTANT = 0.9
+# A sample of a trajectory that comes so much later than it should is told, seconds.
+LATE = 0.01
 
 
 class Reporter:
@@ -97,20 +99,21 @@ class Reporter:
         yet = "" if watchdog.commanded else " yet"
         return f"no command{yet} for {watchdog.silence(time.monotonic_ns()):.3g} s; voltages {reaction}"
 
-    def skipped(self) -> str:
-        """Return how many points of a trajectory were skipped since the last periodic report, and why; "" if none."""
-        trajectory, late = self._controller.trajectory, self.lateness.report()
+    def late(self) -> str:
+        """Return what a trajectory lost since the last periodic report, and why; "" if nothing."""
+        trajectory, report = self._controller.trajectory, self.lateness.report()
         skipped, crowded = trajectory.skipped - self._skipped_before, trajectory.crowded - self._crowded_before
-        if not skipped:
-            return ""
         said = f"{skipped} points of a trajectory skipped, as the next one was already due"
         if 2 * crowded > skipped:
             period = f"{trajectory.period * 1e3:.3g} ms"
             return f"{said}: they are closer together than the output period of {period}; send points {period} apart"
-        delay = f", up to {late.latency[2] * 1e3:.3g} ms" if late else ""
+        latest = report.latency[2] if report else 0.0
+        if not skipped and latest < LATE:
+            return ""
+        late = f"trajectory up to {latest * 1e3:.3g} ms late"
         return (
-            f"{said}: the computer was late{delay}, and the stage went straight on; end other programs, or set "
-            "realtime_priority"
+            f"{f'{said}, ' if skipped else ''}{late}: the computer was busy; the path has an error there, end other "
+            "programs, or set realtime_priority"
         )
 
     def _counters(self) -> dict[str, object]:
@@ -188,8 +191,8 @@ class Reporter:
         yield jumps > 0, WARN, f"the clock of the stamps was set back {jumps} times"
         points = counts.points_held - window.points_held
         yield points > 0, WARN, f"{points} points of a trajectory held at a voltage limit"
-        skipped = self.skipped()
-        yield skipped != "", WARN, skipped
+        late = self.late()
+        yield late != "", WARN, late
         lost = self.lost - self._lost_before
         yield lost > 0, WARN, f"{lost} messages lost by the middleware; send fewer, or make its queue deeper"
         ownership = self._controller.ownership

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slpi_ros.diagnosis.tracking import CAUSES, ErrorPart, Tracking
+from slpi_ros.diagnosis.tracking import CAUSES, Burst, ErrorPart, Tracking
 from slpi_ros.diagnosis.verify import (
     FAILED,
     FEW,
@@ -50,6 +50,8 @@ PARTS = {
     "command": "other voltages than the model's", "model": "hysteresis", "noise": "repeatability",
 }  # fmt: skip
 _SMALLEST_PART = 0.1
+# Largest number of times that are told.
+MOST_TIMES = 3
 LINES = "line interference or vibration"
 
 
@@ -86,8 +88,15 @@ def verification_limits(found: Verification) -> dict[str, str]:
         elif tracked:
             worst_path = max(tracked, key=lambda tracking: tracking.error.rms)
             if worst_path.error.rms > axis.worst.limit:
-                limits[name] = f"the path, {length(worst_path.error.rms)} rms, most by {PARTS[worst_path.blame]}"
+                limits[name] = f"the path, {length(worst_path.error.rms)} rms, most by {_part(worst_path)}"
+                if (burst := worst_path.burst) and burst.gap:
+                    limits[name] += ", while computer or driver was busy"
     return limits
+
+
+def _part(tracking: Tracking) -> str:
+    """Return the name of the largest part of a tracking error."""
+    return "a delay that varies" if tracking.delays and tracking.blame == "delay" else PARTS[tracking.blame]
 
 
 def _limiting(record: RecordVerification) -> str:
@@ -212,14 +221,32 @@ def _notes(record: RecordVerification) -> list[str]:
 def _tracking_notes(tracking: Tracking) -> list[str]:
     """Return the tracking error of a compensated path, what it consists of, and what helps against the largest part."""
     error, late = tracking.error, f" ({tracking.delay * 1e3:.3g} ms)" if tracking.delay else ""
+    if tracking.delays:
+        late = f" (varies, {tracking.delays[0] * 1e3:.3g} to {tracking.delays[1] * 1e3:.3g} ms)"
     told = [
         f"{PARTS[cause]} {length(part)}{late if cause == 'delay' else ''}" for cause, part in _parts(tracking).items()
     ]
+    burst = tracking.burst
     return [
         f"path: measured - desired is {length(error.rms)} rms, {length(error.maximum)} at most, without the zero "
         f"{length(tracking.rest_rms)} rms; of it {', '.join(told)}",
-        f"path, largest part: {CAUSES[tracking.blame]}",
+        *([_when(burst)] if burst else []),
+        f"path, largest part: {tracking.advice(tracking.blame)}",
     ]
+
+
+def _when(burst: Burst) -> str:
+    """Return when most of a tracking error occurs, and that readings are missing there."""
+    times = [f"{begin:.4g} to {end:.4g} s" for begin, end in burst.times[:MOST_TIMES]]
+    others = len(burst.times) - MOST_TIMES
+    times += [f"{others} other times"] if others > 0 else []
+    said = (
+        f"path: {burst.share:.0%} of the mean square error without the zero is at {', '.join(times)} of the record, "
+        f"elsewhere it is {length(burst.elsewhere)} rms"
+    )
+    if burst.gap:
+        said += f"; no reading comes there for up to {burst.gap * 1e3:.3g} ms: computer or driver was busy"
+    return said
 
 
 def _parts(tracking: Tracking) -> dict[str, float]:
@@ -296,10 +323,10 @@ def _show_record(page: Page, name: str, record: RecordVerification) -> None:
 def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
     """Add the causes of the error along a compensated path."""
     page.subsection("Measured - desired displacement")
-    page.lines(_tracking_notes(tracking)[:1])
+    page.lines(_tracking_notes(tracking)[:-1])
     page.table(
         ("part of the error", "rms (nm)", "what it is, and what helps"),
-        [(PARTS[cause], f"{part * 1e9:.1f}", CAUSES[cause]) for cause, part in _parts(tracking).items()],
+        [(PARTS[cause], f"{part * 1e9:.1f}", tracking.advice(cause)) for cause, part in _parts(tracking).items()],
         caption="Rms by which each part enters the whole; of parts that cancel, the smaller one is left out.",
     )
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)

@@ -276,6 +276,52 @@ def test_what_goes_with_the_logarithm_of_the_rate_is_a_rate_dependence(model):
     assert tracking.shares["rate"] + tracking.shares["model"] > 0.9
 
 
+@pytest.mark.parametrize("lost", [0, 30])
+def test_times_at_which_a_path_is_off_are_told_with_gaps_of_the_record(lost, model):
+    t, desired = path(model)
+    v = model.compensate(t, desired, start_memory="start")
+    # The voltage stands still for a while, and no reading comes.
+    begin, end = 1500, 1600
+    v[begin:end] = v[begin]
+    kept = np.ones(t.size, bool)
+    kept[end - lost : end] = False
+    y = after((), 0.0).run(t + 100.0, v)[1]
+    record = record_of(t[kept], v[kept], y[kept])
+    found = slpi_ros.verify(record, model, desired=[{"x": desired[kept]}])
+    tracking, told = found.axes["x"].records[0].tracking, "\n".join(describe_verification(found))
+    burst = tracking.burst
+    assert burst.share > 0.9 and burst.elsewhere < 2.5 * 8e-9 < tracking.rest_rms
+    ((first, last),) = burst.times
+    assert first == pytest.approx(t[begin], abs=0.2) and last == pytest.approx(t[end], abs=0.2)
+    assert burst.gap == (pytest.approx((lost + 1) / RATE) if lost else 0.0)
+    assert ("busy" in verification_limits(found)["x"]) == ("no reading" in told) == bool(lost)
+
+
+def test_a_delay_that_varies_is_told_apart(model):
+    t, desired = path(model)
+    sent = model.compensate(t, desired, start_memory="start")
+    delays = 0.05 * (1.0 + np.sin(0.8 * t))
+    v = np.interp(t - delays, t, sent)
+    found = slpi_ros.verify(record_of(t, v, after((), 0.0).run(t + 100.0, v)[1]), model, desired=[{"x": desired}])
+    validate(found.to_document(), "verification", "test")
+    tracking = found.axes["x"].records[0].tracking
+    assert tracking.blame == "delay" and tracking.shares["delay"] > 0.9
+    assert tracking.delays == pytest.approx((0.0, 0.1), abs=0.015)
+    assert "varies" in "".join(describe_verification(found)) and "busy" in tracking.advice("delay")
+
+
+@pytest.mark.parametrize(("gain", "volts"), [(0.98, 0.0), (1.0, 2.0)])
+def test_voltages_of_another_model_are_no_delay(gain, volts, model):
+    t, desired = path(model)
+    v = np.clip(gain * model.compensate(t, desired, start_memory="start") + volts * np.sin(0.7 * t), 0.0, 100.0)
+    tracking = judged(record_of(t, v, after((), 0.0).run(t + 100.0, v)[1]), model, desired=[{"x": desired}]).tracking
+    assert tracking.delays is None and tracking.shares["delay"] < 0.1
+
+
+def test_an_error_all_along_a_path_has_no_times(model):
+    assert tracked(model).burst is None and tracked(model, gain=1.02).burst is None
+
+
 def test_parts_of_the_error_add_up(model):
     tracking = tracked(model, (100, 20, 80), (0.0, 70.0), 2, 1.0, 1e-7)
     error = np.sum(list(tracking.parts.values()), axis=0)

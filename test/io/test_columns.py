@@ -201,13 +201,13 @@ def test_a_column_of_desired_displacements_is_recognised(table, name):
 
 
 @pytest.mark.parametrize(
-    "name", ["voltage_setpoint_V", "time_of_setpoint", "undesired_um", "setpoint_temperature", "note"]
+    "name", ["voltage_setpoint_V", "time_of_setpoint", "undesired_um", "setpoint_temperature", "desired_mrad", "note"]
 )
 def test_a_column_of_something_else_is_no_desired_displacement(table, name):
     columns = ColumnOptions(time="time_s", voltage=("voltage_V",))
     read = import_with_summary(table(f"time_s,voltage_V,x_um,{name}", "0,1,2,3", "1,1,2,3"), columns)
     assert not read.desired and list(read.record.axes) == ["x"]
-    assert any("--desired" in line for line in read.summary) == (name == "setpoint_temperature")
+    assert any("--desired" in line for line in read.summary) == (name in ("setpoint_temperature", "desired_mrad"))
 
 
 def test_desired_displacements_of_several_axes(table):

@@ -205,8 +205,16 @@ def test_skipped_points_are_told_with_their_reason(xy_file):
         client.node.process.send_signal(signal.SIGSTOP)
         time.sleep(0.1)
         client.node.process.send_signal(signal.SIGCONT)
-        client.graph.wait_for_status(status.name, lambda later: "computer was late" in later.message, "the reason")
+        client.graph.wait_for_status(status.name, lambda later: "computer was busy" in later.message, "the reason")
         client.report(trajectories=2, points_remaining=0)
+        # Between points that are far apart samples are missed, and no points.
+        publisher.publish(trajectory(["x"], np.array([0, 2000]) * MS, np.array([[2e-6], [4e-6]])))
+        client.graph.spin_until(lambda: client.answers[-1][0] > 25.0, "the third trajectory")
+        client.node.process.send_signal(signal.SIGSTOP)
+        time.sleep(0.1)
+        client.node.process.send_signal(signal.SIGCONT)
+        status = client.graph.wait_for_status(status.name, lambda later: " ms late" in later.message, "the delay")
+        assert "skipped" not in status.message
         assert "output period" in client.node.stderr
 
 

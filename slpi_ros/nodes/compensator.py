@@ -477,11 +477,16 @@ class Compensator(LifecycleNode):
         self._report_at_least(WARN)
         if self._controller.counts.excursions > self._excursions:
             self._excursions = self._controller.counts.excursions
-            out = [f"axis {axis.name}{_reach(axis)}" for axis in self._controller.axes if axis.held]
-            self.get_logger().warning(
-                f"desired displacement out of reach, held at a voltage limit: {', '.join(out)}; "
-                "send displacements within the identified range"
-            )
+            held = [axis for axis in self._controller.axes if axis.held]
+            out = [f"axis {axis.name}{_reach(axis)}" for axis in held]
+            remedy = "send displacements within the identified range"
+            if all(_in_range(axis) for axis in held):
+                remedy = (
+                    "that is within the range: send a slower path, one further from its ends, or widen voltage_min and "
+                    "voltage_max if they are narrower than the model"
+                )
+            said = f"desired displacement out of reach, held at a voltage limit: {', '.join(out)}"
+            self.get_logger().warning(f"{said}; {remedy}")
 
     # Motion without messages
 
@@ -755,6 +760,15 @@ def _reach(axis: Axis) -> str:
         return ""
     low, high = model.displacement_range
     return f" at {desired * 1e6:.5g} of {low * 1e6:.5g} to {high * 1e6:.5g} µm"
+
+
+def _in_range(axis: Axis) -> bool:
+    """Return whether the desired displacement of an axis is in the identified range: what is too much is its rate."""
+    desired, model = axis.tracking.desired, axis.model
+    if desired is None or model is None:
+        return False
+    low, high = model.displacement_range
+    return low <= desired <= high
 
 
 def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayLike]:

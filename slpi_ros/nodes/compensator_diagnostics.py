@@ -9,7 +9,7 @@ from rclpy.node import Node
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import Drift
-from slpi_ros.compensator.persistence import KNOWN, RESTORED
+from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED
 from slpi_ros.compensator.statistics import Timing, TimingReport
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
@@ -253,7 +253,8 @@ def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]
     yield moving and axis.feedback_state == "saturated", WARN, saturated
     yield axis.confidence.contradicted, WARN, f"axis '{axis.name}': {axis.confidence.doubt}"
     drift, quality = axis.drift, axis.model.quality if axis.model else None
-    if drift and quality:
+    # Before the end of a reset the model has another memory than the stage.
+    if drift and quality and axis.confidence.state != RESETTING:
         usual = max(quality.held_out_rms, quality.floor_rms)
         text = (
             f"axis '{axis.name}' is off its model by {drift.rms * 1e9:.1f} nm rms, mean {drift.mean * 1e9:.1f} nm, in "

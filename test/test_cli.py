@@ -206,6 +206,17 @@ def test_an_imported_path_is_judged(folder, tmp_path):
     assert "path: measured - desired" in slpi("verify", tmp_path / "b", "--model", folder / "pi.json").stdout
 
 
+def test_a_bag_of_the_identification_proves_nothing(folder, tmp_path):
+    record = slpi_ros.read_bag(folder / "bag")
+    write_bag(tmp_path / "02", record)
+    # The calibrator names its bags by their place beside the model.
+    model = slpi_ros.identify(replace(record, source="02"), "pi")
+    slpi_ros.save_model(model, tmp_path / "model.json")
+    for bag, own in ((tmp_path / "02", True), (folder / "bag", False)):
+        done = slpi("verify", bag, "--model", tmp_path / "model.json")
+        assert ("was identified from this bag" in done.stdout) == own
+
+
 def test_an_import_tells_what_it_took_for_what(tmp_path):
     lines = ["Stage 7", "Zeit;Spannung;Weg [nm]", "0,0;0;-500", "0,5;100,5;19800"]
     (tmp_path / "d.csv").write_text("\n".join(lines), encoding="latin-1")

@@ -30,6 +30,8 @@ LEAST_SHARE = 0.05
 # Largest number of spectral lines and of jumps; power of a line relative to the median of its surroundings; size of a
 # jump relative to the rms difference of the means before and after all other samples.
 MOST_LINES, MOST_JUMPS, LINE, JUMP = 6, 8, 30.0, 5.0
+# Lines of this share of the largest amplitude are told.
+TALL = 0.1
 # Largest number of samples of a record, evenly thinned, for functions of a variable.
 ENOUGH = 40_000
 
@@ -200,7 +202,10 @@ def _of_lines(records: Sequence[Signals]) -> Iterator[Left]:
         if not lines:
             continue
         gains = np.linalg.lstsq(own, record.residual, rcond=None)[0].reshape(-1, 2)
-        told += [f"{f:.4g} Hz ({length(float(np.hypot(*gain)))})" for f, gain in zip(lines, gains, strict=True)]
+        heights = np.hypot(*gains.T).tolist()
+        # Beside a strong line are weak ones that its amplitude, not quite constant, makes.
+        tall = [each for each in zip(lines, heights, strict=True) if each[1] >= TALL * max(heights)]
+        told += [f"{frequency:.4g} Hz ({length(height)})" for frequency, height in tall]
     name = "lines of the spectrum"
     yield Left(
         name, share, f"{share:.0%} of the mean square is in lines at {', '.join(told[:MOST_LINES])}; {HINTS[name]}"

@@ -91,6 +91,12 @@ class RecordVerification:
         return 1.0 - float(np.count_nonzero(np.isfinite(self.measured))) / self.samples
 
     @property
+    def unrepeated_rms(self) -> float:
+        """Part of the error that no model explains, m rms: the repeatability, or the lines of the spectrum."""
+        lines = self.lines.share * self.rest.rms**2 if self.lines else 0.0
+        return float(np.sqrt(max(self.repeatability_rms**2, lines)))
+
+    @property
     def judged_error(self) -> float:
         """Rms error that is compared with the limit, metres."""
         return self.error.rms if self.absolute else self.rest.rms
@@ -298,7 +304,7 @@ def verify(
                 tracking = track(
                     (record.source, name), run.t, one.v, one.measured, followed,
                     one.model - explained, run.assumed, zero=zero,
-                    noise_rms=one.repeatability_rms,
+                    noise_rms=one.unrepeated_rms,
                 )  # fmt: skip
                 one = replace(one, tracking=tracking)
             found[name].append(one)

@@ -47,12 +47,12 @@ SEVERITY: dict[str, Severity] = {PASSED: "good", UNPROVED: "warn", FAILED: "bad"
 # not told.
 PARTS = {
     "zero": "zero", "memory": "initial state", "limits": "voltage limits", "delay": "delay", "rate": "rate dependence",
-    "command": "other voltages than the model's", "model": "hysteresis", "noise": "repeatability",
+    "command": "other voltages than the model's", "model": "hysteresis", "noise": "noise and interference",
 }  # fmt: skip
 _SMALLEST_PART = 0.1
 # Largest number of times that are told.
 MOST_TIMES = 3
-LINES = "line interference or vibration"
+LINES, ZERO = "line interference or vibration", "the zero"
 
 
 def write_files(folder: Path, found: Verification) -> None:
@@ -81,16 +81,17 @@ def verification_limits(found: Verification) -> dict[str, str]:
     limits = {}
     for name, axis in found.axes.items():
         tracked = [record.tracking for record in axis.records if record.tracking]
+        said = []
         if not axis.passed:
             worst, unproved = axis.worst, axis.verdict == UNPROVED
             limit = "unproved" if unproved else _limiting(worst)
-            limits[name] = f"{limit}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed"
-        elif tracked:
-            worst_path = max(tracked, key=lambda tracking: tracking.error.rms)
-            if worst_path.error.rms > axis.worst.limit:
-                limits[name] = f"the path, {length(worst_path.error.rms)} rms, most by {_part(worst_path)}"
-                if (burst := worst_path.burst) and burst.gap:
-                    limits[name] += ", while computer or driver was busy"
+            said.append(f"{limit}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed")
+        path = max(tracked, key=lambda tracking: tracking.error.rms, default=None)
+        if path and path.error.rms > max(axis.worst.limit, axis.worst.judged_error):
+            busy = ", while computer or driver was busy" if (burst := path.burst) and burst.gap else ""
+            said.append(f"the path, {length(path.error.rms)} rms, most by {_part(path)}{busy}")
+        if said:
+            limits[name] = "; ".join(said)
     return limits
 
 
@@ -101,8 +102,8 @@ def _part(tracking: Tracking) -> str:
 
 def _limiting(record: RecordVerification) -> str:
     """Return what makes most of the error of a record that fails."""
-    if record.absolute and record.constant**2 > record.error.rms**2 / 2:
-        return "the zero"
+    if record.absolute and record.zero_moved and record.constant**2 > record.error.rms**2 / 2:
+        return ZERO
     share = record.lines.share if record.lines else 0.0
     if record.rest.rms * np.sqrt(1.0 - share) <= ABOVE_NOISE * record.repeatability_rms:
         return LINES if record.lines else "the noise of the record"
@@ -152,6 +153,11 @@ def _summary(name: str, axis: AxisVerification) -> str:
         return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")
     if axis.verdict == UNPROVED:
         return f"{said} {_why_unproved(next(one for one in axis.records if one.verdict == UNPROVED))}"
+    limit = _limiting(axis.worst)
+    if limit == LINES:
+        return f"{said} It is {LINES}, no error of the model."
+    if limit == ZERO:
+        return f"{said} The zero has moved: '~/set_zero' of the compensator, or judge --without-offset."
     return f"{said} 'slpi diagnose' finds the cause, 'slpi refit' corrects the model."
 
 

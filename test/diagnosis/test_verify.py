@@ -147,6 +147,18 @@ def test_line_interference_is_told_where_it_is_much_of_the_error(amplitude, mode
     # Of a record that fails for it, it is no error of the model.
     failed = slpi_ros.verify(replace(record, displacement={"x": y}), model, tolerance=2e-8)
     assert "interference" in verification_limits(failed)["x"]
+    assert "no error of the model" in "".join(describe_verification(failed))
+
+
+def test_line_interference_is_no_hysteresis_of_a_path(model):
+    t, desired = path(model)
+    v = model.compensate(t, desired, start_memory="start")
+    y = after((), 0.0).run(t + 100.0, v)[1] + 7e-8 * np.sin(2.0 * np.pi * 50.0 * t)
+    found = slpi_ros.verify(record_of(t, v, y), model, tolerance=3e-8, desired=[{"x": desired + 3e-6}])
+    tracking = found.axes["x"].records[0].tracking
+    assert tracking.rms["noise"] == pytest.approx(7e-8 / np.sqrt(2.0), rel=0.1) and tracking.rms["model"] < 2e-8
+    limits = verification_limits(found)["x"]
+    assert limits.startswith("line interference") and "the path, 3" in limits
 
 
 @pytest.mark.parametrize("gain", [0.99, 1.02])

@@ -16,8 +16,8 @@ from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 
 Problem = tuple[bool, bytes, str]
-# Residuals are a constant if their mean is this share of their rms.
-CONSTANT = 0.9
+# Residuals are a constant if their mean is more than the first share of their rms, and have none below the second.
+CONSTANT, NO_CONSTANT = 0.9, 0.3
 # A sample of a trajectory that comes so much later than it should is told, seconds.
 LATE = 0.01
 
@@ -103,7 +103,8 @@ class Reporter:
         """Return what a trajectory lost since the last periodic report, and why; "" if nothing."""
         trajectory, report = self._controller.trajectory, self.lateness.report()
         skipped, crowded = trajectory.skipped - self._skipped_before, trajectory.crowded - self._crowded_before
-        said = f"{skipped} points of a trajectory skipped, as the next one was already due"
+        points = "1 point" if skipped == 1 else f"{skipped} points"
+        said = f"{points} of a trajectory skipped, as the next one was already due"
         if 2 * crowded > skipped:
             period = f"{trajectory.period * 1e3:.3g} ms"
             return f"{said}: they are closer together than the output period of {period}; send points {period} apart"
@@ -113,7 +114,7 @@ class Reporter:
         late = f"trajectory up to {latest * 1e3:.3g} ms late"
         return (
             f"{f'{said}, ' if skipped else ''}{late}: the computer was busy; the path has an error there, end other "
-            "programs, or set realtime_priority"
+            "programs, lower output_rate, or set realtime_priority"
         )
 
     def _counters(self) -> dict[str, object]:
@@ -258,15 +259,18 @@ def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]
         usual = max(quality.held_out_rms, quality.floor_rms)
         text = (
             f"axis '{axis.name}' is off its model by {drift.rms * 1e9:.1f} nm rms, mean {drift.mean * 1e9:.1f} nm, in "
-            f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {_remedy(axis, drift)}"
+            f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {remedy(axis, drift)}"
         )
         yield 0.0 < factor * usual < drift.rms, WARN, text
 
 
-def _remedy(axis: Axis, drift: Drift) -> str:
+def remedy(axis: Axis, drift: Drift) -> str:
     """Return what to do about residuals: what has been done already is not advised again."""
     if axis.confidence.state not in (KNOWN, RESTORED):
-        return "reset the memory (~/reset_memory)"
+        # What an assumed memory adds is no vibration.
+        rest = NO_CONSTANT * drift.rms > abs(drift.mean)
+        other = "; if that does not help, record it: slpi verify tells vibration and interference"
+        return f"reset the memory (~/reset_memory){other if rest else ''}"
     if abs(drift.mean) > CONSTANT * drift.rms:
         return f"the zero, from the {axis.zero.source}, has moved; call ~/set_zero, or switch the feedback on"
     return "the stage has changed; record it and run slpi diagnose, or identify again"

@@ -193,6 +193,31 @@ def test_a_first_sample_that_jumps_is_told_and_a_slew_limit_kept(folder, tmp_pat
     assert one_line(slpi(*command, "--slew", -1), 2)
 
 
+def test_an_imported_path_is_judged(folder, tmp_path):
+    record = slpi_ros.read_bag(folder / "bag")
+    desired = slpi_ros.load_model(folder / "pi.json").simulate(record.t, record.voltage["x"]) - 3e-6
+    rows = np.column_stack([record.t, record.voltage["x"], 1e6 * record.displacement["x"], 1e6 * desired])
+    header = "time_s,voltage_V,displacement_um,desired_um"
+    np.savetxt(tmp_path / "data.csv", rows, delimiter=",", header=header, comments="", fmt="%.12g")
+    done = slpi("import", tmp_path / "data.csv", "-o", tmp_path / "b", "--json")
+    assert json.loads(done.stdout)["desired"] == ["x"]
+    found = slpi("verify", tmp_path / "b", "--model", folder / "pi.json", "--json")
+    tracking = json.loads(found.stdout)["axes"]["x"]["records"][0]["tracking"]
+    assert tracking["samples"] > 0.9 * len(record) and tracking["rms_m"] == pytest.approx(3e-6, rel=0.2)
+    assert "path: measured - desired" in slpi("verify", tmp_path / "b", "--model", folder / "pi.json").stdout
+
+
+def test_a_bag_of_the_identification_proves_nothing(folder, tmp_path):
+    record = slpi_ros.read_bag(folder / "bag")
+    write_bag(tmp_path / "02", record)
+    # The calibrator names its bags by their place beside the model.
+    model = slpi_ros.identify(replace(record, source="02"), "pi")
+    slpi_ros.save_model(model, tmp_path / "model.json")
+    for bag, own in ((tmp_path / "02", True), (folder / "bag", False)):
+        done = slpi("verify", bag, "--model", tmp_path / "model.json")
+        assert ("was identified from this bag" in done.stdout) == own
+
+
 def test_an_import_tells_what_it_took_for_what(tmp_path):
     lines = ["Stage 7", "Zeit;Spannung;Weg [nm]", "0,0;0;-500", "0,5;100,5;19800"]
     (tmp_path / "d.csv").write_text("\n".join(lines), encoding="latin-1")

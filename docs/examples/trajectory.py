@@ -3,6 +3,7 @@
 import math
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -11,7 +12,22 @@ RATE_HZ, SAMPLES, LEAD_NS = 1000, 1001, 200_000_000
 rclpy.init()
 node = rclpy.create_node("planner")
 publisher = node.create_publisher(JointTrajectory, "desired_trajectory", 10)
-while not publisher.get_subscription_count():
+ready = set()
+
+
+def on_diagnostics(array: DiagnosticArray) -> None:
+    """Note whether the compensator, which reports once a second, is active and does not reset the memory."""
+    for status in array.status:
+        values = {pair.key: pair.value for pair in status.values}
+        if status.name.endswith("compensator: compensator"):
+            print(status.message)
+            if values["state"] == "active" and "resetting" not in values["memory"]:
+                ready.add("compensator")
+
+
+node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
+# Another subscriber of the topic, such as a recorder, does not count.
+while not ready & {each.node_name for each in node.get_subscriptions_info_by_topic("desired_trajectory")}:
     rclpy.spin_once(node, timeout_sec=0.1)
 trajectory = JointTrajectory(joint_names=["x"])  # stamp 0: start at once
 for i in range(SAMPLES):

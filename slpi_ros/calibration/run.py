@@ -79,9 +79,8 @@ class TrackingError:
     def told(self) -> str:
         """Return the error in words."""
         return (
-            f"mean error {self.mean * 1e9:.3g} nm ({self.mean / self.stroke:.3%} of the stroke), "
-            f"maximum {self.maximum * 1e9:.3g} nm; of it constant {self.offset * 1e9:+.3g} nm, "
-            f"the rest {self.rest * 1e9:.3g} nm"
+            f"mean error {length(self.mean)} ({self.mean / self.stroke:.3%} of the stroke), maximum "
+            f"{length(self.maximum)}; of it constant {length(self.offset)}, the rest {length(self.rest)}"
         )
 
 
@@ -432,13 +431,13 @@ def why(verified: Sequence[Mapping[str, TrackingError]], diagnosis: Diagnosis, e
     name, worst = max(verified[-1].items(), key=lambda item: item[1].mean / item[1].goal)
     said = [
         f"target {'' if worst.met else 'not '}met",
-        f"axis {name}: {worst.told()}; target {worst.goal * 1e9:.3g} nm",
+        f"axis {name}: {worst.told()}; target {length(worst.goal)}",
     ]
     least = min((errors[name].mean for errors in verified[:-1]), default=worst.mean)
     if worst.mean > CLEARLY * least:
         said.append(
-            f"the error has risen from {least * 1e9:.3g} to {worst.mean * 1e9:.3g} nm between two verifications: the "
-            "stage drifts"
+            f"the error has risen from {length(least)} to {length(worst.mean)} between two verifications: the stage "
+            "drifts"
         )
     effects: Sequence[Effect] = [each.effect for each in diagnosis.axes[name].effects]
     lasting = [effect.name for effect in effects if effect.needs_feedback]

@@ -24,6 +24,11 @@ def _add_options(command: ArgumentParser) -> None:
         help="one column per axis; default: the columns in units of length",
     )  # fmt: skip
     command.add_argument(
+        "--desired", metavar="COLUMN", nargs="+", default=(),
+        help="desired displacement of each axis that has one, on which 'slpi verify' judges the tracking; default: the "
+        "columns with 'desired' or 'setpoint' in their names",
+    )  # fmt: skip
+    command.add_argument(
         "--displacement-unit", help="m, mm, um, nm or pm, for columns without a unit in the name; default: um"
     )
     command.add_argument(
@@ -47,16 +52,23 @@ def _run(options: Namespace) -> Result:
         displacement=tuple(options.displacement),
         displacement_unit=options.displacement_unit,
         axes=tuple(options.axes),
+        desired=tuple(options.desired),
     )
     options.remarks += allow_bag(options.output, overwrite=options.overwrite)
-    record, lines = import_with_summary(options.table, columns)
-    record = replace(record, hardware_id=options.hardware_id)
+    table = import_with_summary(options.table, columns)
+    record = replace(table.record, hardware_id=options.hardware_id)
     # What a link leads to is replaced, not the link.
     place = os.path.realpath(options.output) if options.overwrite else options.output
-    write_bag(place, record, storage=options.storage, replace=options.overwrite)
+    write_bag(place, record, storage=options.storage, replace=options.overwrite, desired=table.desired)
     return Result(
-        [f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s", *lines],
-        {"bag": options.output, "samples": len(record), "axes": list(record.axes), "seconds": float(record.t[-1])},
+        [f"{options.output}: {len(record)} samples of {', '.join(record.axes)}, {record.t[-1]:.6g} s", *table.summary],
+        {
+            "bag": options.output,
+            "samples": len(record),
+            "axes": list(record.axes),
+            "desired": list(table.desired),
+            "seconds": float(record.t[-1]),
+        },
         command_line("slpi", "identify", options.output, "-o", "model.json"),
     )
 

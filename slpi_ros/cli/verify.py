@@ -66,7 +66,9 @@ def _run(options: Namespace) -> Result:
     model = common.with_sensor(load_model(options.model), options)
     if options.output is not None:
         common.allow_folder(options, options.output, *FILES, inputs=[options.model])
-    known = {Path(bag).resolve() for axis in model.axes.values() for bag in axis.quality.sources}
+    # Those of the calibrator are named by their place beside the model.
+    places = Path(), Path(options.model).parent
+    known = {(at / bag).resolve() for axis in model.axes.values() for bag in axis.quality.sources for at in places}
     own = [
         f"{bag}: the model was identified from this bag; an error on it proves nothing, record another one"
         for bag in options.bags

@@ -145,7 +145,8 @@ class _Track:
         self._times, self._rows = self._deadlines_ns[block].tolist(), self._positions[block].tolist()
 
     @property
-    def _deadline_ns(self) -> int:
+    def deadline_ns(self) -> int:
+        """Deadline of the next point, nanoseconds."""
         return int(self._times[self.next - self._from])
 
     def _pieces(self, deadline_ns: int) -> int:
@@ -157,7 +158,7 @@ class _Track:
     @property
     def next_ns(self) -> int:
         """Deadline of the next sample, nanoseconds."""
-        deadline = self._deadline_ns
+        deadline = self.deadline_ns
         return self._since_ns + (deadline - self._since_ns) // self._pieces(deadline)
 
     def until(self, time_ns: int) -> int:
@@ -169,7 +170,7 @@ class _Track:
 
     def take(self, now_ns: int) -> tuple[Point, int]:
         """Return the latest sample that is due, and the number of earlier pending points, which are skipped."""
-        if now_ns < self._deadline_ns:
+        if now_ns < self.deadline_ns:
             return self._between(now_ns), 0
         first, self.next = self.next, self.until(now_ns + 1)
         at, self.begun = self.next - 1 - self._from, True
@@ -185,7 +186,7 @@ class _Track:
 
     def _between(self, now_ns: int) -> Point:
         """Return the latest interpolated sample that is due before the next point."""
-        deadline, since_ns = self._deadline_ns, self._since_ns
+        deadline, since_ns = self.deadline_ns, self._since_ns
         goal = self._rows[self.next - self._from]
         since = self._since
         if since is None:
@@ -213,6 +214,7 @@ class TrajectoryExecutor:
     def __init__(self, period: float = PERIOD, place: Callable[[str], float] | None = None) -> None:
         self.period, self._place = period, place
         self.skipped = 0  # points, because a later one was already due
+        self.crowded = 0  # of these, closer together than the output period
         self._tracks: list[_Track] = []
 
     @property
@@ -285,8 +287,12 @@ class TrajectoryExecutor:
         track = self._tracks[0] if len(self._tracks) == 1 else min(self._tracks, key=lambda each: each.next_ns)
         if now_ns < track.next_ns:
             return None
+        first_ns = track.deadline_ns
         point, skipped = track.take(now_ns)
-        self.skipped += skipped if track.counted else 0
+        if skipped and track.counted:
+            self.skipped += skipped
+            if point.deadline_ns - first_ns < skipped * round(self.period * SECOND_NS):
+                self.crowded += skipped
         if track.next == track.stop:
             self._tracks.remove(track)
         return point

@@ -30,6 +30,8 @@ LEAST_SHARE = 0.05
 # Largest number of spectral lines and of jumps; power of a line relative to the median of its surroundings; size of a
 # jump relative to the rms difference of the means before and after all other samples.
 MOST_LINES, MOST_JUMPS, LINE, JUMP = 6, 8, 30.0, 5.0
+# Lines of this share of the largest amplitude are told.
+TALL = 0.1
 # Largest number of samples of a record, evenly thinned, for functions of a variable.
 ENOUGH = 40_000
 
@@ -80,6 +82,11 @@ def fingerprint(records: Sequence[Signals]) -> tuple[Left, ...]:
     centred, thin = [_centred(record) for record in records], [_centred(_thinned(record)) for record in records]
     found = [*_of_variables(thin), *_of_lines(centred), *_of_jumps(centred)]
     return tuple(sorted((one for one in found if one.share >= LEAST_SHARE), key=lambda one: -one.share))
+
+
+def lines_of(record: Signals, least: float) -> Left | None:
+    """Return the lines of the spectrum of a residual; None if they hold no more than the share `least` of it."""
+    return next((found for found in _of_lines([_centred(record)]) if found.share > least), None)
 
 
 def _thinned(record: Signals) -> Signals:
@@ -195,7 +202,10 @@ def _of_lines(records: Sequence[Signals]) -> Iterator[Left]:
         if not lines:
             continue
         gains = np.linalg.lstsq(own, record.residual, rcond=None)[0].reshape(-1, 2)
-        told += [f"{f:.4g} Hz ({length(float(np.hypot(*gain)))})" for f, gain in zip(lines, gains, strict=True)]
+        heights = np.hypot(*gains.T).tolist()
+        # Beside a strong line are weak ones that its amplitude, not quite constant, makes.
+        tall = [each for each in zip(lines, heights, strict=True) if each[1] >= TALL * max(heights)]
+        told += [f"{frequency:.4g} Hz ({length(height)})" for frequency, height in tall]
     name = "lines of the spectrum"
     yield Left(
         name, share, f"{share:.0%} of the mean square is in lines at {', '.join(told[:MOST_LINES])}; {HINTS[name]}"

@@ -17,6 +17,9 @@ FEWEST_AT_LIMIT = 3
 # Longest delay that is searched for, in seconds and as a share of the record, and number of steps of the search.
 LONGEST_DELAY, DELAY_SHARE, DELAY_STEPS = 0.5, 0.05, 200
 
+# A delay varies if one for each of so many parts of the path reduces the difference by this factor.
+VARIES, DELAY_WINDOWS = 1.8, 100
+
 # What each part of a tracking error is, and what helps.
 CAUSES = {
     "zero": "the zero has moved since the model was identified, or the path counts from another one: ~/set_zero",
@@ -24,10 +27,12 @@ CAUSES = {
     "limits": "the voltage was at a limit: a smaller path",
     "delay": "the stage is late: send the path as a trajectory, with the delay in the model",
     "rate": "loops wider or narrower than those of the model, the faster the more: slpi diagnose on faster records",
-    "command": "the voltages are not those of this model: slew limit, feedback, a reset or another model",
+    "command": "the voltages are not those of this model: slew limit, feedback, a reset, another model, or a computer "
+    "that was busy, which the log of the compensator tells",
     "model": "the hysteresis and what else the model does not hold: slpi diagnose, slpi refit",
-    "noise": "sensor noise and what does not repeat",
+    "noise": "what does not repeat: sensor noise, vibration, line interference",
 }
+VARYING = "the voltages come late, and not always equally: computer or driver was busy, or the slew limit was reached"
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,51 @@ class ErrorPart:
         return {"name": self.name, "samples": self.samples, "rms_m": self.rms, "maximum_m": self.maximum}
 
 
+# Times are told at which the error is so many times the usual one, if they hold this share of the mean square error in
+# at most that share of the path; number of windows that are compared. A gap between readings is told if it is so long
+# (s), and so many times the usual interval.
+ABOVE_USUAL, MOSTLY, SHORT, WINDOWS, GAP, TIMES_USUAL = 2.5, 0.7, 0.15, 200, 0.02, 5.0
+
+
+@dataclass(frozen=True)
+class Burst:
+    """Times (s) of a record in which most of a tracking error lies, the largest part first."""
+
+    times: tuple[tuple[float, float], ...]
+    share: float  # of the mean square error
+    elsewhere: float  # m, rms error at all other times
+    gap: float  # s, longest time without a reading at these times; 0: none that is unusual
+
+    @classmethod
+    def of(cls, t: FloatArray, error: FloatArray) -> "Burst | None":
+        """Find them for an error (m), (N,), at times (s), (N,); None if the error is not concentrated."""
+        length = float(t[-1] - t[0]) / WINDOWS
+        if not length > 0.0 or t.size < WINDOWS:
+            return None
+        window = np.minimum(((t - t[0]) / length).astype(int), WINDOWS - 1)
+        squares = np.bincount(window, error**2, WINDOWS)
+        counts = np.bincount(window, minlength=WINDOWS)
+        means = squares / np.maximum(counts, 1)
+        least = max(np.sort(means)[-round(SHORT * WINDOWS)], ABOVE_USUAL**2 * np.median(means[counts > 0]))
+        chosen = means >= least
+        if squares[chosen].sum() < MOSTLY * squares.sum():
+            return None
+        # One window between two others belongs to them.
+        chosen[1:-1] |= chosen[:-2] & chosen[2:]
+        edges = np.flatnonzero(np.diff(np.pad(chosen, 1).astype(np.int8)))
+        runs = sorted(zip(edges[::2], edges[1::2], strict=True), key=lambda run: -squares[slice(*run)].sum())
+        inside = chosen[window]
+        intervals = np.diff(t)
+        gaps = intervals[inside[1:] | inside[:-1]]
+        gap = float(gaps.max()) if gaps.size else 0.0
+        return cls(
+            tuple((float(t[0] + first * length), float(t[0] + last * length)) for first, last in runs),
+            float(squares[chosen].sum() / squares.sum()),
+            rms(error[~inside]),
+            gap if gap > max(GAP, TIMES_USUAL * float(np.median(intervals))) else 0.0,
+        )
+
+
 @dataclass(frozen=True)
 class Tracking:
     """Tracking error of a compensated path of N samples, and its causes."""
@@ -59,6 +109,7 @@ class Tracking:
     t: FloatArray  # s, (N,)
     desired: FloatArray  # m, (N,)
     parts: Mapping[str, FloatArray]  # m, (N,), of each cause, with noise in "model"
+    delays: tuple[float, ...] | None = None  # s, range of a delay that varies: 5th and 95th percentile
 
     @property
     def rms(self) -> dict[str, float]:
@@ -72,9 +123,18 @@ class Tracking:
         return self.error.rms * float(np.sqrt(max(1.0 - self.shares["zero"], 0.0)))
 
     @property
+    def burst(self) -> Burst | None:
+        """When most of the error without the zero occurs; None if it is spread over the path."""
+        return Burst.of(self.t, np.sum([part for cause, part in self.parts.items() if cause != "zero"], axis=0))
+
+    @property
     def blame(self) -> str:
         """The cause with the largest share."""
         return max(self.shares, key=lambda cause: self.shares[cause])
+
+    def advice(self, cause: str) -> str:
+        """Return what a cause is, and what helps."""
+        return VARYING if self.delays and cause == "delay" else CAUSES[cause]
 
     def to_document(self) -> dict[str, Any]:
         """Return the figures as in ``msg_schemas/verification.schema.json``."""
@@ -85,6 +145,7 @@ class Tracking:
             "shares": dict(self.shares),
             "blame": self.blame,
             "delay_s": self.delay,
+            "delay_range_s": list(self.delays) if self.delays else None,
         }
 
 
@@ -117,8 +178,8 @@ def track(
         raise RecordError(f"{where[0]}: axis '{where[1]}': no desired displacement while it was measured; record both")
     t, v, y, d, estimated = t[at], v[at], y[at], desired[at], estimated[at]
     begun = min((each[at] for each in assumed), key=lambda each: rms(each - d))
-    delay = _delay(t, d, begun)
-    late = np.interp(t - delay, t, d)
+    delay, delays = _delay(t, d, begun)
+    late = np.interp(t - (delay if delays is None else delays), t, d)
     command = begun - late
     limited = _at_limit(v, command)
     # Voltages for displacements that count from another zero, or feedback that takes a zero out.
@@ -152,16 +213,34 @@ def track(
         t=t,
         desired=d,
         parts=parts,
+        delays=None if delays is None else tuple(np.quantile(delays, (0.05, 0.95)).tolist()),
     )
 
 
-def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> float:
-    """Return the delay (s) of the model behind the desired displacement; 0 if no delay is clearly better."""
+def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> tuple[float, FloatArray | None]:
+    """Return the delay (s) of the model behind the desired displacement, and that of each sample, (N,), if it varies.
+
+    0 if no delay is clearly better.
+    """
     longest = min(LONGEST_DELAY, DELAY_SHARE * float(t[-1] - t[0]))
     shifts = np.linspace(0.0, longest, DELAY_STEPS + 1)
-    misses = [float(np.std(model - np.interp(t - shift, t, desired))) for shift in shifts.tolist()]
+    window = np.minimum(((t - t[0]) / (t[-1] - t[0]) * DELAY_WINDOWS).astype(int), DELAY_WINDOWS - 1)
+    misses, squares = [], []
+    for shift in shifts.tolist():
+        left = model - np.interp(t - shift, t, desired)
+        misses.append(float(np.std(left)))
+        squares.append(np.bincount(window, (left - np.median(left)) ** 2, DELAY_WINDOWS))
     best = int(np.argmin(misses))
-    return float(shifts[best]) if misses[best] < misses[0] / BETTER else 0.0
+    best = best if misses[best] < misses[0] / BETTER else 0
+    by_window = np.array(squares)
+    own = np.argmin(by_window, axis=0)
+    # At rest every delay serves.
+    own = np.where(by_window.min(axis=0) < by_window[best] / BETTER, own, best)
+    centres = t[0] + (np.arange(DELAY_WINDOWS) + 0.5) / DELAY_WINDOWS * (t[-1] - t[0])
+    delays = np.interp(t, centres, shifts[own])
+    if float(np.std(model - np.interp(t - delays, t, desired))) * VARIES < misses[best]:
+        return float(np.median(delays)), delays
+    return float(shifts[best]), None
 
 
 def _with_rate(t: FloatArray, model: FloatArray, residual: FloatArray) -> tuple[float, FloatArray, FloatArray]:

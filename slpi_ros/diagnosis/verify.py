@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
+from slpi_ros.diagnosis.fingerprint import Left, Signals, lines_of
 from slpi_ros.diagnosis.tracking import ErrorPart, Tracking, track
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
@@ -36,6 +37,8 @@ TABLE_SAMPLES = 40_000
 # Smallest shares of the samples that are judged: for a judgement without those before the initial state is known,
 # without a warning, and at all.
 MOST_KNOWN, FEW, LEAST = 0.6, 0.2, 0.05
+# Lines of the spectrum are told if they hold more than this share of the mean square of the residual.
+LINES = 0.25
 # Verdicts.
 PASSED, FAILED, UNPROVED = "passed", "failed", "unproved"
 # A voltage stands if it stays within this share of its range for this many samples; shares of moving and standing
@@ -73,6 +76,7 @@ class RecordVerification:
     measured: FloatArray  # m, (N,)
     model: FloatArray  # m, (N,), with the constant
     judged: Mask  # (N,)
+    lines: Left | None = None  # of the spectrum of the rest; None: they hold little of it
     tracking: Tracking | None = None  # None: the desired displacement is not known
     corrected: str = ""  # what was taken out of the readings, as known of the sensor
 
@@ -85,6 +89,12 @@ class RecordVerification:
     def unusable(self) -> float:
         """Share of the readings that cannot be judged, whatever the initial state is."""
         return 1.0 - float(np.count_nonzero(np.isfinite(self.measured))) / self.samples
+
+    @property
+    def unrepeated_rms(self) -> float:
+        """Part of the error that no model explains, m rms: the repeatability, or the lines of the spectrum."""
+        lines = self.lines.share * self.rest.rms**2 if self.lines else 0.0
+        return float(np.sqrt(max(self.repeatability_rms**2, lines)))
 
     @property
     def judged_error(self) -> float:
@@ -136,6 +146,7 @@ class RecordVerification:
             "gain_change": self.gain,
             "width_change": self.width,
             "outside_samples": self.outside,
+            "lines": self.lines.to_document() if self.lines else None,
             "tracking": None if self.tracking is None else self.tracking.to_document(),
         }
 
@@ -293,7 +304,7 @@ def verify(
                 tracking = track(
                     (record.source, name), run.t, one.v, one.measured, followed,
                     one.model - explained, run.assumed, zero=zero,
-                    noise_rms=one.repeatability_rms,
+                    noise_rms=one.unrepeated_rms,
                 )  # fmt: skip
                 one = replace(one, tracking=tracking)
             found[name].append(one)
@@ -477,6 +488,7 @@ def _judge(
         measured=np.where(samples.fitted, samples.y, np.nan),
         model=run.simulated,
         judged=judged,
+        lines=lines_of(Signals(t, v, y, rest), LINES),
         corrected=axis.describe_correction(),
     )
 

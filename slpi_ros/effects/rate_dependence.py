@@ -188,9 +188,10 @@ class RateDependence(EffectBase):
     def describe(self) -> str:
         """Describe the widening for each decade of the rate, and where it begins."""
         decade = self.threshold * 2.302585092994046
+        beside = f"; a part of the motion, {self.reversible_gain * 1e9:.3g} nm per volt, follows the voltage at once"
         return (
-            f"above {self.onset_rate:.3g} V/s the loops are wider by {decade:.3g} V on either side for each decade of "
-            f"the rate; {self.reversible_gain * 1e9:.3g} nm/V of the motion does not wait"
+            f"above {self.onset_rate:.3g} V/s, a voltage that changes ten times faster widens the loops by "
+            f"{decade:.3g} V on either side{beside if self.reversible_gain else ''}"
         )
 
     def laws(self) -> Mapping[str, FloatArray]:

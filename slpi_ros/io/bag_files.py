@@ -196,7 +196,8 @@ def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str]
     found = found or sorted(name for name in topics if name.endswith(wanted))
     if not found:
         raise RecordError(
-            f"{source}: no topic '{topic}'; the bag holds {contents}; name the one of the stage (--topic)"
+            f"{source}: no topic '{topic}'; the bag holds {contents}; name the right one (--topic; of desired "
+            "displacements --desired-topic)"
         )
     if len(found) > 1:
         raise RecordError(f"{source}: topic '{topic}' may be {' or '.join(found)}; give the full name")

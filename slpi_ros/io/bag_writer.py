@@ -3,6 +3,7 @@
 import os
 import shutil
 import sqlite3
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -13,8 +14,10 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_files import absolute_name, one_line, partial_path
+from slpi_ros.io.desired import DESIRED
 from slpi_ros.io.messages import JOINT_STATE, encode_joint_states
 from slpi_ros.io.record import Record
 
@@ -134,16 +137,28 @@ def write_bag(
     storage: str = "mcap",
     topic: str = "/stage_state",
     replace: bool = False,
+    desired: Mapping[str, FloatArray] | None = None,
 ) -> None:
-    """Write a record as a new rosbag2 folder that `slpi_ros.read_bag` reads back without loss, id as ``frame_id``."""
+    """Write a record as a new rosbag2 folder that `slpi_ros.read_bag` reads back without loss, id as ``frame_id``.
+
+    Desired displacements (m), (N,), NaN: none, of some axes become ``desired_displacement``.
+    """
     displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
     voltage = np.column_stack([record.voltage[axis] for axis in record.axes])
     messages = encode_joint_states(record.time_ns, displacement, voltage, record.axes, record.hardware_id)
     # Readers sort by log time, which must not decrease: so the order of the record is kept where its stamps decrease.
     logged = np.maximum.accumulate(record.time_ns)
     with BagWriter(path, storage=storage, topic=topic, replace=replace) as bag:
-        for stamp, message in zip(logged.tolist(), messages, strict=True):
+        if not desired:
+            for stamp, message in zip(logged.tolist(), messages, strict=True):
+                bag.write(stamp, message)
+            return
+        bag.add_topic(DESIRED)
+        paths = np.column_stack([*desired.values()])
+        wanted = encode_joint_states(record.time_ns, paths, np.full_like(paths, np.nan), tuple(desired))
+        for stamp, message, path_message in zip(logged.tolist(), messages, wanted, strict=True):
             bag.write(stamp, message)
+            bag.write(stamp, path_message, DESIRED)
 
 
 @cache

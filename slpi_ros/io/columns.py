@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
 from slpi_ros.errors import RecordError, UsageError
@@ -77,6 +77,8 @@ _SPELLED = {
     **dict.fromkeys(("nanometer", "nanometers", "nanometre", "nanometres"), "nm"),
 }
 
+# Word by which the name of a column says that its displacement is a desired one.
+_DESIRED = re.compile(r"(?<![^\W\d_])(?:desired|set[ _-]?point)(?![^\W\d_])", re.IGNORECASE)
 _INDEX_OF_A_MATRIX = re.compile(r"\((?:\d+,:|:,\d+)\)$")
 _BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]")
 _SEPARATED = re.compile(r"(?:\s+in\s+|\s*/\s+|\s+/\s*)(\S+)\s*$")
@@ -133,6 +135,18 @@ def axis_of(name: str, quantity: ColumnQuantity) -> str:
 def begins(name: str, quantity: ColumnQuantity) -> bool:
     """Return whether a name begins with a word for the quantity."""
     return name.lower().startswith(quantity.prefixes)
+
+
+def is_desired(name: str) -> bool:
+    """Return whether the name of a column says that it holds desired displacements."""
+    return bool(_DESIRED.search(name)) and not any(begins(name, quantity) for quantity in (TIME, VOLTAGE))
+
+
+def _parse_desired(name: str, given_unit: str | None, source: str) -> Column:
+    """Parse the name of a column of desired displacements, whose word for them belongs to no axis."""
+    column = parse_column(name, DISPLACEMENT, given_unit=given_unit, source=source)
+    stem = _DESIRED.sub(" ", _split(name, DISPLACEMENT)[0])
+    return replace(column, axis=_axis(stem.strip(" \t_.-,/")))
 
 
 def _split(name: str, quantity: ColumnQuantity) -> tuple[str, str]:
@@ -202,19 +216,22 @@ class ColumnOptions:
     displacement: tuple[str, ...] = ()
     displacement_unit: str | None = None
     axes: tuple[str, ...] = ()
+    desired: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class ColumnChoice:
-    """The columns of a record; `voltage` and `displacement` have the same axes."""
+    """The columns of a record; `voltage` and `displacement` have the same axes, `desired` some of them or none."""
 
     time: Column
     voltage: Mapping[str, Column]
     displacement: Mapping[str, Column]
+    desired: Mapping[str, Column] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()  # names of desired columns, each with the reason
 
     def columns(self) -> tuple[Column, ...]:
         """Return all columns."""
-        return (self.time, *self.displacement.values(), *self.voltage.values())
+        return (self.time, *self.displacement.values(), *self.voltage.values(), *self.desired.values())
 
 
 def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) -> ColumnChoice:
@@ -237,8 +254,22 @@ def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) ->
     )
     driven = _one_for_each(moved, [parse_column(name, VOLTAGE, source=source) for name in driven_names], source)
     axes = _axis_names(moved, options.axes, source)
-    _require_one_role(time, moved, driven, source)
-    return ColumnChoice(time, dict(zip(axes, driven, strict=True)), dict(zip(axes, moved, strict=True)))
+    taken = {time.name, *(column.name for column in (*moved, *driven))}
+    wanted_names, left_out = [match_column(name, names) for name in options.desired], []
+    for name in () if wanted_names else names:
+        if name not in taken and is_desired(name):
+            unit = _split(name, DISPLACEMENT)[1]
+            if unit and not DISPLACEMENT.unit(unit):
+                left_out.append(f"'{name}': {unit} is no unit of displacement")
+            else:
+                wanted_names.append(name)
+    wanted = [_parse_desired(name, given_unit, source) for name in wanted_names]
+    desired, of_none = _of_axes(wanted, moved, axes, source, named=bool(options.desired))
+    left_out += [f"'{column.name}': no axis '{column.axis}'" for column in of_none]
+    _require_one_role(time, (*moved, *desired.values()), driven, source)
+    return ColumnChoice(
+        time, dict(zip(axes, driven, strict=True)), dict(zip(axes, moved, strict=True)), desired, tuple(left_out)
+    )
 
 
 def _time_column(names: Sequence[str], source: str) -> str:
@@ -249,7 +280,8 @@ def _time_column(names: Sequence[str], source: str) -> str:
     return "time_s" if "time_s" in found else (with_unit or found)[0]
 
 
-def _displacement_columns(names: Sequence[str], source: str) -> list[str]:
+def _displacement_columns(every: Sequence[str], source: str) -> list[str]:
+    names = [name for name in every if not is_desired(name)]
     for word in DISPLACEMENT.prefixes:
         if found := [name for name in names if name.lower().startswith(word)]:
             return found
@@ -258,7 +290,7 @@ def _displacement_columns(names: Sequence[str], source: str) -> list[str]:
     for axes in (driven, {"x", "y", "z"}):
         if found := [name for name in lengths if axis_of(name, DISPLACEMENT).casefold() in axes]:
             return found
-    _missing(names, source, DISPLACEMENT)
+    _missing(every, source, DISPLACEMENT)
 
 
 def _voltage_columns(names: Sequence[str], time: Column, moved: Sequence[Column], source: str) -> list[str]:
@@ -291,6 +323,32 @@ def _one_for_each(moved: Sequence[Column], driven: Sequence[Column], source: str
     return [*driven]
 
 
+def _of_axes(
+    wanted: Sequence[Column], moved: Sequence[Column], axes: Sequence[str], source: str, *, named: bool
+) -> tuple[dict[str, Column], tuple[Column, ...]]:
+    """Return the columns of desired displacements by axis, and those of no axis; `named`: by an option."""
+    own = {column.axis.casefold(): axis for column, axis in zip(moved, axes, strict=True)}
+    found: dict[str, Column] = {}
+    left_out = []
+    for column in wanted:
+        axis = own.get(column.axis.casefold())
+        if axis is None and len(moved) == len(wanted) == 1 and (named or column.axis == "x"):
+            axis = axes[0]
+        if axis is None or axis in found:
+            left_out.append(column)
+        else:
+            found[axis] = column
+    if named and left_out and len(wanted) == len(moved):
+        # Names that tell no axis are in the order of the displacements.
+        return dict(zip(axes, wanted, strict=True)), ()
+    if any(own.get(column.axis.casefold()) in found for column in left_out) or (named and left_out):
+        raise RecordError(
+            f"{source}: desired displacements {_column_names(wanted)} for axes {', '.join(axes)}; name one column for "
+            "each axis (--desired)"
+        )
+    return found, tuple(left_out)
+
+
 def _axis_names(moved: Sequence[Column], axes: Sequence[str], source: str) -> tuple[str, ...]:
     """Return one axis name for each displacement column; all must be different."""
     names = tuple(axes) or tuple(column.axis for column in moved)
@@ -311,7 +369,7 @@ def _require_one_role(time: Column, moved: Sequence[Column], driven: Iterable[Co
         if names.count(name) > 1:
             raise UsageError(
                 f"{source}: column '{name}' twice; time, each displacement and voltage need columns of their own "
-                "(--time, --displacement, --voltage)"
+                "(--time, --displacement, --voltage, --desired)"
             )
 
 

@@ -3,6 +3,7 @@
 import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 
@@ -36,11 +37,20 @@ def import_table(
     # `displacement_unit`, by default micrometres. Empty cells and ``nan`` become NaN. If the first time is negative,
     # all times are shifted such that the record begins at 0.
     options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
-    return import_with_summary(path, options)[0]
+    return import_with_summary(path, options).record
 
 
-def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) -> tuple[Record, tuple[str, ...]]:
-    """Import a table as `import_table` does, with a summary: a line on the time if assumed, and one for each axis."""
+@dataclass(frozen=True)
+class Imported:
+    """Record of a table, the desired displacements (m), (N,), of axes that have some, and what was taken for what."""
+
+    record: Record
+    desired: Mapping[str, FloatArray]
+    summary: tuple[str, ...]
+
+
+def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) -> Imported:
+    """Import a table as `import_table` does, with desired displacements and a summary by axis."""
     path = Path(path)
     table = load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
     choice = choose_columns(table.columns, options, str(path))
@@ -51,21 +61,25 @@ def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) ->
         displacement={axis: _si(values, column) for axis, column in choice.displacement.items()},
         source=str(path),
     )
-    return record, tuple(_summary(record, choice))
+    desired = {axis: _si(values, column) for axis, column in choice.desired.items()}
+    return Imported(record, desired, tuple(_summary(record, desired, choice)))
 
 
 def _si(values: Mapping[str, FloatArray], column: Column) -> FloatArray:
     return values[column.name] * column.scale
 
 
-def _summary(record: Record, choice: ColumnChoice) -> Iterable[str]:
-    """Yield a line for each axis, and one for time if its unit was assumed."""
+def _summary(record: Record, desired: Mapping[str, FloatArray], choice: ColumnChoice) -> Iterable[str]:
+    """Yield a line for each axis, one for time if its unit was assumed, and one for each desired column left out."""
     if choice.time.assumed:
         yield f"time: column '{choice.time.name}' taken as {choice.time.unit}"
     for axis in record.axes:
         voltage = _column_summary(choice.voltage[axis], record.voltage[axis], "V")
         displacement = _column_summary(choice.displacement[axis], record.displacement[axis] * 1e6, "µm")
-        yield f"axis {axis}: {voltage}, {displacement}"
+        wanted = _column_summary(choice.desired[axis], desired[axis] * 1e6, "µm") if axis in desired else ""
+        yield f"axis {axis}: {voltage}, {displacement}{', desired ' + wanted if wanted else ''}"
+    for reason in choice.left_out:
+        yield f"left out, column {reason}; name the columns of desired displacements in units of length (--desired)"
 
 
 def _column_summary(column: Column, values: FloatArray, unit: str) -> str:

@@ -14,9 +14,10 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.calibration.drive_watch import FARTHEST
 from slpi_ros.calibration.run import Progress
 from slpi_ros.calibration.settings import CalibrationSettings
-from slpi_ros.errors import RecordError, SlpiError, UsageError
+from slpi_ros.errors import RecordError, SlpiError, UsageError, length
 from slpi_ros.excitation.drives import slew_limits
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_files import partial_path
@@ -158,15 +159,19 @@ def settings_of(values: Values) -> CalibrationSettings:
 def _path_of(source: str, axes: tuple[str, ...], rate: float) -> dict[str, FloatArray]:
     """Return the desired displacements (m) of a path by axis, (N,), at a rate (Hz); UsageError if they are none."""
     t, columns = read_path(source, axes)
+    if not t[-1] > 0.0:
+        raise UsageError(f"desired_path: {source} lasts no time; give a path over time")
     even, path = np.arange(int(t[-1] * rate) + 1) / rate, {}
     for axis, y in columns.items():
         if axis not in axes:
             raise UsageError(f"desired_path: {source} holds axis '{axis}', the stage has {', '.join(axes)}; rename it")
+        if (farthest := float(np.abs(y).max())) > FARTHEST:
+            raise UsageError(f"desired_path: {source}: axis '{axis}' goes to {farthest:.4g} m; give metres")
         path[axis] = np.interp(even, t, y)
         lost = float(np.abs(np.interp(t, even, path[axis]) - y).max())
         if lost > MOST_LOST * float(np.ptp(y)):
             raise UsageError(
-                f"desired_path: {source}: axis '{axis}' loses {lost * 1e6:.3g} µm at {rate:g} samples per second; "
+                f"desired_path: {source}: axis '{axis}' loses {length(lost)} at {rate:g} samples per second; "
                 "raise the parameter rate, or give a smooth path"
             )
     return path
@@ -360,7 +365,7 @@ class Calibrator(Node):
         found = None if lacking else self._guard.found()
         # A publisher that was killed is known for some seconds more.
         if self._guard.others and not late:
-            lacking = f"{self._guard.others} other publisher of {self._guard.publisher.topic_name}; stop it"
+            lacking = f"{self._guard.told_others()}; stop it"
         if found is not None and not self._guard.others:
             self._waiting = False
             try:

@@ -100,6 +100,15 @@ def _refusing(node: LifecycleNode, change_state: Any) -> Any:
     return on_request
 
 
+def publishers_beside(node: Node, topic: str) -> list[str]:
+    """Return the full names of the other nodes that publish a topic, given with its full name."""
+    own = node.get_name(), node.get_namespace()
+    names = [(each.node_name, each.node_namespace) for each in node.get_publishers_info_by_topic(topic)]
+    if own in names:
+        names.remove(own)
+    return sorted(f"{namespace.rstrip('/')}/{name}" for name, namespace in names)
+
+
 def ask_for_priority(node: Node, priority: int) -> None:
     """Run all threads of this process under SCHED_FIFO, including DDS; log a warning if not permitted."""
     try:

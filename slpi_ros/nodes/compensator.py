@@ -41,6 +41,7 @@ from slpi_ros.nodes.common import (
     as_rclpy_reads,
     ask_for_priority,
     keep_freed_memory,
+    publishers_beside,
     refuse_impossible_transitions,
 )
 from slpi_ros.nodes.compensator_diagnostics import Reporter
@@ -449,6 +450,11 @@ class Compensator(LifecycleNode):
             self._too_fast = said
             self.get_logger().warning(f"trajectory {said}; send it more slowly, or raise slew_limit")
 
+    def _tell_late(self) -> None:
+        """Log that points of a trajectory were skipped, or late."""
+        if late := self._reporter.late():
+            self.get_logger().warning(late, throttle_duration_sec=LOG_PERIOD)
+
     def _reject(self, what: str, error: RejectedError) -> None:
         """Log and report the rejection of a message, which the controller has counted already."""
         self._reporter.last_rejection = str(error)
@@ -471,11 +477,16 @@ class Compensator(LifecycleNode):
         self._report_at_least(WARN)
         if self._controller.counts.excursions > self._excursions:
             self._excursions = self._controller.counts.excursions
-            out = [f"axis {axis.name}{_reach(axis)}" for axis in self._controller.axes if axis.held]
-            self.get_logger().warning(
-                f"desired displacement out of reach, held at a voltage limit: {', '.join(out)}; "
-                "send displacements within the identified range"
-            )
+            held = [axis for axis in self._controller.axes if axis.held]
+            out = [f"axis {axis.name}{_reach(axis)}" for axis in held]
+            remedy = "send displacements within the identified range"
+            if all(_in_range(axis) for axis in held):
+                remedy = (
+                    "that is within the range: send a slower path, one further from its ends, or widen voltage_min and "
+                    "voltage_max if they are narrower than the model"
+                )
+            said = f"desired displacement out of reach, held at a voltage limit: {', '.join(out)}"
+            self.get_logger().warning(f"{said}; {remedy}")
 
     # Motion without messages
 
@@ -521,22 +532,20 @@ class Compensator(LifecycleNode):
         if controller.mode is not before:
             if before is OperatingMode.RESETTING:
                 self._answer_reset()
+            if before is OperatingMode.TRAJECTORY:
+                self._tell_late()
             self._report()
 
     def _other_publishers(self) -> list[str]:
         """Return the other nodes that publish the voltages."""
         if self._controller.mode is OperatingMode.UNCONFIGURED:
             return []
-        own = self.get_name(), self.get_namespace()
-        found = self.get_publishers_info_by_topic(self._publisher.topic_name)
-        names = [(each.node_name, each.node_namespace) for each in found]
-        if own in names:
-            names.remove(own)
-        return sorted(f"{namespace.rstrip('/')}/{name}" for name, namespace in names)
+        return publishers_beside(self, self._publisher.topic_name)
 
     def _on_period(self) -> None:
         self._reporter.others = self._other_publishers()
         self._report()
+        self._tell_late()
         self._reporter.start_window()
         if self._controller.active:
             self._save_memory(complete=False)
@@ -751,6 +760,15 @@ def _reach(axis: Axis) -> str:
         return ""
     low, high = model.displacement_range
     return f" at {desired * 1e6:.5g} of {low * 1e6:.5g} to {high * 1e6:.5g} µm"
+
+
+def _in_range(axis: Axis) -> bool:
+    """Return whether the desired displacement of an axis is in the identified range: what is too much is its rate."""
+    desired, model = axis.tracking.desired, axis.model
+    if desired is None or model is None:
+        return False
+    low, high = model.displacement_range
+    return low <= desired <= high
 
 
 def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayLike]:

@@ -9,15 +9,17 @@ from rclpy.node import Node
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import Drift
-from slpi_ros.compensator.persistence import KNOWN, RESTORED
+from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED
 from slpi_ros.compensator.statistics import Timing, TimingReport
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 
 Problem = tuple[bool, bytes, str]
-# Residuals are a constant if their mean is this share of their rms.
-CONSTANT = 0.9
+# Residuals are a constant if their mean is more than the first share of their rms, and have none below the second.
+CONSTANT, NO_CONSTANT = 0.9, 0.3
+# A sample of a trajectory that comes so much later than it should is told, seconds.
+LATE = 0.01
 
 
 class Reporter:
@@ -56,6 +58,8 @@ class Reporter:
         """Start a new reporting period."""
         self._window, self._window_start = self._controller.counts.copy(), time.perf_counter()
         self._lost_before = self.lost
+        trajectory = self._controller.trajectory
+        self._skipped_before, self._crowded_before = trajectory.skipped, trajectory.crowded
         self._beyond_before = {axis.name for axis in self._controller.axes if axis.path.beyond}
         self.timing.restart()
         self.lateness.restart()
@@ -94,6 +98,24 @@ class Reporter:
             reaction = "go to the safe ones" if controller.mode is OperatingMode.RAMPING else "are the safe ones"
         yet = "" if watchdog.commanded else " yet"
         return f"no command{yet} for {watchdog.silence(time.monotonic_ns()):.3g} s; voltages {reaction}"
+
+    def late(self) -> str:
+        """Return what a trajectory lost since the last periodic report, and why; "" if nothing."""
+        trajectory, report = self._controller.trajectory, self.lateness.report()
+        skipped, crowded = trajectory.skipped - self._skipped_before, trajectory.crowded - self._crowded_before
+        points = "1 point" if skipped == 1 else f"{skipped} points"
+        said = f"{points} of a trajectory skipped, as the next one was already due"
+        if 2 * crowded > skipped:
+            period = f"{trajectory.period * 1e3:.3g} ms"
+            return f"{said}: they are closer together than the output period of {period}; send points {period} apart"
+        latest = report.latency[2] if report else 0.0
+        if not skipped and latest < LATE:
+            return ""
+        late = f"trajectory up to {latest * 1e3:.3g} ms late"
+        return (
+            f"{f'{said}, ' if skipped else ''}{late}: the computer was busy; the path has an error there, end other "
+            "programs, lower output_rate, or set realtime_priority"
+        )
 
     def _counters(self) -> dict[str, object]:
         counts = self._controller.counts
@@ -170,6 +192,8 @@ class Reporter:
         yield jumps > 0, WARN, f"the clock of the stamps was set back {jumps} times"
         points = counts.points_held - window.points_held
         yield points > 0, WARN, f"{points} points of a trajectory held at a voltage limit"
+        late = self.late()
+        yield late != "", WARN, late
         lost = self.lost - self._lost_before
         yield lost > 0, WARN, f"{lost} messages lost by the middleware; send fewer, or make its queue deeper"
         ownership = self._controller.ownership
@@ -230,19 +254,23 @@ def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]
     yield moving and axis.feedback_state == "saturated", WARN, saturated
     yield axis.confidence.contradicted, WARN, f"axis '{axis.name}': {axis.confidence.doubt}"
     drift, quality = axis.drift, axis.model.quality if axis.model else None
-    if drift and quality:
+    # Before the end of a reset the model has another memory than the stage.
+    if drift and quality and axis.confidence.state != RESETTING:
         usual = max(quality.held_out_rms, quality.floor_rms)
         text = (
             f"axis '{axis.name}' is off its model by {drift.rms * 1e9:.1f} nm rms, mean {drift.mean * 1e9:.1f} nm, in "
-            f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {_remedy(axis, drift)}"
+            f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {remedy(axis, drift)}"
         )
         yield 0.0 < factor * usual < drift.rms, WARN, text
 
 
-def _remedy(axis: Axis, drift: Drift) -> str:
+def remedy(axis: Axis, drift: Drift) -> str:
     """Return what to do about residuals: what has been done already is not advised again."""
     if axis.confidence.state not in (KNOWN, RESTORED):
-        return "reset the memory (~/reset_memory)"
+        # What an assumed memory adds is no vibration.
+        rest = NO_CONSTANT * drift.rms > abs(drift.mean)
+        other = "; if that does not help, record it: slpi verify tells vibration and interference"
+        return f"reset the memory (~/reset_memory){other if rest else ''}"
     if abs(drift.mean) > CONSTANT * drift.rms:
         return f"the zero, from the {axis.zero.source}, has moved; call ~/set_zero, or switch the feedback on"
     return "the stage has changed; record it and run slpi diagnose, or identify again"

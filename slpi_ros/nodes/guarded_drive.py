@@ -19,7 +19,7 @@ from slpi_ros.effects.excitation import MEAN_SPEED
 from slpi_ros.errors import RecordError, SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, RateLimiter
-from slpi_ros.nodes.common import COMMANDS
+from slpi_ros.nodes.common import COMMANDS, publishers_beside
 
 STATE, COMMAND = "stage_state", "voltage_command"
 # A voltage is at its goal within this share of the range. Time for the delivery of the last voltage.
@@ -99,9 +99,14 @@ class GuardedDrive:
         """Raise RecordError if another node publishes the topic of the voltages."""
         if self.others > 0:
             raise RecordError(
-                f"{self._node.get_name()}: {self.others} other publisher of {self.publisher.topic_name}; stop it, as "
-                "the voltage would jump between the commands of both"
+                f"{self._node.get_name()}: {self.told_others()}; stop it, as the voltage would jump between the "
+                "commands of both"
             )
+
+    def told_others(self) -> str:
+        """Return the number and the names of the other publishers of the topic of the voltages as text."""
+        topic = self.publisher.topic_name
+        return f"{self.others} other publisher of {topic}, {', '.join(publishers_beside(self._node, topic))}"
 
     def lacking(self) -> str:
         """Return what is missing before a drive may start, with what to do; "" if nothing is."""

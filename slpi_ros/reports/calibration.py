@@ -29,9 +29,10 @@ def page_of(outcome: Outcome) -> Page:
     stage = f" of stage {outcome.model.hardware_id}" if outcome.model.hardware_id else ""
     page = Page(f"Calibration{stage}")
     page.contents(tuple(outcome.errors))
+    path = "the desired path" if outcome.settings.path else "a path of its own"
     page.text(
         f"{outcome.why[0].upper()}{outcome.why[1:]}. The stage moved for {outcome.seconds:.0f} s in "
-        f"{sum(step.seconds > 0 for step in outcome.steps)} drives; every verification followed a path of its own "
+        f"{sum(step.seconds > 0 for step in outcome.steps)} drives; every verification followed {path} "
         "through the compensator after a sweep over the whole range, which resets the memory. Errors are absolute, "
         "measured - desired; what counts is the latest verification."
     )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slpi_ros.diagnosis.tracking import CAUSES, ErrorPart, Tracking
+from slpi_ros.diagnosis.tracking import CAUSES, Burst, ErrorPart, Tracking
 from slpi_ros.diagnosis.verify import (
     FAILED,
     FEW,
@@ -47,9 +47,12 @@ SEVERITY: dict[str, Severity] = {PASSED: "good", UNPROVED: "warn", FAILED: "bad"
 # not told.
 PARTS = {
     "zero": "zero", "memory": "initial state", "limits": "voltage limits", "delay": "delay", "rate": "rate dependence",
-    "command": "other voltages than the model's", "model": "hysteresis", "noise": "sensor noise",
+    "command": "other voltages than the model's", "model": "hysteresis", "noise": "noise and interference",
 }  # fmt: skip
 _SMALLEST_PART = 0.1
+# Largest number of times that are told.
+MOST_TIMES = 3
+LINES, ZERO = "line interference or vibration", "the zero"
 
 
 def write_files(folder: Path, found: Verification) -> None:
@@ -78,23 +81,42 @@ def verification_limits(found: Verification) -> dict[str, str]:
     limits = {}
     for name, axis in found.axes.items():
         tracked = [record.tracking for record in axis.records if record.tracking]
+        said = []
         if not axis.passed:
-            worst = axis.worst
-            noisy = worst.rest.rms <= ABOVE_NOISE * worst.repeatability_rms
-            model = "unproved" if axis.verdict == UNPROVED else "the noise of the record" if noisy else "the model"
-            limits[name] = f"{model}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed"
-        elif tracked:
-            worst_path = max(tracked, key=lambda tracking: tracking.error.rms)
-            if worst_path.error.rms > axis.worst.limit:
-                limits[name] = f"the path, {length(worst_path.error.rms)} rms, most by {PARTS[worst_path.blame]}"
+            worst, unproved = axis.worst, axis.verdict == UNPROVED
+            limit = "unproved" if unproved else _limiting(worst)
+            said.append(f"{limit}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed")
+        path = max(tracked, key=lambda tracking: tracking.error.rms, default=None)
+        if path and path.error.rms > max(axis.worst.limit, axis.worst.judged_error):
+            busy = ", while computer or driver was busy" if (burst := path.burst) and burst.gap else ""
+            said.append(f"the path, {length(path.error.rms)} rms, most by {_part(path)}{busy}")
+        if said:
+            limits[name] = "; ".join(said)
     return limits
+
+
+def _part(tracking: Tracking) -> str:
+    """Return the name of the largest part of a tracking error."""
+    return "a delay that varies" if tracking.delays and tracking.blame == "delay" else PARTS[tracking.blame]
+
+
+def _limiting(record: RecordVerification) -> str:
+    """Return what makes most of the error of a record that fails."""
+    if record.absolute and record.zero_moved and record.constant**2 > record.error.rms**2 / 2:
+        return ZERO
+    share = record.lines.share if record.lines else 0.0
+    if record.rest.rms * np.sqrt(1.0 - share) <= ABOVE_NOISE * record.repeatability_rms:
+        return LINES if record.lines else "the noise of the record"
+    return "the model"
 
 
 def verification_good(found: Verification) -> str:
     """Return how good a verified model is that nothing limits."""
     records = [record for axis in found.axes.values() for record in axis.records]
     noise = all(record.error.rms <= ABOVE_NOISE * record.repeatability_rms for record in records)
-    return "at the repeatability of the record" if noise else "within its limit on every record"
+    lines = max((record.lines.share for record in records if record.lines), default=0.0)
+    good = "at the repeatability of the record" if noise else "within its limit on every record"
+    return f"{good}{f'; {lines:.0%} of the mean square error is {LINES}' if lines else ''}"
 
 
 def little_judged(found: Verification) -> str:
@@ -131,6 +153,11 @@ def _summary(name: str, axis: AxisVerification) -> str:
         return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")
     if axis.verdict == UNPROVED:
         return f"{said} {_why_unproved(next(one for one in axis.records if one.verdict == UNPROVED))}"
+    limit = _limiting(axis.worst)
+    if limit == LINES:
+        return f"{said} It is {LINES}, no error of the model."
+    if limit == ZERO:
+        return f"{said} The zero has moved: '~/set_zero' of the compensator, or judge --without-offset."
     return f"{said} 'slpi diagnose' finds the cause, 'slpi refit' corrects the model."
 
 
@@ -184,6 +211,8 @@ def _notes(record: RecordVerification) -> list[str]:
         notes.append(
             f"while the voltage moves {length(record.moving.rms)} rms, while it stands {length(record.standing.rms)}"
         )
+    if record.lines:
+        notes.append(f"{LINES}: of the error without its constant part, {record.lines.evidence}")
     if record.corrected:
         notes.append(f"errors are those of the stage; taken out of the readings of its sensor: {record.corrected}")
     if record.zero_moved:
@@ -198,14 +227,32 @@ def _notes(record: RecordVerification) -> list[str]:
 def _tracking_notes(tracking: Tracking) -> list[str]:
     """Return the tracking error of a compensated path, what it consists of, and what helps against the largest part."""
     error, late = tracking.error, f" ({tracking.delay * 1e3:.3g} ms)" if tracking.delay else ""
+    if tracking.delays:
+        late = f" (varies, {tracking.delays[0] * 1e3:.3g} to {tracking.delays[1] * 1e3:.3g} ms)"
     told = [
         f"{PARTS[cause]} {length(part)}{late if cause == 'delay' else ''}" for cause, part in _parts(tracking).items()
     ]
+    burst = tracking.burst
     return [
         f"path: measured - desired is {length(error.rms)} rms, {length(error.maximum)} at most, without the zero "
         f"{length(tracking.rest_rms)} rms; of it {', '.join(told)}",
-        f"path, largest part: {CAUSES[tracking.blame]}",
+        *([_when(burst)] if burst else []),
+        f"path, largest part: {tracking.advice(tracking.blame)}",
     ]
+
+
+def _when(burst: Burst) -> str:
+    """Return when most of a tracking error occurs, and that readings are missing there."""
+    times = [f"{begin:.4g} to {end:.4g} s" for begin, end in burst.times[:MOST_TIMES]]
+    others = len(burst.times) - MOST_TIMES
+    times += [f"{others} other times"] if others > 0 else []
+    said = (
+        f"path: {burst.share:.0%} of the mean square error without the zero is at {', '.join(times)} of the record, "
+        f"elsewhere it is {length(burst.elsewhere)} rms"
+    )
+    if burst.gap:
+        said += f"; no reading comes there for up to {burst.gap * 1e3:.3g} ms: computer or driver was busy"
+    return said
 
 
 def _parts(tracking: Tracking) -> dict[str, float]:
@@ -282,10 +329,10 @@ def _show_record(page: Page, name: str, record: RecordVerification) -> None:
 def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
     """Add the causes of the error along a compensated path."""
     page.subsection("Measured - desired displacement")
-    page.lines(_tracking_notes(tracking)[:1])
+    page.lines(_tracking_notes(tracking)[:-1])
     page.table(
         ("part of the error", "rms (nm)", "what it is, and what helps"),
-        [(PARTS[cause], f"{part * 1e9:.1f}", CAUSES[cause]) for cause, part in _parts(tracking).items()],
+        [(PARTS[cause], f"{part * 1e9:.1f}", tracking.advice(cause)) for cause, part in _parts(tracking).items()],
         caption="Rms by which each part enters the whole; of parts that cancel, the smaller one is left out.",
     )
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)

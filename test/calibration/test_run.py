@@ -10,7 +10,7 @@ from strategies import FAMILY_CASE, axis_model
 
 from slpi_ros.calibration.run import Recording, aligned, calibrate, tracking_error, why, with_present_zero
 from slpi_ros.effects.creep import Creep
-from slpi_ros.errors import IdentificationError, RecordError, SlpiError
+from slpi_ros.errors import IdentificationError, RecordError, SlpiError, length
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.calibration import write_files
@@ -123,9 +123,14 @@ def test_errors_are_absolute_and_the_latest_verification_counts():
     assert (moved.offset, moved.rest) == (pytest.approx(60e-9, rel=0.01), pytest.approx(first.rest, rel=1e-6))
     diagnosis = SimpleNamespace(axes={"x": SimpleNamespace(effects=())})
     said = why([{"x": first}, {"x": moved}], diagnosis, "the time budget is spent")
-    risen = f"{first.mean * 1e9:.3g} to {moved.mean * 1e9:.3g} nm"
+    risen = f"{length(first.mean)} to {length(moved.mean)}"
     assert said.startswith("target not met") and risen in said and "~/set_zero" in said
     assert why([{"x": moved}, {"x": first}], diagnosis, "").startswith("target met")
+
+
+def test_lengths_are_told_in_their_own_unit():
+    error = error_of(np.full(4000, 4.6e-6))
+    assert length(error.offset) == "4.6 µm" and "constant 4.6 µm" in error.told() and "e+" not in error.told()
 
 
 def test_the_zero_of_a_model_is_that_of_the_last_record():

@@ -90,6 +90,15 @@ def test_a_clock_that_is_late_once_does_not_delay_what_follows():
     assert (executor.skipped, executor.remaining, executor.next_deadline_ns) == (4, 1, 1900)
 
 
+@pytest.mark.parametrize(("spacing", "crowded"), [(MS // 2, 6), (MS, 0), (2 * MS, 0)])
+def test_skipped_points_that_are_closer_than_the_output_period_are_counted(spacing, crowded):
+    executor = TrajectoryExecutor()
+    executor.start(ticks(np.arange(10) * spacing, MS), 0)
+    executor.due(MS)
+    assert executor.due(MS + 7 * spacing).displacements == [7.0]
+    assert (executor.skipped, executor.crowded) == (6, crowded)
+
+
 def test_the_clock_may_stand_still_or_go_back():
     executor = TrajectoryExecutor()
     executor.start(ticks(np.arange(3) * 100, 1000), 0)

@@ -18,7 +18,12 @@ from slpi_ros.diagnosis.verify import UNPROVED
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.schemas import validate
-from slpi_ros.reports.verification import little_judged
+from slpi_ros.reports.verification import (
+    describe_verification,
+    little_judged,
+    verification_good,
+    verification_limits,
+)
 
 SEED, RATE = 2, 200.0
 # Voltages between which a stage was moved before a record; the last one leads to where the record begins.
@@ -75,7 +80,9 @@ def test_a_moved_zero_is_no_error_of_the_loops(offset, model):
 
 def test_a_tolerance_holds_for_the_absolute_error(model):
     record = unseen(offset=1.5e-7)
-    one = judged(record, model, tolerance=5e-8, start_memory="start")
+    found = slpi_ros.verify(record, model, tolerance=5e-8, start_memory="start")
+    assert verification_limits(found)["x"].startswith("the zero")
+    one = found.axes["x"].records[0]
     assert one.absolute and not one.passed and one.constant == pytest.approx(1.5e-7, rel=0.1)
     assert one.error.rms == pytest.approx(np.hypot(one.constant, one.rest.rms), rel=0.02)
     assert judged(record, model, tolerance=5e-8, start_memory="start", without_offset=True).passed
@@ -123,6 +130,35 @@ def test_moving_and_standing_are_told_apart(model):
     assert one.standing.rms < one.moving.rms
     assert one.standing.samples + one.moving.samples == one.error.samples
     assert one.standing.samples == pytest.approx(2400, abs=60)
+
+
+@pytest.mark.parametrize("amplitude", [3e-9, 4e-8])
+def test_line_interference_is_told_where_it_is_much_of_the_error(amplitude, model):
+    record = unseen()
+    y = record.displacement["x"] + amplitude * np.sin(2.0 * np.pi * 50.1 * record.t)
+    found = slpi_ros.verify(replace(record, displacement={"x": y}), model)
+    validate(found.to_document(), "verification", "test")
+    one, told = found.axes["x"].records[0], "\n".join(describe_verification(found))
+    if amplitude < one.repeatability_rms:
+        assert one.lines is None and "interference" not in told
+        return
+    assert one.lines.share == pytest.approx(0.5 * amplitude**2 / one.rest.rms**2, abs=0.05)
+    assert "50.1 Hz (40.1 nm)" in told and "interference" in verification_good(found)
+    # Of a record that fails for it, it is no error of the model.
+    failed = slpi_ros.verify(replace(record, displacement={"x": y}), model, tolerance=2e-8)
+    assert "interference" in verification_limits(failed)["x"]
+    assert "no error of the model" in "".join(describe_verification(failed))
+
+
+def test_line_interference_is_no_hysteresis_of_a_path(model):
+    t, desired = path(model)
+    v = model.compensate(t, desired, start_memory="start")
+    y = after((), 0.0).run(t + 100.0, v)[1] + 7e-8 * np.sin(2.0 * np.pi * 50.0 * t)
+    found = slpi_ros.verify(record_of(t, v, y), model, tolerance=3e-8, desired=[{"x": desired + 3e-6}])
+    tracking = found.axes["x"].records[0].tracking
+    assert tracking.rms["noise"] == pytest.approx(7e-8 / np.sqrt(2.0), rel=0.1) and tracking.rms["model"] < 2e-8
+    limits = verification_limits(found)["x"]
+    assert limits.startswith("line interference") and "the path, 3" in limits
 
 
 @pytest.mark.parametrize("gain", [0.99, 1.02])
@@ -250,6 +286,52 @@ def test_what_goes_with_the_logarithm_of_the_rate_is_a_rate_dependence(model):
     assert tracking.shares["rate"] > 0.0 and tracking.delay == 0.0
     assert tracking.shares["delay"] == pytest.approx(0.0, abs=1e-6)
     assert tracking.shares["rate"] + tracking.shares["model"] > 0.9
+
+
+@pytest.mark.parametrize("lost", [0, 30])
+def test_times_at_which_a_path_is_off_are_told_with_gaps_of_the_record(lost, model):
+    t, desired = path(model)
+    v = model.compensate(t, desired, start_memory="start")
+    # The voltage stands still for a while, and no reading comes.
+    begin, end = 1500, 1600
+    v[begin:end] = v[begin]
+    kept = np.ones(t.size, bool)
+    kept[end - lost : end] = False
+    y = after((), 0.0).run(t + 100.0, v)[1]
+    record = record_of(t[kept], v[kept], y[kept])
+    found = slpi_ros.verify(record, model, desired=[{"x": desired[kept]}])
+    tracking, told = found.axes["x"].records[0].tracking, "\n".join(describe_verification(found))
+    burst = tracking.burst
+    assert burst.share > 0.9 and burst.elsewhere < 2.5 * 8e-9 < tracking.rest_rms
+    ((first, last),) = burst.times
+    assert first == pytest.approx(t[begin], abs=0.2) and last == pytest.approx(t[end], abs=0.2)
+    assert burst.gap == (pytest.approx((lost + 1) / RATE) if lost else 0.0)
+    assert ("busy" in verification_limits(found)["x"]) == ("no reading" in told) == bool(lost)
+
+
+def test_a_delay_that_varies_is_told_apart(model):
+    t, desired = path(model)
+    sent = model.compensate(t, desired, start_memory="start")
+    delays = 0.05 * (1.0 + np.sin(0.8 * t))
+    v = np.interp(t - delays, t, sent)
+    found = slpi_ros.verify(record_of(t, v, after((), 0.0).run(t + 100.0, v)[1]), model, desired=[{"x": desired}])
+    validate(found.to_document(), "verification", "test")
+    tracking = found.axes["x"].records[0].tracking
+    assert tracking.blame == "delay" and tracking.shares["delay"] > 0.9
+    assert tracking.delays == pytest.approx((0.0, 0.1), abs=0.015)
+    assert "varies" in "".join(describe_verification(found)) and "busy" in tracking.advice("delay")
+
+
+@pytest.mark.parametrize(("gain", "volts"), [(0.98, 0.0), (1.0, 2.0)])
+def test_voltages_of_another_model_are_no_delay(gain, volts, model):
+    t, desired = path(model)
+    v = np.clip(gain * model.compensate(t, desired, start_memory="start") + volts * np.sin(0.7 * t), 0.0, 100.0)
+    tracking = judged(record_of(t, v, after((), 0.0).run(t + 100.0, v)[1]), model, desired=[{"x": desired}]).tracking
+    assert tracking.delays is None and tracking.shares["delay"] < 0.1
+
+
+def test_an_error_all_along_a_path_has_no_times(model):
+    assert tracked(model).burst is None and tracked(model, gain=1.02).burst is None
 
 
 def test_parts_of_the_error_add_up(model):

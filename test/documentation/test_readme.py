@@ -20,7 +20,9 @@ NOT_RUN = {
     "export PATH": "the tests have a PATH of their own",
     "ros2 launch slpi_ros calibrate.launch.py": "launch has no wheels: test_launch_files.py and test_site.py check it",
     "ros2 run slpi_ros exciter": "run below by hand, with another seed",
-    "ros2 bag record": "rosbag2 has no wheels: the recorder does the same",
+    "ros2 bag record /stage_state -o": "rosbag2 has no wheels: the recorder does the same",
+    "ros2 bag record /stage_state /desired": "rosbag2 has no wheels: the recorder does the same",
+    "ros2 run slpi_ros recorder": "the same node as by hand, with more topics: test_recorder.py",
 }
 # The stage moves faster than in life, and the clock of the other nodes is its own.
 FASTER = {"stage_simulator": "-p speed:=4.0 -p rate:=100.0", "calibrator": "-p use_sim_time:=true -p rate:=100.0"}

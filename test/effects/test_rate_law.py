@@ -246,7 +246,8 @@ def test_a_step_within_the_last_digit_of_the_voltage_has_the_direction_of_the_wi
 
 def test_the_sentence_holds_the_figures():
     sentence = RateDependence(1.0, 0.25, 7e-9).describe()
-    assert "0.25 V/s" in sentence and "2.3 V" in sentence and "7 nm/V" in sentence
+    assert "0.25 V/s" in sentence and "2.3 V" in sentence and "7 nm per volt" in sentence
+    assert "at once" not in RateDependence(1.0, 0.25, 0.0).describe()
 
 
 @given(rate_laws(leads=1), numbers(-100, 100), numbers(-100, 100), st.integers(1, 4000))

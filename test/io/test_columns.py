@@ -1,5 +1,6 @@
 """Units and roles of columns, however a program wrote their names; nothing is scaled by a guess in silence."""
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -171,17 +172,55 @@ def test_a_column_has_one_role(table):
 
 def test_an_import_tells_columns_units_and_ranges(table):
     path = table("time_ms,voltage_mV,displacement_nm", "0,0,-500", "1,100000,19800", "2,5,")
-    assert import_with_summary(path, ColumnOptions())[1] == (
+    assert import_with_summary(path, ColumnOptions()).summary == (
         "axis x: voltage_mV 0 to 100 V, displacement_nm -0.5 to 19.8 µm",
     )
     path = table("Time,Voltage,x_V,Position,displacement_y_um", "0,1,2,3,4", "1,5,6,7,8")
     options = ColumnOptions(voltage=("Voltage", "x_V"), displacement=("position", "displacement_y_um"))
-    lines = import_with_summary(path, options)[1]
+    lines = import_with_summary(path, options).summary
     assert lines == (
         "time: column 'Time' taken as s",
         "axis x: Voltage 1 to 5 V (unit assumed), Position 3 to 7 µm (unit assumed)",
         "axis y: x_V 2 to 6 V, displacement_y_um 4 to 8 µm",
     )
     path = table("time_s,voltage_V,displacement", "0,1,", "1,5,nan")
-    lines = import_with_summary(path, ColumnOptions(displacement_unit="nm"))[1]
+    lines = import_with_summary(path, ColumnOptions(displacement_unit="nm")).summary
     assert lines == ("axis x: voltage_V 1 to 5 V, displacement without a value",)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["desired_um", "desired_x_um", "x_desired (um)", "Desired displacement x [um]", "displacement_desired_um",
+     "Setpoint_um", "x set point / um", "DESIRED"],
+)  # fmt: skip
+def test_a_column_of_desired_displacements_is_recognised(table, name):
+    read = import_with_summary(table(f"time_s,voltage_V,x_um,{name}", "0,1,2,3", "1,1,2,"), ColumnOptions())
+    assert list(read.record.axes) == ["x"] and read.record.displacement["x"] == pytest.approx([2e-6, 2e-6])
+    assert read.desired["x"] == pytest.approx([3e-6, np.nan], nan_ok=True)
+    assert f"desired {name} 3 to 3 µm" in read.summary[0]
+
+
+@pytest.mark.parametrize(
+    "name", ["voltage_setpoint_V", "time_of_setpoint", "undesired_um", "setpoint_temperature", "desired_mrad", "note"]
+)
+def test_a_column_of_something_else_is_no_desired_displacement(table, name):
+    columns = ColumnOptions(time="time_s", voltage=("voltage_V",))
+    read = import_with_summary(table(f"time_s,voltage_V,x_um,{name}", "0,1,2,3", "1,1,2,3"), columns)
+    assert not read.desired and list(read.record.axes) == ["x"]
+    assert any("--desired" in line for line in read.summary) == (name in ("setpoint_temperature", "desired_mrad"))
+
+
+def test_desired_displacements_of_several_axes(table):
+    path = table("time_s,voltage_V,x_um,y_um,y_desired_nm,b,a", "0,1,2,3,4,5,6", "1,1,2,3,4,5,6")
+
+    def read(**options):
+        return import_with_summary(path, ColumnOptions(displacement=("x_um", "y_um"), **options)).desired
+
+    assert read()["y"][0] == pytest.approx(4e-9) and list(read(axes=("u", "v"))) == ["v"]
+    found = read(desired=("a", "b"))
+    assert (found["x"][0], found["y"][0]) == (pytest.approx(6e-6), pytest.approx(5e-6))
+    assert holds(refusal(RecordError, read, desired=("a",)), path, "--desired")
+    assert holds(refusal(UsageError, read, desired=("x_um", "y_um")), path, "'x_um'")
+    path = table("time_s,voltage_V,x_um,desired_um,setpoint_um", "0,1,2,3,4", "1,1,2,3,4")
+    assert holds(refusal(RecordError, import_with_summary, path, ColumnOptions()), path, "setpoint_um", "--desired")
+    assert import_with_summary(path, ColumnOptions(desired=("setpoint_um",))).desired["x"][0] == pytest.approx(4e-6)

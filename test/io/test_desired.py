@@ -6,6 +6,7 @@ from bag_makers import STORE, header, joint_state, rosbags_bag
 
 from slpi_ros.errors import RecordError
 from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.desired import desired_of, read_path
 from slpi_ros.io.tables import write_table
 
@@ -29,6 +30,15 @@ def trajectory(stamp_ns: int, names: tuple[str, ...], times_ms: list[int], rows:
 def bag_of(folder, **topics):
     states = [(t, joint_state(t, ("x", "y"), (1e-6, 2e-6), (k, k))) for k, t in enumerate(TIMES)]
     return rosbags_bag(folder, {"/stage_state": states, **{f"/{name}": rows for name, rows in topics.items()}})
+
+
+def test_what_a_bag_is_written_with_is_read(tmp_path):
+    record = read_bag(bag_of(tmp_path / "bag"))
+    desired = 1e-6 * np.sin(record.t)
+    write_bag(tmp_path / "with", record, desired={"y": np.where(record.t < 0.1, np.nan, desired)})
+    found = desired_of(tmp_path / "with", read_bag(tmp_path / "with"))
+    assert list(found) == ["y"] and np.isnan(found["y"][:10]).all()
+    np.testing.assert_array_equal(found["y"][10:], desired[10:])
 
 
 def test_messages_are_held_and_trajectories_interpolated(tmp_path):

@@ -20,6 +20,7 @@ from slpi_ros.errors import UsageError  # noqa: E402
 from slpi_ros.io.bag_reader import read_bag  # noqa: E402
 from slpi_ros.io.tables import write_table  # noqa: E402
 from slpi_ros.model.document import parse_model  # noqa: E402
+from slpi_ros.nodes.calibration_job import PATH  # noqa: E402
 from slpi_ros.nodes.calibrator import DECLARATIONS, settings_of  # noqa: E402
 
 LOW, HIGH, SLEW, RATE, REST = -10.0, 90.0, 300.0, 100.0, 5.0
@@ -254,6 +255,11 @@ def test_a_desired_path_is_sampled_at_the_rate(tmp_path):
     for wrong in ({"rate": 10.0}, {"axes": ["y"]}):
         with pytest.raises(UsageError, match="desired_path"):
             settings_of(values | wrong)
+    # Micrometres, and no time.
+    for times, y in ((t, np.sin(t)), (0.0 * t, 1e-6 * t)):
+        write_table(tmp_path / "path.csv", times, {"x": y}, "m")
+        with pytest.raises(UsageError, match="desired_path"):
+            settings_of(values)
 
 
 def test_a_folder_in_use_is_not_touched(tmp_path):
@@ -287,3 +293,32 @@ def test_a_stage_with_a_hidden_cause_calibrates_itself(tmp_path):
     assert "creep" in [effect.name for effect in model.axes["x"].effects]
     assert parse_model((out / "model.json").read_text(), "model.json").hardware_id.startswith("simulated-0-")
     assert {"report.html", "diagnosis", "01_check", "02_calibration"} <= {path.name for path in out.iterdir()}
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.long
+def test_models_are_verified_on_a_desired_path(tmp_path):
+    rate = 100.0
+    t = np.arange(int(15 * rate) + 1) / rate
+    path = 8e-6 - 4e-6 * np.cos(2.0 * np.pi * 0.5 * t) * np.exp(-t / 20.0)
+    write_table(tmp_path / "path.csv", t, {"x": path}, "m")
+    parameters = {
+        "voltage_min": 0.0, "voltage_max": 100.0, "slew_limit": 1000.0, "rate": rate, "target": 0.1,
+        "output": str(tmp_path / "out"), "desired_path": str(tmp_path / "path.csv"), "use_sim_time": True,
+    }  # fmt: skip
+    simulated = {"rate": rate, "speed": 4.0}
+    with started("stage_simulator", simulated), started("calibrator", parameters) as node:
+        assert node.process.wait(600.0) == 0, node.stderr
+    out = tmp_path / "out"
+    verifications = sorted(out.glob("*_verification"))
+    assert verifications
+    for bag in verifications:
+        desired = read_bag(bag, PATH).displacement["x"]
+        desired = desired[np.isfinite(desired)]
+        # After the way to its begin, the whole path; then at rest at its end.
+        assert desired.max() == pytest.approx(path.max(), abs=1e-8) and desired.min() <= path.min() + 1e-8
+        assert desired[-1] == pytest.approx(path[-1], abs=1e-9)
+    model = parse_model((out / "model.json").read_text(), "model.json").axes["x"]
+    assert model.voltage_range == pytest.approx((0.0, 100.0), abs=1.0)
+    assert "the desired path" in (out / "report.html").read_text()

@@ -167,6 +167,15 @@ def test_a_displacement_below_the_remanence_waits_at_the_limit(x_file):
         assert client.ask(["x"], [5e-6]) == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.parametrize(("share", "remedy"), [(0.9, "narrower than the model"), (1.05, "within the identified range")])
+def test_what_to_do_about_a_displacement_out_of_reach_depends_on_the_range(share, remedy, x_file):
+    top = stage_model().axis("x").displacement_range[1]
+    with compensator(model_file=x_file, voltage_max=50.0) as client:
+        client.connect()
+        client.ask(["x"], [share * top])
+        client.graph.spin_until(lambda: remedy in client.node.stderr, "the remedy")
+
+
 def test_axes_that_are_not_named_keep_their_voltage(xy_file):
     with compensator(axes=["y", "x"], model_file=xy_file) as client:
         client.connect()

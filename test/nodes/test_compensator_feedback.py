@@ -1,6 +1,7 @@
 """Measured displacements over DDS: they correct the voltage when told to, and tell when the model no longer holds."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from nodes.ros_helpers import stage_model  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
+from slpi_ros.compensator.feedback import Drift  # noqa: E402
 from slpi_ros.model.document import save_model  # noqa: E402
+from slpi_ros.nodes.compensator_diagnostics import remedy  # noqa: E402
 
 GAINS = {"kp": 2e6, "ki": 1e9}
 
@@ -124,3 +127,12 @@ def test_a_measurement_that_cannot_be_is_told_and_moves_nothing(x_file):
         statuses = client.graph.statuses(f"{client.name}: compensator")
         warned = [status for status in statuses if "measurements rejected, the last: axis 'x'" in status.message]
         assert warned and warned[0].level == b"\1"
+
+
+@pytest.mark.parametrize(
+    ("state", "mean", "advised"), [("assumed", 5e-8, False), ("assumed", 1e-9, True), ("known", 5e-8, False)]
+)
+def test_what_oscillates_is_not_only_blamed_on_the_memory(state, mean, advised):
+    axis = SimpleNamespace(confidence=SimpleNamespace(state=state), zero=SimpleNamespace(source="calibration"))
+    said = remedy(axis, Drift(mean=mean, rms=5.1e-8, samples=500))
+    assert ("interference" in said) == advised and ("~/reset_memory" in said) == (state == "assumed")

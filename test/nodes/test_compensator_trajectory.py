@@ -1,5 +1,6 @@
 """Trajectories over DDS: accepted as a whole, given at their own times, replaced and cancelled."""
 
+import signal
 import time
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E
 from slpi_ros.compensator.persistence import model_id  # noqa: E402
 from slpi_ros.model.document import format_model, save_model  # noqa: E402
 from slpi_ros.model.stage_model import HeldAtLimitWarning  # noqa: E402
+from slpi_ros.nodes.common import WARN  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings(f"ignore::{HeldAtLimitWarning.__module__}.{HeldAtLimitWarning.__name__}")
 MS = 1_000_000
@@ -186,6 +188,35 @@ def test_a_trajectory_that_waits_is_given_with_the_model_that_came_meanwhile(xy_
         reached = [np.abs(np.array(x) - v).min() < 1e-8 for v in expected]
         assert sum(reached) >= 20 - int(client.reports[-1]["points_skipped"])
         assert client.ask(["x"], [path[-1]])[0] == pytest.approx(x[-1], abs=1e-8)
+
+
+def test_skipped_points_are_told_with_their_reason(xy_file):
+    with compensator(axes=["x", "y"], model_file=xy_file) as client:
+        client.connect()
+        publisher = sender(client)
+        publisher.publish(trajectory(["x"], 20 * MS + np.arange(2000) * MS // 100, np.full((2000, 1), 1e-6)))
+        status, values = client.report(trajectories=1, points_remaining=0)
+        assert status.level == WARN and int(values["points_skipped"]) > 0
+        assert f"{values['points_skipped']} points" in status.message and "output period of 1 ms" in status.message
+        # Told once: a later report has nothing new.
+        client.graph.wait_for_status(status.name, lambda later: "skipped" not in later.message, "a report without")
+        publisher.publish(trajectory(["x"], np.arange(200) * 5 * MS, np.full((200, 1), 2e-6)))
+        client.graph.spin_until(lambda: client.answers[-1][0] > 15.0, "the second trajectory")
+        client.node.process.send_signal(signal.SIGSTOP)
+        time.sleep(0.1)
+        client.node.process.send_signal(signal.SIGCONT)
+        client.graph.wait_for_status(status.name, lambda later: "computer was busy" in later.message, "the reason")
+        client.report(trajectories=2, points_remaining=0)
+        # Between points that are far apart samples are missed, and no points.
+        publisher.publish(trajectory(["x"], np.array([0, 2000]) * MS, np.array([[2e-6], [4e-6]])))
+        client.graph.spin_until(lambda: client.answers[-1][0] > 25.0, "the third trajectory")
+        client.node.process.send_signal(signal.SIGSTOP)
+        time.sleep(0.1)
+        client.node.process.send_signal(signal.SIGCONT)
+        client.graph.wait_for_status(
+            status.name, lambda later: " ms late" in later.message and "skipped" not in later.message, "the delay"
+        )
+        assert "output period" in client.node.stderr
 
 
 def test_a_cancelled_trajectory_brakes(xy_file):

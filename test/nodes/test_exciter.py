@@ -316,7 +316,7 @@ def test_it_drives_nothing_beside_another_publisher():
         listener = Listener(graph)
         with exciter(graph, **LIMITS, settle=0.5, rest_voltage=0.0) as node:
             assert wait_for_end(graph, node) == 1
-            assert holds(node.stderr.splitlines()[-1], "1 other publisher", "voltage_command")
+            assert holds(node.stderr.splitlines()[-1], "1 other publisher", "voltage_command", graph.node.get_name())
             assert "exciting" not in node.stderr
     assert not listener.commands
 
@@ -327,7 +327,7 @@ def test_it_returns_when_another_publisher_appears():
         listener.wait_for_motion()
         graph.node.create_publisher(Float64MultiArray, "voltage_command", RELIABLE)
         assert wait_for_end(graph, node) == 1
-        assert holds(node.stderr.splitlines()[-1], "1 other publisher", "voltage_command")
+        assert holds(node.stderr.splitlines()[-1], "1 other publisher", "voltage_command", graph.node.get_name())
         v = listener.v
     assert v[-1, 0] == pytest.approx(0.0, abs=1e-9) and v.max() > 60.0
     assert fastest(v) <= 2 * 400.0 * (1 + 1e-9) and len(v) < 20.0 * RATE

@@ -57,6 +57,12 @@ class EachRecord(EffectBase):
         records = zip(self.parts, around.split(signal), around.records, strict=True)
         return np.concatenate([part.invert(own, record) for part, own, record in records])
 
+    def joined(self, other: "EachRecord") -> "EachRecord | None":
+        """Return the effects of both, record by record."""
+        parts = [one.joined(two) for one, two in zip(self.parts, other.parts, strict=True)]
+        found = tuple(part for part in parts if part is not None)
+        return EachRecord(found) if len(found) == len(parts) else None
+
     def plausible(self, view: FitContext) -> bool:
         """Return whether the parameters of each record are plausible."""
         return all(part.plausible(view) for part in self.parts)

@@ -14,6 +14,7 @@ from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.filters import Mode
+from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS, from_document, in_order, to_document
@@ -281,6 +282,16 @@ def test_parameters_survive_the_document(effect):
     for one in (effect, replace(effect, uncertainty=spread)):
         text = json.dumps(to_document(one), allow_nan=False)
         assert from_document(json.loads(text)) == one
+
+
+def test_lists_are_joined():
+    """Lines add up, modes share the motion, and what an axis has once is not joined."""
+    t, one, other = np.arange(100) * 1e-3, Hum((Line(50.0, 1e-9, 0.1),)), Hum((Line(60.0, 2e-9, 0.2),))
+    np.testing.assert_allclose(one.joined(other).wave(t), one.wave(t) + other.wave(t), rtol=0, atol=1e-20)
+    both = Resonance((Mode(100.0, 0.1, 0.9),)).joined(Resonance((Mode(300.0, 0.1, 0.9),)))
+    assert [mode.gain for mode in both.modes] == [0.5, 0.5] and both.rest == 0.0
+    crowd = Hum((Line(50.0, 1e-9, 0.1),) * 100)
+    assert crowd.joined(one) is None and Lag(0.1).joined(Lag(0.1)) is None
 
 
 @given(st.lists(EVERY, unique_by=lambda effect: effect.name, max_size=11))

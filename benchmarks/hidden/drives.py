@@ -115,6 +115,7 @@ NEEDED: dict[str, tuple[Section, ...]] = {
     "thermal_drift": (varied,),
     "sensor_periodic": (ramps,),
     "hum": (holds,),
+    "steps": (varied,),
 }
 _ANY: tuple[Section, ...] = (varied, nests, tempos, peaks, holds)
 

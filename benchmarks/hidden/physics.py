@@ -351,6 +351,28 @@ class Temperature:
 
 
 @dataclass(frozen=True)
+class Slips:
+    """A mount, or a counter of fringes, that gives way at some moments.
+
+    Parameters
+    ----------
+    moments : tuple of float, seconds
+        From the start of the record.
+    distances : tuple of float, metres
+    """
+
+    moments: tuple[float, ...]
+    distances: tuple[float, ...]
+
+    def path(self, t: FloatArray) -> FloatArray:
+        """Return how far it has slipped, shape (N,), metres, at times `t` from 0 on, shape (N,), seconds."""
+        gone = np.zeros_like(t)
+        for moment, distance in zip(self.moments, self.distances, strict=True):
+            gone[t > moment] += distance
+        return gone
+
+
+@dataclass(frozen=True)
 class Flexure:
     """A lightly damped second-order mode.
 
@@ -396,6 +418,7 @@ class Physics:
     coupling : mapping of axis name to float
         Share of the motion of another axis, relative to its start, that is added to this axis.
     temperature : Temperature, optional
+    slips : Slips, optional
     interferometer : Interferometer, optional
     hum : Hum, optional
     """
@@ -407,6 +430,7 @@ class Physics:
     ageing: Ageing | None = None
     coupling: Mapping[str, float] = field(default_factory=dict)
     temperature: Temperature | None = None
+    slips: Slips | None = None
     interferometer: Interferometer | None = None
     hum: Hum | None = None
 
@@ -467,6 +491,8 @@ def sensed(physics: Physics, t: FloatArray, motion: Mapping[str, FloatArray], ax
         y = y + gain * (motion[other] - motion[other][0])
     if physics.temperature:
         y = y + physics.temperature.path(t)
+    if physics.slips:
+        y = y + physics.slips.path(t - t[0])
     if physics.interferometer:
         y = physics.interferometer.read(y)
     if physics.hum:

@@ -21,6 +21,7 @@ MODULES = (
     "gain_drift",
     "cross_coupling",
     "thermal_drift",
+    "steps",
     "sensor_periodic",
     "hum",
 )

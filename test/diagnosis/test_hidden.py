@@ -13,8 +13,8 @@ from slpi_ros.io.bag_writer import write_bag
 pytestmark = pytest.mark.slow
 
 SAMPLES = 12_000
-# All eleven take minutes: `make bench-diagnosis`.
-FAST = ["lag", "hum"]
+# All of them take minutes: `make bench-diagnosis`.
+FAST = ["lag", "hum", "steps"]
 SLOW = ["creep", "resonance", "cross_coupling", "sensor_periodic", "thermal_drift", "gain_drift"]
 # Large enough that nobody should miss it; what is found of smaller ones is for the bench to say.
 LARGE = 10.0

@@ -19,10 +19,11 @@ from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS, from_document, in_order, to_document
 from slpi_ros.effects.resonance import Resonance, zeros
+from slpi_ros.effects.steps import Steps
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.schemas import load_schema
 
-EXACT = ("rate_dependence", "creep", "gain_drift", "cross_coupling", "thermal_drift", "sensor_periodic", "hum")
+EXACT = ("rate_dependence", "creep", "gain_drift", "cross_coupling", "thermal_drift", "steps", "sensor_periodic", "hum")
 FOLLOWED = ("lag", "creep", "resonance", "sensor_periodic")
 
 
@@ -39,7 +40,7 @@ def test_registry_schemas_and_strategies_know_the_same_effects():
 def test_every_effect_has_its_side_and_acts_on_one_signal(effect):
     signals = dict.fromkeys(("delay", "lag", "saturation"), "voltage") | {"rate_dependence": "hysteresis"}
     assert effect.acts_on == signals.get(effect.name, "displacement")
-    others = {"sensor_periodic": "sensor", "hum": "record", "thermal_drift": "record"}
+    others = {"sensor_periodic": "sensor", "hum": "record", "thermal_drift": "record", "steps": "record"}
     assert effect.side == others.get(effect.name, "stage")
     # No inverse for the stage holds what is not of the stage.
     chain = Chain.of((effect,))
@@ -290,6 +291,8 @@ def test_lists_are_joined():
     np.testing.assert_allclose(one.joined(other).wave(t), one.wave(t) + other.wave(t), rtol=0, atol=1e-20)
     both = Resonance((Mode(100.0, 0.1, 0.9),)).joined(Resonance((Mode(300.0, 0.1, 0.9),)))
     assert [mode.gain for mode in both.modes] == [0.5, 0.5] and both.rest == 0.0
+    twice = Steps((1.0, 2.0), (1e-9, 3e-9)).joined(Steps((1.5, 2.0), (5e-9, 1e-9)))
+    assert twice == Steps((1.0, 1.5, 2.0), (1e-9, 5e-9, 4e-9))
     crowd = Hum((Line(50.0, 1e-9, 0.1),) * 100)
     assert crowd.joined(one) is None and Lag(0.1).joined(Lag(0.1)) is None
 
@@ -396,6 +399,8 @@ MODE, LINE = {"frequency": 100.0, "damping": 0.1}, {"frequency": 50.0, "amplitud
         ("gain_drift", {"times": [1.0], "gains": [0.1, 0.2], "origin": 0.0}),
         ("gain_drift", {"times": [1.0], "gains": [0.1], "origin": None}),
         ("thermal_drift", {"times": [1.0, 1.0], "values": [0.0, 0.0]}),
+        ("steps", {"times": [2.0, 1.0], "sizes": [1e-8, 1e-8]}),
+        ("steps", {"times": [1.0], "sizes": []}),
         ("sensor_periodic", {"period": 1e-7, "amplitude": 1e-7, "phase": 0.0}),
         ("hum", {"frequency": 50.0, "amplitude": 1e-9, "phase": 0.0}),
         ("hum", {"lines": []}),

@@ -211,6 +211,12 @@ def test_sensor_periodic_is_slow_and_steady_at_two_speeds():
     assert min(steps for _, steps in ramps) > 10 * 22 / 0.316
 
 
+def test_steps_are_looked_for_at_rest():
+    _, v, _ = drive("steps")
+    rests = holds(v, least=400)
+    assert len({round(voltage) for _, voltage in rests}) == 7 and sum(steps for steps, _ in rests) > 0.6 * v.size
+
+
 def test_hum_is_mostly_rest_at_three_levels():
     _, v, _ = drive("hum")
     rests = [(steps, voltage) for steps, voltage in holds(v, least=1000)]

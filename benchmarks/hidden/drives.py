@@ -106,6 +106,7 @@ def nests(path: Path, rng: np.random.Generator, seconds: float) -> None:
 NEEDED: dict[str, tuple[Section, ...]] = {
     "delay": (tempos, varied),
     "lag": (tempos, varied),
+    "slew": (tempos, varied),
     "saturation": (peaks,),
     "rate_dependence": (tempos, varied),
     "creep": (holds,),

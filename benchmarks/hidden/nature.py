@@ -76,6 +76,17 @@ def _lag(rng: np.random.Generator, setting: Setting) -> Nature:
     return Nature(1e-3, 20e-3, lambda s: Physics(amplifier=Amplifier(lag=s)), lambda s: {"time_constant": s})
 
 
+def _slew(rng: np.random.Generator, setting: Setting) -> Nature:
+    # The strength is how far the limit is below the fastest rate, as the logarithm of their ratio.
+    fastest = float(np.quantile(np.abs(np.diff(setting.v) / np.diff(setting.t)), 0.999))
+    return Nature(
+        0.05,
+        2.0,
+        lambda s: Physics(amplifier=Amplifier(slew=fastest * np.exp(-s))),
+        lambda s: {"rate": fastest * np.exp(-s)},
+    )
+
+
 def _saturation(rng: np.random.Generator, setting: Setting) -> Nature:
     # The strength is the fraction of the range that is cut off. The part that a refit cannot explain does not grow with
     # it, so it is drawn here.
@@ -234,6 +245,7 @@ def _hum(rng: np.random.Generator, setting: Setting) -> Nature:
 DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "delay": _delay,
     "lag": _lag,
+    "slew": _slew,
     "saturation": _saturation,
     "rate_dependence": _rate_dependence,
     "creep": _creep,

@@ -14,6 +14,7 @@ from slpi_ros.errors import ModelError
 MODULES = (
     "delay",
     "lag",
+    "slew",
     "saturation",
     "rate_dependence",
     "creep",

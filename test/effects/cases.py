@@ -18,6 +18,7 @@ from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
+from slpi_ros.effects.slew import Slew
 from slpi_ros.effects.steps import Steps
 from slpi_ros.effects.thermal_drift import ThermalDrift
 
@@ -94,6 +95,7 @@ LINES = st.builds(Line, powers(1, 1000), powers(1e-10, 1e-7), numbers(-7, 7))
 BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "delay": st.builds(Delay, numbers(-0.2, 0.2)),
     "lag": st.builds(Lag, powers(1e-4, 1)),
+    "slew": st.builds(Slew, powers(1, 1e4)),
     "saturation": saturations(),
     "rate_dependence": rate_laws(),
     "creep": creeps(),
@@ -107,7 +109,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
 }
 EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__) | rate_laws(leads=3)
 # They change what moves, and leave what rests as it is.
-ABOUT_MOTION = ("delay", "lag", "rate_dependence", "creep", "resonance", "cross_coupling")
+ABOUT_MOTION = ("delay", "lag", "slew", "rate_dependence", "creep", "resonance", "cross_coupling")
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.io.schemas import load_schema
 
 EXACT = ("rate_dependence", "creep", "gain_drift", "cross_coupling", "thermal_drift", "steps", "sensor_periodic", "hum")
-FOLLOWED = ("lag", "creep", "resonance", "sensor_periodic")
+INVERTED = ("lag", "creep", "resonance", "sensor_periodic")
+FOLLOWED = (*INVERTED, "slew")
 
 
 def test_registry_schemas_and_strategies_know_the_same_effects():
@@ -38,7 +39,7 @@ def test_registry_schemas_and_strategies_know_the_same_effects():
 
 @given(EVERY)
 def test_every_effect_has_its_side_and_acts_on_one_signal(effect):
-    signals = dict.fromkeys(("delay", "lag", "saturation"), "voltage") | {"rate_dependence": "hysteresis"}
+    signals = dict.fromkeys(("delay", "lag", "slew", "saturation"), "voltage") | {"rate_dependence": "hysteresis"}
     assert effect.acts_on == signals.get(effect.name, "displacement")
     others = {"sensor_periodic": "sensor", "hum": "record", "thermal_drift": "record", "steps": "record"}
     assert effect.side == others.get(effect.name, "stage")
@@ -91,6 +92,16 @@ def test_saturation_is_a_limit(effect, record):
     assert effect.streaming() is None, "the limits of the command are those of the effect"
 
 
+@given(BY_NAME["slew"], records("voltage"), st.none() | st.floats(0, 100))
+def test_a_slew_limit_is_the_fastest_way_to_the_command(effect, record, start):
+    around = replace(record.around, start=start)
+    u, t, now = effect.apply(record.signal, around), around.t, record.signal[0] if start is None else start
+    for k, step in enumerate(effect.rate * np.diff(t, prepend=t[0])):
+        now = np.clip(record.signal[k], now - step, now + step)
+        assert u[k] == pytest.approx(now, rel=1e-12, abs=1e-12)
+    np.testing.assert_array_equal(effect.invert(u, around), u)
+
+
 @given(effects_and_records(ABOUT_MOTION), st.sampled_from(("apply", "invert")))
 def test_at_rest_nothing_changes(drawn, verb):
     effect, record = drawn
@@ -110,7 +121,7 @@ def test_follower_does_what_apply_does(drawn):
     np.testing.assert_allclose(followed, expected, rtol=0, atol=1e-8 * record.span)
 
 
-@given(effects_and_records(FOLLOWED), st.data())
+@given(effects_and_records(INVERTED), st.data())
 def test_follower_gives_what_is_wanted(drawn, data):
     """In uneven steps too; and asking moves nothing."""
     effect, record = drawn
@@ -372,6 +383,8 @@ MODE, LINE = {"frequency": 100.0, "damping": 0.1}, {"frequency": 50.0, "amplitud
         ("lag", {"time_constant": "0.1"}),
         ("lag", {}),
         ("delay", {"seconds": float("inf")}),
+        ("slew", {"rate": 0.0}),
+        ("slew", {"rate": None}),
         ("saturation", {"lower": 5.0, "upper": 5.0}),
         ("saturation", {"lower": float("nan"), "upper": None}),
         ("creep", {"time_constants": [], "gains": []}),

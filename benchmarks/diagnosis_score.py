@@ -146,7 +146,8 @@ def parameter_errors(truth: Truth, effect, hidden: Hidden) -> dict[str, float]:
     """Return the relative errors by parameter name; a list of knots or relaxations has one error.
 
     ``saturation``: relative to the voltage that is cut off. ``creep``: step response from 0.1 s to half of the record.
-    ``gain_drift``, ``thermal_drift``: course in time, without its mean. ``wave``: the sine, including its phase.
+    ``gain_drift``, ``thermal_drift``, ``steps``: course in time, without its mean. ``wave``: the sine, including its
+    phase.
     """
     true, t = truth.parameters, hidden.record.t
     if truth.name in ("resonance", "hum"):
@@ -169,6 +170,8 @@ def parameter_errors(truth: Truth, effect, hidden: Hidden) -> dict[str, float]:
             return {"course": _mismatch(*(_course(each, t) for each in (effect, true)))}
         case "thermal_drift":
             return {"path": _mismatch(*(_path(each, t) for each in (effect, true)))}
+        case "steps":
+            return {"path": _mismatch(*(_stairs(each, t) for each in (effect, true)))}
         case "sensor_periodic" | "hum":
             scale = "period" if truth.name == "sensor_periodic" else "frequency"
             wave = _mismatch(*(_wave(each, scale, hidden.clean[truth.axis], t) for each in (effect, true)))
@@ -203,6 +206,10 @@ def _after_a_step(source, times):
 
 def _path(source, t):
     return np.interp(t, _of(source, "times"), _of(source, "values"))
+
+
+def _stairs(source, t):
+    return np.cumsum((0.0, *_of(source, "sizes")))[np.searchsorted(_of(source, "times"), t)]
 
 
 def _course(source, t):

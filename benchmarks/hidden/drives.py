@@ -106,6 +106,7 @@ def nests(path: Path, rng: np.random.Generator, seconds: float) -> None:
 NEEDED: dict[str, tuple[Section, ...]] = {
     "delay": (tempos, varied),
     "lag": (tempos, varied),
+    "slew": (tempos, varied),
     "saturation": (peaks,),
     "rate_dependence": (tempos, varied),
     "creep": (holds,),
@@ -115,6 +116,7 @@ NEEDED: dict[str, tuple[Section, ...]] = {
     "thermal_drift": (varied,),
     "sensor_periodic": (ramps,),
     "hum": (holds,),
+    "steps": (varied,),
 }
 _ANY: tuple[Section, ...] = (varied, nests, tempos, peaks, holds)
 

@@ -1,4 +1,4 @@
-"""Random draws of the eleven effects: the physics of each, and its parameters by their names in the package."""
+"""Random draws of the effects: the physics of each, and its parameters by their names in the package."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -16,6 +16,7 @@ from .physics import (
     Flexure,
     Physics,
     RateLaw,
+    Slips,
     SlowDomains,
     Temperature,
     Viscosity,
@@ -27,7 +28,7 @@ Parameters = Mapping[str, float | tuple[float, ...] | Mapping[str, float]]
 # Pairs of effects that cannot be distinguished from a single effect.
 CONFUSABLE = ({"delay", "lag"},)
 # Effects that differ between records of the same stage.
-OWN = ("gain_drift", "thermal_drift", "hum")
+OWN = ("gain_drift", "thermal_drift", "steps", "hum")
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,17 @@ def _delay(rng: np.random.Generator, setting: Setting) -> Nature:
 
 def _lag(rng: np.random.Generator, setting: Setting) -> Nature:
     return Nature(1e-3, 20e-3, lambda s: Physics(amplifier=Amplifier(lag=s)), lambda s: {"time_constant": s})
+
+
+def _slew(rng: np.random.Generator, setting: Setting) -> Nature:
+    # The strength is how far the limit is below the fastest rate, as the logarithm of their ratio.
+    fastest = float(np.quantile(np.abs(np.diff(setting.v) / np.diff(setting.t)), 0.999))
+    return Nature(
+        0.05,
+        2.0,
+        lambda s: Physics(amplifier=Amplifier(slew=fastest * np.exp(-s))),
+        lambda s: {"rate": fastest * np.exp(-s)},
+    )
 
 
 def _saturation(rng: np.random.Generator, setting: Setting) -> Nature:
@@ -185,6 +197,24 @@ def _thermal_drift(rng: np.random.Generator, setting: Setting) -> Nature:
     )
 
 
+def _steps(rng: np.random.Generator, setting: Setting) -> Nature:
+    duration, count = float(setting.t[-1]), int(rng.integers(1, 5))
+    # At least a fortieth of the record apart, so that it shows how far each went.
+    moments = np.sort(0.1 * duration + 0.02 * duration * rng.choice(np.arange(40), count, replace=False))
+    moments = tuple((moments + rng.uniform(0.0, 0.005, count) * duration).tolist())
+    shares = rng.choice([-1.0, 1.0], count) * np.exp(rng.uniform(-0.7, 0.7, count))
+
+    def distances(strength: float) -> tuple[float, ...]:
+        return tuple((strength * shares).tolist())
+
+    return Nature(
+        2e-9,
+        1e-6,
+        lambda s: Physics(slips=Slips(moments, distances(s))),
+        lambda s: {"times": moments, "sizes": distances(s)},
+    )
+
+
 def _sensor_periodic(rng: np.random.Generator, setting: Setting) -> Nature:
     period = float(rng.choice([158e-9, 266e-9, 316e-9, 388e-9, 633e-9]))
     phase = float(rng.uniform(-np.pi, np.pi))
@@ -215,6 +245,7 @@ def _hum(rng: np.random.Generator, setting: Setting) -> Nature:
 DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "delay": _delay,
     "lag": _lag,
+    "slew": _slew,
     "saturation": _saturation,
     "rate_dependence": _rate_dependence,
     "creep": _creep,
@@ -224,6 +255,7 @@ DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "sensor_periodic": _sensor_periodic,
     "hum": _hum,
     "gain_drift": _gain_drift,
+    "steps": _steps,
 }
 NAMES = tuple(DRAWS)
 

@@ -110,6 +110,8 @@ class Amplifier:
         Limits of the output.
     softness : float, volts
         Distance from a limit at which the output starts to saturate; 0 for a sharp limit.
+    slew : float, V/s
+        Charge that its current brings into the piezo in a second, as a voltage.
 
     Raises
     ------
@@ -122,6 +124,7 @@ class Amplifier:
     lower: float = -math.inf
     upper: float = math.inf
     softness: float = 0.0
+    slew: float = math.inf
 
     def __post_init__(self) -> None:
         """Validate the parameters."""
@@ -148,7 +151,21 @@ class Amplifier:
         ndarray, shape (N,), volts
             Voltage at the piezo, at the same times.
         """
-        return self._clip(self._lag(t, np.interp(t - self.delay, t, command) if self.delay else command))
+        late = np.interp(t - self.delay, t, command) if self.delay else command
+        return self._clip(self._charged(t, self._lag(t, late)))
+
+    def _charged(self, t: FloatArray, command: FloatArray) -> FloatArray:
+        """Return the voltage of a piezo that is charged with a limited current, in ten steps a sample."""
+        if math.isinf(self.slew) or t.size < 2:
+            return command
+        fine = np.interp(np.arange(10 * t.size - 9) / 10, np.arange(t.size), t)
+        now, charged = float(command[0]), []
+        for duration, wanted in zip(
+            np.diff(fine, prepend=fine[0]).tolist(), np.interp(fine, t, command).tolist(), strict=True
+        ):
+            now += max(-self.slew * duration, min(self.slew * duration, wanted - now))
+            charged.append(now)
+        return np.array(charged[::10])
 
     def _lag(self, t: FloatArray, command: FloatArray) -> FloatArray:
         if not self.lag or not t.size:
@@ -351,6 +368,28 @@ class Temperature:
 
 
 @dataclass(frozen=True)
+class Slips:
+    """A mount, or a counter of fringes, that gives way at some moments.
+
+    Parameters
+    ----------
+    moments : tuple of float, seconds
+        From the start of the record.
+    distances : tuple of float, metres
+    """
+
+    moments: tuple[float, ...]
+    distances: tuple[float, ...]
+
+    def path(self, t: FloatArray) -> FloatArray:
+        """Return how far it has slipped, shape (N,), metres, at times `t` from 0 on, shape (N,), seconds."""
+        gone = np.zeros_like(t)
+        for moment, distance in zip(self.moments, self.distances, strict=True):
+            gone[t > moment] += distance
+        return gone
+
+
+@dataclass(frozen=True)
 class Flexure:
     """A lightly damped second-order mode.
 
@@ -396,6 +435,7 @@ class Physics:
     coupling : mapping of axis name to float
         Share of the motion of another axis, relative to its start, that is added to this axis.
     temperature : Temperature, optional
+    slips : Slips, optional
     interferometer : Interferometer, optional
     hum : Hum, optional
     """
@@ -407,6 +447,7 @@ class Physics:
     ageing: Ageing | None = None
     coupling: Mapping[str, float] = field(default_factory=dict)
     temperature: Temperature | None = None
+    slips: Slips | None = None
     interferometer: Interferometer | None = None
     hum: Hum | None = None
 
@@ -467,6 +508,8 @@ def sensed(physics: Physics, t: FloatArray, motion: Mapping[str, FloatArray], ax
         y = y + gain * (motion[other] - motion[other][0])
     if physics.temperature:
         y = y + physics.temperature.path(t)
+    if physics.slips:
+        y = y + physics.slips.path(t - t[0])
     if physics.interferometer:
         y = physics.interferometer.read(y)
     if physics.hum:

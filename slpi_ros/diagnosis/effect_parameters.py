@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import exp, log
 from typing import ClassVar
 
@@ -57,9 +58,18 @@ class EachRecord(EffectBase):
         records = zip(self.parts, around.split(signal), around.records, strict=True)
         return np.concatenate([part.invert(own, record) for part, own, record in records])
 
+    def joined(self, other: "EachRecord") -> "EachRecord | None":
+        """Return the effects of both, record by record."""
+        parts = [one.joined(two) for one, two in zip(self.parts, other.parts, strict=True)]
+        found = tuple(part for part in parts if part is not None)
+        return EachRecord(found) if len(found) == len(parts) else None
+
     def plausible(self, view: FitContext) -> bool:
         """Return whether the parameters of each record are plausible."""
-        return all(part.plausible(view) for part in self.parts)
+        ends = np.append(np.flatnonzero(np.diff(view.t) < 0.0) + 1, view.t.size)
+        rows = [slice(*pair) for pair in pairwise([0, *ends.tolist()])]
+        signals = [{name: getattr(view, name)[own] for name in ("t", "v", "u", "h", "y", "used")} for own in rows]
+        return all(part.plausible(replace(view, **own)) for part, own in zip(self.parts, signals, strict=True))
 
     def free_leaves(self) -> list[Leaf]:
         """Return the fitted numbers of all records."""

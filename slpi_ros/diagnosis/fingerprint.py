@@ -13,6 +13,7 @@ import scipy.linalg
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import wave
+from slpi_ros.effects.jumps import jumps
 from slpi_ros.errors import length
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.drive import smallest_turn
@@ -27,9 +28,8 @@ KNOTS, KNOTS_OF_TIME = 12, 20
 ROUGHNESS = 1e-5
 # Smallest share of the mean square that is told.
 LEAST_SHARE = 0.05
-# Largest number of spectral lines and of jumps; power of a line relative to the median of its surroundings; size of a
-# jump relative to the rms difference of the means before and after all other samples.
-MOST_LINES, MOST_JUMPS, LINE, JUMP = 6, 8, 30.0, 5.0
+# Largest number of spectral lines and of jumps; power of a line relative to the median of its surroundings.
+MOST_LINES, MOST_JUMPS, LINE = 6, 8, 30.0
 # Lines of this share of the largest amplitude are told.
 TALL = 0.1
 # Largest number of samples of a record, evenly thinned, for functions of a variable.
@@ -256,7 +256,7 @@ def _refined(t: FloatArray, x: FloatArray, frequency: float, bin_width: float) -
 
 
 def _of_jumps(records: Sequence[Signals]) -> Iterator[Left]:
-    found = [_jumps(record) for record in records]
+    found = [jumps(record.residual, MOST_JUMPS) for record in records]
     if not any(found):
         return
     columns = [
@@ -270,26 +270,3 @@ def _of_jumps(records: Sequence[Signals]) -> Iterator[Left]:
     )
     told = ", ".join(f"{length(size)} at {at:.4g} s" for at, size in largest[:MOST_JUMPS])
     yield Left("jumps", share, f"{share:.0%} of the mean square is in jumps: {told}; {HINTS['jumps']}")
-
-
-def _jumps(record: Signals) -> list[tuple[int, float]]:
-    """Return the sample and the size (m) of sudden shifts of the mean of a residual, the largest first found."""
-    size = max(16, record.t.size // 200)
-    if record.t.size < 4 * size:
-        return []
-    left = record.residual
-    found: list[tuple[int, float]] = []
-    for _ in range(MOST_JUMPS):
-        total = np.concatenate([[0.0], np.cumsum(left)])
-        square = np.concatenate([[0.0], np.cumsum(left**2)])
-        at = np.arange(size, left.size - size + 1)
-        before, after = (total[at] - total[at - size]) / size, (total[at + size] - total[at]) / size
-        spread = (square[at + size] - square[at - size]) / size - before**2 - after**2
-        step = after - before
-        score = np.abs(step) / np.sqrt(np.maximum(spread, 1e-300) / size + np.mean(step**2))
-        k = int(np.argmax(score))
-        if score[k] < JUMP:
-            break
-        found.append((int(at[k]), float(step[k])))
-        left = left - step[k] * (np.arange(left.size) >= at[k])
-    return found

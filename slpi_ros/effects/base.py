@@ -216,6 +216,10 @@ class EffectBase(Protocol):
         """Return the simpler effect that looks the same in records with a sampling interval of `step` (s), if any."""
         return None
 
+    def joined(self, other: Self) -> Self | None:
+        """Return one effect that stands for both; None if an axis has it once, or if it would hold too much."""
+        return None
+
     def starting(self, around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
         """Return what is left (m, (N, k)) of its state before each record, with `older` also of long before."""
         return np.empty((around.t.size, 0))

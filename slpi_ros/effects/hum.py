@@ -73,6 +73,11 @@ class Hum(EffectBase):
         """Return the only line as a list."""
         return as_list("lines", given, spread)
 
+    def joined(self, other: "Hum") -> "Hum | None":
+        """Return the lines of both."""
+        lines = (*self.lines, *other.lines)
+        return Hum(lines) if len(lines) <= MOST_LINES else None
+
     def plausible(self, context: FitContext) -> bool:
         """Return whether no line is a low harmonic of the single drive frequency of any record, within resolution."""
         return not any(

@@ -14,6 +14,7 @@ from slpi_ros.errors import ModelError
 MODULES = (
     "delay",
     "lag",
+    "slew",
     "saturation",
     "rate_dependence",
     "creep",
@@ -21,6 +22,7 @@ MODULES = (
     "gain_drift",
     "cross_coupling",
     "thermal_drift",
+    "steps",
     "sensor_periodic",
     "hum",
 )

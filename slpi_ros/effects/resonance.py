@@ -251,6 +251,11 @@ class Resonance(EffectBase):
         """Return new parameters with gains that are at most 1 in sum."""
         return {"modes": _within(changed["modes"])}
 
+    def joined(self, other: "Resonance") -> "Resonance | None":
+        """Return the modes of both, with gains that are at most 1 in sum."""
+        modes = (*self.modes, *other.modes)
+        return Resonance(_within(modes)) if len(modes) <= MOST_MODES else None
+
     def plausible(self, context: FitContext) -> bool:
         """Return whether no mode far above the excited frequencies, damped, just shifts in time or is hysteresis."""
         highest = RINGS * context.excited_frequency()

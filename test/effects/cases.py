@@ -18,6 +18,8 @@ from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
+from slpi_ros.effects.slew import Slew
+from slpi_ros.effects.steps import Steps
 from slpi_ros.effects.thermal_drift import ThermalDrift
 
 FloatArray = NDArray[np.float64]
@@ -44,6 +46,11 @@ def drifts(draw: st.DrawFn) -> ThermalDrift:
     values = draw(st.lists(numbers(-1e-6, 1e-6), min_size=1, max_size=5))
     steps = draw(st.lists(numbers(0.01, 1), min_size=len(values), max_size=len(values)))
     return ThermalDrift(tuple(np.cumsum(steps).tolist()), tuple(values))
+
+
+def staircases() -> st.SearchStrategy[Steps]:
+    jumps = st.dictionaries(numbers(0.0, 2.0), numbers(-1e-6, 1e-6), max_size=5)
+    return jumps.map(lambda found: Steps(tuple(sorted(found)), tuple(found[t] for t in sorted(found))))
 
 
 @st.composite
@@ -88,6 +95,7 @@ LINES = st.builds(Line, powers(1, 1000), powers(1e-10, 1e-7), numbers(-7, 7))
 BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "delay": st.builds(Delay, numbers(-0.2, 0.2)),
     "lag": st.builds(Lag, powers(1e-4, 1)),
+    "slew": st.builds(Slew, powers(1, 1e4)),
     "saturation": saturations(),
     "rate_dependence": rate_laws(),
     "creep": creeps(),
@@ -95,12 +103,13 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "gain_drift": gain_drifts(),
     "cross_coupling": st.builds(CrossCoupling, st.dictionaries(st.sampled_from("yz"), numbers(-0.4, 0.4), min_size=1)),
     "thermal_drift": drifts(),
+    "steps": staircases(),
     "sensor_periodic": sensors(),
     "hum": st.builds(Hum, st.lists(LINES, min_size=1, max_size=3).map(tuple)),
 }
 EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__) | rate_laws(leads=3)
 # They change what moves, and leave what rests as it is.
-ABOUT_MOTION = ("delay", "lag", "rate_dependence", "creep", "resonance", "cross_coupling")
+ABOUT_MOTION = ("delay", "lag", "slew", "rate_dependence", "creep", "resonance", "cross_coupling")
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,18 @@ from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.filters import Mode
+from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS, from_document, in_order, to_document
 from slpi_ros.effects.resonance import Resonance, zeros
+from slpi_ros.effects.steps import Steps
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.schemas import load_schema
 
-EXACT = ("rate_dependence", "creep", "gain_drift", "cross_coupling", "thermal_drift", "sensor_periodic", "hum")
-FOLLOWED = ("lag", "creep", "resonance", "sensor_periodic")
+EXACT = ("rate_dependence", "creep", "gain_drift", "cross_coupling", "thermal_drift", "steps", "sensor_periodic", "hum")
+INVERTED = ("lag", "creep", "resonance", "sensor_periodic")
+FOLLOWED = (*INVERTED, "slew")
 
 
 def test_registry_schemas_and_strategies_know_the_same_effects():
@@ -36,9 +39,9 @@ def test_registry_schemas_and_strategies_know_the_same_effects():
 
 @given(EVERY)
 def test_every_effect_has_its_side_and_acts_on_one_signal(effect):
-    signals = dict.fromkeys(("delay", "lag", "saturation"), "voltage") | {"rate_dependence": "hysteresis"}
+    signals = dict.fromkeys(("delay", "lag", "slew", "saturation"), "voltage") | {"rate_dependence": "hysteresis"}
     assert effect.acts_on == signals.get(effect.name, "displacement")
-    others = {"sensor_periodic": "sensor", "hum": "record", "thermal_drift": "record"}
+    others = {"sensor_periodic": "sensor", "hum": "record", "thermal_drift": "record", "steps": "record"}
     assert effect.side == others.get(effect.name, "stage")
     # No inverse for the stage holds what is not of the stage.
     chain = Chain.of((effect,))
@@ -89,6 +92,16 @@ def test_saturation_is_a_limit(effect, record):
     assert effect.streaming() is None, "the limits of the command are those of the effect"
 
 
+@given(BY_NAME["slew"], records("voltage"), st.none() | st.floats(0, 100))
+def test_a_slew_limit_is_the_fastest_way_to_the_command(effect, record, start):
+    around = replace(record.around, start=start)
+    u, t, now = effect.apply(record.signal, around), around.t, record.signal[0] if start is None else start
+    for k, step in enumerate(effect.rate * np.diff(t, prepend=t[0])):
+        now = np.clip(record.signal[k], now - step, now + step)
+        assert u[k] == pytest.approx(now, rel=1e-12, abs=1e-12)
+    np.testing.assert_array_equal(effect.invert(u, around), u)
+
+
 @given(effects_and_records(ABOUT_MOTION), st.sampled_from(("apply", "invert")))
 def test_at_rest_nothing_changes(drawn, verb):
     effect, record = drawn
@@ -108,7 +121,7 @@ def test_follower_does_what_apply_does(drawn):
     np.testing.assert_allclose(followed, expected, rtol=0, atol=1e-8 * record.span)
 
 
-@given(effects_and_records(FOLLOWED), st.data())
+@given(effects_and_records(INVERTED), st.data())
 def test_follower_gives_what_is_wanted(drawn, data):
     """In uneven steps too; and asking moves nothing."""
     effect, record = drawn
@@ -283,6 +296,18 @@ def test_parameters_survive_the_document(effect):
         assert from_document(json.loads(text)) == one
 
 
+def test_lists_are_joined():
+    """Lines add up, modes share the motion, and what an axis has once is not joined."""
+    t, one, other = np.arange(100) * 1e-3, Hum((Line(50.0, 1e-9, 0.1),)), Hum((Line(60.0, 2e-9, 0.2),))
+    np.testing.assert_allclose(one.joined(other).wave(t), one.wave(t) + other.wave(t), rtol=0, atol=1e-20)
+    both = Resonance((Mode(100.0, 0.1, 0.9),)).joined(Resonance((Mode(300.0, 0.1, 0.9),)))
+    assert [mode.gain for mode in both.modes] == [0.5, 0.5] and both.rest == 0.0
+    twice = Steps((1.0, 2.0), (1e-9, 3e-9)).joined(Steps((1.5, 2.0), (5e-9, 1e-9)))
+    assert twice == Steps((1.0, 1.5, 2.0), (1e-9, 5e-9, 4e-9))
+    crowd = Hum((Line(50.0, 1e-9, 0.1),) * 100)
+    assert crowd.joined(one) is None and Lag(0.1).joined(Lag(0.1)) is None
+
+
 @given(st.lists(EVERY, unique_by=lambda effect: effect.name, max_size=11))
 def test_effects_stand_in_the_order_of_the_chain(effects):
     ordered = in_order(effects)
@@ -358,6 +383,8 @@ MODE, LINE = {"frequency": 100.0, "damping": 0.1}, {"frequency": 50.0, "amplitud
         ("lag", {"time_constant": "0.1"}),
         ("lag", {}),
         ("delay", {"seconds": float("inf")}),
+        ("slew", {"rate": 0.0}),
+        ("slew", {"rate": None}),
         ("saturation", {"lower": 5.0, "upper": 5.0}),
         ("saturation", {"lower": float("nan"), "upper": None}),
         ("creep", {"time_constants": [], "gains": []}),
@@ -385,6 +412,8 @@ MODE, LINE = {"frequency": 100.0, "damping": 0.1}, {"frequency": 50.0, "amplitud
         ("gain_drift", {"times": [1.0], "gains": [0.1, 0.2], "origin": 0.0}),
         ("gain_drift", {"times": [1.0], "gains": [0.1], "origin": None}),
         ("thermal_drift", {"times": [1.0, 1.0], "values": [0.0, 0.0]}),
+        ("steps", {"times": [2.0, 1.0], "sizes": [1e-8, 1e-8]}),
+        ("steps", {"times": [1.0], "sizes": []}),
         ("sensor_periodic", {"period": 1e-7, "amplitude": 1e-7, "phase": 0.0}),
         ("hum", {"frequency": 50.0, "amplitude": 1e-9, "phase": 0.0}),
         ("hum", {"lines": []}),

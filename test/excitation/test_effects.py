@@ -123,6 +123,14 @@ def test_saturation_comes_up_to_both_limits_at_two_speeds():
     assert max(to_the_limits) > 2.5 * min(to_the_limits)
 
 
+def test_slew_ramps_ever_faster_with_a_hold_after_each():
+    _, v, _ = drive("slew")
+    moves = bursts(v)[2:]
+    assert len(moves) == 8 and {span for span, _ in moves} == {100.0}
+    assert moves[0][1] > 5 * moves[-1][1] and np.all(np.diff([steps for _, steps in moves]) < 0)
+    assert len(holds(v, least=20)) >= 8
+
+
 def test_rate_dependence_has_loops_of_other_size_at_the_same_speed():
     moves = [(round(span), steps) for span, steps in bursts(drive("rate_dependence")[1])[2:]]
     by_span = {span: [steps for s, steps in moves if s == span] for span in (60, 30, 15)}
@@ -209,6 +217,12 @@ def test_sensor_periodic_is_slow_and_steady_at_two_speeds():
     assert np.max(np.abs(np.diff(v, 2))[v.size // 4 : -v.size // 20]) < 0.3
     # At least 10 samples a period of 316 nm on a stage of 22 µm.
     assert min(steps for _, steps in ramps) > 10 * 22 / 0.316
+
+
+def test_steps_are_looked_for_at_rest():
+    _, v, _ = drive("steps")
+    rests = holds(v, least=400)
+    assert len({round(voltage) for _, voltage in rests}) == 7 and sum(steps for steps, _ in rests) > 0.6 * v.size
 
 
 def test_hum_is_mostly_rest_at_three_levels():

@@ -23,7 +23,7 @@ from slpi_ros.model.stage_model import StageModel
 FloatArray = NDArray[np.float64]
 pytest.importorskip("numba")
 # A delay is compensated by preview; what belongs to sensor or record is in no inverse.
-INVERTED = ("lag", "saturation", "rate_dependence", "creep", "resonance", "gain_drift")
+INVERTED = ("lag", "slew", "saturation", "rate_dependence", "creep", "resonance", "gain_drift")
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,8 @@ def axes(draw: st.DrawFn) -> tuple[AxisModel, FloatArray]:
     effects = []
     for name in sorted(draw(st.sets(st.sampled_from(INVERTED)))):
         effect = draw(rate_laws() if name == "rate_dependence" else BY_NAME[name])
+        if name == "saturation" and not (effect.lower < axis.voltage_range[1] and effect.upper > axis.voltage_range[0]):
+            continue
         if name == "creep" and draw(st.booleans()):
             effect = replace(effect, initial=unit * 1e-6)
         if name == "gain_drift":

@@ -1,0 +1,67 @@
+"""Jumps of the zero: where they are found in a residual, and what is none."""
+
+import numpy as np
+import pytest
+from effects.residuals import Residual
+
+from slpi_ros.effects.base import FitContext
+from slpi_ros.effects.jumps import follows_drive, jumps
+from slpi_ros.effects.steps import Steps
+
+T = np.arange(20_000) / 1000.0
+V = 50.0 - 50.0 * np.cos(2 * np.pi * 0.7 * T)
+NOISE = 8e-9
+JUMPS = Steps((3.2345, 9.8765, 10.2345), (3 * NOISE, -5 * NOISE, 4 * NOISE))
+NONE = {
+    "noise": 0.0 * T,
+    "exponential drift": 40 * NOISE * np.exp(-T / 8.0),
+    "wandering": NOISE * np.cumsum(np.random.default_rng(2).standard_normal(T.size)) / 10.0,
+    "repeats with the motion": 10 * NOISE * np.sin(2 * np.pi * 0.7 * T) * np.sin(2 * np.pi * 2.1 * T),
+}
+
+
+def noisy(x, seed=0):
+    return x + NOISE * np.random.default_rng(seed).standard_normal(x.size)
+
+
+def view(y):
+    h, used = 2e-7 * V, np.ones(T.size, dtype=bool)
+    return FitContext(T, V, V, h, h + y, used, 1e-10, (), lambda: 0.7, lambda: [(0.7, 20.0)], lambda: np.zeros(1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_small_jumps_are_found_where_they_are(seed):
+    found = sorted(jumps(noisy(JUMPS.path(T), seed), 12))
+    assert [k for k, _ in found] == pytest.approx([3235, 9877, 10235], abs=4)
+    assert [size for _, size in found] == pytest.approx(JUMPS.sizes, abs=0.5 * NOISE)
+
+
+@pytest.mark.parametrize("case", NONE)
+def test_what_is_gradual_or_everywhere_is_no_jump(case):
+    assert all(not jumps(noisy(NONE[case], seed), 12) for seed in range(4))
+
+
+def test_the_candidates_hold_ever_more_jumps():
+    h = 2e-7 * V
+    forms = list(Steps.fit(Residual(T, V, h, noisy(h))))
+    assert {form.columns.shape[1] for form in forms} == {0} and forms[0].effect(np.empty(0)) == Steps((), ())
+    forms = list(Steps.fit(Residual(T, V, h, noisy(h + JUMPS.path(T)))))
+    assert [form.columns.shape[1] for form in forms][:4] == [1, 2, 3, 3]
+    found = forms[2].effect(np.array(JUMPS.sizes))
+    assert found.times == pytest.approx(JUMPS.times, abs=5e-3) and found.sizes == JUMPS.sizes
+    # A jump that the joint fit makes another one than it looks like was none.
+    assert forms[2].effect(np.array([1.0, -1.0, 1.0]) * JUMPS.sizes).sizes == JUMPS.sizes[::2]
+
+
+def test_jumps_are_plausible_if_sudden_and_where_the_voltage_does_not_turn():
+    assert JUMPS.plausible(view(noisy(JUMPS.path(T))))
+    ramp = np.interp(T, (9.0, 10.0), (0.0, 10 * NOISE))
+    assert not Steps((9.5,), (10 * NOISE,)).plausible(view(noisy(ramp)))
+    turns = Steps(tuple(k / 1.4 + 5e-4 for k in range(1, 6)), tuple(10 * NOISE * (-1) ** k for k in range(5)))
+    assert not turns.plausible(view(noisy(turns.path(T))))
+    assert not follows_drive(np.array([5000, 9000]), V)
+
+
+def test_a_description_tells_the_largest():
+    assert "3 times" in JUMPS.describe() and "9.8765 s" in JUMPS.describe()
+    assert Steps((), ()).describe() == "the zero does not jump in this record"

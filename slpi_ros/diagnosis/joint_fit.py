@@ -20,7 +20,7 @@ from scipy.optimize import lsq_linear
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, of_starts, steps
-from slpi_ros.diagnosis.prepare import Evidence
+from slpi_ros.diagnosis.prepare import Evidence, Part
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
 from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.registry import in_order
@@ -30,6 +30,7 @@ from slpi_ros.identification.design_matrix import Rows
 from slpi_ros.identification.least_squares import FOLDS, Problem, blocked_folds
 from slpi_ros.identification.linear_kinds import SMOOTHNESS
 from slpi_ros.identification.samples import Samples
+from slpi_ros.identification.signal_statistics import white_noise
 
 Factor = tuple[FloatArray, bool]
 
@@ -57,6 +58,8 @@ SEEN, UNSEEN, FEWEST_JUDGED = 0.1, 0.02, 200
 UNCERTAIN, LOOKED_AT = 10.0, 1000
 # Number of blocks of held-out samples for the comparison of two scores.
 BLOCKS = 40
+# An error below this share of the displacement range is beyond the resolution of any sensor.
+FINEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -563,6 +566,21 @@ class Explanation:
             effects.append(moved(effect, values + bounded(effect, step), limit))
         return effects
 
+    @cached_property
+    def noise(self) -> float:
+        """Sensor noise (m rms): the white part of the residual, the largest of the records.
+
+        At least the rounding error, and the resolution of the best of sensors.
+        """
+        finest = FINEST * float(np.ptp(self.y[self.used]))
+        return max([finest, self.evidence.rounding, *(white_noise(residual) for _, residual in self.residuals)])
+
+    @property
+    def residuals(self) -> list[tuple[Part, FloatArray]]:
+        """The data of each record with its residual (m), NaN at samples that are not used."""
+        parts = zip(self.evidence.parts, self.evidence.slices, strict=True)
+        return [(part, np.where(part.used, self.residual[rows], np.nan)) for part, rows in parts]
+
     def hysteresis(self) -> tuple[Hysteresis, tuple[float, ...]]:
         """Return the hysteresis with monotone branches, and its displacement at the start of each record, m."""
         problem = replace(self.joint.problem, y=self.joint.padded(self.target - self.settling))
@@ -615,8 +633,10 @@ class Explanation:
         return next(effect for effect in self.effects if effect.name == name)
 
     def adding(self, effect: Effect) -> "Explanation":
-        """Return the fit with one more effect."""
-        return Explanation(self.evidence, [*self.effects, effect], self)
+        """Return the fit with one more effect, or with more of one that is there; ModelError if it has that once."""
+        more = {other.name: other.joined(effect) for other in self.effects if other.name == effect.name}
+        joined = [more.get(other.name) or other for other in self.effects]
+        return Explanation(self.evidence, joined if all(more.values()) and more else [*joined, effect], self)
 
     def only(self, names: Collection[str]) -> "Explanation":
         """Return the fit with only the named effects, refitted if any effect is removed."""

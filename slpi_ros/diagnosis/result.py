@@ -11,7 +11,8 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.fingerprint import HINTS, Left, Signals, fingerprint
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import Evidence, one_speed
-from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, chance_of_gain, held_out_error
+from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, held_out_error
+from slpi_ros.diagnosis.significance import chance_of_gain
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.registry import to_document as effect_document
 from slpi_ros.errors import length
@@ -52,7 +53,7 @@ class NamedEffect:
     gain_percent: float
     # Share of the mean square held-out error without effects that the effect explains, 0..1.
     share_of_residual: float
-    # Probability that chance reduces the error as much.
+    # Probability that chance reduces the error as much, with the best of all effects that were tried.
     p_value: float
     # Effects that explain the error equally well, so that the records do not distinguish them.
     alternatives: tuple[str, ...]
@@ -242,7 +243,7 @@ def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
 
 
 def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEffect:
-    chance = chance_of_gain(named.before, named.after)
+    chance = chance_of_gain(named.before, named.after, selection.trials)
     whole, before, after = (
         held_out_error(score, own=named.own) for score in (selection.base.held_out, named.before, named.after)
     )

@@ -591,18 +591,32 @@ class Explanation:
 
     def with_uncertainty(self) -> list[Effect]:
         """Return the effects with the standard deviations of their free parameters."""
-        # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
         if not self.effects:
             return []
-        precision = self.joint.columns(self.tangents, self._before).precision
-        errors = self.residual[self.evidence.used]
-        size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
-        inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
-        spread = np.sqrt(np.maximum(np.diag(inverse), 0.0) * np.mean(errors**2) * alike_in_a_row(errors)).tolist()
+        spread = self._deviations(self.tangents).tolist()
         effects = []
         for effect in self.effects:
             effects.append(certain(effect, [spread.pop(0) for _ in free(effect)]))
         return effects
+
+    def certainty(self, name: str) -> float:
+        """Return by how many of its standard deviations an effect as a whole differs from none, its form given."""
+        own = np.concatenate([np.full(free(effect).size, effect.name == name) for effect in self.effects])
+        contribution = self.predicted - self.prediction_without(name)
+        if not contribution.any():
+            return 0.0
+        deviation = float(self._deviations(np.column_stack([contribution, self.tangents[:, ~own]]))[0])
+        return 1.0 / deviation if deviation > 0.0 else np.inf
+
+    def _deviations(self, columns: FloatArray) -> FloatArray:
+        """Return the standard deviations, shape (k,), of the gains of columns, shape (N, k), metres."""
+        # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
+        precision = self.joint.columns(columns, self._before).precision
+        errors = self.residual[self.evidence.used]
+        size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
+        inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
+        variances = np.maximum(np.diag(inverse)[: columns.shape[1]], 0.0)
+        return np.sqrt(variances * np.mean(errors**2) * alike_in_a_row(errors))
 
     def smoothed(self) -> "Explanation":
         """Return the fit with the smoothness of the hysteresis reselected by cross-validation, given the effects."""

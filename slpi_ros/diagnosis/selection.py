@@ -51,6 +51,8 @@ ALTERNATIVE = 0.7
 ALTERNATIVE_AT_ONE_SPEED = 0.4
 # Smallest relative reduction of the held-out error by an effect with a companion: two at once find more by chance.
 LEAST_GAIN_IN_COMPANY = 0.1
+# An effect differs from none by at least this number of its standard deviations.
+CERTAIN = 3.0
 # Gauss-Newton steps of a candidate, and of the selected effects in the end.
 STEPS, CONVERGED = 5, 15
 # Steps that lower the objective below this share of it began far from the best parameters.
@@ -332,7 +334,7 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
 
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
-    """Return the fit with simpler effects, unless clearly worse, and without effects at bounds or implausible ones."""
+    """Return the fit with simpler effects, unless clearly worse, without those at bounds, implausible or uncertain."""
     several, step = len(now.evidence.parts) > 1, usual_step(now.t)
     for effect in now.effects:
         simple, effects = effect.simpler(step), {other.name: other for other in now.effects}
@@ -355,6 +357,10 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
             now = anew[0].explanation if anew else without
         elif effect.plausible_to_the_end and not effect.plausible(seen(now)):
             now = now.without(name)
+    while uncertain := {
+        effect.name: certainty for effect in now.effects if (certainty := now.certainty(effect.name)) < CERTAIN
+    }:
+        now = now.without(min(uncertain, key=lambda name: uncertain[name]))
     return now
 
 

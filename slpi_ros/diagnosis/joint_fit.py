@@ -616,7 +616,8 @@ class Explanation:
         size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
         inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
         variances = np.maximum(np.diag(inverse)[: columns.shape[1]], 0.0)
-        return np.sqrt(variances * np.mean(errors**2) * alike_in_a_row(errors))
+        deviations: FloatArray = np.sqrt(variances * np.mean(errors**2) * alike_in_a_row(errors))
+        return deviations
 
     def smoothed(self) -> "Explanation":
         """Return the fit with the smoothness of the hysteresis reselected by cross-validation, given the effects."""

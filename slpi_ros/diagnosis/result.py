@@ -10,10 +10,11 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.fingerprint import HINTS, Left, Signals, fingerprint
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
-from slpi_ros.diagnosis.prepare import Evidence, one_speed
+from slpi_ros.diagnosis.prepare import MOST_SAMPLES, Evidence, one_speed
 from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, held_out_error
 from slpi_ros.diagnosis.significance import chance_of_gain
-from slpi_ros.effects.base import Effect
+from slpi_ros.effects.base import Effect, usual_step
+from slpi_ros.effects.excitation import FASTEST
 from slpi_ros.effects.registry import to_document as effect_document
 from slpi_ros.errors import length
 from slpi_ros.excitation.effects import for_effect, separating
@@ -38,6 +39,9 @@ AS_BEFORE = 1.1
 # Thresholds for a changed stage: excess rms error as a share of the motion; relative change of gain; change of gain in
 # standard deviations.
 CHANGED, LEAST_CHANGE, CERTAIN = 1e-3, 3e-3, 5.0
+
+# Advised drive: duration (s) at usual sampling rates, smallest number of readings, and those of a move over the range.
+DRIVE_SECONDS, FEWEST_READINGS, READINGS_OF_A_MOVE = 30.0, 2000, 20
 
 SCHEMA = "slpi_ros/diagnosis/2"
 NAMED, PARTLY_NAMED, AMBIGUOUS = "named", "partly_named", "ambiguous"
@@ -398,8 +402,16 @@ def _separating(names: Sequence[str], evidence: Evidence) -> str:
 
 
 def _command(evidence: Evidence) -> str:
+    """Return the command for a drive that suits the stage: its voltage range, sampling rate and speed."""
     low, high = float(evidence.v.min()), float(evidence.v.max())
-    return f"slpi excite -o drive.csv --voltage-min {low:.4g} --voltage-max {high:.4g}"
+    rate = 1.0 / usual_step(evidence.parts[0].t)
+    seconds = max(min(DRIVE_SECONDS, MOST_SAMPLES / rate), FEWEST_READINGS / rate)
+    slew = (high - low) * rate / READINGS_OF_A_MOVE
+    slow = f" --slew-limit {slew:.3g}" if slew < FASTEST * (high - low) else ""
+    return (
+        f"slpi excite -o drive.csv --voltage-min {low:.4g} --voltage-max {high:.4g} --rate {rate:.4g} "
+        f"--duration {seconds:.3g}{slow}"
+    )
 
 
 def _of_structure(structure: str) -> str:

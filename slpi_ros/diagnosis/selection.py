@@ -27,6 +27,7 @@ from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.identification.progress import report_progress
+from slpi_ros.model.axis_model import ABOVE_NOISE
 
 # Defect of other kinds of hysteresis model than the loop family.
 BIAS = "loops that depend on bias"
@@ -38,6 +39,8 @@ FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
 LEAST_FALL = 0.01
 # Largest number of effects that are selected; records cannot determine more.
 MOST_EFFECTS = 4
+# Largest number of other effects with which the selection begins anew if more than the noise is left.
+FRESH_STARTS = 2
 # Largest number of rounds in which an effect is added, or a line or mode to one.
 MOST_ROUNDS = 12
 # Screening: effects are fitted if their gain exceeds these shares of the best gain and of the error.
@@ -166,6 +169,11 @@ def _with_companion(now: Explanation, effect: Effect) -> Explanation:
     return now.adding(companion)
 
 
+def _beginning(now: Explanation, effect: Effect) -> Explanation:
+    """Return the fit with an effect that is known from an earlier selection."""
+    return _with_companion(now, effect).adding(effect).refined(STEPS)
+
+
 def _error(one: Contender) -> float:
     return one.rms
 
@@ -281,11 +289,29 @@ class Selection:
     dropped: tuple[str, ...]
     # Largest number of independent candidates among which an effect was chosen.
     trials: float = 1.0
+    # The effect that was added first, and the others that had a significant gain then, the best one first.
+    beginnings: tuple[Effect, ...] = ()
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
-    """Add effects as long as one has a significant gain, and remove those that later ones make unnecessary."""
-    # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better.
+    """Select effects, beginning with the best one, and with others if that leaves more than the noise."""
+    # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better. Of two
+    # effects a third one with more parameters may imitate both, and better than either alone.
+    best = _grown(base, family)
+    beginnings = best.beginnings
+    for first in range(1, min(len(beginnings), 1 + FRESH_STARTS)):
+        error = best.now.held_out.rms_of_records
+        if error <= ABOVE_NOISE * best.now.noise:
+            break
+        order = (beginnings[first], *beginnings[:first], *beginnings[first + 1 :])
+        other = _grown(base, family, order)
+        if other.named and other.now.held_out.rms_of_records < (1.0 - LEAST_GAIN) * error:
+            best = replace(other, trials=max(best.trials, other.trials))
+    return best
+
+
+def _grown(base: Explanation, family: Explanation | None, beginnings: tuple[Effect, ...] = ()) -> Selection:
+    """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones."""
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
@@ -297,7 +323,8 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     while len(rivals) < MOST_EFFECTS and rounds < MOST_ROUNDS and now.held_out.rms > finest:
         rounds += 1
         report_progress(f"{len(now.effects)} effects found, {now.held_out.rms * 1e9:.3g} nm left, trying others")
-        found = contenders(now)
+        begun = rivals or not beginnings
+        found = contenders(now) if begun else [Contender(beginnings[0].name, _beginning(now, beginnings[0]))]
         structure, with_structure = _best_structure(now, structures)
         if structure and (not found or _beats(with_structure.held_out, found[0].score)):
             now, structures = with_structure, (*structures, structure)
@@ -315,11 +342,14 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
         trials = max(trials, best.trials)
         if EFFECTS[best.name].companion():
             best = best.refined(CONVERGED)
-        others = [other.effect for other in found if other is not best]
+        beside = [one.effect for one in found if one.name != best.name] if begun else list(beginnings[1:])
+        if not beginnings:
+            significant = (one.effect for one in found if one.name != best.name and one.counts_beside(now))
+            beginnings = (best.effect, *significant)
         for effect in best.explanation.effects:
             if effect.name not in {known.name for known in now.effects}:
-                rivals[effect.name] = others
-        rivals.setdefault(best.name, others)
+                rivals[effect.name] = beside
+        rivals.setdefault(best.name, beside)
         now = _without_needless(best.explanation.smoothed(), set(rivals) - {best.name})
         resembled = {effect.resembles_when_old for effect in now.effects} & {effect.name for effect in now.effects}
         if resembled and not now.evidence.older_moves:
@@ -330,7 +360,8 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     # At their best parameters together, some may no longer be necessary.
     now = _without_needless(_plainer(now.refined(CONVERGED), rivals), set(rivals), restart=False)
     named = _named(start, now, rivals)
-    return Selection(base, now, named, structures, tuple(sorted(dropped - {one.name for one in named})), trials)
+    dropped -= {one.name for one in named}
+    return Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings)
 
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:

@@ -19,7 +19,7 @@ import scipy.linalg
 from scipy.optimize import lsq_linear
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
-from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, of_starts, steps
+from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, of_starts, steps
 from slpi_ros.diagnosis.prepare import Evidence, Part
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
 from slpi_ros.effects.chain import Chain
@@ -600,13 +600,21 @@ class Explanation:
         return effects
 
     def certainty(self, name: str) -> float:
-        """Return by how many of its standard deviations an effect as a whole differs from none, its form given."""
+        """Return by how many of its standard deviations an effect differs from none.
+
+        As a whole, its form given, or by a parameter that is 0 where there is none, if that is less certain.
+        """
         own = np.concatenate([np.full(free(effect).size, effect.name == name) for effect in self.effects])
         contribution = self.predicted - self.prediction_without(name)
         if not contribution.any():
             return 0.0
         deviation = float(self._deviations(np.column_stack([contribution, self.tangents[:, ~own]]))[0])
-        return 1.0 / deviation if deviation > 0.0 else np.inf
+        whole = 1.0 / deviation if deviation > 0.0 else np.inf
+        effect = next(one for one in self.with_uncertainty() if one.name == name)
+        if isinstance(effect, EachRecord):
+            return whole
+        sizes = [leaf for leaf in effect.free_leaves() if leaf.facts.fit and leaf.facts.fit.size]
+        return min([whole, *(abs(leaf.value) / max(effect.uncertainty[leaf.place], 1e-300) for leaf in sizes)])
 
     def _deviations(self, columns: FloatArray) -> FloatArray:
         """Return the standard deviations, shape (k,), of the gains of columns, shape (N, k), metres."""

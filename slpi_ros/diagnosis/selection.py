@@ -386,7 +386,7 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
                 one for one in contenders(without, [name]) if one.counts_beside(without) and not one.effect.at_bound
             ]
             now = anew[0].explanation if anew else without
-        elif effect.plausible_to_the_end and not effect.plausible(seen(now)):
+        elif not effect.plausible(seen(now)):
             now = now.without(name)
     while uncertain := {
         effect.name: certainty for effect in now.effects if (certainty := now.certainty(effect.name)) < CERTAIN

@@ -179,8 +179,6 @@ class EffectBase(Protocol):
     dynamic: ClassVar[bool] = False
     # Whether a change of the sensitivity between records may be its doing.
     changes_gain: ClassVar[bool] = False
-    # Whether it is dropped from the selection if its final parameters are not plausible.
-    plausible_to_the_end: ClassVar[bool] = False
     # Effect that it resembles if it continues from long before a record.
     resembles_when_old: ClassVar[str] = ""
 

@@ -225,7 +225,6 @@ class Resonance(EffectBase):
     side: ClassVar[Side] = "stage"
     what: ClassVar[str] = "lightly damped modes that ring after turns, each with its share of the motion"
     compensated: ClassVar[str] = "exactly, if a part of the motion follows at once; else what would ring is taken out"
-    plausible_to_the_end: ClassVar[bool] = True
     time_shift: ClassVar[TimeShift] = "partly"
     contains_shift: ClassVar[bool] = True
     excitation: ClassVar[Excitation] = Excitation(

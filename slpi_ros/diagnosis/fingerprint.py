@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import wave
+from slpi_ros.effects.base import usual_step, wave
 from slpi_ros.errors import length
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.drive import smallest_turn
@@ -80,6 +80,23 @@ def fingerprint(records: Sequence[Signals]) -> tuple[Left, ...]:
     centred, thin = [_centred(record) for record in records], [_centred(_thinned(record)) for record in records]
     found = [*_of_variables(thin), *_of_lines(centred), *_of_jumps(centred)]
     return tuple(sorted((one for one in found if one.share >= LEAST_SHARE), key=lambda one: -one.share))
+
+
+def half_power(records: Sequence[Signals]) -> float:
+    """Return the frequency (Hz) below which half of the mean square of the residuals lies; 0 without any."""
+    frequencies, powers = [], []
+    for record in records:
+        step = usual_step(record.t) if record.t.size > 1 else 0.0
+        if step > 0.0:
+            grid = np.arange(record.t[0], record.t[-1], step)
+            powers.append(np.abs(np.fft.rfft(np.interp(grid, record.t, _centred(record).residual))) ** 2 / grid.size)
+            frequencies.append(np.fft.rfftfreq(grid.size, step))
+    if not powers or not sum(power.sum() for power in powers) > 0.0:
+        return 0.0
+    frequency, power = np.concatenate(frequencies), np.concatenate(powers)
+    order = np.argsort(frequency)
+    total = np.cumsum(power[order])
+    return float(frequency[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def _thinned(record: Signals) -> Signals:

@@ -8,7 +8,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord
-from slpi_ros.diagnosis.fingerprint import HINTS, Left, Signals, fingerprint
+from slpi_ros.diagnosis.fingerprint import HINTS, Left, Signals, fingerprint, half_power
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import MOST_SAMPLES, Evidence, one_speed
 from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, held_out_error
@@ -216,12 +216,13 @@ def judged(
     base, now = selection.base, selection.now
     effects = _named_effects(selection)
     verdict = _verdict(selection, effects, noise_rms, left_out_of_model)
-    left = _left(now)
+    signals = _signals(now)
+    left = fingerprint(signals)
     return AxisDiagnosis(
         verdict=verdict,
         summary=_of_given(given, selection, before_rms)
         + _summary(verdict, selection, effects, noise_rms, before_rms)
-        + _goes_with(left)
+        + _goes_with(left, verdict, signals)
         + _not_in_model(now, left_out_of_model, selection.dropped)
         + _mixed(now.evidence)
         + _cannot_tell(driven_alike),
@@ -285,18 +286,24 @@ def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: 
     return PARTLY_NAMED if more_than_noise else NAMED
 
 
-def _left(now: Explanation) -> tuple[Left, ...]:
-    """Return the measured variables that go with what a joint fit leaves."""
+def _signals(now: Explanation) -> list[Signals]:
+    """Return the used samples of each record with what a joint fit leaves."""
     evidence = now.evidence
     records = []
     for part, rows in zip(evidence.parts, evidence.slices, strict=True):
         used = part.used
         records.append(Signals(part.t[used], part.v[used], part.y[used], now.residual[rows][used]))
-    return fingerprint([record for record in records if record.t.size])
+    return [record for record in records if record.t.size]
 
 
-def _goes_with(left: Sequence[Left]) -> str:
-    return f" Of what is left, {left[0].evidence}." if left else ""
+def _goes_with(left: Sequence[Left], verdict: str, records: Sequence[Signals]) -> str:
+    if left:
+        return f" Of what is left, {left[0].evidence}."
+    if verdict not in (UNEXPLAINED, PARTLY_NAMED):
+        return ""
+    return (
+        f" No measured variable predicts what is left; half of its mean square is below {half_power(records):.3g} Hz."
+    )
 
 
 def _stale(given: Given, selection: Selection) -> bool:

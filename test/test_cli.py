@@ -134,7 +134,7 @@ def test_a_drive_for_a_path_goes_along_its_voltages(folder, tmp_path):
     windows = np.lib.stride_tricks.sliding_window_view(drive["x"], along.size)
     assert np.abs(windows - along).max(axis=1).min() < 1e-6
     # Without a model it goes over the whole range; what the slew limit does not allow is told.
-    whole = slpi(*options, "-o", tmp_path / "whole.csv", "--slew", 80)
+    whole = slpi(*options, "-o", tmp_path / "whole.csv", "--slew-limit", 80)
     assert whole.returncode == 0 and "V/s" in whole.stderr and "--model" in whole.stderr
     assert one_line(slpi("excite", *options[1:5], "-o", tmp_path / "no.csv", "--model", folder / "pi.json"), 2)
 
@@ -180,17 +180,17 @@ def test_a_first_sample_that_jumps_is_told_and_a_slew_limit_kept(folder, tmp_pat
     jump = json.loads(slpi(*command, "--json").stdout)["axes"]["x"]["first_jump_V"]
     t, free = read_table(tmp_path / "v.csv", "V")
     assert jump == pytest.approx(free["x"][0] - start.voltage) and abs(jump) > 1.0
-    assert holds(slpi(*command).stdout, f"{jump:+.4g} V", "--slew")
+    assert holds(slpi(*command).stdout, f"{jump:+.4g} V", "--slew-limit")
     fastest = float(np.max(np.abs(np.diff(free["x"]) / np.diff(t))))
     for slew in (0.5 * fastest, 1e6):
-        found = json.loads(slpi(*command, "--slew", slew, "--json").stdout)["axes"]["x"]
+        found = json.loads(slpi(*command, "--slew-limit", slew, "--json").stdout)["axes"]["x"]
         _, limited = read_table(tmp_path / "v.csv", "V")
         assert found["first_jump_V"] == 0.0 and limited["x"][0] == pytest.approx(start.voltage)
         assert np.max(np.abs(np.diff(limited["x"]) / np.diff(t))) <= slew * (1 + 1e-6)
         assert (found["slew_limited"] > 0) == (slew < fastest)
     # Where the limit does not hold it back, the voltage is that of the whole path.
     np.testing.assert_allclose(limited["x"][1:], free["x"][1:], atol=1e-6)
-    assert one_line(slpi(*command, "--slew", -1), 2)
+    assert one_line(slpi(*command, "--slew-limit", -1), 2)
 
 
 def test_an_imported_path_is_judged(folder, tmp_path):

@@ -68,7 +68,7 @@ def test_arguments_that_are_no_value(argument, capsys, folder):
 
 
 @pytest.mark.parametrize(
-    "option", [("--voltage-min", "nan"), ("--voltage-max", "0"), ("--slew", "-1"), ("--axis", "a\x1b[2J")]
+    "option", [("--voltage-min", "nan"), ("--voltage-max", "0"), ("--slew-limit", "-1"), ("--axis", "a\x1b[2J")]
 )
 def test_a_calibration_that_the_node_would_refuse(option, capsys, folder):
     refused(capsys, folder, "calibrate", "-o", "d", "--voltage-min", "0", "--voltage-max", "100", *option)
@@ -113,7 +113,7 @@ def test_names_of_axes_to_excite(name, capsys, folder):
 
 
 def test_a_slew_limit_near_zero(capsys, folder):
-    refused(capsys, folder, *EXCITE, "--voltage-max", "9", "--slew", "1e-30")
+    refused(capsys, folder, *EXCITE, "--voltage-max", "9", "--slew-limit", "1e-30")
 
 
 def subparsers():

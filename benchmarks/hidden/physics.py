@@ -478,7 +478,7 @@ def own_motion(base: AxisParameters | BoucWen, physics: Physics, t: FloatArray, 
     if physics.creep:
         y = _creeping(physics.creep, t, y)
     if physics.flexure:
-        y = _ringing(physics.flexure, t, y)
+        y = ringing(physics.flexure, t, y)
     if physics.ageing:
         y = physics.ageing.scaled(t, v, y)
     return base.offset + y
@@ -533,7 +533,7 @@ def _creeping(domains: SlowDomains, t: FloatArray, y: FloatArray) -> FloatArray:
     return np.array([value + float(gains @ elements.step(duration, value)) for duration, value in steps])
 
 
-def _ringing(flexure: Flexure, t: FloatArray, y: FloatArray) -> FloatArray:
+def ringing(flexure: Flexure, t: FloatArray, y: FloatArray) -> FloatArray:
     mode = FlexureMode(flexure.frequency, flexure.damping)
     steps = zip(np.diff(t, prepend=t[:1]).tolist(), y.tolist(), strict=True)
     return np.array([mode.step(duration, value) for duration, value in steps])

@@ -21,7 +21,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
     command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
     command.add_argument(
-        "--slew", metavar="V/S", type=float, default=0.0,
+        "--slew-limit", "--slew", dest="slew", metavar="V/S", type=float, default=0.0,
         help="rate limit; the voltage then begins where the stage is; 0 (default): no limit",
     )  # fmt: skip
     command.add_argument(
@@ -49,7 +49,7 @@ def _run(options: Namespace) -> Result:
     known = common.model_columns(desired, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "V"), overwrite=options.overwrite)
     if options.slew < 0.0 or math.isnan(options.slew):
-        raise UsageError(f"--slew {options.slew:g}: give a positive number of V/s, or 0 for no limit")
+        raise UsageError(f"--slew-limit {options.slew:g}: give a positive number of V/s, or 0 for no limit")
     limits = Limits(options.voltage_min, options.voltage_max, options.slew or math.inf)
     try:
         answers = model.command(t, known, limits, options.start_memory)
@@ -72,7 +72,7 @@ def _run(options: Namespace) -> Result:
         if abs(jump) > SMALLEST_JUMP * (high - low):
             lines.append(
                 f"axis {axis}: the first sample jumps by {jump:+.4g} V, to {known[axis][0] * 1e6:.4g} µm from "
-                f"{start.displacement * 1e6:.6g} µm; begin the path there, or give --slew"
+                f"{start.displacement * 1e6:.6g} µm; begin the path there, or give --slew-limit"
             )
         if limited:
             lines.append(f"axis {axis}: {limited} of {v.size} samples are at the slew limit; the path is late there")
@@ -85,7 +85,7 @@ def _run(options: Namespace) -> Result:
 
 COMMAND = Command(
     "compute the voltage for a desired displacement",
-    "slpi compensate model.json desired.csv -o voltage.csv --slew 1000",
+    "slpi compensate model.json desired.csv -o voltage.csv --slew-limit 1000",
     _add_options,
     _run,
 )

@@ -74,7 +74,7 @@ def _run(options: Namespace) -> Result:
         if slew and wanted > FASTER * slew:
             options.remarks.append(
                 f"axis '{axis}': the path needs up to {wanted:.3g} V/s, the drive keeps to {slew:.3g} V/s; give a "
-                "first model (--model), a higher --slew, or a slower path"
+                "first model (--model), a higher --slew-limit, or a slower path"
             )
         slack = 1e-6 * (options.voltage_max - options.voltage_min)
         if v.min() < options.voltage_min - slack or v.max() > options.voltage_max + slack:

@@ -106,7 +106,7 @@ def add_limits(command: ArgumentParser, slew: str) -> None:
     command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="lowest voltage")
     command.add_argument("--voltage-max", metavar="V", type=float, required=True, help="highest voltage")
     text = f"{slew}; default: the voltage range in 0.1 s; 0: no limit"
-    command.add_argument("--slew", metavar="V/S", type=float, help=text)
+    command.add_argument("--slew-limit", "--slew", dest="slew", metavar="V/S", type=float, help=text)
 
 
 def slew_of(options: Namespace) -> float:

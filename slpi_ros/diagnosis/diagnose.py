@@ -13,7 +13,8 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, FINEST, NO_WORSE, Selection, counts, is_own, seen, select
+from slpi_ros.diagnosis.selection import BIAS, Selection, is_own, seen, select
+from slpi_ros.diagnosis.significance import NO_WORSE, counts
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
@@ -21,7 +22,6 @@ from slpi_ros.identification.free_run import FreeRun, free_run, likely_starts, r
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.repeatability import Repeatability, repeatability_of
-from slpi_ros.identification.signal_statistics import white_noise
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import ABOVE_NOISE, AxisModel, Start
 from slpi_ros.model.coverage import fastest
@@ -149,7 +149,7 @@ def _diagnose_axis(
         selection = replace(selection, now=selection.base)
     extension = extension or _Extension(model, [named.name for named in selection.named], runs)
     outcomes = _outcomes(runs, extension.runs, selection.now)
-    noise, repeats, alike = _noise(selection.now), _repeatability(selection.now), driven_alike(records, axis)
+    noise, repeats, alike = selection.now.noise, _repeatability(selection.now), driven_alike(records, axis)
     found = judged(selection, noise, repeats, before, given, outcomes, extension.left_out, alike)
     return found, extension.model
 
@@ -250,26 +250,11 @@ def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
     return select(base, family) if counts(selection.now.held_out, with_effects.held_out) else selection
 
 
-def _noise(now: Explanation) -> float:
-    """Return the sensor noise (m rms): the white part of the residual, the largest of the records.
-
-    At least the rounding error, and the resolution of the best of sensors.
-    """
-    finest = FINEST * float(np.ptp(now.y[now.used]))
-    return max([finest, now.evidence.rounding, *(white_noise(residual) for _, residual in _residuals(now))])
-
-
 def _repeatability(now: Explanation) -> Repeatability:
     """Return the largest repeatability of the records, between the rounding error and the held-out error."""
-    repeats = [repeatability_of(part.t, part.v, part.y, residual) for part, residual in _residuals(now)]
+    repeats = [repeatability_of(part.t, part.v, part.y, residual) for part, residual in now.residuals]
     worst = max(repeats, key=lambda one: one.rms)
     return replace(worst, rms=min(max(worst.rms, now.evidence.rounding), now.held_out.rms))
-
-
-def _residuals(now: Explanation) -> list[tuple[Part, FloatArray]]:
-    """Return the data of each record with its residual (m), NaN at samples that are not used."""
-    parts = zip(now.evidence.parts, now.evidence.slices, strict=True)
-    return [(part, np.where(part.used, now.residual[rows], np.nan)) for part, rows in parts]
 
 
 def _run(model: AxisModel, part: Part, *, of_record: bool) -> FreeRun:
@@ -422,7 +407,7 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
             rms=float(np.sqrt(np.mean(errors**2))),
             maximum=float(np.abs(errors).max()),
             held_out_rms=now.held_out.rms,
-            floor_rms=_noise(now),
+            floor_rms=now.noise,
             samples=y.size,
             source=source,
             fastest=max(fastest(part.t[part.used], part.v[part.used]) for part in evidence.parts),

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import wave
+from slpi_ros.effects.base import usual_step, wave
 from slpi_ros.effects.jumps import jumps
 from slpi_ros.errors import length
 from slpi_ros.hysteresis.reversals import reversals
@@ -87,6 +87,23 @@ def fingerprint(records: Sequence[Signals]) -> tuple[Left, ...]:
 def lines_of(record: Signals, least: float) -> Left | None:
     """Return the lines of the spectrum of a residual; None if they hold no more than the share `least` of it."""
     return next((found for found in _of_lines([_centred(record)]) if found.share > least), None)
+
+
+def half_power(records: Sequence[Signals]) -> float:
+    """Return the frequency (Hz) below which half of the mean square of the residuals lies; 0 without any."""
+    frequencies, powers = [], []
+    for record in records:
+        step = usual_step(record.t) if record.t.size > 1 else 0.0
+        if step > 0.0:
+            grid = np.arange(record.t[0], record.t[-1], step)
+            powers.append(np.abs(np.fft.rfft(np.interp(grid, record.t, _centred(record).residual))) ** 2 / grid.size)
+            frequencies.append(np.fft.rfftfreq(grid.size, step))
+    if not powers or not sum(power.sum() for power in powers) > 0.0:
+        return 0.0
+    frequency, power = np.concatenate(frequencies), np.concatenate(powers)
+    order = np.argsort(frequency)
+    total = np.cumsum(power[order])
+    return float(frequency[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def _thinned(record: Signals) -> Signals:

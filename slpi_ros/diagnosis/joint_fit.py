@@ -19,8 +19,8 @@ import scipy.linalg
 from scipy.optimize import lsq_linear
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
-from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, of_starts, steps
-from slpi_ros.diagnosis.prepare import Evidence
+from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, of_starts, steps
+from slpi_ros.diagnosis.prepare import Evidence, Part
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
 from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.registry import in_order
@@ -30,6 +30,7 @@ from slpi_ros.identification.design_matrix import Rows
 from slpi_ros.identification.least_squares import FOLDS, Problem, blocked_folds
 from slpi_ros.identification.linear_kinds import SMOOTHNESS
 from slpi_ros.identification.samples import Samples
+from slpi_ros.identification.signal_statistics import white_noise
 
 Factor = tuple[FloatArray, bool]
 
@@ -57,6 +58,8 @@ SEEN, UNSEEN, FEWEST_JUDGED = 0.1, 0.02, 200
 UNCERTAIN, LOOKED_AT = 10.0, 1000
 # Number of blocks of held-out samples for the comparison of two scores.
 BLOCKS = 40
+# An error below this share of the displacement range is beyond the resolution of any sensor.
+FINEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -563,6 +566,21 @@ class Explanation:
             effects.append(moved(effect, values + bounded(effect, step), limit))
         return effects
 
+    @cached_property
+    def noise(self) -> float:
+        """Sensor noise (m rms): the white part of the residual, the largest of the records.
+
+        At least the rounding error, and the resolution of the best of sensors.
+        """
+        finest = FINEST * float(np.ptp(self.y[self.used]))
+        return max([finest, self.evidence.rounding, *(white_noise(residual) for _, residual in self.residuals)])
+
+    @property
+    def residuals(self) -> list[tuple[Part, FloatArray]]:
+        """The data of each record with its residual (m), NaN at samples that are not used."""
+        parts = zip(self.evidence.parts, self.evidence.slices, strict=True)
+        return [(part, np.where(part.used, self.residual[rows], np.nan)) for part, rows in parts]
+
     def hysteresis(self) -> tuple[Hysteresis, tuple[float, ...]]:
         """Return the hysteresis with monotone branches, and its displacement at the start of each record, m."""
         problem = replace(self.joint.problem, y=self.joint.padded(self.target - self.settling))
@@ -573,18 +591,41 @@ class Explanation:
 
     def with_uncertainty(self) -> list[Effect]:
         """Return the effects with the standard deviations of their free parameters."""
-        # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
         if not self.effects:
             return []
-        precision = self.joint.columns(self.tangents, self._before).precision
-        errors = self.residual[self.evidence.used]
-        size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
-        inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
-        spread = np.sqrt(np.maximum(np.diag(inverse), 0.0) * np.mean(errors**2) * alike_in_a_row(errors)).tolist()
+        spread = self._deviations(self.tangents).tolist()
         effects = []
         for effect in self.effects:
             effects.append(certain(effect, [spread.pop(0) for _ in free(effect)]))
         return effects
+
+    def certainty(self, name: str) -> float:
+        """Return by how many of its standard deviations an effect differs from none.
+
+        As a whole, its form given, or by a parameter that is 0 where there is none, if that is less certain.
+        """
+        own = np.concatenate([np.full(free(effect).size, effect.name == name) for effect in self.effects])
+        contribution = self.predicted - self.prediction_without(name)
+        if not contribution.any():
+            return 0.0
+        deviation = float(self._deviations(np.column_stack([contribution, self.tangents[:, ~own]]))[0])
+        whole = 1.0 / deviation if deviation > 0.0 else np.inf
+        effect = next(one for one in self.with_uncertainty() if one.name == name)
+        if isinstance(effect, EachRecord):
+            return whole
+        sizes = [leaf for leaf in effect.free_leaves() if leaf.facts.fit and leaf.facts.fit.size]
+        return min([whole, *(abs(leaf.value) / max(effect.uncertainty[leaf.place], 1e-300) for leaf in sizes)])
+
+    def _deviations(self, columns: FloatArray) -> FloatArray:
+        """Return the standard deviations, shape (k,), of the gains of columns, shape (N, k), metres."""
+        # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
+        precision = self.joint.columns(columns, self._before).precision
+        errors = self.residual[self.evidence.used]
+        size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
+        inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
+        variances = np.maximum(np.diag(inverse)[: columns.shape[1]], 0.0)
+        deviations: FloatArray = np.sqrt(variances * np.mean(errors**2) * alike_in_a_row(errors))
+        return deviations
 
     def smoothed(self) -> "Explanation":
         """Return the fit with the smoothness of the hysteresis reselected by cross-validation, given the effects."""
@@ -615,8 +656,10 @@ class Explanation:
         return next(effect for effect in self.effects if effect.name == name)
 
     def adding(self, effect: Effect) -> "Explanation":
-        """Return the fit with one more effect."""
-        return Explanation(self.evidence, [*self.effects, effect], self)
+        """Return the fit with one more effect, or with more of one that is there; ModelError if it has that once."""
+        more = {other.name: other.joined(effect) for other in self.effects if other.name == effect.name}
+        joined = [more.get(other.name) or other for other in self.effects]
+        return Explanation(self.evidence, joined if all(more.values()) and more else [*joined, effect], self)
 
     def only(self, names: Collection[str]) -> "Explanation":
         """Return the fit with only the named effects, refitted if any effect is removed."""

@@ -8,11 +8,13 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord
-from slpi_ros.diagnosis.fingerprint import HINTS, Left, Signals, fingerprint
+from slpi_ros.diagnosis.fingerprint import HINTS, Left, Signals, fingerprint, half_power
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
-from slpi_ros.diagnosis.prepare import Evidence, one_speed
-from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, chance_of_gain, held_out_error
-from slpi_ros.effects.base import Effect
+from slpi_ros.diagnosis.prepare import MOST_SAMPLES, Evidence, one_speed
+from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, held_out_error
+from slpi_ros.diagnosis.significance import chance_of_gain
+from slpi_ros.effects.base import Effect, usual_step
+from slpi_ros.effects.excitation import FASTEST
 from slpi_ros.effects.registry import to_document as effect_document
 from slpi_ros.errors import length
 from slpi_ros.excitation.effects import for_effect, separating
@@ -38,6 +40,9 @@ AS_BEFORE = 1.1
 # standard deviations.
 CHANGED, LEAST_CHANGE, CERTAIN = 1e-3, 3e-3, 5.0
 
+# Advised drive: duration (s) at usual sampling rates, smallest number of readings, and those of a move over the range.
+DRIVE_SECONDS, FEWEST_READINGS, READINGS_OF_A_MOVE = 30.0, 2000, 20
+
 SCHEMA = "slpi_ros/diagnosis/2"
 NAMED, PARTLY_NAMED, AMBIGUOUS = "named", "partly_named", "ambiguous"
 UNEXPLAINED, NOTHING_FOUND = "unexplained", "nothing_found"
@@ -52,7 +57,7 @@ class NamedEffect:
     gain_percent: float
     # Share of the mean square held-out error without effects that the effect explains, 0..1.
     share_of_residual: float
-    # Probability that chance reduces the error as much.
+    # Probability that chance reduces the error as much, with the best of all effects that were tried.
     p_value: float
     # Effects that explain the error equally well, so that the records do not distinguish them.
     alternatives: tuple[str, ...]
@@ -211,12 +216,13 @@ def judged(
     base, now = selection.base, selection.now
     effects = _named_effects(selection)
     verdict = _verdict(selection, effects, noise_rms, left_out_of_model)
-    left = _left(now)
+    signals = _signals(now)
+    left = fingerprint(signals)
     return AxisDiagnosis(
         verdict=verdict,
         summary=_of_given(given, selection, before_rms)
         + _summary(verdict, selection, effects, noise_rms, before_rms)
-        + _goes_with(left)
+        + _goes_with(left, verdict, signals)
         + _not_in_model(now, left_out_of_model, selection.dropped)
         + _mixed(now.evidence)
         + _cannot_tell(driven_alike),
@@ -242,7 +248,7 @@ def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
 
 
 def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEffect:
-    chance = chance_of_gain(named.before, named.after)
+    chance = chance_of_gain(named.before, named.after, selection.trials)
     whole, before, after = (
         held_out_error(score, own=named.own) for score in (selection.base.held_out, named.before, named.after)
     )
@@ -280,18 +286,24 @@ def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: 
     return PARTLY_NAMED if more_than_noise else NAMED
 
 
-def _left(now: Explanation) -> tuple[Left, ...]:
-    """Return the measured variables that go with what a joint fit leaves."""
+def _signals(now: Explanation) -> list[Signals]:
+    """Return the used samples of each record with what a joint fit leaves."""
     evidence = now.evidence
     records = []
     for part, rows in zip(evidence.parts, evidence.slices, strict=True):
         used = part.used
         records.append(Signals(part.t[used], part.v[used], part.y[used], now.residual[rows][used]))
-    return fingerprint([record for record in records if record.t.size])
+    return [record for record in records if record.t.size]
 
 
-def _goes_with(left: Sequence[Left]) -> str:
-    return f" Of what is left, {left[0].evidence}." if left else ""
+def _goes_with(left: Sequence[Left], verdict: str, records: Sequence[Signals]) -> str:
+    if left:
+        return f" Of what is left, {left[0].evidence}."
+    if verdict not in (UNEXPLAINED, PARTLY_NAMED):
+        return ""
+    return (
+        f" No measured variable predicts what is left; half of its mean square is below {half_power(records):.3g} Hz."
+    )
 
 
 def _stale(given: Given, selection: Selection) -> bool:
@@ -397,8 +409,16 @@ def _separating(names: Sequence[str], evidence: Evidence) -> str:
 
 
 def _command(evidence: Evidence) -> str:
+    """Return the command for a drive that suits the stage: its voltage range, sampling rate and speed."""
     low, high = float(evidence.v.min()), float(evidence.v.max())
-    return f"slpi excite -o drive.csv --voltage-min {low:.4g} --voltage-max {high:.4g}"
+    rate = 1.0 / usual_step(evidence.parts[0].t)
+    seconds = max(min(DRIVE_SECONDS, MOST_SAMPLES / rate), FEWEST_READINGS / rate)
+    slew = (high - low) * rate / READINGS_OF_A_MOVE
+    slow = f" --slew-limit {slew:.3g}" if slew < FASTEST * (high - low) else ""
+    return (
+        f"slpi excite -o drive.csv --voltage-min {low:.4g} --voltage-max {high:.4g} --rate {rate:.4g} "
+        f"--duration {seconds:.3g}{slow}"
+    )
 
 
 def _of_structure(structure: str) -> str:

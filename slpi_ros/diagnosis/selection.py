@@ -1,21 +1,33 @@
 """Forward selection of effects: the one that best explains the residual is added if its gain is significant."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
-from slpi_ros.diagnosis.joint_fit import Explanation, Score
+from slpi_ros.diagnosis.joint_fit import FINEST, Explanation, Score
 from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency, one_speed
-from slpi_ros.effects.base import FEW_SAMPLES, Candidate, Effect, FitContext, usual_step
+from slpi_ros.diagnosis.significance import (
+    ALIKE,
+    LEAST_GAIN,
+    NO_WORSE,
+    carries_over_clearly,
+    chance_of_gain,
+    clearly_better,
+    counts,
+    gain,
+    independent_trials,
+)
+from slpi_ros.effects.base import Candidate, Effect, FitContext, usual_step
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.identification.progress import report_progress
+from slpi_ros.model.axis_model import ABOVE_NOISE
 
 # Defect of other kinds of hysteresis model than the loop family.
 BIAS = "loops that depend on bias"
@@ -23,19 +35,14 @@ BIAS = "loops that depend on bias"
 NOT_CLOSING, LEVEL = "loops that do not close", "loops that depend on level"
 # Memory lengths (voltage travel, share of the voltage range) for hysteresis without return-point memory.
 FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
-# Smallest relative reduction of the held-out error by an effect.
-LEAST_GAIN = 0.05
 # A fit from other initial parameters, or with another effect, is preferred if it lowers the error by this share.
 LEAST_FALL = 0.01
 # Largest number of effects that are selected; records cannot determine more.
 MOST_EFFECTS = 4
-# Largest p-value for a gain to be significant, and for two effects to differ; number of random sign patterns.
-CHANCE, ALIKE = 0.01, 0.05
-# The p-value of an effect that acts in a few blocks only, such as a saturation, is never small: limit for a large gain.
-LARGE_GAIN, CHANCE_OF_LARGE_GAIN = 0.3, 0.05
-SURROGATES = 1999
-# Lower bound of losses, for records without noise (m^2).
-TINY = 1e-30
+# Largest number of other effects with which the selection begins anew if more than the noise is left.
+FRESH_STARTS = 2
+# Largest number of rounds in which an effect is added, or a line or mode to one.
+MOST_ROUNDS = 12
 # Screening: effects are fitted if their gain exceeds these shares of the best gain and of the error.
 WORTH_TRYING, LEAST_SCREENED = 0.3, 0.01
 # After one Gauss-Newton step, effects are refined further if they explain at least this share of what the best one
@@ -47,19 +54,14 @@ ALTERNATIVE = 0.7
 ALTERNATIVE_AT_ONE_SPEED = 0.4
 # Smallest relative reduction of the held-out error by an effect with a companion: two at once find more by chance.
 LEAST_GAIN_IN_COMPANY = 0.1
-# An effect for which a simpler one may stand stays only if its held-out error is lower by this share: a lag also rounds
-# off turns that the hysteresis model makes too sharp.
-CLEARLY = 0.25
+# An effect differs from none by at least this number of its standard deviations.
+CERTAIN = 3.0
 # Gauss-Newton steps of a candidate, and of the selected effects in the end.
 STEPS, CONVERGED = 5, 15
 # Steps that lower the objective below this share of it began far from the best parameters.
 FAR_OFF = 0.9
-# Largest accepted ratio of the error with an effect to that without it, on any held-out record.
-NO_WORSE = 1.05
 # Largest residual that counts as rounding, as a multiple of the rms rounding error.
 ROUNDING_LEFT = 1.3
-# An error below this share of the displacement range is beyond the resolution of any sensor.
-FINEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,8 @@ class Contender:
 
     name: str
     explanation: Explanation
+    # Number of independent candidates that were tried together with it.
+    trials: float = 1.0
 
     @property
     def effect(self) -> Effect:
@@ -86,13 +90,13 @@ class Contender:
 
     @property
     def parameters(self) -> int:
-        """Number of fitted parameters of the effect."""
-        return free(self.effect).size
+        """Number of fitted parameters of all effects of the joint fit."""
+        return sum(free(effect).size for effect in self.explanation.effects)
 
     def refined(self, steps: int = STEPS) -> "Contender":
         """Return the candidate after up to `steps` Gauss-Newton steps, unless these increase the held-out error."""
         # Far from the best parameters the held-out error, of a fit that is linear in them, says nothing.
-        better = Contender(self.name, self.explanation.refined(steps))
+        better = replace(self, explanation=self.explanation.refined(steps))
         if EFFECTS[self.name].companion() and better.explanation.objective < FAR_OFF * self.explanation.objective:
             return better
         return min(self, better, key=lambda one: one.rms)
@@ -100,7 +104,7 @@ class Contender:
     def counts_beside(self, now: Explanation) -> bool:
         """Return whether the candidate significantly improves the joint fit `now`, which does not include it."""
         least = LEAST_GAIN_IN_COMPANY if EFFECTS[self.name].companion() else LEAST_GAIN
-        return counts(now.held_out, self.score, own=is_own(self.effect), least=least)
+        return counts(now.held_out, self.score, own=is_own(self.effect), least=least, trials=self.trials)
 
 
 def seen(now: Explanation) -> FitContext:
@@ -115,6 +119,7 @@ def seen(now: Explanation) -> FitContext:
         excited_frequency=lambda: excited_frequency(evidence),
         drives=drives,
         zeros=lambda: now.zeros,
+        records=now.around.records,
     )
 
 
@@ -131,14 +136,16 @@ def held_out_error(score: Score, *, own: bool) -> float:
 def contenders(now: Explanation, names: Iterable[str] | None = None) -> list[Contender]:
     """Return candidates for the named effects (default: all) that explain part of the residual, the best one first."""
     # Of several records, significant effects precede all others, and among them those that are common to all records.
-    taken = {effect.name for effect in now.effects}
-    screened = [best for name in names or EFFECTS if name not in taken for best in _screened(name, now)]
+    scores: list[Score] = []
+    once = {effect.name for effect in now.effects if effect.joined(effect) is None}
+    screened = [best for name in names or EFFECTS if name not in once for best in _screened(name, now, scores)]
+    trials = independent_trials(now.held_out, scores)
     error = now.held_out.rms
     # Implausible effects do not determine the threshold.
     most = max((error - score.rms for score, effect in screened if effect.plausible(seen(now))), default=0.0)
     least = max(WORTH_TRYING * most, LEAST_SCREENED * error)
     tried = [
-        Contender(effect.name, _with_companion(now, effect).adding(effect)).refined(1)
+        Contender(effect.name, _with_companion(now, effect).adding(effect), trials).refined(1)
         for score, effect in screened
         if error - score.rms > least
     ]
@@ -163,6 +170,11 @@ def _with_companion(now: Explanation, effect: Effect) -> Explanation:
     return now.adding(companion)
 
 
+def _beginning(now: Explanation, effect: Effect) -> Explanation:
+    """Return the fit with an effect that is known from an earlier selection."""
+    return _with_companion(now, effect).adding(effect).refined(STEPS)
+
+
 def _error(one: Contender) -> float:
     return one.rms
 
@@ -173,12 +185,18 @@ def _refined(tried: Sequence[Contender], before: Explanation, most: float) -> li
     return [one.refined() if square - one.score.rms**2 >= least else one for one in tried]
 
 
-def _screened(name: str, now: Explanation) -> list[tuple[Score, Effect]]:
-    """Return the held-out errors and the effect for the best form of each group of forms of the effect `name`."""
+def _screened(name: str, now: Explanation, scores: list[Score]) -> list[tuple[Score, Effect]]:
+    """Return the held-out errors and the effect for the best form of each group of forms of the effect `name`.
+
+    The held-out errors of all forms that are tried are appended to `scores`.
+    """
     # Surplus parameters extrapolate poorly.
     tried: dict[int, list[tuple[Score, Effect]]] = {}
     for form in _forms(name, now):
-        if (scored := _scored(form, now)) and scored[1].in_phase(seen(now)):
+        if (scored := _scored(form, now)) is None:
+            continue
+        scores.append(scored[0])
+        if scored[1].in_phase(seen(now)):
             tried.setdefault(getattr(form, "group", 0), []).append(scored)
     return [_simplest_of_best(group) for group in tried.values()]
 
@@ -224,62 +242,11 @@ def _scored(form: Candidate | Effect, now: Explanation) -> tuple[Score, Effect] 
     return (score, effect) if effect is not None else None
 
 
-def chance_of_gain(before: Score, after: Score) -> float:
-    """Return the p-value of a reduction of the block losses, by a sign-flip test with random signs of each."""
-    # The test is made with absolute and with logarithmic reductions, so that a single block with large errors does not
-    # hide the others; the smaller p-value is returned.
-    signs = _signs(before.losses.size)
-    gains = (before.losses - after.losses, np.log(np.maximum(before.losses, TINY) / np.maximum(after.losses, TINY)))
-    return min(float((1 + np.count_nonzero(signs @ gain >= gain.sum())) / (1 + SURROGATES)) for gain in gains)
-
-
-@cache
-def _signs(blocks: int) -> FloatArray:
-    """Return random sign patterns, shape (surrogates, blocks), the same ones at every call."""
-    return np.random.default_rng(0).choice([-1.0, 1.0], (SURROGATES, blocks))
-
-
-def gain(before: Score, after: Score) -> float:
-    """Return the relative reduction of the held-out error on blocks."""
-    return 1.0 - after.rms / before.rms
-
-
-def carries_over(before: Score, after: Score) -> bool:
-    """Return whether the error falls on each held-out record, or `_carries_over_clearly`; True for one record."""
-    ratio = _ratio_on_records(before, after)
-    lower = ratio.size == 0 or float(ratio.max()) < 1.0
-    return lower or _carries_over_clearly(before, after)
-
-
-def _carries_over_clearly(before: Score, after: Score) -> bool:
-    """Return whether the error on held-out records falls by `LEAST_GAIN` and rises to `NO_WORSE` times on none."""
-    ratio = _ratio_on_records(before, after)
-    less = after.rms_of_records <= (1.0 - LEAST_GAIN) * before.rms_of_records
-    return ratio.size > 0 and float(ratio.max()) <= NO_WORSE and less
-
-
-def _ratio_on_records(before: Score, after: Score) -> FloatArray:
-    """Return the ratio of the errors, after / before, on each held-out record for which both are known."""
-    if not before.records.size:
-        return np.empty(0)
-    both = np.isfinite(before.records) & np.isfinite(after.records)
-    ratio: FloatArray = np.sqrt(after.records[both] / np.maximum(before.records[both], TINY))
-    return ratio
-
-
-def counts(before: Score, after: Score, *, own: bool = True, least: float = LEAST_GAIN) -> bool:
-    """Return whether a gain is at least `least`, significant and, unless the effect is of one record, carries over."""
-    chance = CHANCE if gain(before, after) < LARGE_GAIN else CHANCE_OF_LARGE_GAIN
-    if not (gain(before, after) >= least and chance_of_gain(before, after) <= chance):
-        return False
-    return own or carries_over(before, after)
-
-
 def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) -> bool:
     """Return whether the records do not distinguish another effect from the best one."""
     # A single drive frequency cannot distinguish effects that depend on time from those that depend on rate; a better
-    # fit then only means a more suitable loop shape. Delay and lag of a few sampling periods are alike, too. If there
-    # are several records, the errors on held-out records also decide.
+    # fit then only means a more suitable loop shape. If there are several records, the errors on held-out records also
+    # decide.
     explained, by_other = before.rms**2 - best.score.rms**2, before.rms**2 - other.score.rms**2
     one, two = EFFECTS[best.name], EFFECTS[other.name]
     if one.time_shift == "only" and two.contains_shift:
@@ -288,10 +255,10 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
         return False
     if one_speed and one.dynamic and two.dynamic:
         return by_other >= ALTERNATIVE_AT_ONE_SPEED * explained
-    shifts = one is not two and one.time_shift == two.time_shift == "only"
-    if shifts and abs(best.effect.slow_shift) < FEW_SAMPLES * usual_step(best.explanation.t):
-        return by_other >= ALTERNATIVE * explained
-    return by_other >= ALTERNATIVE * explained and chance_of_gain(other.score, best.score) > ALIKE
+    if by_other < ALTERNATIVE * explained:
+        return False
+    clearly = clearly_better(best.score, other.score, best.explanation.noise)
+    return not clearly or chance_of_gain(other.score, best.score) > ALIKE
 
 
 @dataclass(frozen=True)
@@ -321,22 +288,44 @@ class Selection:
     structures: tuple[str, ...]
     # Effects that were found on some records but do not carry over to others.
     dropped: tuple[str, ...]
+    # Largest number of independent candidates among which an effect was chosen.
+    trials: float = 1.0
+    # The effect that was added first, and the others that had a significant gain then, the best one first.
+    beginnings: tuple[Effect, ...] = ()
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
-    """Add effects as long as one has a significant gain, and remove those that later ones make unnecessary."""
-    # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better.
+    """Select effects, beginning with the best one, and with others if that leaves more than the noise."""
+    # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better. Of two
+    # effects a third one with more parameters may imitate both, and better than either alone.
+    best = _grown(base, family)
+    beginnings = best.beginnings
+    for first in range(1, min(len(beginnings), 1 + FRESH_STARTS)):
+        error = best.now.held_out.rms_of_records
+        if error <= ABOVE_NOISE * best.now.noise:
+            break
+        order = (beginnings[first], *beginnings[:first], *beginnings[first + 1 :])
+        other = _grown(base, family, order)
+        if other.named and other.now.held_out.rms_of_records < (1.0 - LEAST_GAIN) * error:
+            best = replace(other, trials=max(best.trials, other.trials))
+    return best
+
+
+def _grown(base: Explanation, family: Explanation | None, beginnings: tuple[Effect, ...] = ()) -> Selection:
+    """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones."""
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
     # Only effects are stored, because a joint fit takes much memory.
     rivals: dict[str, list[Effect]] = {}
     dropped: set[str] = set()
-    exchanged = False
+    exchanged, rounds, trials = False, 0, 1.0
     finest = max(FINEST * float(np.ptp(now.y[now.used])), ROUNDING_LEFT * now.evidence.rounding)
-    while len(rivals) < MOST_EFFECTS and now.held_out.rms > finest:
+    while len(rivals) < MOST_EFFECTS and rounds < MOST_ROUNDS and now.held_out.rms > finest:
+        rounds += 1
         report_progress(f"{len(now.effects)} effects found, {now.held_out.rms * 1e9:.3g} nm left, trying others")
-        found = contenders(now)
+        begun = rivals or not beginnings
+        found = contenders(now) if begun else [Contender(beginnings[0].name, _beginning(now, beginnings[0]))]
         structure, with_structure = _best_structure(now, structures)
         if structure and (not found or _beats(with_structure.held_out, found[0].score)):
             now, structures = with_structure, (*structures, structure)
@@ -351,12 +340,17 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
                 break
             continue
         best = _simplest(found, now)
+        trials = max(trials, best.trials)
         if EFFECTS[best.name].companion():
             best = best.refined(CONVERGED)
-        others = [other.effect for other in found if other is not best]
+        beside = [one.effect for one in found if one.name != best.name] if begun else list(beginnings[1:])
+        if not beginnings:
+            significant = (one.effect for one in found if one.name != best.name and one.counts_beside(now))
+            beginnings = (best.effect, *significant)
         for effect in best.explanation.effects:
-            if effect.name == best.name or effect.name not in {known.name for known in now.effects}:
-                rivals[effect.name] = others
+            if effect.name not in {known.name for known in now.effects}:
+                rivals[effect.name] = beside
+        rivals.setdefault(best.name, beside)
         now = _without_needless(best.explanation.smoothed(), set(rivals) - {best.name})
         resembled = {effect.resembles_when_old for effect in now.effects} & {effect.name for effect in now.effects}
         if resembled and not now.evidence.older_moves:
@@ -367,11 +361,12 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     # At their best parameters together, some may no longer be necessary.
     now = _without_needless(_plainer(now.refined(CONVERGED), rivals), set(rivals), restart=False)
     named = _named(start, now, rivals)
-    return Selection(base, now, named, structures, tuple(sorted(dropped - {one.name for one in named})))
+    dropped -= {one.name for one in named}
+    return Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings)
 
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
-    """Return the fit with simpler effects, unless clearly worse, and without effects at bounds or implausible ones."""
+    """Return the fit with simpler effects, unless clearly worse, without those at bounds, implausible or uncertain."""
     several, step = len(now.evidence.parts) > 1, usual_step(now.t)
     for effect in now.effects:
         simple, effects = effect.simpler(step), {other.name: other for other in now.effects}
@@ -379,7 +374,8 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
             continue
         effects[effect.name] = simple
         other = Explanation(now.evidence, list(effects.values()), now).refined(CONVERGED)
-        if gain(other.held_out, now.held_out) < CLEARLY:
+        # A lag also rounds off turns that the hysteresis model makes too sharp.
+        if not clearly_better(now.held_out, other.held_out, now.noise):
             rest = [rival for rival in rivals.pop(effect.name, []) if rival.name != simple.name]
             rivals[simple.name] = [effect, *rest]
             now = other
@@ -391,8 +387,12 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
                 one for one in contenders(without, [name]) if one.counts_beside(without) and not one.effect.at_bound
             ]
             now = anew[0].explanation if anew else without
-        elif effect.plausible_to_the_end and not effect.plausible(seen(now)):
+        elif not effect.plausible(seen(now)):
             now = now.without(name)
+    while uncertain := {
+        effect.name: certainty for effect in now.effects if (certainty := now.certainty(effect.name)) < CERTAIN
+    }:
+        now = now.without(min(uncertain, key=lambda name: uncertain[name]))
     return now
 
 
@@ -498,7 +498,7 @@ def _in_its_place(
         # At a single frequency a better fit only means a more suitable loop shape.
         others = [*(other.name for other in tried), *(key for key in EFFECTS if EFFECTS[key].time_shift != "only")]
         alternatives = [other for other in others if other != name and EFFECTS[other].dynamic][:1]
-    confirmed = _carries_over_clearly(rest.held_out, now.held_out)
+    confirmed = carries_over_clearly(rest.held_out, now.held_out)
     return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None, confirmed
 
 

@@ -179,8 +179,6 @@ class EffectBase(Protocol):
     dynamic: ClassVar[bool] = False
     # Whether a change of the sensitivity between records may be its doing.
     changes_gain: ClassVar[bool] = False
-    # Whether it is dropped from the selection if its final parameters are not plausible.
-    plausible_to_the_end: ClassVar[bool] = False
     # Effect that it resembles if it continues from long before a record.
     resembles_when_old: ClassVar[str] = ""
 
@@ -428,6 +426,18 @@ class FitContext:
     excited_frequency: Callable[[], float]
     drives: Callable[[], Sequence[tuple[float, float]]]
     zeros: Callable[[], FloatArray]
+    # Contexts of the records that the signals are concatenated from; empty for a single record.
+    records: tuple[EffectContext, ...] = ()
+
+    def of_record(self, k: int) -> "FitContext":
+        """Return what concerns record `k`."""
+        if not self.records:
+            return self
+        first = sum(record.t.size for record in self.records[:k])
+        own = slice(first, first + self.records[k].t.size)
+        t, v, u, h, y, used = (x[own] for x in (self.t, self.v, self.u, self.h, self.y, self.used))
+        drives, zeros = (lambda: [self.drives()[k]]), (lambda: self.zeros()[k : k + 1])
+        return FitContext(t, v, u, h, y, used, self.rounding, self.effects, self.excited_frequency, drives, zeros)
 
     @property
     def step(self) -> float:

@@ -46,7 +46,11 @@ class Delay(EffectBase):
     )
 
     seconds: float = parameter(
-        "s", "delay of the displacement; negative: stamped too early", -100, 100, fit=Fit("linear", in_samples)
+        "s",
+        "delay of the displacement; negative: stamped too early",
+        -100,
+        100,
+        fit=Fit("linear", in_samples, size=True),
     )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 

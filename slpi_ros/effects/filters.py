@@ -73,7 +73,7 @@ class Mode:
     damping: float = parameter("", "damping ratio", 1e-6, 1, below=True, fit=Fit("relative", least=1e-3, most=0.4))
     gain: float = parameter(
         "", "share of the static displacement; at most 1 in sum", 0, 1, default=1.0, required=True,
-        fit=Fit("linear", 1e-5, LEAST_GAIN, 1.0),
+        fit=Fit("linear", 1e-5, LEAST_GAIN, 1.0, size=True),
     )  # fmt: skip
 
     @cached_property

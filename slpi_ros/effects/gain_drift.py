@@ -51,7 +51,6 @@ class GainDrift(EffectBase):
     needs_feedback: ClassVar[bool] = True
     sharing: ClassVar[Sharing] = "separate"
     changes_gain: ClassVar[bool] = True
-    plausible_to_the_end: ClassVar[bool] = True
     excitation: ClassVar[Excitation] = Excitation(
         "Full loops one after the other, all alike and without a rest: voltage, memory and creep repeat, so a "
         "stroke that grows or shrinks is the sensitivity, where a drift moves both ends of each loop by the same "

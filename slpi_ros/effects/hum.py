@@ -45,7 +45,7 @@ class Line:
     frequency: float = parameter(
         "Hz", "frequency", 0, 1e7, above=True, fit=Fit("relative", lambda _, of: 1e-3 / of.duration, 1e-3)
     )
-    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0))
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, size=True))
     phase: float = parameter("rad", "phase at the record's start", -1e6, 1e6, fit=Fit("angle", 1e-4))
 
 

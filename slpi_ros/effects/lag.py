@@ -53,7 +53,7 @@ class Lag(EffectBase):
     )
 
     time_constant: float = parameter(
-        "s", "time constant tau", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6)
+        "s", "time constant tau", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6, size=True)
     )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 

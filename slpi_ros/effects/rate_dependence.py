@@ -85,8 +85,9 @@ class RateDependence(EffectBase):
     )
 
     threshold: float = parameter(
-        "V", "half-width c that loops gain for each factor of e in the rate", 0, 1e5, fit=Fit("logarithmic", 1e-4, 1e-6)
-    )
+        "V", "half-width c that loops gain for each factor of e in the rate", 0, 1e5,
+        fit=Fit("logarithmic", 1e-4, 1e-6, size=True),
+    )  # fmt: skip
     onset_rate: float = parameter(
         "V/s", "rate s0 above which they widen", 1e-12, 1e12, fit=Fit("logarithmic", 1e-4, 1e-9)
     )

@@ -186,6 +186,8 @@ class StreamingResonance(StreamingBase):
 # Modes of the candidates: lowest frequency (Hz), highest as share of the sampling rate, number of spectral peaks.
 LOWEST, HIGHEST, LINES = 10.0, 0.45, 4
 DAMPINGS = (0.02, 0.08)
+# Largest damping ratio of a resonance; above it a mode hardly rings, and is a lag.
+MOST_DAMPING = 0.3
 # Highest frequency of any resonance, as a multiple of the highest excited frequency; above it only sharp ones can be
 # identified, with at most this damping ratio: turns excite them.
 RINGS, SHARP = 2.0, 0.1
@@ -257,9 +259,9 @@ class Resonance(EffectBase):
         return Resonance(_within(modes)) if len(modes) <= MOST_MODES else None
 
     def plausible(self, context: FitContext) -> bool:
-        """Return whether no mode far above the excited frequencies, damped, just shifts in time or is hysteresis."""
+        """Return whether all modes ring, those far above the excited frequencies sharply: others shift in time."""
         highest = RINGS * context.excited_frequency()
-        return all(mode.frequency <= highest or mode.damping <= SHARP for mode in self.modes)
+        return all(mode.damping <= (MOST_DAMPING if mode.frequency <= highest else SHARP) for mode in self.modes)
 
     @property
     def rest(self) -> float:

@@ -68,7 +68,7 @@ class Slew(EffectBase):
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether a noticeable part of the drive is faster, and the voltage is late there only."""
-        rates, around = _rates(context.t, context.v), EffectContext(context.t)
+        rates, around = _rates(context.t, context.v), EffectContext(context.t, records=context.records)
         late = np.abs(self.apply(context.v, around) - context.v) > LATE * float(np.ptp(context.v))
         moving = rates > 0.01 * np.quantile(rates, FASTEST)
         return float(np.mean(rates[moving] > self.rate)) >= LEAST_FASTER and float(np.mean(late)) <= MOST_LATE

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slpi_ros.diagnosis.fingerprint import Signals, fingerprint
+from slpi_ros.diagnosis.fingerprint import Signals, fingerprint, half_power
 
 T = np.arange(20_000) / 1000.0
 V = (
@@ -55,6 +55,14 @@ def test_a_share_is_of_data_that_were_held_out():
 def test_frequencies_and_amplitudes_of_lines_are_told():
     found = fingerprint([record(np.sin(2 * np.pi * 50.3 * T), 0)])
     assert "50.3 Hz (30" in found[0].evidence or "50.3 Hz (29" in found[0].evidence
+
+
+def test_half_of_the_power_is_below_a_frequency():
+    slow = Signals(T, V, V, np.sin(2 * np.pi * 3.0 * T) + 0.9 * np.sin(2 * np.pi * 40.0 * T))
+    assert half_power([slow]) == pytest.approx(3.0, abs=0.2)
+    fast = slow._replace(residual=np.sin(2 * np.pi * 40.0 * T))
+    assert half_power([slow, fast]) == pytest.approx(40.0, abs=0.2)
+    assert half_power([]) == half_power([slow._replace(residual=0.0 * T)]) == 0.0
 
 
 def test_short_and_still_records_have_a_fingerprint_too():

@@ -7,6 +7,7 @@ import pytest
 
 import slpi_ros
 from benchmarks.hidden import NAMES, calibration_of, hide
+from benchmarks.hidden.physics import Flexure, ringing
 from benchmarks.hidden.size import beyond_hysteresis
 from slpi_ros.io.bag_writer import write_bag
 
@@ -67,6 +68,46 @@ def test_two_hidden_effects_are_both_named(tmp_path):
     hidden = hide(3, ["creep", "hum"], size=LARGE, samples=SAMPLES)
     found = diagnosed(hidden, tmp_path).axes[hidden.truth[0].axis]
     assert {each.effect.name for each in found.effects} == {"creep", "hum"}, found.summary
+
+
+def with_reading(hidden, reading):
+    """Return the record of a draw with another noise-free reading of axis x."""
+    noise = hidden.record.displacement["x"] - hidden.reading["x"]
+    return dataclasses.replace(hidden.record, displacement={"x": reading + noise})
+
+
+def test_lines_are_found_one_by_one_and_are_one_effect():
+    hidden = hide(3, axes=1, base="preisach", samples=SAMPLES)
+    t, floor = hidden.record.t, hidden.floor["x"]
+    lines = {50.0: 5 * floor, 81.3: 3 * floor}
+    waves = sum(size * np.sin(2 * np.pi * frequency * t + 1.0) for frequency, size in lines.items())
+    record = with_reading(hidden, hidden.reading["x"] + waves)
+    (found,) = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"].effects
+    assert found.name == "hum"
+    sizes = {line.frequency: line.amplitude for line in found.effect.lines}
+    assert sorted(sizes) == pytest.approx(sorted(lines), rel=1e-4)
+    assert [sizes[key] for key in sorted(sizes)] == pytest.approx([lines[key] for key in sorted(lines)], rel=0.05)
+
+
+@pytest.mark.long
+def test_modes_are_found_one_by_one_and_are_one_effect():
+    hidden = hide(2, ["resonance"], axes=1, base="preisach", samples=20_000)
+    y, modes = hidden.clean["x"], {61.0: 0.6, 140.0: 0.4}
+    parts = (gain * ringing(Flexure(frequency, 0.02), hidden.record.t, y) for frequency, gain in modes.items())
+    record = with_reading(hidden, sum(parts))
+    (found,) = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes["x"].effects
+    assert found.name == "resonance"
+    gains = {mode.frequency: mode.gain for mode in found.effect.modes}
+    assert sorted(gains) == pytest.approx(sorted(modes), rel=1e-3)
+    assert [gains[key] for key in sorted(gains)] == pytest.approx([0.6, 0.4], abs=0.02)
+
+
+@pytest.mark.long
+def test_two_simple_effects_are_found_although_one_with_more_parameters_is_better_at_first():
+    hidden = hide(0, ["lag", "creep"], samples=40_000)
+    axis = hidden.truth[0].axis
+    found = slpi_ros.diagnose(hidden.record, slpi_ros.identify(hidden.record), axes=[axis]).axes[axis]
+    assert {each.name for each in found.effects} == {"lag", "creep"} and found.verdict == "named"
 
 
 @pytest.mark.parametrize("effects", [[], ["creep"], ["cross_coupling", "hum"]])

@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 
 from slpi_ros.diagnosis.joint_fit import Score
-from slpi_ros.diagnosis.selection import LEAST_GAIN, alike, carries_over, counts, gain
-from slpi_ros.effects.delay import Delay
-from slpi_ros.effects.lag import Lag
+from slpi_ros.diagnosis.selection import alike
+from slpi_ros.diagnosis.significance import (
+    CHANCE,
+    LEAST_GAIN,
+    carries_over,
+    chance_of_gain,
+    clearly_better,
+    counts,
+    gain,
+    independent_trials,
+)
 
 BLOCKS = 12
 NOTHING = np.empty(0)
@@ -30,10 +38,11 @@ class Rival:
     score: Score
     effect: object = None
     step: float = 1e-3
+    noise: float = 1e-9
 
     @property
     def explanation(self) -> SimpleNamespace:
-        return SimpleNamespace(t=np.arange(50) * self.step)
+        return SimpleNamespace(t=np.arange(50) * self.step, noise=self.noise)
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.2 * LEAST_GAIN, False), (0.9 * LEAST_GAIN, False), (0.2, True)])
@@ -80,8 +89,37 @@ def test_at_one_speed_time_and_rate_are_alike_although_one_is_better():
     assert not alike(best, rival, score(1e-8), one_speed=False)
 
 
-@pytest.mark.parametrize(("shift", "expected"), [(0.5e-3, True), (5e-3, False)])
-def test_delay_and_lag_of_less_than_a_sample_are_alike(shift, expected):
-    for best, rival in ((Delay(shift), Lag(shift)), (Lag(shift), Delay(shift))):
-        one, other = Rival(best.name, score(1e-9), best), Rival(rival.name, score(2e-9), rival)
-        assert alike(one, other, score(1e-8), one_speed=False) is expected
+def test_a_difference_within_what_the_better_one_leaves_beyond_the_noise_decides_nothing():
+    best, rival = Rival("creep", score(1.5e-9)), Rival("thermal_drift", score(1.6e-9))
+    assert alike(best, rival, score(1e-8), one_speed=False)
+    best.noise = 1.5e-9
+    assert not alike(best, rival, score(1e-8), one_speed=False)
+    assert clearly_better(score(1e-9), score(1.01e-9), 1e-9) and not clearly_better(score(2e-9), score(2.5e-9), 1e-9)
+
+
+def noise_scores(count: int, seed: int) -> tuple[Score, list[Score]]:
+    """Return a score, and scores of candidates whose gains are noise, independent of each other."""
+    rng = np.random.default_rng(seed)
+    before = Score(np.full(40, 1.0), NOTHING, NOTHING)
+    return before, [Score(1.0 + 0.05 * rng.standard_normal(40), NOTHING, NOTHING) for _ in range(count)]
+
+
+@pytest.mark.parametrize("count", [1, 10, 100])
+def test_the_number_of_trials_is_that_of_the_independent_candidates(count):
+    before, tried = noise_scores(count, 1)
+    assert independent_trials(before, tried) == pytest.approx(count, rel=0.5)
+    # A copy is no trial of its own.
+    assert independent_trials(before, 3 * tried) == pytest.approx(independent_trials(before, tried), rel=0.05)
+
+
+def test_the_best_of_many_that_are_noise_is_as_seldom_significant_as_one():
+    found = []
+    for seed in range(200):
+        before, tried = noise_scores(30, seed)
+        trials = independent_trials(before, tried)
+        found.append(min(chance_of_gain(before, one, trials) for one in tried))
+    alone = [
+        min(chance_of_gain(before, one) for one in tried) for before, tried in map(noise_scores, [30] * 200, range(200))
+    ]
+    assert np.mean(np.array(found) < 0.05) < 0.15 < np.mean(np.array(alone) < 0.05)
+    assert np.mean(np.array(found) < CHANCE) < 0.05

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from math import exp, log
 from typing import ClassVar
 
@@ -66,10 +65,7 @@ class EachRecord(EffectBase):
 
     def plausible(self, view: FitContext) -> bool:
         """Return whether the parameters of each record are plausible."""
-        ends = np.append(np.flatnonzero(np.diff(view.t) < 0.0) + 1, view.t.size)
-        rows = [slice(*pair) for pair in pairwise([0, *ends.tolist()])]
-        signals = [{name: getattr(view, name)[own] for name in ("t", "v", "u", "h", "y", "used")} for own in rows]
-        return all(part.plausible(replace(view, **own)) for part, own in zip(self.parts, signals, strict=True))
+        return all(part.plausible(view.of_record(k)) for k, part in enumerate(self.parts))
 
     def free_leaves(self) -> list[Leaf]:
         """Return the fitted numbers of all records."""

@@ -435,9 +435,10 @@ class FitContext:
             return self
         first = sum(record.t.size for record in self.records[:k])
         own = slice(first, first + self.records[k].t.size)
-        t, v, u, h, y, used = (x[own] for x in (self.t, self.v, self.u, self.h, self.y, self.used))
+        t, v, u, h, y = (x[own] for x in (self.t, self.v, self.u, self.h, self.y))
         drives, zeros = (lambda: [self.drives()[k]]), (lambda: self.zeros()[k : k + 1])
-        return FitContext(t, v, u, h, y, used, self.rounding, self.effects, self.excited_frequency, drives, zeros)
+        effects, excited = self.effects, self.excited_frequency
+        return FitContext(t, v, u, h, y, self.used[own], self.rounding, effects, excited, drives, zeros)
 
     @property
     def step(self) -> float:

@@ -149,6 +149,6 @@ class StreamingSlew(StreamingBase):
 
 
 def _rates(t: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the rates of a voltage (V/s), without its sign, between samples of one record, shape (M,)."""
+    """Return the rates of a voltage (V/s), without its sign, between successive samples of a record, shape (M,)."""
     dt = np.diff(t)
     return np.abs(np.diff(v)[dt > 0.0]) / dt[dt > 0.0]

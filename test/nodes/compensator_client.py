@@ -31,6 +31,7 @@ class Client:
         self._answers = graph.record(
             Float64MultiArray, names.get("voltage_command", f"{namespace}/voltage_command"), RELIABLE
         )
+        self._voltages: list[list[float]] = []
         self._wishes = graph.node.create_publisher(
             desired, names.get("desired_displacement", f"{namespace}/desired_displacement"), RELIABLE
         )
@@ -38,8 +39,9 @@ class Client:
 
     @property
     def answers(self) -> list[list[float]]:
-        """All voltages so far, volts."""
-        return [list(message.data) for message in self._answers]
+        """All voltages so far, volts; each is converted once, or who looks after each of many falls behind them."""
+        self._voltages.extend(list(message.data) for message in self._answers[len(self._voltages) :])
+        return self._voltages
 
     @property
     def answered(self) -> int:

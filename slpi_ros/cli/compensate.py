@@ -21,7 +21,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
     command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
     command.add_argument(
-        "--slew-limit", "--slew", dest="slew", metavar="V/S", type=float, default=0.0,
+        "--slew-limit", "--slew", dest="slew_limit", metavar="V/S", type=float, default=0.0,
         help="rate limit; the voltage then begins where the stage is; 0 (default): no limit",
     )  # fmt: skip
     command.add_argument(
@@ -48,9 +48,9 @@ def _run(options: Namespace) -> Result:
     check_time(t)
     known = common.model_columns(desired, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "V"), overwrite=options.overwrite)
-    if options.slew < 0.0 or math.isnan(options.slew):
-        raise UsageError(f"--slew-limit {options.slew:g}: give a positive number of V/s, or 0 for no limit")
-    limits = Limits(options.voltage_min, options.voltage_max, options.slew or math.inf)
+    if options.slew_limit < 0.0 or math.isnan(options.slew_limit):
+        raise UsageError(f"--slew-limit {options.slew_limit:g}: give a positive number of V/s, or 0 for no limit")
+    limits = Limits(options.voltage_min, options.voltage_max, options.slew_limit or math.inf)
     try:
         answers = model.command(t, known, limits, options.start_memory)
     except SlpiError as error:
@@ -67,8 +67,8 @@ def _run(options: Namespace) -> Result:
         start = model.axes[axis].initial(options.start_memory)
         jump, (low, high) = float(v[0] - start.voltage), model.axes[axis].voltage_range
         # The largest step between samples that the slew limit allows; a longer pause counts as MAX_DT.
-        most = options.slew * np.minimum(np.diff(t), MAX_DT)
-        limited = int(np.count_nonzero(np.abs(np.diff(v)) >= most * (1.0 - 1e-9))) if options.slew else 0
+        most = options.slew_limit * np.minimum(np.diff(t), MAX_DT)
+        limited = int(np.count_nonzero(np.abs(np.diff(v)) >= most * (1.0 - 1e-9))) if options.slew_limit else 0
         if abs(jump) > SMALLEST_JUMP * (high - low):
             lines.append(
                 f"axis {axis}: the first sample jumps by {jump:+.4g} V, to {known[axis][0] * 1e6:.4g} µm from "

@@ -106,14 +106,14 @@ def add_limits(command: ArgumentParser, slew: str) -> None:
     command.add_argument("--voltage-min", metavar="V", type=float, required=True, help="lowest voltage")
     command.add_argument("--voltage-max", metavar="V", type=float, required=True, help="highest voltage")
     text = f"{slew}; default: the voltage range in 0.1 s; 0: no limit"
-    command.add_argument("--slew-limit", "--slew", dest="slew", metavar="V/S", type=float, help=text)
+    command.add_argument("--slew-limit", "--slew", dest="slew_limit", metavar="V/S", type=float, help=text)
 
 
 def slew_of(options: Namespace) -> float:
     """Return the slew limit (V/s) that the options select."""
     from slpi_ros.excitation.drives import slew_limits
 
-    given = None if options.slew is None else (options.slew,)
+    given = None if options.slew_limit is None else (options.slew_limit,)
     return slew_limits(given, (options.voltage_min,), (options.voltage_max,))[0]
 
 

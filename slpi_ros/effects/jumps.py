@@ -12,6 +12,8 @@ from slpi_ros.hysteresis.reversals import reversals
 SHORTEST, LONGEST = 16, 1 / 16
 # Size of a jump, and of one whose place is sought, relative to the usual distance of two lines of that length.
 LEAST, SEEN = 8.0, 5.0
+# Smallest and largest share of a jump that happens within a few samples; places that are tried for each jump.
+SHARP, TRIES = (0.5, 2.0), 4
 # Samples within which a jump is at a turn or a jump of the voltage; shares of the voltage range of the smallest turn
 # and of the smallest jump of one sample; probability below which it is there by more than chance.
 NEAR, TURN, LEAP, CHANCE = 8, 0.01, 0.02, 0.01
@@ -25,8 +27,14 @@ def jumps(x: FloatArray, most: int) -> list[tuple[int, float]]:
     widths = [SHORTEST]
     while 2 * widths[-1] <= LONGEST * x.size:
         widths.append(2 * widths[-1])
-    for _ in range(most if x.size >= 4 * SHORTEST else 0):
+    # Where a change is gradual, no jump is sought any more.
+    gradual = np.zeros(x.size + 1, dtype=bool)
+    for _ in range(TRIES * most if x.size >= 4 * SHORTEST else 0):
+        if len(found) == most:
+            break
         scores = [_scores(left, width) for width in widths]
+        for width, (score, _) in zip(widths, scores, strict=True):
+            score[gradual[width : x.size - width + 1]] = 0.0
         best = max(range(len(widths)), key=lambda one: float(np.max(np.abs(scores[one][0]))))
         k = widths[best] + int(np.argmax(np.abs(scores[best][0])))
         score, usual = scores[best]
@@ -42,6 +50,9 @@ def jumps(x: FloatArray, most: int) -> list[tuple[int, float]]:
                 break
             k, reach = first + widths[one] + int(np.argmax(near)), widths[one]
         k = _divide(left, k, reach)
+        if not sudden(left, k, size):
+            gradual[max(k - widths[best], 0) : k + widths[best]] = True
+            continue
         k = next((other for other in found if abs(other - k) < SHORTEST), k)
         found[k] = found.get(k, 0.0) + size
         left = left - size * (np.arange(x.size) >= k)
@@ -72,7 +83,12 @@ def _divide(x: FloatArray, k: int, reach: int) -> int:
     return first + 1 + int(np.argmax(apart**2 * before * after))
 
 
-def sharpness(x: FloatArray, k: int, size: float) -> float:
+def sudden(x: FloatArray, k: int, size: float) -> bool:
+    """Return whether a jump of `size` at sample `k` of `x`, shape (N,), happens within a few samples."""
+    return SHARP[0] <= _sharpness(x, k, size) <= SHARP[1]
+
+
+def _sharpness(x: FloatArray, k: int, size: float) -> float:
     """Return the share of a jump of `size` at sample `k` of `x`, shape (N,), that happens within a few samples."""
     noise = 1.4826 * float(np.median(np.abs(np.diff(x, 2)))) / 6.0**0.5
     # As many as make its noise a quarter of the size.

@@ -11,11 +11,11 @@ import numpy as np
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FitContext, ResidualContext, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, move, remaining
-from slpi_ros.effects.jumps import follows_drive, jumps, sharpness
+from slpi_ros.effects.jumps import follows_drive, jumps, sudden
 from slpi_ros.effects.parameters import Fit, parameter, require
 
-# Numbers of jumps of the candidates; smallest and largest share of a jump that happens within a few samples.
-COUNTS, SHARP = (1, 2, 3, 5, 8, 12), (0.5, 2.0)
+# Numbers of jumps of the candidates.
+COUNTS = (1, 2, 3, 5, 8, 12)
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
@@ -67,7 +67,7 @@ class Steps(EffectBase):
         places = np.searchsorted(context.t, self.times)
         left = np.interp(context.t, context.t[context.used], (context.y - context.h)[context.used])
         pairs = zip(places.tolist(), self.sizes, strict=True)
-        return all(_sudden(left, k, size) for k, size in pairs) and not follows_drive(places, context.v)
+        return all(sudden(left, k, size) for k, size in pairs) and not follows_drive(places, context.v)
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with the jumps, shape (N,), metres."""
@@ -85,13 +85,13 @@ class Steps(EffectBase):
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield the clearest jumps of the residual, in increasing number."""
         left = np.interp(context.t, context.t[context.used], context.residual[context.used])
-        sudden = [k for k, size in jumps(left, COUNTS[-1]) if _sudden(left, k, size)]
-        counts = [min(count, len(sudden)) for count in COUNTS]
+        found = [k for k, _ in jumps(left, COUNTS[-1])]
+        counts = [min(count, len(found)) for count in COUNTS]
         # Of several records each has as many forms, some without a jump.
         for count in sorted(set(counts) - {0}) if context.around.records else counts:
             yield Candidate(
-                (np.arange(context.t.size)[:, None] >= sorted(sudden[:count])).astype(np.float64),
-                partial(cls._at, context.t, left, sorted(sudden[:count])),
+                (np.arange(context.t.size)[:, None] >= sorted(found[:count])).astype(np.float64),
+                partial(cls._at, context.t, left, sorted(found[:count])),
             )
 
     @classmethod
@@ -99,7 +99,7 @@ class Steps(EffectBase):
         if len(places) != sizes.size:
             return None
         # The rest are of the hysteresis, which has bent towards the jumps that were not there before.
-        kept = [(k, size) for k, size in zip(places, sizes.tolist(), strict=True) if _sudden(left, k, size)]
+        kept = [(k, size) for k, size in zip(places, sizes.tolist(), strict=True) if sudden(left, k, size)]
         # Between two samples.
         found = cls(tuple(float(t[k - 1] + t[k]) / 2 for k, _ in kept), tuple(size for _, size in kept))
         return found if kept or not places else None
@@ -113,7 +113,3 @@ class Steps(EffectBase):
         return f"the zero jumps {jump}" if len(self.times) == 1 else (
             f"the zero jumps {len(self.times)} times, at most {jump}"
         )  # fmt: skip
-
-
-def _sudden(left: FloatArray, k: int, size: float) -> bool:
-    return SHARP[0] <= sharpness(left, k, size) <= SHARP[1]

@@ -163,8 +163,8 @@ def test_a_record_without_any_noise(diagnose, hidden, tmp_path):
     code, said, complaints = diagnose(replace(hidden.record, displacement={"x": hidden.clean["x"]}))
     assert (code, complaints) == (0, "") and said
     found = document_in(tmp_path / "out")["axes"]["x"]
-    # What the model of the hysteresis leaves is more than no noise, but no cause is invented for it.
-    assert (found["verdict"], found["effects"]) == ("unexplained", [])
+    # What the model of the hysteresis leaves may be more than no noise, but no cause is invented for it.
+    assert found["verdict"] in ("unexplained", "nothing_found") and found["effects"] == []
     assert found["after_rms_m"] < 1e-4 * np.ptp(hidden.clean["x"])
 
 

@@ -91,8 +91,8 @@ def sudden(x: FloatArray, k: int, size: float) -> bool:
 def _sharpness(x: FloatArray, k: int, size: float) -> float:
     """Return the share of a jump of `size` at sample `k` of `x`, shape (N,), that happens within a few samples."""
     noise = 1.4826 * float(np.median(np.abs(np.diff(x, 2)))) / 6.0**0.5
-    # As many as make its noise a quarter of the size.
-    few = int(np.clip(32.0 * (noise / max(abs(size), 1e-300)) ** 2, 3, 8 * SHORTEST))
+    # As many as make its noise less than a fifth of the size, and the place need not be exact.
+    few = int(np.clip(64.0 * (noise / max(abs(size), 1e-300)) ** 2, 6, 8 * SHORTEST))
     before, after = x[max(k - few, 0) : k], x[k : k + few]
     return float(np.mean(after) - np.mean(before)) / size if before.size and after.size else 0.0
 

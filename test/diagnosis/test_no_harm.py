@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def hidden():
-    record = hide(2, ["creep"], size=10.0, samples=6_000).record
+    record = hide(2, ["creep"], size=10.0, axes=1, samples=6_000).record
     return record, slpi_ros.identify(record)
 
 

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 SAMPLES = 12_000
 # All of them take minutes: `make bench-diagnosis`.
 FAST = ["lag", "hum", "steps"]
-SLOW = ["slew", "creep", "resonance", "cross_coupling", "sensor_periodic", "thermal_drift", "gain_drift"]
+SLOW = ["slew", "creep", "contact", "resonance", "cross_coupling", "sensor_periodic", "thermal_drift", "gain_drift"]
 # Large enough that nobody should miss it; what is found of smaller ones is for the bench to say.
 LARGE = 10.0
 # A draw of a coercivity that grows with the logarithm of the rate.

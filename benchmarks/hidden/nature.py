@@ -248,14 +248,13 @@ def _hum(rng: np.random.Generator, setting: Setting) -> Nature:
     )
 
 
+# A new one comes last: the place of a name is in the seeds of its draws.
 DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "delay": _delay,
     "lag": _lag,
-    "slew": _slew,
     "saturation": _saturation,
     "rate_dependence": _rate_dependence,
     "creep": _creep,
-    "contact": _contact,
     "resonance": _resonance,
     "cross_coupling": _cross_coupling,
     "thermal_drift": _thermal_drift,
@@ -263,6 +262,8 @@ DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "hum": _hum,
     "gain_drift": _gain_drift,
     "steps": _steps,
+    "slew": _slew,
+    "contact": _contact,
 }
 NAMES = tuple(DRAWS)
 

@@ -10,6 +10,8 @@ from slpi_ros.hysteresis.reversals import reversals
 
 # Shortest length of the lines on either side of a jump (samples), and the longest as a share of the signal.
 SHORTEST, LONGEST = 16, 1 / 16
+# Number of places that are looked at for each jump.
+TRIES = 3
 # Size of a jump, and of one whose place is sought, relative to the usual distance of two lines of that length.
 LEAST, SEEN = 8.0, 5.0
 # Samples within which a jump is at a turn or a jump of the voltage; shares of the voltage range of the smallest turn
@@ -21,12 +23,15 @@ def jumps(x: FloatArray, most: int) -> list[tuple[int, float]]:
     """Return the first sample and the size of up to `most` sudden shifts of `x`, shape (N,), the clearest first."""
     # A jump is the distance, at one place, of the lines fitted to the samples before and after it. Lines, so that drift
     # is none; relative to the usual distance at all places, so that whatever is everywhere is none, noise included.
-    left, found = x - np.mean(x), dict[int, float]()
+    left, found, shut = x - np.mean(x), dict[int, float](), list[int]()
     widths = [SHORTEST]
     while 2 * widths[-1] <= LONGEST * x.size:
         widths.append(2 * widths[-1])
-    for _ in range(most if x.size >= 4 * SHORTEST else 0):
+    for _ in range(TRIES * most if x.size >= 4 * SHORTEST else 0):
         scores = [_scores(left, width) for width in widths]
+        for width, (score, _) in zip(widths, scores, strict=True):
+            for k in shut:
+                score[max(k - 2 * width, 0) : k + 1] = 0.0
         best = max(range(len(widths)), key=lambda one: float(np.max(np.abs(scores[one][0]))))
         k = widths[best] + int(np.argmax(np.abs(scores[best][0])))
         score, usual = scores[best]
@@ -42,7 +47,12 @@ def jumps(x: FloatArray, most: int) -> list[tuple[int, float]]:
                 break
             k, reach = first + widths[one] + int(np.argmax(near)), widths[one]
         k = _divide(left, k, reach)
-        k = next((other for other in found if abs(other - k) < SHORTEST), k)
+        known = next((other for other in found if abs(other - k) < SHORTEST), None)
+        if known is not None:
+            # What a jump does not take away is none, and may hide others.
+            k, shut = known, [*shut, known]
+        elif len(found) == most:
+            break
         found[k] = found.get(k, 0.0) + size
         left = left - size * (np.arange(x.size) >= k)
     return list(found.items())

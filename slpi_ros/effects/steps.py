@@ -16,6 +16,8 @@ from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Numbers of jumps of the candidates; smallest and largest share of a jump that happens within a few samples.
 COUNTS, SHARP = (1, 2, 3, 5, 8, 12), (0.5, 2.0)
+# Largest number of places in the residual that are looked at.
+MOST = 20
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
@@ -83,9 +85,12 @@ class Steps(EffectBase):
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
-        """Yield the clearest jumps of the residual, in increasing number."""
+        """Yield the most sudden jumps of the residual, in increasing number."""
         left = np.interp(context.t, context.t[context.used], context.residual[context.used])
-        sudden = [k for k, size in jumps(left, COUNTS[-1]) if _sudden(left, k, size)]
+        found = [(k, sharpness(left, k, size), size) for k, size in jumps(left, MOST)]
+        # The hysteresis has bent towards the jumps; what it cannot follow is what happens within a few samples.
+        order = sorted(found, key=lambda one: -abs(one[1] * one[2]))
+        sudden = [k for k, share, _ in order if share >= SHARP[0]]
         counts = [min(count, len(sudden)) for count in COUNTS]
         # Of several records each has as many forms, some without a jump.
         for count in sorted(set(counts) - {0}) if context.around.records else counts:

@@ -58,7 +58,7 @@ class Drives:
         return sensed(physics, self.t, motion, axis)
 
     def _motion(self, axis: str, physics: Physics) -> FloatArray:
-        key = (axis, physics.amplifier, physics.viscosity, physics.creep, physics.flexure, physics.ageing)
+        key = (axis, physics.amplifier, physics.viscosity, physics.creep, physics.stop, physics.flexure, physics.ageing)
         if key not in self._own:
             stage, before = self.stage[axis], self._before[axis]
             t = np.concatenate([self.t[0] + np.arange(-before.size, 0) / RATE_BEFORE, self.t])

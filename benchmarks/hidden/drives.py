@@ -110,6 +110,7 @@ NEEDED: dict[str, tuple[Section, ...]] = {
     "saturation": (peaks,),
     "rate_dependence": (tempos, varied),
     "creep": (holds,),
+    "contact": (varied, nests),
     "resonance": (steps,),
     "gain_drift": (varied,),
     "cross_coupling": (varied,),

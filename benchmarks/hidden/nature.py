@@ -18,6 +18,7 @@ from .physics import (
     RateLaw,
     Slips,
     SlowDomains,
+    Stop,
     Temperature,
     Viscosity,
 )
@@ -135,6 +136,11 @@ def _creep(rng: np.random.Generator, setting: Setting) -> Nature:
     )
 
 
+def _contact(rng: np.random.Generator, setting: Setting) -> Nature:
+    at = float(rng.uniform(3e-6, 12e-6))
+    return Nature(1e-3, 1.0, lambda s: Physics(stop=Stop(at, s)), lambda s: {"gain": 1.0 / (1.0 + s)})
+
+
 def _resonance(rng: np.random.Generator, setting: Setting) -> Nature:
     # The strength is the reciprocal of the damping; only a larger noise can make this effect weak.
     frequency, damping = log_uniform(rng, 50.0, min(400.0, setting.rate / 5)), log_uniform(rng, 0.012, 0.08)
@@ -242,10 +248,10 @@ def _hum(rng: np.random.Generator, setting: Setting) -> Nature:
     )
 
 
+# A new one comes last: the place of a name is in the seeds of its draws.
 DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "delay": _delay,
     "lag": _lag,
-    "slew": _slew,
     "saturation": _saturation,
     "rate_dependence": _rate_dependence,
     "creep": _creep,
@@ -256,6 +262,8 @@ DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "hum": _hum,
     "gain_drift": _gain_drift,
     "steps": _steps,
+    "slew": _slew,
+    "contact": _contact,
 }
 NAMES = tuple(DRAWS)
 

@@ -406,6 +406,26 @@ class Flexure:
 
 
 @dataclass(frozen=True)
+class Stop:
+    """A spring that the stage meets, such as a sample or a stop.
+
+    Parameters
+    ----------
+    at : float, metres
+        Displacement, relative to rest, at which the stage meets it.
+    stiffness : float
+        Its stiffness over that of the stage.
+    """
+
+    at: float
+    stiffness: float
+
+    def pushed(self, y: FloatArray) -> FloatArray:
+        """Return where the stage comes to, shape (N,), metres, that would come to `y` (m) by itself."""
+        return y - self.stiffness / (1.0 + self.stiffness) * np.maximum(y - self.at, 0.0)
+
+
+@dataclass(frozen=True)
 class SlowDomains:
     """Slow domains, each of which follows the fast displacement with its own time constant.
 
@@ -430,6 +450,7 @@ class Physics:
     viscosity : Viscosity, optional
         Rate dependence; the form ``coercivity`` requires a Preisach stage.
     creep : SlowDomains, optional
+    stop : Stop, optional
     flexure : Flexure, optional
     ageing : Ageing, optional
     coupling : mapping of axis name to float
@@ -443,6 +464,7 @@ class Physics:
     amplifier: Amplifier | None = None
     viscosity: Viscosity | None = None
     creep: SlowDomains | None = None
+    stop: Stop | None = None
     flexure: Flexure | None = None
     ageing: Ageing | None = None
     coupling: Mapping[str, float] = field(default_factory=dict)
@@ -477,6 +499,8 @@ def own_motion(base: AxisParameters | BoucWen, physics: Physics, t: FloatArray, 
         y = y - physics.viscosity.drag(t, v)
     if physics.creep:
         y = _creeping(physics.creep, t, y)
+    if physics.stop:
+        y = physics.stop.pushed(y)
     if physics.flexure:
         y = ringing(physics.flexure, t, y)
     if physics.ageing:

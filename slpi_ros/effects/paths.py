@@ -21,6 +21,7 @@ class Laws(NamedTuple):
     rate: FloatArray = np.empty(0)  # (0,) or (3,): threshold (V), onset rate (V/s), reversible gain (m/V)
     relaxations: FloatArray = np.empty((2, 0))  # (2, K): time constants (s) and gains of the creep
     rest_of_creep: float = np.inf  # m, its origin; inf: the displacement at the start
+    contact: FloatArray = np.array([np.inf, 1.0])  # (2,): position (m) and gain beyond it
     modes: FloatArray = np.empty((0, 4))  # (M, 4): 0, angular frequency (rad/s), damping, gain
     rest: float = 1.0  # share of the motion beside the modes
     factors: FloatArray = np.empty((0, 8))  # (F, 8), of the inverse of the resonance, `Exact.law`, `Unringing.law`
@@ -102,6 +103,18 @@ def creep_forward(dt: float, x: float, creep: FloatArray) -> float:
         creep[k, STATE] = creep[k, NOW] * moved + creep[k, BEFORE] * before + creep[k, KEPT] * creep[k, STATE]
     creep[last, INPUT] = moved
     return float(x + crept)
+
+
+@compiled
+def contact_forward(x: float, contact: FloatArray) -> float:
+    """Return the displacement with a contact (m), as `StreamingContact.forward`."""
+    return float(contact[0] + contact[1] * (x - contact[0])) if x > contact[0] else x
+
+
+@compiled
+def contact_inverse(wanted: float, contact: FloatArray) -> float:
+    """Return the displacement without a contact (m), as `StreamingContact.inverse`."""
+    return float(contact[0] + (wanted - contact[0]) / contact[1]) if wanted > contact[0] else wanted
 
 
 @compiled
@@ -262,6 +275,7 @@ def inverse_path(
         creep[k, ORIGIN], creep[k, INPUT] = laws.rest_of_creep, x - laws.rest_of_creep
         creep[:k, STATE] = creep[k, INPUT]
         x += laws.relaxations[1].sum() * creep[k, INPUT]
+    x, contact = contact_forward(x, laws.contact), laws.contact
     modes, factors, rest_share = np.zeros((m, WIDTH)), np.zeros((f, WIDTH)), laws.rest
     modes[:, :4], factors[:, :8] = laws.modes, laws.factors
     modes[:, MOVED : MOVED + 2] = factors[:, MOVED : MOVED + 2] = x
@@ -283,12 +297,14 @@ def inverse_path(
             if k:
                 axis = creep_forward(pause, axis, creep)
             if m:
+                axis = contact_forward(axis, contact)
                 axis = modes_forward(pause, axis, rest_share, modes)
                 resonance_inverse(pause, axis, factors, inputs, times, values)
                 factors_forward(pause, factors, inputs, times, values)
         h = origin + (wanted[n] - origin) / factor
         if m:
             h = resonance_inverse(counted, h, factors, inputs, times, values)
+        h = contact_inverse(h, contact)
         if k:
             h = creep_inverse(counted, h, creep)
         if not abs(h - rest[1]) < far:
@@ -346,6 +362,7 @@ def inverse_path(
         axis = point[1] + beside
         if k:
             axis = creep_forward(counted, axis, creep)
+        axis = contact_forward(axis, contact)
         if m:
             axis = modes_forward(counted, axis, rest_share, modes)
             factors_forward(counted, factors, inputs, times, values)

@@ -18,6 +18,7 @@ MODULES = (
     "saturation",
     "rate_dependence",
     "creep",
+    "contact",
     "resonance",
     "gain_drift",
     "cross_coupling",

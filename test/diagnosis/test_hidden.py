@@ -18,7 +18,10 @@ SAMPLES = 12_000
 FEW = 3_000
 # All of them take minutes: `make bench-diagnosis`.
 FAST = ["lag", "steps"]
-SLOW = ["slew", "hum", "creep", "resonance", "cross_coupling", "sensor_periodic", "thermal_drift", "gain_drift"]
+SLOW = [
+    *("slew", "hum", "creep", "contact", "resonance", "cross_coupling", "sensor_periodic", "thermal_drift"),
+    "gain_drift",
+]
 # Large enough that nobody should miss it; what is found of smaller ones is for the bench to say.
 LARGE = 10.0
 # A draw of a coercivity that grows with the logarithm of the rate.

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from slpi_ros.effects.base import Effect, EffectContext
+from slpi_ros.effects.contact import Contact
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.delay import Delay
@@ -99,6 +100,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "saturation": saturations(),
     "rate_dependence": rate_laws(),
     "creep": creeps(),
+    "contact": st.builds(Contact, numbers(-5e-6, 2e-5), powers(0.05, 5)),
     "resonance": resonances(),
     "gain_drift": gain_drifts(),
     "cross_coupling": st.builds(CrossCoupling, st.dictionaries(st.sampled_from("yz"), numbers(-0.4, 0.4), min_size=1)),

@@ -4,7 +4,7 @@ from dataclasses import replace
 import control
 import numpy as np
 import pytest
-from effects.cases import ABOUT_MOTION, BY_NAME, EVERY, creeps, effects_and_records, records, sensors
+from effects.cases import ABOUT_MOTION, BY_NAME, EVERY, creeps, effects_and_records, numbers, records, sensors
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.signal import lsim
@@ -23,8 +23,9 @@ from slpi_ros.effects.steps import Steps
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.schemas import load_schema
 
-EXACT = ("rate_dependence", "creep", "gain_drift", "cross_coupling", "thermal_drift", "steps", "sensor_periodic", "hum")
-INVERTED = ("lag", "creep", "resonance", "sensor_periodic")
+EXACT = ("rate_dependence", "creep", "contact", "gain_drift", "cross_coupling", "thermal_drift", "steps")
+EXACT = (*EXACT, "sensor_periodic", "hum")
+INVERTED = ("lag", "creep", "contact", "resonance", "sensor_periodic")
 FOLLOWED = (*INVERTED, "slew")
 
 
@@ -100,6 +101,14 @@ def test_a_slew_limit_is_the_fastest_way_to_the_command(effect, record, start):
         now = np.clip(record.signal[k], now - step, now + step)
         assert u[k] == pytest.approx(now, rel=1e-12, abs=1e-12)
     np.testing.assert_array_equal(effect.invert(u, around), u)
+
+
+@given(BY_NAME["contact"], records("displacement"), numbers(-1e-6, 1e-6))
+def test_a_contact_moves_with_the_zero(effect, record, by):
+    moved = effect.shifted(by).apply(record.signal + by, record.around)
+    np.testing.assert_allclose(moved, effect.apply(record.signal, record.around) + by, rtol=0, atol=1e-15)
+    before = record.signal <= effect.position
+    np.testing.assert_array_equal(effect.apply(record.signal, record.around)[before], record.signal[before])
 
 
 @given(effects_and_records(ABOUT_MOTION), st.sampled_from(("apply", "invert")))
@@ -414,6 +423,8 @@ MODE, LINE = {"frequency": 100.0, "damping": 0.1}, {"frequency": 50.0, "amplitud
         ("thermal_drift", {"times": [1.0, 1.0], "values": [0.0, 0.0]}),
         ("steps", {"times": [2.0, 1.0], "sizes": [1e-8, 1e-8]}),
         ("steps", {"times": [1.0], "sizes": []}),
+        ("contact", {"position": 1e-6, "gain": 0.0}),
+        ("contact", {"position": None, "gain": 1.0}),
         ("sensor_periodic", {"period": 1e-7, "amplitude": 1e-7, "phase": 0.0}),
         ("hum", {"frequency": 50.0, "amplitude": 1e-9, "phase": 0.0}),
         ("hum", {"lines": []}),

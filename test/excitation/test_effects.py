@@ -140,6 +140,14 @@ def test_rate_dependence_has_loops_of_other_size_at_the_same_speed():
     assert min(abs(a / b - 1) for a in speeds[60] for b in speeds[15]) < 0.1
 
 
+def test_contact_has_loops_of_one_size_at_five_levels():
+    _, v, _ = drive("contact")
+    small = [span for span, _ in bursts(v) if span == pytest.approx(20.0)]
+    assert len(small) >= 5 * 3
+    ends = turning_points(v)
+    assert {0.0, 20.0, 40.0, 60.0, 80.0, 100.0} <= {round(float(end), 6) for end in ends}
+
+
 def test_creep_has_ever_longer_holds_after_moves_up_and_down():
     _, v, _ = drive("creep")
     rests = holds(v, least=100)[1:]

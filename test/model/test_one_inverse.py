@@ -23,7 +23,7 @@ from slpi_ros.model.stage_model import StageModel
 FloatArray = NDArray[np.float64]
 pytest.importorskip("numba")
 # A delay is compensated by preview; what belongs to sensor or record is in no inverse.
-INVERTED = ("lag", "slew", "saturation", "rate_dependence", "creep", "resonance", "gain_drift")
+INVERTED = ("lag", "slew", "saturation", "rate_dependence", "creep", "contact", "resonance", "gain_drift")
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,8 @@ def axes(draw: st.DrawFn) -> tuple[AxisModel, FloatArray]:
             continue
         if name == "creep" and draw(st.booleans()):
             effect = replace(effect, initial=unit * 1e-6)
+        if name == "contact":
+            effect = replace(effect, position=unit * effect.position)
         if name == "gain_drift":
             effect = replace(effect, origin=unit * effect.origin)
         if name == "rate_dependence":

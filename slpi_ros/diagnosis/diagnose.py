@@ -15,7 +15,7 @@ from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
 from slpi_ros.diagnosis.selection import BIAS, Selection, is_own, seen, select
 from slpi_ros.diagnosis.significance import NO_WORSE, counts
-from slpi_ros.effects.registry import EFFECTS
+from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.free_run import FreeRun, free_run, likely_starts, rms_of
@@ -137,17 +137,17 @@ def _diagnose_axis(
     if _ambiguous(selection):
         # Causes that the model will do without are judged alike, in an extension by all of them.
         tried.append(_extended_by(model, selection, (), source))
-    if _of_another_kind(selection) or any(_not_as_judged(one.runs, runs, selection) for one in tried):
+    if _of_another_kind(selection) or any(_not_as_judged(one.with_own, runs, selection) for one in tried):
         # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
         selection = _without_causes(selection)
         given = _given(model, runs, selection)
         extension = _extension(model, selection, given, source)
-        if extension and _not_as_judged(extension.runs, runs, selection):
+        if extension and _not_as_judged(extension.with_own, runs, selection):
             extension = None
     if not (extension or selection.named):
         # Nothing is explained, so that nothing is fitted beside the hysteresis of the given kind.
         selection = replace(selection, now=selection.base)
-    extension = extension or _Extension(model, [named.name for named in selection.named], runs)
+    extension = extension or _Extension(model, [named.name for named in selection.named], runs, runs)
     outcomes = _outcomes(runs, extension.runs, selection.now)
     noise, repeats, alike = selection.now.noise, _repeatability(selection.now), driven_alike(records, axis)
     found = judged(selection, noise, repeats, before, given, outcomes, extension.left_out, alike)
@@ -155,11 +155,15 @@ def _diagnose_axis(
 
 
 class _Extension(NamedTuple):
-    """Refitted model, the effects of the selection that it does without, and its free run on each record."""
+    """Refitted model, the effects of the selection that it does without, and its free run on each record.
+
+    `with_own` are its free runs with what belongs to each record, such as drift, by which the causes are judged.
+    """
 
     model: AxisModel
     left_out: Sequence[str]
     runs: Sequence[FreeRun]
+    with_own: Sequence[FreeRun]
 
 
 def _extension(model: AxisModel, selection: Selection, given: Given, source: str) -> _Extension | None:
@@ -175,7 +179,9 @@ def _extended_by(model: AxisModel, selection: Selection, left_out: Sequence[str]
     """Return the extension of a model by the effects of a selection but those `left_out`."""
     final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
     extended = _extended(model, final, source)
-    return _Extension(extended, left_out, _runs(extended, selection.now))
+    runs = _runs(extended, selection.now)
+    own = any(isinstance(one, EachRecord) for one in final.effects)
+    return _Extension(extended, left_out, runs, _runs(extended, final, own=True) if own else runs)
 
 
 def _of_another_kind(selection: Selection) -> bool:
@@ -203,12 +209,18 @@ def _without_causes(selection: Selection) -> Selection:
     return replace(selection, now=now, named=(), dropped=tuple(sorted({*selection.dropped, *causes})))
 
 
-def _runs(model: AxisModel, now: Explanation) -> list[FreeRun]:
-    """Return the free run of an extended model on each of its records, as the effects began there."""
-    return [
-        _run(replace(model, effects=tuple(effect.of_record(k) for effect in model.effects)), part, of_record=True)
-        for k, part in enumerate(now.evidence.parts)
-    ]
+def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[FreeRun]:
+    """Return the free run of an extended model on each of its records, as the effects began there.
+
+    With `own`, also with the effects that have separate parameters in each record.
+    """
+    runs = []
+    for k, part in enumerate(now.evidence.parts):
+        effects = [effect.of_record(k) for effect in model.effects]
+        if own:
+            effects += [one.parts[k] for one in now.effects if isinstance(one, EachRecord)]
+        runs.append(_run(replace(model, effects=in_order(effects)), part, of_record=True))
+    return runs
 
 
 def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection: Selection) -> bool:

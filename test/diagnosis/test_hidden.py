@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import slpi_ros
-from benchmarks.hidden import NAMES, calibration_of, hide
+from benchmarks.hidden import NAMES, again, calibration_of, hide
 from benchmarks.hidden.physics import Flexure, ringing
 from benchmarks.hidden.size import beyond_hysteresis
 from slpi_ros.io.bag_writer import write_bag
@@ -65,6 +65,16 @@ def test_loops_that_do_not_close_have_no_invented_cause(tmp_path):
     found = diagnosed(hide(2, base="bouc_wen", axes=1, samples=SAMPLES), tmp_path).axes["x"]
     assert found.verdict == "unexplained" and not found.effects
     assert "close" in found.summary
+
+
+def test_jumps_of_two_records_are_no_error_of_the_model_that_they_share():
+    hidden = hide(5, ["steps"], size=8.0, axes=1, samples=SAMPLES)
+    rate = 1e9 / float(np.diff(hidden.record.time_ns[:2])[0])
+    records = [hidden.record, again(hidden, 1, hidden.record.voltage, rate).record]
+    diagnosis = slpi_ros.diagnose(records, slpi_ros.identify(records[0]))
+    found = diagnosis.axes["x"]
+    assert [effect.name for effect in found.effects] == ["steps"] and found.verdict == "named"
+    assert diagnosis.extended.axes["x"].effects == ()
 
 
 def test_two_hidden_effects_are_both_named(tmp_path):

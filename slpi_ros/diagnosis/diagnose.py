@@ -212,13 +212,12 @@ def _without_causes(selection: Selection) -> Selection:
 def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[FreeRun]:
     """Return the free run of an extended model on each of its records, as the effects began there.
 
-    With `own`, also with the effects that have separate parameters in each record.
+    With `own`, also with what is added to the displacement in each record, such as drift.
     """
+    added = [one.parts for one in now.effects if own and isinstance(one, EachRecord) and one.parts[0].side == "record"]
     runs = []
     for k, part in enumerate(now.evidence.parts):
-        effects = [effect.of_record(k) for effect in model.effects]
-        if own:
-            effects += [one.parts[k] for one in now.effects if isinstance(one, EachRecord)]
+        effects = [*(effect.of_record(k) for effect in model.effects), *(parts[k] for parts in added)]
         runs.append(_run(replace(model, effects=in_order(effects)), part, of_record=True))
     return runs
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -214,7 +214,8 @@ def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[Free
 
     With `own`, also with what is added to the displacement in each record, such as drift.
     """
-    added = [one.parts for one in now.effects if own and isinstance(one, EachRecord) and one.parts[0].side == "record"]
+    separate: list[Any] = [effect for effect in now.effects if isinstance(effect, EachRecord)]
+    added = [one.parts for one in separate if own and one.parts[0].side == "record"]
     runs = []
     for k, part in enumerate(now.evidence.parts):
         effects = [*(effect.of_record(k) for effect in model.effects), *(parts[k] for parts in added)]

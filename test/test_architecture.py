@@ -251,3 +251,14 @@ def test_the_objects_of_the_architecture_page_stand_where_it_says():
     for names, path, line in places:
         there = (ROOT.parent / path).read_text().splitlines()[int(line) - 1]
         assert any(f"def {name.strip()}(" in there for name in names.split(",")), (path, line, there)
+
+
+def test_what_the_architecture_page_names_is_there():
+    text = (ROOT.parent / "docs" / "architecture.md").read_text()
+    table = text[text.index("## Where to look") : text.index("## Decisions")]
+    places = re.findall(r"`([\w/]+\.py)`(?: \(([^)]*)\))?", table)
+    assert len(places) >= 15
+    for path, names in places:
+        there = (ROOT / path).read_text()
+        for name in re.findall(r"`(\w+)`", names):
+            assert re.search(rf"(def|class) {name}\b|^{name} = ", there, re.MULTILINE), (path, name)

@@ -93,11 +93,11 @@ $(BUILD_STAMP): $(VENV_STAMP) $(INSTALLED)
 		--event-handlers console_start_end- summary-
 	@touch $@
 
+# The types are checked beside the tests, of which those with nodes wait most of their time.
 test: build
 	$(VENV) -m ruff check .
 	$(VENV) -m ruff format --check .
-	$(VENV) -m mypy
-	$(PYTEST) -m 'not long'
+	@$(VENV) -m mypy & types=$$!; ($(PYTEST) -m 'not long'); tests=$$?; wait $$types && exit $$tests
 
 # Also every property, with more examples than in `make test`.
 test-long: export SLPI_EXAMPLES = 100

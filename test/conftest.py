@@ -13,10 +13,10 @@ import hypothesis
 import pytest
 
 CHECKOUT = Path(__file__).resolve().parents[1]
-# Folders whose tests start nodes.
-STREAM = ("nodes", "documentation")
-# A folder whose files share what takes long to make.
-TOGETHER = "fleet"
+# The folder whose tests start nodes.
+STREAM = "nodes"
+# Folders whose files are run one after the other, too: they share what takes long to make, or start some nodes.
+TOGETHER = ("fleet", "documentation")
 # Those that compute more than they wait, and need no core at any moment.
 COMPUTES = ("test_identify.py", "test_site.py")
 
@@ -68,8 +68,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")
     # The stream of nodes and the files with slow tests begin first; what is short fills the gaps at the end.
-    first = {item.path for item in items if item.get_closest_marker("slow") or item.path.parent.name == TOGETHER}
-    items.sort(key=lambda item: (item.path.parent.name not in STREAM, item.path not in first))
+    first = {item.path for item in items if item.get_closest_marker("slow") or item.path.parent.name in TOGETHER}
+    items.sort(key=lambda item: (item.path.parent.name != STREAM, item.path not in first))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -83,9 +83,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     class ByFile(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file = Path(nodeid.partition("::")[0])
-            if file.parent.name == TOGETHER:
-                return TOGETHER
-            return "nodes" if file.parent.name in STREAM and file.name not in COMPUTES else str(file)
+            together = file.parent.name in (STREAM, *TOGETHER) and file.name not in COMPUTES
+            return file.parent.name if together else str(file)
 
     # As sorted above.
     config.option.loadscopereorder = False

@@ -114,7 +114,7 @@ def publish_state(graph, **effort):
     graph.node.create_timer(0.02, report)
     graph.spin_until(publisher.get_subscription_count, "the exciter to listen")
     end = time.monotonic() + 0.2
-    graph.spin_until(lambda: time.monotonic() > end, "some states")
+    graph.spin_until(lambda: time.monotonic() > end or graph.tested.process.poll() is not None, "some states")
 
 
 @pytest.fixture(scope="class")

@@ -39,7 +39,7 @@ FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
 LEAST_FALL = 0.01
 # Largest number of effects that are selected; records cannot determine more.
 MOST_EFFECTS = 4
-# Largest number of simpler effects with which the selection begins anew if more than the noise is left.
+# Largest number of other effects with which the selection begins anew if more than the noise is left.
 FRESH_STARTS = 2
 # Largest number of rounds in which an effect is added, or a line or mode to one.
 MOST_ROUNDS = 12
@@ -295,14 +295,14 @@ class Selection:
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
-    """Select effects, beginning with the best one, and with simpler ones if that leaves more than the noise."""
+    """Select effects, beginning with the best one, and with others if that leaves more than the noise."""
     # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better. Of two
-    # effects a third one with more parameters may imitate both, and better than either alone. At a single drive
-    # frequency nothing tells them apart.
+    # effects a third one may imitate both, and better than either alone. At a single drive frequency nothing tells them
+    # apart.
     best = _grown(base, family)
     beginnings = best.beginnings
-    simpler = [k for k, effect in enumerate(beginnings) if free(effect).size < free(beginnings[0]).size]
-    for first in [] if one_speed(base.evidence) else simpler[:FRESH_STARTS]:
+    others = 0 if one_speed(base.evidence) else min(len(beginnings) - 1, FRESH_STARTS)
+    for first in range(1, 1 + others):
         error = best.now.held_out.rms_of_records
         if error <= ABOVE_NOISE * best.now.noise:
             break

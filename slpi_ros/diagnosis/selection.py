@@ -39,8 +39,9 @@ FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
 LEAST_FALL = 0.01
 # Largest number of effects that are selected; records cannot determine more.
 MOST_EFFECTS = 4
-# Largest number of other effects with which the selection begins anew if more than the noise is left.
-FRESH_STARTS = 2
+# Largest number of other effects with which the selection begins anew if more than the noise, and more than this share
+# of the error, is left.
+FRESH_STARTS, LEFT = 2, 0.4
 # Largest number of rounds in which an effect is added, or a line or mode to one.
 MOST_ROUNDS = 12
 # Screening: effects are fitted if their gain exceeds these shares of the best gain and of the error.
@@ -295,7 +296,7 @@ class Selection:
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
-    """Select effects, beginning with the best one, and with others if that leaves more than the noise."""
+    """Select effects, beginning with the best one, and with others if that leaves much and more than the noise."""
     # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better. Of two
     # effects a third one may imitate both, and better than either alone. At a single drive frequency nothing tells them
     # apart.
@@ -304,7 +305,7 @@ def select(base: Explanation, family: Explanation | None) -> Selection:
     others = 0 if one_speed(base.evidence) else min(len(beginnings) - 1, FRESH_STARTS)
     for first in range(1, 1 + others):
         error = best.now.held_out.rms_of_records
-        if error <= ABOVE_NOISE * best.now.noise:
+        if error <= max(ABOVE_NOISE * best.now.noise, LEFT * base.held_out.rms_of_records):
             break
         order = (beginnings[first], *beginnings[:first], *beginnings[first + 1 :])
         other = _grown(base, family, order)
@@ -391,9 +392,13 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
             now = anew[0].explanation if anew else without
         elif not effect.plausible(seen(now)):
             now = now.without(name)
-    while uncertain := {
-        effect.name: certainty for effect in now.effects if (certainty := now.certainty(effect.name)) < CERTAIN
-    }:
+    # Of several records, that an effect holds on those that are left out says more than its standard deviations, which
+    # are too large where the model leaves more than noise.
+    while not several and (
+        uncertain := {
+            effect.name: certainty for effect in now.effects if (certainty := now.certainty(effect.name)) < CERTAIN
+        }
+    ):
         now = now.without(min(uncertain, key=lambda name: uncertain[name]))
     return now
 

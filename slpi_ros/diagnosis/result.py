@@ -268,7 +268,7 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) ->
     on = "records" if named.after.records.size and not named.own else "blocks"
     gained = (
         f"with it the error on held-out {on} falls from {length(before)} to {length(after)} rms "
-        f"(p = {chance:.2g}: the probability that chance gains as much)"
+        f"(p = {chance:.2g}, on blocks: the probability that chance gains as much)"
     )
     if not named.runner_up:
         return f"{sentence}; {gained}, and no other effect comes near"

@@ -76,7 +76,7 @@ class Slew(EffectBase):
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the voltage at the piezo, shape (N,), volts; exact at each sample."""
-        u, reached = signal.copy(), around.start if around.start is not None else None
+        u, reached = signal.copy(), around.start
         steps = self.rate * np.diff(around.t, prepend=around.t[:1])
         # The voltage is late from a sample that is too fast to the next one that it reaches.
         fast = np.abs(np.diff(signal, prepend=signal[:1] if reached is None else reached)) > steps

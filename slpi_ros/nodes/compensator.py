@@ -22,6 +22,7 @@ from trajectory_msgs.msg import JointTrajectory
 from slpi_ros.compensator.amplifier import Calibration
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
+from slpi_ros.compensator.ownership import AUTO
 from slpi_ros.compensator.path_watch import PathWatch
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, model_id
 from slpi_ros.compensator.validation import RejectedError
@@ -59,12 +60,11 @@ SIMULATED_PERIOD = 1e-3
 OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 # A measurement whose stamp is older than this, or further in the future, does not count at the start.
 OLDEST_NS, EARLIEST_NS = SECOND_NS // 5, SECOND_NS // 20
-# Reports of the amplifiers are no longer expected this long after the start of the node.
-TELL_NS = 2 * SECOND_NS
 # While voltages are output, reports of the amplifiers are looked at once in this time.
 REPORT_NS = SECOND_NS // 200
 # Time from the start of the node within which publishers of stage_state are discovered; polling period, seconds.
-DISCOVERY_NS, DISCOVERY_POLL = SECOND_NS, 0.005
+# The middleware repeats what a busy machine has missed of its discovery after 3 s.
+DISCOVERY_NS, DISCOVERY_POLL = 7 * SECOND_NS // 2, 0.005
 # Desired messages that are answered at once if they wait.
 BACKLOG = 200
 # Time to wait at shutdown for the delivery of the last voltages.
@@ -164,7 +164,8 @@ class Compensator(LifecycleNode):
             # During autostart the error ends the process and is printed there.
             self._refuse_model(error, logged=not self._starting)
             return TransitionCallbackReturn.FAILURE
-        self._wait_for_discovery()
+        if AUTO in self._settings.starts:
+            self._wait_for_discovery()
         self._publisher = self.create_lifecycle_publisher(
             Float64MultiArray, "voltage_command", COMMANDS, qos_overriding_options=OVERRIDABLE
         )
@@ -389,10 +390,9 @@ class Compensator(LifecycleNode):
             self._report()
 
     def _tell_notes(self) -> None:
-        """Log once what is not certain about the voltages at the start, when reports can no longer be expected."""
+        """Log once what is not certain about the voltages at the start."""
         notes = {name: note for name, note in self._controller.ownership.notes.items() if note}
-        told = self._controller.ownership.started or time.monotonic_ns() - self._begun_ns > TELL_NS
-        if told and not self._controller.ownership.obstacle and notes and notes.keys() != self._noted:
+        if not self._controller.ownership.obstacle and notes and notes.keys() != self._noted:
             self._noted = set(notes)
             for name, note in notes.items():
                 self.get_logger().warning(f"axis '{name}': {note}")

@@ -34,6 +34,8 @@ REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects that leave more than noise are part of the model if they leave at most this share of the error (a third of its
 # mean square), and if the free run of the extended model shows this share of the held-out gain.
 LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
+# Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices.
+REFINED = 3
 # A zero has moved if its shift exceeds this multiple of the error; number of parts for the uncertainty of a gain;
 # fewest samples of a comparison.
 ZERO, STRETCHES, FEWEST = 4.0, 8, 50
@@ -125,7 +127,7 @@ def _diagnose_axis(
     # Other kinds are not refitted; a comparison with the loop family shows whether they are suitable.
     fitted = model.kind in REFITTED
     family = evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None
-    selection = _selected(base, family) if fitted else select(base, None)
+    selection = _selected(base, family if fitted else None)
     runs = [_run(model, part, of_record=same) for part in selection.now.evidence.parts]
     before = base.held_out.rms_of_records if fitted else rms_of(runs)
     if not fitted and before > WRONG_KIND * base.held_out.rms:
@@ -251,7 +253,18 @@ def _ambiguous(selection: Selection) -> list[str]:
 
 
 def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
-    """Return the selection of effects, with the loop family as hysteresis if clearly better than the kind of `base`."""
+    """Return the selection of effects, made with a coarser hysteresis, and the joint fit with that of the evidence."""
+    coarse = base if base.evidence.coarse is base.evidence else Explanation(base.evidence.coarse, base.effects)
+    selection = _of_kind(coarse, of_family.coarse if of_family else None)
+    now = selection.now
+    finest = of_family if of_family and BIAS in selection.structures else base.evidence
+    if now.evidence.basis is not finest.basis:
+        now = Explanation(replace(now.evidence, basis=finest.basis), now.effects).refined(REFINED)
+    return replace(selection, base=base, now=now)
+
+
+def _of_kind(base: Explanation, of_family: Evidence | None) -> Selection:
+    """Return the selection, with the loop family as hysteresis if clearly better than the kind of `base`."""
     if of_family is None:
         return select(base, None)
     family = Explanation(of_family, base.effects)

@@ -103,7 +103,9 @@ class Joint:
         return self._factored(self.everything.gram(), self._ends[-1])
 
     def _factored(self, gram: FloatArray, count: int) -> Factor:
-        return _factor(gram + self.problem.penalty(self.evidence.smoothness, float(count)))
+        matrix = self.problem.penalty(self.evidence.smoothness, float(count))
+        matrix += gram
+        return _factor(matrix)
 
     @cached_property
     def rows(self) -> list[Rows]:
@@ -361,7 +363,9 @@ def _predicted(own: Rows, known: Mask, rest: FloatArray, factor: Factor, size: i
 
 
 def _factor(matrix: FloatArray) -> Factor:
-    factor: Factor = scipy.linalg.cho_factor(matrix, check_finite=False)
+    """Return the Cholesky factor of a symmetric matrix, which is overwritten."""
+    # Transposed it is in the order of LAPACK, which then needs no copy.
+    factor: Factor = scipy.linalg.cho_factor(matrix.T, overwrite_a=True, check_finite=False)
     return factor
 
 
@@ -383,7 +387,7 @@ class Explanation:
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
         self.u, self._aside = Chain.of(self.effects).reaching(evidence.v, evidence.around)
-        if like and not (like.evidence.parts is evidence.parts and like.evidence.smoothness == evidence.smoothness):
+        if like and not evidence.poses_as(like.evidence):
             like = None
         if like and np.array_equal(like.u, self.u):
             self.joint = like.joint

@@ -29,6 +29,8 @@ from slpi_ros.model.axis_model import AxisModel
 FEWEST_SAMPLES, FEWEST_TURNS = 1000, 4
 # Number of vertices of the loop family if those of the model do not cover the record.
 VERTICES = 41
+# Largest number of vertices of a loop family while effects are selected.
+COARSE = 31
 # Samples before the reset of the hysteresis state may be excluded if at least this share of the samples remains.
 ENOUGH_WIPED = 0.5
 # They are excluded if their error exceeds that of the others by this factor, because the motion before the record is
@@ -167,6 +169,18 @@ class Evidence:
         walks = [Walk.along(own.v, symmetric_rest=self.basis.symmetric_rest, primed=own.primed) for own in samples]
         walk = Walk.joined(walks)
         return Design.of(walk, self.basis.branch_part(walk))
+
+    def poses_as(self, other: "Evidence") -> bool:
+        """Return whether the hysteresis has the same equations for the same voltage."""
+        return self.parts is other.parts and self.basis is other.basis and self.smoothness == other.smoothness
+
+    @property
+    def coarse(self) -> "Evidence":
+        """The same data with at most `COARSE` vertices of a loop family, for which a fit takes half the time."""
+        basis = self.basis
+        if not isinstance(basis, SurfaceBasis) or basis.grid.size <= COARSE:
+            return self
+        return replace(self, basis=SurfaceBasis(np.linspace(basis.grid[0], basis.grid[-1], COARSE)))
 
     def of_record(self, k: int) -> "Evidence":
         """Return the data of record `k` only."""

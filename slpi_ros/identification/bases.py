@@ -101,32 +101,34 @@ class SurfaceBasis:
 
     def _cell(self, v: FloatArray) -> tuple[IntArray, FloatArray]:
         x = (v - self.grid[0]) / (self.grid[1] - self.grid[0])
-        cell = np.clip(np.floor(x).astype(np.int64), 0, self.grid.size - 2)
+        cell = np.clip(x.astype(np.int64), 0, self.grid.size - 2)
         return cell, x - cell
 
     def _surface_rows(self, upper: FloatArray, lower: FloatArray, factor: FloatArray) -> sp.csr_array:
         """Return rows of `factor` times the Everett function: bilinear, linear in cells on the diagonal."""
-        (i, p), (j, q) = self._cell(upper), self._cell(lower)
-        row = np.arange(upper.size)
-        on_diagonal = i == j
-        corners = [(i + 1, j, np.where(on_diagonal, p - q, p * (1 - q)))]
-        for di, dj, weight in ((0, 0, (1 - p) * (1 - q)), (0, 1, (1 - p) * q), (1, 1, p * q)):
-            corners.append((i + di, j + dj, np.where(on_diagonal, 0.0, weight)))
-        rows, columns, values = [], [], []
-        for at_i, at_j, weight in corners:
-            used = (factor != 0) & (at_i > at_j) & (weight != 0)
-            rows.append(row[used])
-            columns.append(self._column[at_i[used], at_j[used]])
-            values.append((factor * weight)[used])
-        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-        return sp.csr_array(entries, shape=(upper.size, self.size))
+        moved = np.flatnonzero(factor)
+        (i, p), (j, q), by = self._cell(upper[moved]), self._cell(lower[moved]), factor[moved]
+        # In ascending order of the parameters.
+        weights = np.stack([by * (1 - p) * (1 - q), by * (1 - p) * q, by * p * (1 - q), by * p * q], axis=1)
+        columns = np.stack(
+            [self._column[i, j], self._column[i, j + 1]] + [self._column[i + 1, j + k] for k in (0, 1)], 1
+        )
+        on_diagonal = np.flatnonzero(i == j)
+        weights[on_diagonal] = 0.0
+        weights[on_diagonal, 2] = (by * (p - q))[on_diagonal]
+        return self._rows(moved, columns, np.where(columns < 0, 0.0, weights), upper.size)
 
     def _rise_rows(self, v: FloatArray, factor: FloatArray) -> sp.csr_array:
-        cell, p = self._cell(v)
-        row = np.arange(v.size)
-        columns = np.concatenate([self._rise_columns[cell], self._rise_columns[cell + 1]])
-        values = np.concatenate([factor * (1 - p), factor * p])
-        return sp.csr_array((values, (np.concatenate([row, row]), columns)), shape=(v.size, self.size))
+        moved = np.flatnonzero(factor)
+        (cell, p), by = self._cell(v[moved]), factor[moved]
+        columns = self._rise_columns[np.stack([cell, cell + 1], axis=1)]
+        return self._rows(moved, columns, np.stack([by * (1 - p), by * p], axis=1), v.size)
+
+    def _rows(self, at: IntArray, columns: IntArray, values: FloatArray, count: int) -> sp.csr_array:
+        """Return a matrix of `count` rows with `values` in some `columns`, shape (m, k) each, of the rows `at` (m,)."""
+        used, filled = values != 0.0, np.zeros(count + 1, dtype=np.int64)
+        filled[at + 1] = np.count_nonzero(used, axis=1)
+        return sp.csr_array((values[used], columns[used], np.cumsum(filled)), shape=(count, self.size))
 
     @cached_property
     def roughness(self) -> sp.csr_array:

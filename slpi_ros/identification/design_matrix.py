@@ -114,8 +114,8 @@ class Design:
     def of(cls, walk: Walk, branch_part: sp.csr_array) -> "Design":
         """Return the design matrix of a `branch_part`, shape (N, size), with a column for each displacement at rest."""
         rows = np.flatnonzero(walk.origin < 0)
-        starts, record = np.unique(walk.first, return_inverse=True)
-        no_turn = sp.csr_array((np.ones(rows.size), (rows, record[rows])), shape=(walk.v.size, starts.size))
+        record = np.cumsum(walk.first == np.arange(walk.first.size)) - 1
+        no_turn = sp.csr_array((np.ones(rows.size), (rows, record[rows])), shape=(walk.v.size, int(record[-1]) + 1))
         local = sp.csr_array(sp.hstack([branch_part, no_turn], format="csr"))
         return cls(local, np.unique(walk.origin[walk.origin >= 0]), walk)
 

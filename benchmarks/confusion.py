@@ -13,7 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import time
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from multiprocessing import get_context
 
@@ -23,10 +23,17 @@ from hidden.unknown import KINDS, NEAR, hide_unknown
 from scipy.stats import beta
 
 import slpi_ros
+from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.record import Record
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.character import Character
+from slpi_ros.simulation.parameters import AxisParameters
 
-GROUPS = ("single", "pair", "clean", "unknown")
+GROUPS = ("single", "pair", "simulator", "clean", "unknown")
 SAMPLES = 40_000
+# Group "simulator": the simulated stage of the package and its default calibration drive (s, Hz), sensor noise (m), lag
+# (s), and smallest and largest creep per decade of time (share of the displacement).
+DURATION, RATE, NOISE, LAG, CREEP = 60.0, 500.0, 8e-9, 3e-3, (0.005, 0.03)
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,7 @@ class Outcome:
     @property
     def silent(self) -> bool:
         """Whether it claims that nothing is left although there is something."""
-        missed = self.case.group in ("single", "pair") and self.verdict == "nothing_found"
+        missed = self.case.group in ("single", "pair", "simulator") and self.verdict == "nothing_found"
         # The white part of what is left is the noise that the sensor has, whatever its cause.
         return missed or (self.verdict in ("named", "nothing_found") and self.left > 1.6 * max(self.noise, 1.0))
 
@@ -112,9 +119,20 @@ def _drawn(case: Case) -> tuple[Record, str, float]:
     if case.group == "unknown":
         one = hide_unknown(case.hidden[0], case.seed, SAMPLES)
         return one.record, "x", one.floor
+    if case.group == "simulator":
+        return _simulated(case.seed), "x", NOISE
     hidden = hide(case.seed, case.hidden, samples=SAMPLES, base="preisach" if case.group == "clean" else None)
     axis = next((truth.axis for truth in hidden.truth), "x")
     return hidden.record, axis, hidden.floor[axis]
+
+
+def _simulated(seed: int) -> Record:
+    """Return the calibration record of a simulated stage with creep and lag."""
+    character = Character(lag=LAG, creep=float(np.random.default_rng(seed).uniform(*CREEP)))
+    axis = SimulatedAxis(replace(AxisParameters.random(seed), noise_rms=NOISE), seed, character)
+    t, v = calibration_drive(0.0, 100.0, duration=DURATION, rate=RATE, seed=seed)
+    _, measured = axis.run(t, v)
+    return slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": measured}, "calibration")
 
 
 def cases(groups: list[str], draws: int, seed: int, only: str | None) -> list[Case]:
@@ -131,6 +149,8 @@ def cases(groups: list[str], draws: int, seed: int, only: str | None) -> list[Ca
             found += [
                 Case("pair", seed + index, pairs[k]) for k in rng.choice(len(pairs), len(NAMES), replace=False).tolist()
             ]
+        if "simulator" in groups:
+            found += [Case("simulator", seed + 4 * index + k, ("creep", "lag")) for k in range(4)]
         if "clean" in groups:
             found += [Case("clean", seed + 10 * index + k, ()) for k in range(10)]
     return [case for case in found if not only or only in case.hidden]
@@ -140,7 +160,7 @@ def table(outcomes: list[Outcome]) -> None:
     """Print what was named for each hidden cause, and the rates."""
     rows: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for one in outcomes:
-        rows[one.case.group, "+".join(one.case.hidden) if one.case.group != "pair" else "pairs"].append(one)
+        rows[one.case.group, "pairs" if one.case.group == "pair" else "+".join(one.case.hidden)].append(one)
     print(f"\n{'hidden':<26}{'n':>4}{'right':>7}{'wrong':>7}{'silent':>7}  verdicts; names; left in times of the noise")
     for (_, name), own in rows.items():
         verdicts = ", ".join(f"{count} {what}" for what, count in Counter(one.verdict for one in own).most_common())

@@ -665,6 +665,10 @@ class Explanation:
         joined = [more.get(other.name) or other for other in self.effects]
         return Explanation(self.evidence, joined if all(more.values()) and more else [*joined, effect], self)
 
+    def replacing(self, name: str, effect: Effect) -> "Explanation":
+        """Return the fit with an effect in place of another one."""
+        return Explanation(self.evidence, [effect if one.name == name else one for one in self.effects], self)
+
     def only(self, names: Collection[str]) -> "Explanation":
         """Return the fit with only the named effects, refitted if any effect is removed."""
         kept = [effect for effect in self.effects if effect.name in names]

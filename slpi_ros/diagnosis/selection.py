@@ -53,8 +53,9 @@ WORTH_REFINING = 0.3
 ALTERNATIVE = 0.7
 # The same for a single drive frequency, where a better fit proves little.
 ALTERNATIVE_AT_ONE_SPEED = 0.4
-# Smallest relative reduction of the held-out error by an effect with a companion: two at once find more by chance.
-LEAST_GAIN_IN_COMPANY = 0.1
+# Smallest relative reduction of the held-out error by an effect with a companion: two at once find more by chance; and
+# by one that another effect resembles: what is left of creep from before a record looks like a drift.
+LEAST_GAIN_IN_COMPANY, LEAST_GAIN_BESIDE_ALIKE = 0.1, 0.2
 # An effect differs from none by at least this number of its standard deviations.
 CERTAIN = 3.0
 # Gauss-Newton steps of a candidate, and of the selected effects in the end.
@@ -104,7 +105,7 @@ class Contender:
 
     def counts_beside(self, now: Explanation) -> bool:
         """Return whether the candidate significantly improves the joint fit `now`, which does not include it."""
-        least = LEAST_GAIN_IN_COMPANY if EFFECTS[self.name].companion() else LEAST_GAIN
+        least = LEAST_GAIN_IN_COMPANY if EFFECTS[self.name].companion() else least_gain(self.name, now)
         return counts(now.held_out, self.score, own=is_own(self.effect), least=least, trials=self.trials)
 
 
@@ -122,6 +123,12 @@ def seen(now: Explanation) -> FitContext:
         zeros=lambda: now.zeros,
         records=now.around.records,
     )
+
+
+def least_gain(name: str, beside: Explanation) -> float:
+    """Return the smallest relative reduction of the held-out error by an effect beside those of a joint fit."""
+    alike = any(other.resembles_when_old == name for other in beside.effects)
+    return LEAST_GAIN_BESIDE_ALIKE if alike else LEAST_GAIN
 
 
 def is_own(effect: Effect | type[Any]) -> bool:
@@ -370,13 +377,12 @@ def _grown(base: Explanation, family: Explanation | None, beginnings: tuple[Effe
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
     """Return the fit with simpler effects, unless clearly worse, without those at bounds, implausible or uncertain."""
-    several, step = len(now.evidence.parts) > 1, usual_step(now.t)
+    several, step, refused = len(now.evidence.parts) > 1, usual_step(now.t), set[str]()
     for effect in now.effects:
-        simple, effects = effect.simpler(step), {other.name: other for other in now.effects}
-        if simple is None or simple.name in effects:
+        simple = effect.simpler(step)
+        if simple is None or simple.name in {other.name for other in now.effects}:
             continue
-        effects[effect.name] = simple
-        other = Explanation(now.evidence, list(effects.values()), now).refined(CONVERGED)
+        other = now.replacing(effect.name, simple).refined(CONVERGED)
         # A lag also rounds off turns that the hysteresis model makes too sharp.
         if not clearly_better(now.held_out, other.held_out, now.noise):
             rest = [rival for rival in rivals.pop(effect.name, []) if rival.name != simple.name]
@@ -391,7 +397,8 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
             ]
             now = anew[0].explanation if anew else without
         elif not effect.plausible(seen(now)):
-            now = now.without(name)
+            refused.add(name)
+            now = _without(name, now, rivals, refused)
     # Of several records, that an effect holds on those that are left out says more than its standard deviations, which
     # are too large where the model leaves more than noise.
     while not several and (
@@ -399,8 +406,21 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
             effect.name: certainty for effect in now.effects if (certainty := now.certainty(effect.name)) < CERTAIN
         }
     ):
-        now = now.without(min(uncertain, key=lambda name: uncertain[name]))
+        refused.add(least := min(uncertain, key=lambda name: uncertain[name]))
+        now = _without(least, now, rivals, refused)
     return now
+
+
+def _without(name: str, now: Explanation, rivals: dict[str, list[Effect]], refused: Collection[str]) -> Explanation:
+    """Return the fit without an effect, but with one of its rivals that are not `refused` if that helps."""
+    rest, own = now.without(name), rivals.pop(name, [])
+    others = {rival.name for rival in own} - {*refused, *(effect.name for effect in now.effects)}
+    found = [one for one in contenders(rest, others) if one.counts_beside(rest)] if others else []
+    if not found:
+        return rest
+    best = _simplest(found, rest)
+    rivals[best.name] = [rival for rival in own if rival.name != best.name]
+    return best.explanation.refined(CONVERGED)
 
 
 def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
@@ -420,7 +440,8 @@ def _without_needless(now: Explanation, names: Collection[str], *, restart: bool
     # parameters may compensate for another effect that was missing when it was found.
     for name in [effect.name for effect in now.effects if effect.name in names]:
         without = now.without(name)
-        needed = counts(without.held_out, now.held_out, own=is_own(now.effect(name)))
+        least = least_gain(name, without)
+        needed = counts(without.held_out, now.held_out, own=is_own(now.effect(name)), least=least)
         # The others may reach their best parameters only without it.
         anew = contenders(without, [name]) if without.effects and (restart or not needed) else []
         for one in anew:
@@ -454,10 +475,10 @@ def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation
 
 
 def _tried(name: str, now: Explanation, rest: Explanation, rivals: Sequence[Effect]) -> list[Contender]:
-    """Return the rivals of an effect as candidates added to `rest`, the fit without the effect, the best one first."""
+    """Return the rivals of an effect as candidates in its place, the best one first; `rest` is the fit without it."""
     present = {effect.name for effect in now.effects}
     absent = {rival.name: rival for rival in rivals if rival.name not in present}
-    tried = [Contender(name, rest.adding(rival).refined(1)) for name, rival in absent.items()]
+    tried = [Contender(other, now.replacing(name, rival).refined(1)) for other, rival in absent.items()]
     refined = _refined(tried, rest, rest.held_out.rms**2 - now.held_out.rms**2)
     return sorted(refined, key=lambda contender: contender.rms)
 

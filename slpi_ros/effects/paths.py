@@ -2,6 +2,7 @@
 # `inverse_path` does at each sample what `slpi_ros.model.streaming.StreamingInverse.move` does, with the same rounding:
 # changes of one are changes of both. The machine code is kept until this file changes, not those that it calls.
 
+from math import expm1
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,20 @@ def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArr
             total += gains[i] * states[i]
         crept[k], before = total, moved[k]
     return crept
+
+
+@compiled
+def heated(dt: FloatArray, v: FloatArray, time_constant: float, most: float) -> FloatArray:
+    """Return the mean square rates (V^2/s^2, (N,)) of voltages (V, (N,)), as `StreamingSelfHeating.forward`."""
+    before, now, last = np.empty_like(v), 0.0, v[0]
+    for k in range(v.size):
+        before[k] = now
+        if dt[k] > 0.0:
+            moved, rate = -expm1(-dt[k] / time_constant), (v[k] - last) / dt[k]
+            before[k] = now * (1.0 - moved)
+            now = min(before[k] + moved * rate * rate, most)
+        last = v[k]
+    return before
 
 
 hold, mode_transition, mode_poles = (

@@ -18,6 +18,7 @@ from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
+from slpi_ros.effects.self_heating import SelfHeating
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.slew import Slew
 from slpi_ros.effects.steps import Steps
@@ -61,6 +62,12 @@ def gain_drifts(draw: st.DrawFn) -> GainDrift:
     return GainDrift(tuple(np.cumsum(steps).tolist()), tuple(gains), draw(numbers(-1e-5, 1e-5)))
 
 
+def self_heatings() -> st.SearchStrategy[SelfHeating]:
+    """Draw self-heating, at times so strong that a move reaches its bound."""
+    gains = st.tuples(st.sampled_from((-1.0, 1.0)), powers(1e-9, 1e-2)).map(lambda drawn: drawn[0] * drawn[1])
+    return st.builds(SelfHeating, gains, powers(0.5, 300), numbers(-1e-5, 1e-5))
+
+
 @st.composite
 def sensors(draw: st.DrawFn) -> SensorPeriodic:
     period = draw(powers(1e-7, 1e-5))
@@ -102,6 +109,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "creep": creeps(),
     "contact": st.builds(Contact, numbers(-5e-6, 2e-5), powers(0.05, 5)),
     "resonance": resonances(),
+    "self_heating": self_heatings(),
     "gain_drift": gain_drifts(),
     "cross_coupling": st.builds(CrossCoupling, st.dictionaries(st.sampled_from("yz"), numbers(-0.4, 0.4), min_size=1)),
     "thermal_drift": drifts(),
@@ -135,7 +143,7 @@ def records(draw: st.DrawFn, acts_on: str) -> Record:
     u = 50 + 40 * _motion(t, rng)
     others = {"y": 1e-5 * _motion(t, rng)} if draw(st.booleans()) else {}
     signal = 2e-7 * u + 1e-9 * u**1.5 + 1e-6 * _motion(t, rng) if acts_on == "displacement" else u
-    return Record(signal, EffectContext(t, others))
+    return Record(signal, EffectContext(t, others, voltage=u))
 
 
 def _motion(t: FloatArray, rng: np.random.Generator) -> FloatArray:

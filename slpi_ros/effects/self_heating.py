@@ -28,16 +28,18 @@ TIME_CONSTANTS, SHORTEST, LONGEST = 8, 1.0, 2.0
 # Largest change of the sensitivity that is plausible, largest that there is at all, and largest distance of the origin
 # from the displacement range, as a share of that range.
 LARGEST, MOST, ORIGIN = 0.3, 0.5, 0.3
-# Number of bursts of the drive, share of the time that they take, and number of slow loops in each pause.
-BURSTS, FAST, SLOW_LOOPS = 3, 0.3, 2
+# Largest number of bursts of the drive, share of the time that they take, and number of slow loops in each pause;
+# shortest time for a burst and its pause, in multiples of the shortest move over the range.
+BURSTS, FAST, SLOW_LOOPS, LEAST_TIME = 3, 0.3, 2, 14
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
-    each = remaining(limits) / BURSTS
     quickest = max(limits.quickest(1.0), safe_duration(1.0))
+    bursts = min(max(int(remaining(limits) / (LEAST_TIME * quickest)), 1), BURSTS)
+    each = remaining(limits) / bursts
     count = max(int(FAST * each / (2 * quickest)), 2)
-    slow = max(0.5 * ((1.0 - FAST) * each) / (2 * SLOW_LOOPS), quickest)
-    for _ in range(BURSTS):
+    slow = max(0.5 * (1.0 - FAST) * each / (2 * SLOW_LOOPS), quickest)
+    for _ in range(bursts):
         loops(path, 0.0, 1.0, quickest, count)
         move(path, 1.0)
         path.hold(0.4 * (1.0 - FAST) * each)

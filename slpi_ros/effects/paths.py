@@ -43,9 +43,9 @@ def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArr
 
 
 @compiled
-def heated(dt: FloatArray, v: FloatArray, time_constant: float, most: float) -> FloatArray:
+def heated(dt: FloatArray, v: FloatArray, time_constant: float, first: float, most: float) -> FloatArray:
     """Return the mean square rates (V^2/s^2, (N,)) of voltages (V, (N,)), as `StreamingSelfHeating.forward`."""
-    before, now, last = np.empty_like(v), 0.0, v[0]
+    before, now, last = np.empty_like(v), min(first, most), v[0]
     for k in range(v.size):
         before[k] = now
         if dt[k] > 0.0:

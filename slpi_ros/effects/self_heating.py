@@ -1,10 +1,10 @@
 """Self-heating: the sensitivity of the stage follows the power that its own motion dissipates."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import expm1, inf
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,6 +28,11 @@ TIME_CONSTANTS, SHORTEST, LONGEST = 8, 1.0, 2.0
 # Largest change of the sensitivity that is plausible, largest that there is at all, and largest distance of the origin
 # from the displacement range, as a share of that range.
 LARGEST, MOST, ORIGIN = 0.3, 0.5, 0.3
+# Mean square rate at the start of a record, in multiples of the largest one in the records: none below, and none that
+# is plausible above, where the stage that cools down would stand for any drift of the sensitivity.
+WARM, HOT = 0.02, 2.0
+# A change of the sensitivity at the start below this is none.
+NO_START = 1e-4
 # Largest number of bursts of the drive, share of the time that they take, and number of slow loops in each pause;
 # shortest time for a burst and its pause, in multiples of the shortest move over the range.
 BURSTS, FAST, SLOW_LOOPS, LEAST_TIME = 3, 0.3, 2, 14
@@ -51,7 +56,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class SelfHeating(EffectBase):
     """A factor on the displacement, ``y = x0 + (1 + gain P) (x - x0)``, ``time_constant dP/dt = (dv/dt)^2 - P``.
 
-    ``P``, the mean square rate of the voltage ``v`` at the piezo, is 0 at the start of a record: the stage is cold.
+    ``P`` is the mean square rate of the voltage ``v`` at the piezo, 0 at first: a stage at rest is cold.
     """
 
     # At each sample the rate up to the one before counts, so that the inverse needs no voltage that it is to return. A
@@ -82,7 +87,27 @@ class SelfHeating(EffectBase):
     origin: float = parameter(
         "m", "displacement that does not change with the sensitivity", -1e3, 1e3, default=0.0, fit=Fit("linear", 1e-9)
     )
+    # Of the records of the fit; any other one starts cold, as streaming does.
+    initial: tuple[float, ...] = parameter(
+        "V^2/s^2", "mean square rate of the voltage at the start of each record, 0: cold", 0, 1e18, default=(),
+        count=(0, 1000), fit=Fit("relative", least=0.0, start=True),
+    )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
+        """Return new parameters, with 0 for small states at the start."""
+        least = NO_START / max(abs(changed["gain"]), 1e-300)
+        return changed | {"initial": tuple(0.0 if first < least else first for first in changed["initial"])}
+
+    @property
+    def lasting(self) -> "SelfHeating":
+        """The effect without the starts of its records."""
+        return replace(self, initial=())
+
+    def of_record(self, k: int) -> "SelfHeating":
+        """Return the effect with the start of the record of number `k` of those that it was fitted to."""
+        return replace(self, initial=self.initial[k : k + 1])
 
     @property
     def most(self) -> float:
@@ -97,11 +122,12 @@ class SelfHeating(EffectBase):
         rates = _mean_square_rates(
             self.time_constant, EffectContext(context.t, records=context.records, voltage=context.u)
         )
-        return near and abs(self.gain) * float(rates.max()) <= LARGEST
+        largest = float(rates.max())
+        return near and abs(self.gain) * largest <= LARGEST and max((0.0, *self.initial)) <= HOT * largest
 
     def factor(self, around: EffectContext) -> FloatArray:
         """Return ``1 + gain P``, shape (N,)."""
-        return 1.0 + self.gain * _mean_square_rates(self.time_constant, around, self.most)
+        return 1.0 + self.gain * _mean_square_rates(self.time_constant, around, self.initial, self.most)
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with the changed sensitivity, shape (N,), metres."""
@@ -113,24 +139,32 @@ class SelfHeating(EffectBase):
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
-        """Yield time constants up to a multiple of the longest record."""
-        # A shift in proportion to the change of the sensitivity is fitted with it; their ratio gives the origin.
+        """Yield time constants up to a multiple of the longest record, for cold stages and for warm ones."""
+        # A shift in proportion to each change of the sensitivity is fitted with it; their ratio gives the origin.
         slowest, (low, high) = LONGEST * longest(context.around), (float(context.h.min()), float(context.h.max()))
         if not slowest > SHORTEST:
             return
         for tau in np.geomspace(SHORTEST, slowest, TIME_CONSTANTS).tolist():
             rates = _mean_square_rates(tau, context.around)
             if most := float(rates.max()):
-                columns = (rates / most)[:, None] * np.column_stack([context.h - low, np.full(rates.size, high - low)])
-                yield Candidate(columns, partial(cls._through, tau, most, low, high))
+                moved = np.column_stack([context.h - low, np.full(rates.size, high - low)])
+                own, cooling = (rates / most)[:, None] * moved, _cooling(tau, context.around)
+                yield Candidate(own, partial(cls._through, tau, most, low, high))
+                warm = [cooling[:, [k]] * moved for k in range(cooling.shape[1])]
+                columns = np.column_stack([*warm, own])
+                yield Candidate(columns, partial(cls._through, tau, most, low, high), starting=2 * len(warm))
 
     @classmethod
     def _through(cls, tau: float, most: float, low: float, high: float, found: FloatArray) -> "SelfHeating | None":
-        """Return it for the fitted largest change and shift; its origin is limited to `low` to `high` (m)."""
-        change, shift = found.tolist()
+        """Return it for fitted changes and shifts; its origin is limited to the range `low` to `high` (m)."""
+        *starts, change, shift = found.tolist()
         if not 0.0 < abs(change) <= LARGEST:
             return None
-        return cls(change / most, tau, low + min(max(-shift / change, 0.0), 1.0) * (high - low))
+        warm = [start / change for start in starts[::2]]
+        if starts and max(warm) < WARM:
+            return None
+        initial = tuple(most * share if share >= WARM else 0.0 for share in warm)
+        return cls(change / most, tau, low + min(max(-shift / change, 0.0), 1.0) * (high - low), initial)
 
     def describe(self) -> str:
         """Describe the change at a rate, and the time constant."""
@@ -195,11 +229,23 @@ class StreamingSelfHeating(StreamingBase):
         return self._rate * (1.0 - self._moved)
 
 
-def _mean_square_rates(time_constant: float, around: EffectContext, most: float = inf) -> FloatArray:
+def _mean_square_rates(
+    time_constant: float, around: EffectContext, initial: tuple[float, ...] = (), most: float = inf
+) -> FloatArray:
     """Return the mean square rate of the voltage before each sample, shape (N,), V^2/s^2, at most `most`."""
     if around.voltage is None or not around.t.size:
         return np.zeros_like(around.t)
     from slpi_ros.effects.paths import heated
 
-    parts = zip(around.split(around.t), around.split(around.voltage), strict=True)
-    return np.concatenate([heated(np.diff(t, prepend=t[:1]), v, time_constant, most) for t, v in parts])
+    times = around.split(around.t)
+    parts = zip(times, around.split(around.voltage), (*initial, *(0.0,) * len(times)), strict=False)
+    return np.concatenate([heated(np.diff(t, prepend=t[:1]), v, time_constant, first, most) for t, v, first in parts])
+
+
+def _cooling(time_constant: float, around: EffectContext) -> FloatArray:
+    """Return what is left of a mean square rate of 1 at the start of each record, shape (N, records)."""
+    times = around.split(around.t)
+    whole = np.zeros((around.t.size, len(times)))
+    for k, (rows, t) in enumerate(zip(around.split(np.arange(around.t.size)), times, strict=True)):
+        whole[rows, k] = np.exp(-(t - t[0]) / time_constant)
+    return whole

@@ -62,10 +62,11 @@ def gain_drifts(draw: st.DrawFn) -> GainDrift:
     return GainDrift(tuple(np.cumsum(steps).tolist()), tuple(gains), draw(numbers(-1e-5, 1e-5)))
 
 
-def self_heatings() -> st.SearchStrategy[SelfHeating]:
-    """Draw self-heating, at times so strong that a move reaches its bound."""
+def self_heatings(leads: int = 0) -> st.SearchStrategy[SelfHeating]:
+    """Draw self-heating, at times so strong that a move reaches its bound; the first `leads` records may start warm."""
     gains = st.tuples(st.sampled_from((-1.0, 1.0)), powers(1e-9, 1e-2)).map(lambda drawn: drawn[0] * drawn[1])
-    return st.builds(SelfHeating, gains, powers(0.5, 300), numbers(-1e-5, 1e-5))
+    starts = st.lists(st.just(0.0) | powers(1.0, 1e7), max_size=leads).map(tuple)
+    return st.builds(SelfHeating, gains, powers(0.5, 300), numbers(-1e-5, 1e-5), starts)
 
 
 @st.composite
@@ -117,7 +118,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "sensor_periodic": sensors(),
     "hum": st.builds(Hum, st.lists(LINES, min_size=1, max_size=3).map(tuple)),
 }
-EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__) | rate_laws(leads=3)
+EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__) | rate_laws(leads=3) | self_heatings(leads=3)
 # They change what moves, and leave what rests as it is.
 ABOUT_MOTION = ("delay", "lag", "slew", "rate_dependence", "creep", "resonance", "cross_coupling")
 

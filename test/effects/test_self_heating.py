@@ -75,6 +75,16 @@ def test_each_record_starts_cold_and_a_piezo_without_a_voltage_rests():
     np.testing.assert_allclose(HEAT.apply(H, EffectContext(T)), H, rtol=1e-15)
 
 
+def test_a_record_that_starts_warm_cools_down_to_what_its_motion_makes():
+    warm = replace(HEAT, initial=(0.0, POWER))
+    two = EffectContext(np.concatenate([T, T]), records=(EffectContext(T), EffectContext(T))).driven(np.tile(V, 2))
+    first, second = two.split(warm.factor(two))
+    np.testing.assert_array_equal(first, HEAT.factor(AROUND))
+    np.testing.assert_allclose(second - first, -4e-7 * POWER * np.exp(-T / 7.0), rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(warm.of_record(1).factor(AROUND), second)
+    assert warm.lasting == HEAT and warm.of_record(0).factor(AROUND) == pytest.approx(first)
+
+
 @pytest.mark.parametrize("effect", [HEAT, replace(HEAT, gain=3e-3), replace(HEAT, time_constant=0.01)])
 def test_sample_by_sample_it_is_the_same(effect):
     rng = np.random.default_rng(0)
@@ -109,6 +119,18 @@ def test_fit_finds_the_gain_and_the_time_constant_of_a_simulated_stage(warmth):
     assert best.time_constant == pytest.approx(warmth.time_constant, rel=0.7)
     assert best.gain == pytest.approx(warmth.change, rel=0.5)
     assert best.origin == pytest.approx(warmth.pivot, abs=1e-6)
+
+
+def test_fit_finds_a_warm_start():
+    true = replace(HEAT, time_constant=5.656854, initial=(0.5 * POWER,))
+    record = Residual(T, V, H, true.apply(H, AROUND))
+    fits = []
+    for candidate in SelfHeating.fit(record):
+        gains, left, *_ = np.linalg.lstsq(candidate.columns, record.residual, rcond=None)
+        fits.append((float(left[0]), candidate.starting, candidate.effect(gains)))
+    _, starting, best = min(fits, key=lambda one: one[0])
+    assert starting == 2 and best.initial == pytest.approx((0.5 * POWER,), rel=0.5)
+    assert all(not effect.initial for _, starting, effect in fits if effect and not starting)
 
 
 def test_a_stage_at_rest_has_no_candidates():

@@ -175,6 +175,10 @@ class SelfHeating(EffectBase):
             f"{self.time_constant:.3g} s"
         )
 
+    def laws(self) -> Mapping[str, FloatArray]:
+        """Return gain (s^2/V^2), time constant (s), origin (m) and bound (V^2/s^2) for the compiled inverse."""
+        return {"heating": np.array([self.gain, self.time_constant, self.origin, self.most])}
+
     def streaming(self) -> "StreamingSelfHeating":
         """Return the streaming self-heating, at first cold."""
         return StreamingSelfHeating(self)

@@ -250,16 +250,16 @@ def _hum(rng: np.random.Generator, setting: Setting) -> Nature:
 
 
 def _self_heating(rng: np.random.Generator, setting: Setting) -> Nature:
-    # The strength is the change of the sensitivity by the rms rate of the record, if that lasted.
+    # The strength is the largest change of the sensitivity in the record; with a rate of 1 V/s, that is its gain.
     sign = float(rng.choice([-1.0, 1.0]))
-    rate = float(np.sqrt(np.mean(np.gradient(setting.v, setting.t) ** 2)))
     time_constant = log_uniform(rng, 1.5, 0.5 * float(setting.t[-1]))
     pivot = float(rng.choice([0.0, rng.uniform(0.0, 15e-6)]))
+    gain = sign / float(np.max(Warmth(1.0, 1.0, time_constant).path(setting.t, setting.v)))
     return Nature(
         1e-3,
-        0.08,
-        lambda s: Physics(warmth=Warmth(sign * s, rate, time_constant, pivot)),
-        lambda s: {"gain": sign * s / rate**2, "time_constant": time_constant},
+        0.2,
+        lambda s: Physics(warmth=Warmth(s * gain, 1.0, time_constant, pivot)),
+        lambda s: {"gain": s * gain, "time_constant": time_constant},
     )
 
 

@@ -24,7 +24,7 @@ from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loop
 from slpi_ros.effects.parameters import Fit, parameter
 
 # Number of time constants of the candidates; the shortest (s), and the longest as a multiple of the longest record.
-TIME_CONSTANTS, SHORTEST, LONGEST = 8, 1.0, 2.0
+TIME_CONSTANTS, SHORTEST, LONGEST = 12, 1.0, 2.0
 # Largest change of the sensitivity that is plausible, largest that there is at all, and largest distance of the origin
 # from the displacement range, as a share of that range.
 LARGEST, MOST, ORIGIN = 0.3, 0.5, 0.3

@@ -12,7 +12,8 @@ from slpi_ros.effects.parameters import facts_of
 from slpi_ros.effects.registry import EFFECTS
 
 SCHEMAS = Path(__file__).resolve().parents[1] / "msg_schemas"
-UNITS = {"s": "Seconds", "V": "Volts", "V/s": "V/s", "m/V": "m/V", "m": "Metres", "Hz": "Hertz", "rad": "Radians"}
+# A unit without a name stands as it is.
+UNITS = {"s": "Seconds", "V": "Volts", "m": "Metres", "Hz": "Hertz", "rad": "Radians"}
 WIDTH = 120
 
 
@@ -49,7 +50,7 @@ def _fields(kind):
 
 
 def _field(facts, kind):
-    unit = f" {UNITS[facts.unit]}." if facts.unit else ""
+    unit = f" {UNITS.get(facts.unit, facts.unit)}." if facts.unit else ""
     about = {"description": f"{facts.meaning[0].upper()}{facts.meaning[1:]}{'; null: none' * facts.none}.{unit}"}
     few, most = facts.count
     holds = get_origin(kind)

@@ -22,7 +22,9 @@ NOISE = (3e-9, 15e-9)
 # Relative tolerance of a requested size.
 CLOSE = 0.15
 # Slow effects, which need long records.
-SLOW = {"creep", "gain_drift", "thermal_drift"}
+SLOW = {"creep", "gain_drift", "thermal_drift", "self_heating"}
+# Effects for which the drive of an axis without effects may be designed. None is added, so that a seed draws the same.
+OF_OTHERS = [name for name in NAMES[: NAMES.index("self_heating")] if name != "cross_coupling"]
 # Sample rate of the voltages before a record, hertz.
 RATE_BEFORE = 100.0
 # Shortest duration of a record if the number of samples allows it, seconds.
@@ -58,7 +60,8 @@ class Drives:
         return sensed(physics, self.t, motion, axis)
 
     def _motion(self, axis: str, physics: Physics) -> FloatArray:
-        key = (axis, physics.amplifier, physics.viscosity, physics.creep, physics.stop, physics.flexure, physics.ageing)
+        parts = (physics.amplifier, physics.viscosity, physics.creep, physics.stop, physics.flexure, physics.warmth)
+        key = (axis, *parts, physics.ageing)
         if key not in self._own:
             stage, before = self.stage[axis], self._before[axis]
             t = np.concatenate([self.t[0] + np.arange(-before.size, 0) / RATE_BEFORE, self.t])
@@ -137,7 +140,7 @@ def _stage(rng: np.random.Generator, base: str) -> Base:
 
 def _others(rng: np.random.Generator) -> tuple[str, ...]:
     """Return a random effect for which the excitation of an axis without effects is designed."""
-    return (str(rng.choice([name for name in NAMES if name != "cross_coupling"])),)
+    return (str(rng.choice(OF_OTHERS)),)
 
 
 def _stamps(rng: np.random.Generator, count: int, rate: float) -> NDArray[np.int64]:

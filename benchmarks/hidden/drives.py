@@ -102,6 +102,21 @@ def nests(path: Path, rng: np.random.Generator, seconds: float) -> None:
             left *= rng.uniform(0.5, 0.85)
 
 
+def bursts(path: Path, rng: np.random.Generator, seconds: float) -> None:
+    """Run bursts of fast loops, each followed by a hold and slow moves."""
+    end = _spent(path) + seconds
+    while _spent(path) < end:
+        low, high = rng.uniform(0.0, 0.2), rng.uniform(0.7, 1.0)
+        leg = (high - low) / rng.uniform(0.5 * FASTEST, FASTEST)
+        for _ in range(max(1, round(rng.uniform(0.1, 0.25) * seconds / (2 * leg)))):
+            path.to(high, leg)
+            path.to(low, leg)
+        _move(path, rng, float(rng.uniform(0.5, 1.0)))
+        path.hold(float(rng.uniform(0.05, 0.15)) * seconds)
+        for _ in range(2):
+            _move(path, rng, float(rng.uniform(0.0, 1.0)), 0.1, 0.5)
+
+
 # Sections that a record must contain so that an effect can be distinguished from others.
 NEEDED: dict[str, tuple[Section, ...]] = {
     "delay": (tempos, varied),
@@ -118,6 +133,7 @@ NEEDED: dict[str, tuple[Section, ...]] = {
     "sensor_periodic": (ramps,),
     "hum": (holds,),
     "steps": (varied,),
+    "self_heating": (bursts,),
 }
 _ANY: tuple[Section, ...] = (varied, nests, tempos, peaks, holds)
 

@@ -21,6 +21,7 @@ from .physics import (
     Stop,
     Temperature,
     Viscosity,
+    Warmth,
 )
 
 FloatArray = NDArray[np.float64]
@@ -248,6 +249,20 @@ def _hum(rng: np.random.Generator, setting: Setting) -> Nature:
     )
 
 
+def _self_heating(rng: np.random.Generator, setting: Setting) -> Nature:
+    # The strength is the largest change of the sensitivity in the record; with a rate of 1 V/s, that is its gain.
+    sign = float(rng.choice([-1.0, 1.0]))
+    time_constant = log_uniform(rng, 1.5, 0.5 * float(setting.t[-1]))
+    pivot = float(rng.choice([0.0, rng.uniform(0.0, 15e-6)]))
+    gain = sign / float(np.max(Warmth(1.0, 1.0, time_constant).path(setting.t, setting.v)))
+    return Nature(
+        1e-3,
+        0.2,
+        lambda s: Physics(warmth=Warmth(s * gain, 1.0, time_constant, pivot)),
+        lambda s: {"gain": s * gain, "time_constant": time_constant},
+    )
+
+
 # A new one comes last: the place of a name is in the seeds of its draws.
 DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "delay": _delay,
@@ -264,6 +279,7 @@ DRAWS: dict[str, Callable[[np.random.Generator, Setting], Nature]] = {
     "steps": _steps,
     "slew": _slew,
     "contact": _contact,
+    "self_heating": _self_heating,
 }
 NAMES = tuple(DRAWS)
 

@@ -313,6 +313,48 @@ class Ageing:
         return self.pivot + (1.0 + self.path(t, v)) * (y - self.pivot)
 
 
+# Steps a sample in which the temperature of a stage that warms itself is integrated.
+_FINE = 4
+
+
+@dataclass(frozen=True)
+class Warmth:
+    """A piezo that warms itself: the loss of each moment goes into its heat capacity, and out to its mount.
+
+    Parameters
+    ----------
+    change : float
+        Relative change of the sensitivity in the end, signed, while the voltage changes at `rate`.
+    rate : float, V/s
+    time_constant : float, seconds
+        Heat capacity over the conductance to the mount, which stays as warm as it is.
+    pivot : float, metres
+        Displacement, relative to rest, that is independent of the sensitivity.
+    """
+
+    change: float
+    rate: float
+    time_constant: float
+    pivot: float = 0.0
+
+    def path(self, t: FloatArray, v: FloatArray) -> FloatArray:
+        """Return the relative change of the sensitivity, shape (N,), for voltages `v` (V) at times `t` (s)."""
+        # The current, and with it the loss, is that of the mean rate about each moment; the midpoint rule.
+        fine = np.interp(np.arange(_FINE * (t.size - 1) + 1) / _FINE, np.arange(t.size), t)
+        rate = np.gradient(v, t) / self.rate
+        power = np.interp(0.5 * (fine[1:] + fine[:-1]), t, rate**2)
+        warmth, now = [0.0], 0.0
+        for duration, loss in zip(np.diff(fine).tolist(), power.tolist(), strict=True):
+            half = now + 0.5 * duration * (loss - now) / self.time_constant
+            now += duration * (loss - half) / self.time_constant
+            warmth.append(now)
+        return self.change * np.array(warmth[::_FINE])
+
+    def scaled(self, t: FloatArray, v: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the displacement with the changed sensitivity, shape (N,), metres."""
+        return self.pivot + (1.0 + self.path(t, v)) * (y - self.pivot)
+
+
 # Smoothing time of random temperature, due to the heat capacity of the stage.
 _INERTIA_S = 6.0
 
@@ -452,6 +494,7 @@ class Physics:
     creep : SlowDomains, optional
     stop : Stop, optional
     flexure : Flexure, optional
+    warmth : Warmth, optional
     ageing : Ageing, optional
     coupling : mapping of axis name to float
         Share of the motion of another axis, relative to its start, that is added to this axis.
@@ -466,6 +509,7 @@ class Physics:
     creep: SlowDomains | None = None
     stop: Stop | None = None
     flexure: Flexure | None = None
+    warmth: Warmth | None = None
     ageing: Ageing | None = None
     coupling: Mapping[str, float] = field(default_factory=dict)
     temperature: Temperature | None = None
@@ -503,6 +547,8 @@ def own_motion(base: AxisParameters | BoucWen, physics: Physics, t: FloatArray, 
         y = physics.stop.pushed(y)
     if physics.flexure:
         y = ringing(physics.flexure, t, y)
+    if physics.warmth:
+        y = physics.warmth.scaled(t, v, y)
     if physics.ageing:
         y = physics.ageing.scaled(t, v, y)
     return base.offset + y

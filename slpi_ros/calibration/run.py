@@ -334,7 +334,7 @@ def _left_at(model: StageModel, last: Record) -> StageModel:
     for name, axis in model.axes.items():
         v = last.voltage[name]
         known = np.isfinite(v)
-        u, _ = axis.chain.reaching(v[known], EffectContext(last.t[known]))
+        _, u, _ = axis.chain.reaching(v[known], EffectContext(last.t[known]))
         axes[name] = replace(axis, end=axis.at_rest(u, float(v[known][-1]), "end"))
     return replace(model, axes=axes)
 

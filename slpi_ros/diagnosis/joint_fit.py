@@ -22,7 +22,7 @@ from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, of_starts, steps
 from slpi_ros.diagnosis.prepare import Evidence, Part
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
-from slpi_ros.effects.chain import Chain
+from slpi_ros.effects.chain import Chain, forward
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.kinds import Hysteresis
@@ -386,7 +386,9 @@ class Explanation:
 
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
-        self.u, self._aside = Chain.of(self.effects).reaching(evidence.v, evidence.around)
+        applied, self.u, self._aside = Chain.of(self.effects).reaching(evidence.v, evidence.around)
+        # Context passed to the effects.
+        self.around = evidence.around.driven(applied)
         if like and not evidence.poses_as(like.evidence):
             like = None
         if like and np.array_equal(like.u, self.u):
@@ -408,7 +410,7 @@ class Explanation:
             self.h, self.added = like.h, like.added
         for _ in range(MOST_TURNS):
             h, before = self.h, self.added
-            self.added = self._behind(self.effects, h + self._aside) - h
+            self.added = _behind(self.effects, h + self._aside, self.around) - h
             self._fit(beside)
             if np.ptp(self.added - before) < SETTLED * np.std(self.target - h):
                 break
@@ -457,24 +459,11 @@ class Explanation:
         """Residual, measured - predicted, shape (N,), metres."""
         return self.evidence.y - self.predicted
 
-    @property
-    def around(self) -> EffectContext:
-        """Context passed to the effects."""
-        return self.evidence.around
-
     def of_record(self, k: int) -> "RecordResidual":
         """Return the signals and the residual of record `k`."""
         rows, around = self.evidence.slices[k], self.around.records[k]
         t, u, h, y, residual = (x[rows] for x in (self.t, self.u, self.h, self.y, self.residual))
         return RecordResidual(t, u, h, y, self.used[rows], residual, around)
-
-    def _behind(self, effects: Sequence[Effect], h: FloatArray) -> FloatArray:
-        """Return the displacement, shape (N,), metres, after effects have been applied to the hysteresis output `h`."""
-        around = self.evidence.around
-        for effect in effects:
-            if effect.acts_on == "displacement":
-                h = effect.apply(h, around)
-        return h
 
     def respond(self, u: FloatArray) -> FloatArray:
         """Return the displacement of the hysteresis, shape (N,), metres, for another voltage `u`, shape (N,), volts."""
@@ -496,9 +485,9 @@ class Explanation:
 
     def _whole(self, effects: Sequence[Effect]) -> FloatArray:
         """Return the prediction, shape (N,), metres, of the same hysteresis with other effects."""
-        u, beside = Chain.of(tuple(effects)).reaching(self.evidence.v, self.evidence.around)
+        applied, u, beside = Chain.of(tuple(effects)).reaching(self.evidence.v, self.evidence.around)
         h = self.h if np.array_equal(u, self.u) else self.respond(u)
-        return self.settling + self._behind(effects, h + beside)
+        return self.settling + _behind(effects, h + beside, self.evidence.around.driven(applied))
 
     def prediction_without(self, name: str) -> FloatArray:
         """Return the prediction, shape (N,), metres, without one of the effects and with everything else unchanged."""
@@ -715,6 +704,11 @@ class RecordResidual:
     def respond(self, u: FloatArray) -> FloatArray:
         """Raise NotImplementedError: effects of a single record do not act on the voltage."""
         raise NotImplementedError
+
+
+def _behind(effects: Sequence[Effect], h: FloatArray, around: EffectContext) -> FloatArray:
+    """Return the displacement, shape (N,), metres, after effects have been applied to the hysteresis output `h`."""
+    return forward([effect for effect in effects if effect.acts_on == "displacement"], h, around)
 
 
 def alike_in_a_row(errors: FloatArray) -> float:

@@ -45,6 +45,8 @@ class EffectContext:
     # Grid that covers `t`, if already computed.
     grid: Uniform | None = None
     start: float | None = None
+    # Voltage (V) at the piezo, shape (N,), for effects on the displacement; None: it rests.
+    voltage: FloatArray | None = None
 
     @classmethod
     def since_start(
@@ -52,6 +54,11 @@ class EffectContext:
     ) -> "EffectContext":
         """Return the context for stamps `t`, shape (N,), seconds, counted from the first one."""
         return cls(t - t[0] if t.size and t[0] else t, others or {}, start=start)
+
+    def driven(self, voltage: FloatArray) -> "EffectContext":
+        """Return the context with the voltage at the piezo, shape (N,), volts."""
+        parts = zip(self.records, self.split(voltage), strict=False)
+        return replace(self, voltage=voltage, records=tuple(record.driven(part) for record, part in parts))
 
     @property
     def uniform(self) -> Uniform:
@@ -121,6 +128,9 @@ class StreamingEffect(Streaming, Protocol):
     def relax_from(self, distances: Sequence[float]) -> None:
         """Continue from distances as `relaxing` returned them; others are ignored."""
 
+    def reach(self, voltage: float) -> None:
+        """Note the voltage (V) at the piezo for the next `forward`; called if the effect `needs_voltage`."""
+
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the input, or a stable approximation, for the output `wanted` after `dt` (s); keep the state."""
 
@@ -130,6 +140,10 @@ class StreamingAround(Streaming, Protocol):
 
     def inverse(self, dt: float, wanted: float, memory: Memory, lower: float, upper: float) -> float:
         """Return the voltage (V) for the displacement `wanted` (m); `memory` moves, within `lower` and `upper` (V)."""
+
+    @property
+    def applied(self) -> float:
+        """Applied voltage (V), of which the hysteresis feels another."""
 
     @property
     def beside(self) -> float:
@@ -148,6 +162,9 @@ class StreamingBase:
         """Do nothing."""
 
     def start(self, x: float) -> None:
+        """Do nothing."""
+
+    def reach(self, voltage: float) -> None:
         """Do nothing."""
 
     def snapshot(self) -> Any:
@@ -171,6 +188,8 @@ class EffectBase(Protocol):
     side: ClassVar[Side]
     # Whether only feedback undoes it, because it follows time and not the voltage, or comes before the voltage.
     needs_feedback: ClassVar[bool] = False
+    # Whether it acts on the displacement, and depends on the voltage at the piezo, too.
+    needs_voltage: ClassVar[bool] = False
     sharing: ClassVar[Sharing] = "shared"
     time_shift: ClassVar[TimeShift] = "none"
     # Whether a time shift is its special case: if it does not fit better than one, it is not there.

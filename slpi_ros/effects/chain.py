@@ -53,13 +53,13 @@ class Chain:
         passes = [effect.passes for effect in self.before]
         return max([-np.inf, *(low for low, _ in passes)]), min([np.inf, *(high for _, high in passes)])
 
-    def reaching(self, v: FloatArray, context: EffectContext) -> tuple[FloatArray, FloatArray]:
-        """Return the voltage (V) that the hysteresis feels, and the displacement (m) beside it, shape (N,) each."""
+    def reaching(self, v: FloatArray, context: EffectContext) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the voltages (V) at the piezo and felt by the hysteresis, and the displacement (m) beside it, (N,)."""
         v = forward(self.before, v, context)
         if not self.around:
-            return v, np.zeros_like(v)
+            return v, v, np.zeros_like(v)
         u = self.around.apply(v, context)
-        return u, self.around.beside(v, u)
+        return v, u, self.around.beside(v, u)
 
 
 def lasting(effects: Sequence[Effect]) -> tuple[Effect, ...]:

@@ -2,6 +2,7 @@
 # `inverse_path` does at each sample what `slpi_ros.model.streaming.StreamingInverse.move` does, with the same rounding:
 # changes of one are changes of both. The machine code is kept until this file changes, not those that it calls.
 
+from math import expm1
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ class Laws(NamedTuple):
     modes: FloatArray = np.empty((0, 4))  # (M, 4): 0, angular frequency (rad/s), damping, gain
     rest: float = 1.0  # share of the motion beside the modes
     factors: FloatArray = np.empty((0, 8))  # (F, 8), of the inverse of the resonance, `Exact.law`, `Unringing.law`
+    heating: FloatArray = np.empty(0)  # (0,) or (4,): gain (s^2/V^2), time constant (s), origin (m), most (V^2/s^2)
     gain: FloatArray = np.array([0.0, 1.0])  # (2,): origin (m) and factor of the sensitivity
 
 
@@ -39,6 +41,20 @@ def relaxed(moved: FloatArray, gains: FloatArray, holds: FloatArray) -> FloatArr
             total += gains[i] * states[i]
         crept[k], before = total, moved[k]
     return crept
+
+
+@compiled
+def heated(dt: FloatArray, v: FloatArray, time_constant: float, first: float, most: float) -> FloatArray:
+    """Return the mean square rates (V^2/s^2, (N,)) of voltages (V, (N,)), as `StreamingSelfHeating.forward`."""
+    before, now, last = np.empty_like(v), min(first, most), v[0]
+    for k in range(v.size):
+        before[k] = now
+        if dt[k] > 0.0:
+            moved, rate = -expm1(-dt[k] / time_constant), (v[k] - last) / dt[k]
+            before[k] = now * (1.0 - moved)
+            now = min(before[k] + moved * rate * rate, most)
+        last = v[k]
+    return before
 
 
 hold, mode_transition, mode_poles = (
@@ -56,6 +72,8 @@ ORIGIN, INPUT, STEP, SUM_NOW, SUM_BEFORE = range(5)
 # Columns of an array of modes: angular frequency, damping, then as given, and from `MOVED` on input, position and
 # velocity, step and transition matrix; of a factor that looks back, spacing and taps, first and end of its inputs.
 OMEGA, DAMPED, MOVED, MATRIX, WIDTH = 1, 2, 8, 11, 18
+# Places in the array of a self-heating: as given, then step, what fades in it, mean square rate, and last voltage.
+HEAT, FADES, ZERO, MOST, SPAN, FADED, RATE, VOLTAGE = range(8)
 
 
 @compiled
@@ -115,6 +133,32 @@ def contact_forward(x: float, contact: FloatArray) -> float:
 def contact_inverse(wanted: float, contact: FloatArray) -> float:
     """Return the displacement without a contact (m), as `StreamingContact.inverse`."""
     return float(contact[0] + (wanted - contact[0]) / contact[1]) if wanted > contact[0] else wanted
+
+
+@compiled
+def heat_left(dt: float, heating: FloatArray) -> float:
+    """Return what is left of the mean square rate (V^2/s^2), as in `StreamingSelfHeating`."""
+    if dt != heating[SPAN]:
+        heating[SPAN], heating[FADED] = dt, -expm1(-dt / heating[FADES])
+    return float(heating[RATE] * (1.0 - heating[FADED]))
+
+
+@compiled
+def heating_inverse(dt: float, wanted: float, heating: FloatArray) -> float:
+    """Return the displacement of the cold stage (m), as `StreamingSelfHeating.inverse`."""
+    return float(heating[ZERO] + (wanted - heating[ZERO]) / (1.0 + heating[HEAT] * heat_left(dt, heating)))
+
+
+@compiled
+def heating_forward(dt: float, x: float, v: float, heating: FloatArray) -> float:
+    """Return the displacement (m) for a voltage `v` (V) at the piezo, as `StreamingSelfHeating.forward`."""
+    left = heat_left(dt, heating)
+    heating[RATE] = left
+    if dt > 0.0:
+        rate = (v - heating[VOLTAGE]) / dt
+        heating[RATE] = min(left + heating[FADED] * rate * rate, heating[MOST])
+    heating[VOLTAGE] = v
+    return float(heating[ZERO] + (1.0 + heating[HEAT] * left) * (x - heating[ZERO]))
 
 
 @compiled
@@ -283,6 +327,9 @@ def inverse_path(
     # Inputs of the factors, now and before.
     inputs, times, values = np.full(f, x), np.zeros((f, 2 * dt.size + 4)), np.empty((f, 2 * dt.size + 4))
     values[:, 0] = x
+    has_heat, heating = laws.heating.size > 0, np.zeros(8)
+    if has_heat:
+        heating[:SPAN], heating[VOLTAGE] = laws.heating, point[0]
     origin, factor = laws.gain[0], laws.gain[1]
     lag, command, beside = np.array([point[0], point[0]]), point[0], 0.0
     # As `StreamingRateDependence`: applied voltage, last three ``w``, last desired displacement.
@@ -301,7 +348,11 @@ def inverse_path(
                 axis = modes_forward(pause, axis, rest_share, modes)
                 resonance_inverse(pause, axis, factors, inputs, times, values)
                 factors_forward(pause, factors, inputs, times, values)
+            if has_heat:
+                heating_forward(pause, axis, heating[VOLTAGE], heating)
         h = origin + (wanted[n] - origin) / factor
+        if has_heat:
+            h = heating_inverse(counted, h, heating)
         if m:
             h = resonance_inverse(counted, h, factors, inputs, times, values)
         h = contact_inverse(h, contact)
@@ -366,6 +417,8 @@ def inverse_path(
         if m:
             axis = modes_forward(counted, axis, rest_share, modes)
             factors_forward(counted, factors, inputs, times, values)
+        if has_heat:
+            axis = heating_forward(counted, axis, rate[0] if has_rate else point[0], heating)
         short = wanted[n] - (origin + factor * (axis - origin))
         if min(missing, short) > 0.0:
             held[n] = v >= upper - rounding[1] * (1.0 + abs(upper))

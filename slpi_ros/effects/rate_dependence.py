@@ -252,6 +252,11 @@ class StreamingRateDependence(StreamingBase):
         return self._v
 
     @property
+    def applied(self) -> float:
+        """Applied voltage (V)."""
+        return self._v
+
+    @property
     def beside(self) -> float:
         """Reversible displacement (m) beside that of the hysteresis."""
         return self._g * (self._v - self._u)

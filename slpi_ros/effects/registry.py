@@ -20,6 +20,7 @@ MODULES = (
     "creep",
     "contact",
     "resonance",
+    "self_heating",
     "gain_drift",
     "cross_coupling",
     "thermal_drift",

@@ -59,6 +59,9 @@ class StreamingInverse:
         self._before, self._behind = _streaming(chain.before), _streaming(chain.own)
         self._around: StreamingAround | None = chain.around.streaming() if chain.around else None
         self._around_name = chain.around.name if chain.around else ""
+        # Effects after the hysteresis that follow the voltage, too.
+        needing = [effect.name for effect in chain.own if effect.needs_voltage]
+        self._driven = tuple(self._behind[name] for name in needing if name in self._behind)
         # Only the hysteresis, and what is around it: the command alone determines where the axis is.
         self._direct = not (self._before or self._behind)
         self._alone = not (chain.before or chain.own or chain.shared)
@@ -71,6 +74,8 @@ class StreamingInverse:
             streaming.start(memory.voltage)
         if self._around:
             self._around.start(memory.voltage)
+        for streaming in self._driven:
+            streaming.reach(self._applied)
         y = memory.displacement
         for streaming in self._behind.values():
             streaming.start(y)
@@ -117,6 +122,11 @@ class StreamingInverse:
     def uncoupled_displacement(self) -> float:
         """Displacement (m) of the model for the present voltage, without cross-coupling."""
         return self._inside if self._direct else self._displacement
+
+    @property
+    def _applied(self) -> float:
+        """Voltage (V) at the piezo."""
+        return self._around.applied if self._around else self.memory.voltage
 
     @property
     def _inside(self) -> float:
@@ -336,7 +346,8 @@ class StreamingInverse:
         other = copy(self)
         other.memory, other.pace = copy(self.memory), self.pace.copy()
         other.memory.restore(self.memory.snapshot())
-        other._before, other._around, other._behind = deepcopy((self._before, self._around, self._behind))
+        own = self._before, self._around, self._behind, self._driven
+        other._before, other._around, other._behind, other._driven = deepcopy(own)
         return other
 
     def _move(self, dt: float, elapsed: float, h: float, now_ns: int) -> float:
@@ -387,6 +398,9 @@ class StreamingInverse:
 
     def _follow(self, dt: float) -> None:
         """Propagate the output of the hysteresis through the effects after it."""
+        if self._driven:
+            for streaming in self._driven:
+                streaming.reach(self._applied)
         y = self._inside
         for streaming in self._behind.values():
             y = streaming.forward(dt, y)

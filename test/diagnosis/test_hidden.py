@@ -20,7 +20,7 @@ FEW = 3_000
 FAST = ["lag", "steps"]
 SLOW = [
     *("slew", "hum", "creep", "contact", "resonance", "cross_coupling", "sensor_periodic", "thermal_drift"),
-    "gain_drift",
+    *("gain_drift", "self_heating"),
 ]
 # Large enough that nobody should miss it; what is found of smaller ones is for the bench to say.
 LARGE = 10.0

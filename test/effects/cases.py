@@ -18,6 +18,7 @@ from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
+from slpi_ros.effects.self_heating import SelfHeating
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.slew import Slew
 from slpi_ros.effects.steps import Steps
@@ -61,6 +62,13 @@ def gain_drifts(draw: st.DrawFn) -> GainDrift:
     return GainDrift(tuple(np.cumsum(steps).tolist()), tuple(gains), draw(numbers(-1e-5, 1e-5)))
 
 
+def self_heatings(leads: int = 0) -> st.SearchStrategy[SelfHeating]:
+    """Draw self-heating, at times so strong that a move reaches its bound; the first `leads` records may start warm."""
+    gains = st.tuples(st.sampled_from((-1.0, 1.0)), powers(1e-9, 1e-2)).map(lambda drawn: drawn[0] * drawn[1])
+    starts = st.lists(st.just(0.0) | powers(1.0, 1e7), max_size=leads).map(tuple)
+    return st.builds(SelfHeating, gains, powers(0.5, 300), numbers(-1e-5, 1e-5), starts)
+
+
 @st.composite
 def sensors(draw: st.DrawFn) -> SensorPeriodic:
     period = draw(powers(1e-7, 1e-5))
@@ -102,6 +110,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "creep": creeps(),
     "contact": st.builds(Contact, numbers(-5e-6, 2e-5), powers(0.05, 5)),
     "resonance": resonances(),
+    "self_heating": self_heatings(),
     "gain_drift": gain_drifts(),
     "cross_coupling": st.builds(CrossCoupling, st.dictionaries(st.sampled_from("yz"), numbers(-0.4, 0.4), min_size=1)),
     "thermal_drift": drifts(),
@@ -109,7 +118,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "sensor_periodic": sensors(),
     "hum": st.builds(Hum, st.lists(LINES, min_size=1, max_size=3).map(tuple)),
 }
-EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__) | rate_laws(leads=3)
+EVERY = st.sampled_from(sorted(BY_NAME)).flatmap(BY_NAME.__getitem__) | rate_laws(leads=3) | self_heatings(leads=3)
 # They change what moves, and leave what rests as it is.
 ABOUT_MOTION = ("delay", "lag", "slew", "rate_dependence", "creep", "resonance", "cross_coupling")
 
@@ -135,7 +144,7 @@ def records(draw: st.DrawFn, acts_on: str) -> Record:
     u = 50 + 40 * _motion(t, rng)
     others = {"y": 1e-5 * _motion(t, rng)} if draw(st.booleans()) else {}
     signal = 2e-7 * u + 1e-9 * u**1.5 + 1e-6 * _motion(t, rng) if acts_on == "displacement" else u
-    return Record(signal, EffectContext(t, others))
+    return Record(signal, EffectContext(t, others, voltage=u))
 
 
 def _motion(t: FloatArray, rng: np.random.Generator) -> FloatArray:

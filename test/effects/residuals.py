@@ -30,7 +30,7 @@ class Residual:
 
     @property
     def around(self) -> EffectContext:
-        return EffectContext(self.t, self.others)
+        return EffectContext(self.t, self.others, voltage=self.u)
 
     def respond(self, u: FloatArray) -> FloatArray:
         return np.interp(u, np.sort(self.u), np.sort(self.h))

@@ -62,6 +62,7 @@ def test_there_is_a_drive_for_every_effect():
         (("delay", "rate_dependence", "lag", "creep"), "lag"),
         (("delay", "rate_dependence"), "rate_dependence"),
         (("creep", "thermal_drift", "gain_drift"), "gain_drift"),
+        (("gain_drift", "self_heating"), "self_heating"),
         (("creep", "thermal_drift", "lag"), "thermal_drift"),
         (("rate_dependence", "creep"), "creep"),
         (("delay", "resonance"), "resonance"),
@@ -215,6 +216,17 @@ def test_gain_drift_repeats_full_loops_without_a_rest():
     assert max(lengths) - min(lengths) <= 2
     rest = np.diff(v[v.size // 5 : -v.size // 20]) == 0
     assert np.count_nonzero(rest) <= len(moves)
+
+
+def test_self_heating_has_bursts_of_fast_loops_with_rests_and_slow_loops_between():
+    t, v, _ = drive("self_heating", duration=120.0)
+    rate, seconds = np.abs(np.diff(v)) * RATE, np.arange(120)
+    fast = np.array([float(np.sqrt(np.mean(rate[(t[:-1] >= s) & (t[:-1] < s + 1)] ** 2))) for s in seconds])[20:-5]
+    assert np.count_nonzero(np.diff(fast > 100.0)) >= 5
+    assert 0.2 < np.mean(fast > 100.0) < 0.4 and np.mean(fast < 30.0) > 0.4
+    tops = [voltage for steps, voltage in holds(v, least=1000) if voltage == 100.0]
+    assert len(tops) == 3
+    assert sum(span == pytest.approx(100.0) and steps > 500 for span, steps in bursts(v)) >= 10
 
 
 def test_sensor_periodic_is_slow_and_steady_at_two_speeds():

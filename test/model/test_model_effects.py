@@ -34,7 +34,7 @@ T = DT * np.arange(4000)
 CREEP = Creep((0.03, 0.3, 3.0), (0.02, 0.02, 0.03))
 DRIFT = ThermalDrift((0.0, 2.0, 3.0), (0.0, 1e-7, -1e-7))
 # What is undone exactly, whatever the path.
-EXACT = ("rate_dependence", "creep", "gain_drift")
+EXACT = ("rate_dependence", "creep", "self_heating", "gain_drift")
 # What belongs to the sensor or to the record: in no inverse.
 NEVER = ("thermal_drift", "sensor_periodic", "hum")
 

@@ -23,7 +23,8 @@ from slpi_ros.model.stage_model import StageModel
 FloatArray = NDArray[np.float64]
 pytest.importorskip("numba")
 # A delay is compensated by preview; what belongs to sensor or record is in no inverse.
-INVERTED = ("lag", "slew", "saturation", "rate_dependence", "creep", "contact", "resonance", "gain_drift")
+INVERTED = ("lag", "slew", "saturation", "rate_dependence", "creep", "contact", "resonance")
+INVERTED = (*INVERTED, "self_heating", "gain_drift")
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def axes(draw: st.DrawFn) -> tuple[AxisModel, FloatArray]:
             effect = replace(effect, initial=unit * 1e-6)
         if name == "contact":
             effect = replace(effect, position=unit * effect.position)
-        if name == "gain_drift":
+        if name in ("self_heating", "gain_drift"):
             effect = replace(effect, origin=unit * effect.origin)
         if name == "rate_dependence":
             effect = replace(effect, reversible_gain=unit * effect.reversible_gain)

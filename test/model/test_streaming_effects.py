@@ -15,6 +15,7 @@ from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
+from slpi_ros.effects.self_heating import SelfHeating
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.errors import SlpiError
 from slpi_ros.model.limits import MAX_DT, Limits
@@ -27,7 +28,8 @@ SENSITIVE = GainDrift((0.0,), (0.1,), 0.0)
 SENSOR = SensorPeriodic(3e-7, 5e-9, 1.0)
 EVERY = (LAG, RATE, CREEP, MODE)
 # That of the sensor changes nothing, alone or beside others: see test_model_effects.
-SETS = [(LAG,), (CREEP,), (MODE,), (RATE,), (LAG, CREEP), EVERY]
+HEAT = SelfHeating(5e-6, 2.0, 3e-6)
+SETS = [(LAG,), (CREEP,), (MODE,), (RATE,), (HEAT,), (LAG, CREEP), (LAG, RATE, HEAT), EVERY]
 
 
 def ids(effects):

@@ -54,9 +54,12 @@ def independent_trials(before: Score, tried: Sequence[Score]) -> float:
     if not tried:
         return 1.0
     gains = np.array([part for after in tried for part in _gains_of_blocks(before, after)])
-    size = np.sqrt((gains**2).sum(axis=1))
-    count = before.losses.size
-    shares = (_signs(count) @ (gains[size > 0.0] / size[size > 0.0, None]).T).max(axis=1, initial=0.0)
+    # A form far from the data may have losses beyond all bounds, of which the squares would overflow.
+    largest, count = np.abs(gains).max(axis=1), before.losses.size
+    gains = gains[(largest > 0.0) & np.isfinite(largest)]
+    gains = gains / np.abs(gains).max(axis=1, keepdims=True)
+    directions = gains / np.linalg.norm(gains, axis=1, keepdims=True)
+    shares = (_signs(count) @ directions.T).max(axis=1, initial=0.0)
     # The sum of gains with random signs, relative to the root of the sum of their squares, as Student's t.
     share = float(np.clip(np.quantile(shares, 1.0 - TAIL), 0.0, np.sqrt(count) * 0.99))
     alone = float(stdtr(count - 1, -share * np.sqrt((count - 1) / (count - share**2))))

@@ -107,12 +107,18 @@ def free(effect: Effect) -> FloatArray:
     return np.array(values, dtype=np.float64)
 
 
-def moved(effect: Effect, values: FloatArray, longest: float = np.inf) -> Effect:
-    """Return the effect with new free parameters, clipped to their bounds; `longest`: largest time constant (s)."""
+def moved(
+    effect: Effect, values: FloatArray, longest: float = np.inf, near: tuple[float, float] = (-np.inf, np.inf)
+) -> Effect:
+    """Return the effect with new free parameters, clipped to their bounds.
+
+    `longest` is the largest time constant (s), and `near` are the bounds (m) of a displacement near the motion.
+    """
     new = []
     for (_, fit, _), value in zip(_fitted(effect), values.tolist(), strict=True):
         number = exp(min(value, 300.0)) if fit.kind == "logarithmic" else value
-        new.append(min(max(number, fit.least), longest if fit.within_record else fit.most))
+        low, high = near if fit.near_motion else (fit.least, longest if fit.within_record else fit.most)
+        new.append(min(max(number, low), high))
     return effect.with_free(new)
 
 

@@ -41,6 +41,8 @@ MOST_TURNS, SETTLED = 15, 0.001
 ENOUGH = 1e-3
 # Upper bound of time constants, as a multiple of the duration of the longest record.
 SLOWEST = 10.0
+# Bounds of an origin of displacements, beyond the measured ones, as a share of their range.
+NEAR_MOTION = 0.25
 # Shares of a Gauss-Newton step, tried in this order until one lowers the objective.
 SHARES = (1.0, 0.4, 0.1)
 # Regularisation that keeps the gains unique for collinear columns, relative to the size of the columns.
@@ -551,12 +553,14 @@ class Explanation:
 
     def _stepped(self, change: FloatArray) -> list[Effect]:
         effects, first = [], 0
-        limit = SLOWEST * longest(self.evidence.around)
+        limit, used = SLOWEST * longest(self.evidence.around), self.y[self.used]
+        around = NEAR_MOTION * float(np.ptp(used))
+        near = float(used.min()) - around, float(used.max()) + around
         for effect in self.effects:
             values = free(effect)
             step = change[first : first + values.size]
             first += values.size
-            effects.append(moved(effect, values + bounded(effect, step), limit))
+            effects.append(moved(effect, values + bounded(effect, step), limit, near))
         return effects
 
     @cached_property

@@ -25,6 +25,8 @@ from slpi_ros.effects.parameters import Fit, parameter, require
 # Numbers of uniform knots of the candidates. The first interval has more knots, spaced logarithmically (number per
 # decade), as piezo ageing is logarithmic in time; the first lies after one loop and at least this many readings.
 UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
+# Numbers of knots at equal shares of the way of the voltage.
+OF_TRAVEL = (8, 16)
 # Largest distance of the origin from the displacement range, as a share of that range: with an origin far away, a gain
 # drift is a thermal drift; largest gain: no piezo changes by more; and shortest duration (s).
 ORIGIN, LARGEST, TAKES = 0.3, 0.3, 10.0
@@ -65,7 +67,11 @@ class GainDrift(EffectBase):
         "", "relative changes g of the sensitivity at the knots", -0.9, 10, above=True, fit=Fit("linear", 1e-5)
     )
     origin: float = parameter(
-        "m", "displacement that does not change with the sensitivity", -1e3, 1e3, fit=Fit("linear", 1e-9)
+        "m",
+        "displacement that does not change with the sensitivity",
+        -1e3,
+        1e3,
+        fit=Fit("linear", 1e-9, near_motion=True),
     )
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
@@ -115,6 +121,10 @@ class GainDrift(EffectBase):
             knots = np.linspace(0.0, end, count + 1)[1:]
             early = int(np.ceil(PER_DECADE * np.log10(knots[0] / first))) if 0.0 < first < knots[0] else 0
             curves.append(np.append(np.geomspace(first, knots[0], early, endpoint=False), knots))
+        # Run-in follows the way that the voltage has gone, which rests between bursts of motion.
+        for count in OF_TRAVEL:
+            knots = np.interp(np.linspace(0.0, travel[-1], count + 1)[1:], travel, t)
+            curves.append(np.append(knots[:-1], end))
         low, high = float(context.h.min()), float(context.h.max())
         for times in curves:
             hats = np.column_stack([np.interp(t, (0.0, *times), (0.0, *row)) for row in np.eye(times.size)])

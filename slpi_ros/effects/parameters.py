@@ -38,6 +38,8 @@ class Fit:
     most: float = inf
     # Whether a multiple of the duration of the record is the upper bound instead.
     within_record: bool = False
+    # Whether it is a displacement that stays near those of the record.
+    near_motion: bool = False
     # Whether the effect is none where it is 0.
     size: bool = False
     # Whether it is the state at the start of each record; an entry that is 0 stays 0.

@@ -85,7 +85,12 @@ class SelfHeating(EffectBase):
         fit=Fit("relative", least=SHORTEST, within_record=True),
     )  # fmt: skip
     origin: float = parameter(
-        "m", "displacement that does not change with the sensitivity", -1e3, 1e3, default=0.0, fit=Fit("linear", 1e-9)
+        "m",
+        "displacement that does not change with the sensitivity",
+        -1e3,
+        1e3,
+        default=0.0,
+        fit=Fit("linear", 1e-9, near_motion=True),
     )
     # Of the records of the fit; any other one starts cold, as streaming does.
     initial: tuple[float, ...] = parameter(

@@ -122,7 +122,7 @@ class GainDrift(EffectBase):
             early = int(np.ceil(PER_DECADE * np.log10(knots[0] / first))) if 0.0 < first < knots[0] else 0
             curves.append(np.append(np.geomspace(first, knots[0], early, endpoint=False), knots))
         # Run-in follows the way that the voltage has gone, which rests between bursts of motion.
-        for count in OF_TRAVEL:
+        for count in OF_TRAVEL if travel[-1] > 0.0 else ():
             knots = np.interp(np.linspace(0.0, travel[-1], count + 1)[1:], travel, t)
             curves.append(np.append(knots[:-1], end))
         low, high = float(context.h.min()), float(context.h.max())

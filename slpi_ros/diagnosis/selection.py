@@ -41,7 +41,7 @@ LEAST_FALL = 0.01
 MOST_EFFECTS = 4
 # Largest number of other effects with which the selection begins anew if more than the noise, and more than this share
 # of the error, is left.
-FRESH_STARTS, LEFT = 2, 0.4
+FRESH_STARTS, LEFT = 1, 0.4
 # Largest number of rounds in which an effect is added, or a line or mode to one.
 MOST_ROUNDS = 12
 # Screening: effects are fitted if their gain exceeds these shares of the best gain and of the error.
@@ -53,8 +53,9 @@ WORTH_REFINING = 0.3
 ALTERNATIVE = 0.7
 # The same for a single drive frequency, where a better fit proves little.
 ALTERNATIVE_AT_ONE_SPEED = 0.4
-# Smallest relative reduction of the held-out error by an effect with a companion: two at once find more by chance; and
-# by one that another effect resembles: what is left of creep from before a record looks like a drift.
+# Smallest relative reduction of the held-out error by an effect with a companion, as two at once find more by chance,
+# or beside others that leave little; and by one that another effect resembles: what is left of creep from before a
+# record looks like a drift.
 LEAST_GAIN_IN_COMPANY, LEAST_GAIN_BESIDE_ALIKE = 0.1, 0.2
 # An effect differs from none by at least this number of its standard deviations.
 CERTAIN = 3.0
@@ -127,8 +128,11 @@ def seen(now: Explanation) -> FitContext:
 
 def least_gain(name: str, beside: Explanation) -> float:
     """Return the smallest relative reduction of the held-out error by an effect beside those of a joint fit."""
-    alike = any(other.resembles_when_old == name for other in beside.effects)
-    return LEAST_GAIN_BESIDE_ALIKE if alike else LEAST_GAIN
+    if any(other.resembles_when_old == name for other in beside.effects):
+        return LEAST_GAIN_BESIDE_ALIKE
+    # So near the noise, what is left is a defect of the model.
+    near = beside.effects and beside.held_out.rms <= ABOVE_NOISE * beside.noise
+    return LEAST_GAIN_IN_COMPANY if near else LEAST_GAIN
 
 
 def is_own(effect: Effect | type[Any]) -> bool:
@@ -303,7 +307,7 @@ class Selection:
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
-    """Select effects, beginning with the best one, and with others if that leaves much and more than the noise."""
+    """Select effects, beginning with the best one, and with the next if that leaves much and more than the noise."""
     # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better. Of two
     # effects a third one may imitate both, and better than either alone. At a single drive frequency nothing tells them
     # apart.

@@ -45,9 +45,9 @@ DECLARATIONS = (
 class DeviceSimulator(Node):
     """Simulate a device by its protocol, for a driver to connect to.
 
-    The output of the simulated device moves a simulated stage, whose position it reports. It keeps its voltage when a
-    client leaves, as a real one does. Setting the parameter ``fault`` makes the next reading fail. Parameters in
-    `DECLARATIONS`.
+    The output of the simulated device moves a simulated stage, whose position it reports.
+    It keeps its voltage when a client leaves, as a real one does. Setting the parameter ``fault`` makes the next
+    reading fail. Parameters in `DECLARATIONS`.
     """
 
     def __init__(self) -> None:

@@ -68,6 +68,8 @@ setup(
             "recorder = slpi_ros.nodes.start:recorder",
             "slpi = slpi_ros.cli:main",
             "exciter = slpi_ros.nodes.start:exciter",
+            "device_simulator = slpi_ros.nodes.start:device_simulator",
+            "driver = slpi_ros.nodes.start:driver",
             "stage_simulator = slpi_ros.nodes.start:stage_simulator",
         ],
     },

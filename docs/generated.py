@@ -10,6 +10,7 @@ from pathlib import Path
 
 from slpi_ros import cli, nodes
 from slpi_ros.effects.registry import EFFECTS
+from slpi_ros.nodes import start
 
 ROOT = Path(__file__).resolve().parents[1]
 SCHEMAS = ROOT / "msg_schemas"
@@ -38,9 +39,10 @@ def parameters():
 
 
 def node_names():
-    """Return the modules of nodes: those with a table of parameters and an entry point."""
-    names = [module.name for module in pkgutil.iter_modules(nodes.__path__)]
-    return [name for name in names if {"DECLARATIONS", "main"} <= vars(import_module(f"slpi_ros.nodes.{name}")).keys()]
+    """Return the modules of nodes: those with an executable."""
+    return [
+        module.name for module in pkgutil.iter_modules(nodes.__path__) if callable(getattr(start, module.name, None))
+    ]
 
 
 def _value(value):

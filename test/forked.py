@@ -13,7 +13,9 @@ from collections.abc import Sequence
 from importlib import import_module
 from multiprocessing import get_context
 
-NODES = ("calibrator", "compensator", "exciter", "identify", "recorder", "stage_simulator")
+NODES = (
+    "calibrator", "compensator", "device_simulator", "driver", "exciter", "identify", "recorder", "stage_simulator",
+)  # fmt: skip
 _FORKS = get_context("forkserver")
 _FORKS.set_forkserver_preload(
     ["forked", "slpi_ros", "slpi_ros.cli", *(f"slpi_ros.nodes.{name}" for name in (*NODES, "common", "help"))]

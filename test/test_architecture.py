@@ -24,7 +24,7 @@ LAYERS = (
     {"identification", "compensator"},
     {"model", "excitation"},
     {"effects"},
-    {"hysteresis", "io", "simulation"},
+    {"hysteresis", "io", "drivers", "simulation"},
     {"errors", "arrays"},
 )
 # Modules beside the folders.

@@ -77,7 +77,9 @@ def test_the_command_line_names_it_in_one_line(record, tmp_path, name, arguments
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("node", ["calibrator", "compensator", "exciter", "identify", "recorder", "stage_simulator"])
+@pytest.mark.parametrize(
+    "node", ["calibrator", "compensator", "driver", "exciter", "identify", "recorder", "stage_simulator"]
+)
 @pytest.mark.parametrize(("name", "contents"), [("rclpy", MISSING), ("numpy", MISSING), ("numpy", BROKEN)])
 def test_a_node_names_it_in_one_line(tmp_path, node, name, contents):
     done = run(tmp_path, name, contents, "-m", "slpi_ros.nodes.start", node)

@@ -45,6 +45,8 @@ def _executable(name: str, node: str) -> "Callable[[], int]":
 
 calibrator = _executable("calibrator", "Calibrator")
 compensator = _executable("compensator", "Compensator")
+device_simulator = _executable("device_simulator", "DeviceSimulator")
+driver = _executable("driver", "Driver")
 exciter = _executable("exciter", "Exciter")
 identify = _executable("identify", "Identify")
 recorder = _executable("recorder", "Recorder")

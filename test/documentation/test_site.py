@@ -1,6 +1,7 @@
 """The documentation site: it builds without a warning, and what it says exists."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from documentation.pages import DOCS, PAGES, README, ROOT, commands_of  # noqa: 
 
 from slpi_ros import cli  # noqa: E402
 
+PATHS = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 SHOWN = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href"}
 
 
@@ -97,6 +99,15 @@ def test_the_nodes_page_has_every_node_and_service():
         source = (ROOT / "slpi_ros" / "nodes" / f"{name}.py").read_text()
         for service in set(re.findall(r'"(~/\w+)"', source)):
             assert f"`{service}`" in section, (name, service)
+
+
+def test_the_page_of_parameters_has_those_of_every_node():
+    command = [sys.executable, "-c", "import generated; print(generated.parameters())"]
+    said = subprocess.run(
+        command, cwd=DOCS, stdout=subprocess.PIPE, text=True, check=True, env=os.environ | PATHS
+    ).stdout
+    programs = re.findall(r'"(\w+) = slpi_ros\.nodes\.', (ROOT / "setup.py").read_text())
+    assert len(programs) >= 8 and re.findall(r"^## (\w+)$", said, re.MULTILINE) == sorted(programs)
 
 
 def test_the_diagnosis_page_has_the_table_of_all_effects():

@@ -184,6 +184,7 @@ LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0}
 PROGRAMS = {
     "calibrator": (LIMITS, 1),
     "compensator": ({}, 0),
+    "device_simulator": ({"address": "127.0.0.1:0"}, 0),
     "exciter": (LIMITS | {"rest_voltage": 0.0}, 0),
     "identify": ({}, 0),
     "recorder": ({}, 1),

@@ -1,0 +1,110 @@
+"""The interface of a device: an amplifier together with the sensor of the stage, and what goes wrong with it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from slpi_ros.errors import SlpiError
+
+# Longest time that a device may take to accept a connection or to answer, seconds.
+TIMEOUT = 0.2
+
+
+class DeviceError(SlpiError):
+    """Something is wrong with a device; the message begins with its kind and address."""
+
+
+class LinkError(DeviceError):
+    """A device cannot be reached, does not answer in time or has closed the connection."""
+
+
+class AnswerError(DeviceError):
+    """A device answers something else than what was asked."""
+
+
+class RefusedError(DeviceError):
+    """A device reports an error."""
+
+
+class UnsuitableError(DeviceError):
+    """A device cannot be used as it is, or not with this configuration; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One axis at a device, and the units of it."""
+
+    name: str  # the device's name of the axis
+    gain: float = 1.0  # V/V of an amplifier behind the device: volts at the stage for one volt of the device
+    scale: float = 1e-6  # m for one unit of the position that the device reports
+    offset: float = 0.0  # m, added to it
+
+    def stage_volts(self, voltage: float) -> float:
+        """Return the voltage (V) at the stage for a voltage (V) of the device."""
+        return self.gain * voltage
+
+    def device_volts(self, voltage: float) -> float:
+        """Return the voltage (V) of the device for a voltage (V) at the stage."""
+        return voltage / self.gain
+
+    def metres(self, position: float) -> float:
+        """Return the displacement (m) for a position in units of the device."""
+        return self.scale * position + self.offset
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a device says, one value for each channel."""
+
+    read_ns: int  # when the positions were read, by the steady clock of the process
+    voltages: tuple[float, ...]  # V at the stage, that the device says it has
+    positions: tuple[float, ...]  # m
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a device says of itself when it is opened, one value for each channel."""
+
+    identity: str  # maker, model, serial number
+    reading: Reading
+    setpoints: tuple[float, ...]  # V at the stage: writing these changes nothing
+    lowest: tuple[float, ...]  # V at the stage, own range; -inf: not told
+    highest: tuple[float, ...]  # V; inf: not told
+    servo: tuple[bool, ...]  # whether the device's own position control is on, so that it moves the voltage
+    notes: tuple[str, ...] = ()  # what the user should know
+
+
+class Device(ABC):
+    """A device with one or more channels; all voltages are those at the stage (V), all positions displacements (m).
+
+    Every method raises a DeviceError; no single wait is longer than twice `TIMEOUT`. After an error only `open` and
+    `close` may be called. A device is used by one thread.
+    """
+
+    def __init__(self, kind: str, address: str, channels: Sequence[Channel]) -> None:
+        self.name = f"{kind} {address}"
+        self.channels = tuple(channels)
+
+    @abstractmethod
+    def open(self) -> Found:
+        """Connect anew and ask the device what it is and where it is; changes no output and no setting."""
+
+    @abstractmethod
+    def release_servo(self) -> Found:
+        """Switch the device's own position control off; return what the device says afterwards."""
+
+    @abstractmethod
+    def exchange(self, voltages: Sequence[float] | None) -> Reading:
+        """Write voltages (V), none if None, and read."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the connection; changes no output. Never raises."""
+
+    def read(self) -> Reading:
+        """Read without writing."""
+        return self.exchange(None)
+
+    def write(self, voltages: Sequence[float]) -> Reading:
+        """Write voltages (V); return what is read after them."""
+        return self.exchange(voltages)

@@ -1,0 +1,329 @@
+"""Controllers of Physik Instrumente (PI) that speak the General Command Set (GCS 2) over TCP.
+
+Commands and answers are lines of ASCII. Each line of an answer but the last one ends with a space before the line feed.
+What a controller has not got is left out: it lists its commands on ``HLP?``. Syntax: user manual of E-727 (E727T0005,
+page 178).
+"""
+
+import math
+import select
+import socket
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+
+from slpi_ros.drivers.base import (
+    TIMEOUT,
+    AnswerError,
+    Channel,
+    Device,
+    Found,
+    LinkError,
+    Reading,
+    RefusedError,
+    UnsuitableError,
+)
+from slpi_ros.errors import UsageError, shown
+
+PORT = 50_000
+NEEDED = ("POS?", "SVA")
+# `SVA?` and `VOL?` of one axis may differ by this share of the device's own range, or where it tells none by this, V.
+AGREEMENT, AGREEMENT_V = 0.01, 1.0
+# Longest answer, bytes: a list of commands has some ten thousand.
+LONGEST = 1 << 18
+# Characters of an answer that are shown in a message.
+SHOWN = 60
+MEANINGS = {
+    1: "syntax of a parameter",
+    2: "unknown command",
+    5: "servo off or axis not referenced",
+    7: "position out of limits",
+    10: "stopped by a command",
+    15: "no such axis",
+    17: "parameter out of range",
+    302: "voltage out of limits",
+    303: "open-loop motion while the servo is on",
+    304: "command too long",
+}
+
+
+class GcsDevice(Device):
+    """A PI controller over TCP; one that has been opened is moved by ``SVA`` alone."""
+
+    def __init__(self, address: str, channels: Sequence[Channel]) -> None:
+        super().__init__("gcs", address, channels)
+        self._host, self._port = _host_and_port(address)
+        self._socket: socket.socket | None = None
+        self._buffer = b""
+        self._axes = [channel.name for channel in channels]
+        self._known: frozenset[str] = frozenset()
+        self._outputs: list[str] = []  # output channel of each axis; [] if the controller does not tell voltages
+        self._poll = b""
+
+    def open(self) -> Found:
+        """Connect, then only ask."""
+        self.close()
+        self._connect()
+        identity = " ".join(self._ask("*IDN?"))
+        self._known = frozenset(line.split()[0].upper() for line in self._ask("HLP?") if line.split())
+        if lacking := [command for command in NEEDED if command not in self._known]:
+            raise UnsuitableError(
+                f"{self.name}: {shown(identity, SHOWN)} has no {' and no '.join(lacking)} in its list of commands "
+                "(HLP?), so this driver cannot use it"
+            )
+        if not {"VOL?", "SVA?"} & self._known:
+            raise UnsuitableError(
+                f"{self.name}: neither VOL? nor SVA? is in its list of commands (HLP?); without the present voltage "
+                "the first one would be a jump"
+            )
+        axes = self._ask("SAI?") if "SAI?" in self._known else self._axes
+        if strangers := [axis for axis in self._axes if axis not in axes]:
+            raise UnsuitableError(
+                f"{self.name}: it has no axis '{strangers[0]}'; give channels out of {', '.join(axes)}"
+            )
+        self._outputs = self._outputs_of(axes)
+        ids = " ".join(self._axes)
+        volts = f"VOL? {' '.join(self._outputs)}" if self._outputs else f"SVA? {ids}"
+        self._poll = f"POS? {ids}\n{volts}\nERR?\n".encode()
+        return self._found(identity)
+
+    def release_servo(self) -> Found:
+        """Switch the servo of all axes off; UnsuitableError if the voltage then is not that of ``SVA?``."""
+        before = self.read().voltages
+        self._send("".join(f"SVO {axis} 0\n" for axis in self._axes).encode())
+        after = self.read().voltages
+        found = self._found(" ".join(self._ask("*IDN?")))
+        moves = ", ".join(
+            f"{axis} from {v:.3f} to {w:.3f} V" for axis, v, w in zip(self._axes, before, after, strict=True)
+        )
+        note = f"the servo was switched off: {moves}"
+        return Found(**{**vars(found), "notes": (note, *found.notes)})
+
+    def exchange(self, voltages: Sequence[float] | None) -> Reading:
+        """Send ``SVA`` and all questions at once, so that there is one wait."""
+        command = ""
+        if voltages is not None:
+            pairs = zip(self.channels, voltages, strict=True)
+            command = "SVA " + " ".join(f"{each.name} {each.device_volts(v):.6f}" for each, v in pairs)
+        sent_ns = time.monotonic_ns()
+        self._send(f"{command}\n".encode() + self._poll if command else self._poll)
+        count = len(self._axes)
+        lines = self._lines(2 * count + 1, command or "POS?")
+        received_ns = time.monotonic_ns()
+        if self._buffer:
+            raise AnswerError(f"{self.name}: it sent {_cut(self._buffer)} beyond what was asked")
+        positions = self._values("POS?", lines[:count], self._axes)
+        told = self._values("VOL?" if self._outputs else "SVA?", lines[count:-1], self._outputs or self._axes)
+        if code := self._error(lines[-1]):
+            raise RefusedError(f"{self.name}: error {_meaning(code)} after '{command or 'questions only'}'")
+        return Reading(
+            (sent_ns + received_ns) // 2,
+            tuple(each.stage_volts(v) for each, v in zip(self.channels, told, strict=True)),
+            tuple(each.metres(p) for each, p in zip(self.channels, positions, strict=True)),
+        )
+
+    def close(self) -> None:
+        """End the connection; the controller keeps its voltages."""
+        if self._socket is not None:
+            with suppress(OSError):
+                self._socket.close()
+        self._socket, self._buffer = None, b""
+
+    # What the controller says of itself
+
+    def _outputs_of(self, axes: Sequence[str]) -> list[str]:
+        """Return the output channel of each axis: of the same name, else at the same place among all."""
+        if "VOL?" not in self._known:
+            return []
+        outputs = list(self._table("VOL?"))
+        found = []
+        for axis in self._axes:
+            place = axes.index(axis)
+            if axis not in outputs and place >= len(outputs):
+                raise UnsuitableError(
+                    f"{self.name}: VOL? tells the voltages of {', '.join(outputs)}, none of them of axis '{axis}'"
+                )
+            found.append(axis if axis in outputs else outputs[place])
+        return found
+
+    def _found(self, identity: str) -> Found:
+        """Ask for everything but what never changes."""
+        notes = []
+        # An error of the past is read here, else it would be taken for one of the first command.
+        if old := self._error(" ".join(self._ask("ERR?"))):
+            notes.append(f"it told the old error {_meaning(old)}")
+        servo = self._switches("SVO?", self._axes, default=False)
+        online = self._switches("ONL?", self._outputs or self._axes, default=True)
+        if not all(online):
+            off = self._axes[online.index(False)]
+            raise UnsuitableError(
+                f"{self.name}: axis '{off}' is not controlled by commands (ONL? tells 0), so an analog input decides "
+                "its voltage; switch it over at the controller, knowing that this may move the stage"
+            )
+        lowest = self._optional("VMI?", self._outputs, -math.inf)
+        highest = self._optional("VMA?", self._outputs, math.inf)
+        if "TMN?" in self._known and "TMX?" in self._known:
+            travel = [self._named(command, self._axes) for command in ("TMN?", "TMX?")]
+            notes += [
+                f"travel of {axis}: {low:g} to {high:g} in units of the device"
+                for axis, low, high in zip(self._axes, *travel, strict=True)
+            ]
+        reading = self.read()
+        told = [each.device_volts(v) for each, v in zip(self.channels, reading.voltages, strict=True)]
+        setpoints = self._named("SVA?", self._axes) if "SVA?" in self._known else told
+        if "VOL?" not in self._known:
+            notes.append("it has no VOL?: the voltage is what SVA? says, which cannot be checked to be in volts")
+        if not any(servo):
+            self._require_agreement(setpoints, told, lowest, highest)
+        gains = [each.stage_volts for each in self.channels]
+        ranges = [sorted((gain(a), gain(b))) for gain, a, b in zip(gains, lowest, highest, strict=True)]
+        return Found(
+            identity,
+            reading,
+            tuple(gain(v) for gain, v in zip(gains, setpoints, strict=True)),
+            tuple(low for low, _ in ranges),
+            tuple(high for _, high in ranges),
+            tuple(servo),
+            tuple(notes),
+        )
+
+    def _require_agreement(
+        self, setpoints: Sequence[float], told: Sequence[float], lowest: Sequence[float], highest: Sequence[float]
+    ) -> None:
+        """Raise UnsuitableError where ``SVA?`` and ``VOL?`` disagree: SVA is not in volts, or of another output."""
+        for axis, setpoint, v, low, high in zip(self._axes, setpoints, told, lowest, highest, strict=True):
+            tolerated = AGREEMENT * (high - low) if math.isfinite(high - low) else AGREEMENT_V
+            if abs(setpoint - v) > tolerated:
+                raise UnsuitableError(
+                    f"{self.name}: axis '{axis}': SVA? tells {setpoint:g}, VOL? {v:g} V; so SVA is not in volts on "
+                    "this controller, or belongs to another output, or something else adds to it: this driver cannot "
+                    "use it as it is"
+                )
+
+    def _optional(self, command: str, outputs: Sequence[str], absent: float) -> list[float]:
+        """Return a number for each output, or `absent` if the controller does not tell them."""
+        if command in self._known and outputs:
+            return self._named(command, outputs)
+        return [absent] * len(self._axes)
+
+    def _switches(self, command: str, names: Sequence[str], *, default: bool) -> list[bool]:
+        """Return a switch for each name, or the default if the controller has none."""
+        return [value != 0.0 for value in self._named(command, names)] if command in self._known else (
+            [default] * len(names)
+        )  # fmt: skip
+
+    # Lines
+
+    def _connect(self) -> None:
+        try:
+            self._socket = socket.create_connection((self._host, self._port), TIMEOUT)
+            # A command leaves at once, not with the next one.
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except OSError as error:
+            raise LinkError(
+                f"{self.name}: no connection ({error.strerror or error}); check that the controller is on, its address "
+                "and its port, and that no other program is connected to it"
+            ) from error
+
+    def _send(self, data: bytes) -> None:
+        if self._socket is None:
+            raise LinkError(f"{self.name}: it is not open")
+        if self._buffer or select.select([self._socket], [], [], 0.0)[0]:
+            # An answer that comes late or twice would be taken for the next one.
+            self._receive("an answer without a question")
+            raise AnswerError(f"{self.name}: it sent {_cut(self._buffer)} without having been asked")
+        try:
+            self._socket.sendall(data)
+        except OSError as error:
+            raise LinkError(f"{self.name}: the link was lost ({error.strerror or error})") from error
+
+    def _receive(self, what: str) -> None:
+        """Add what has come to the buffer, waiting for it if there is nothing."""
+        assert self._socket is not None
+        try:
+            data = self._socket.recv(65_536)
+        except TimeoutError:
+            raise LinkError(
+                f"{self.name}: no whole answer to {what} within {TIMEOUT:g} s; until then came {_cut(self._buffer)}"
+            ) from None
+        except OSError as error:
+            raise LinkError(f"{self.name}: the link was lost ({error.strerror or error})") from error
+        if not data:
+            raise LinkError(f"{self.name}: it closed the connection")
+        self._buffer += data
+        if len(self._buffer) > LONGEST:
+            raise AnswerError(f"{self.name}: it sent more than {LONGEST} bytes; they begin with {_cut(self._buffer)}")
+
+    def _lines(self, count: int, what: str) -> list[str]:
+        """Return the next lines; `count` 0: those of one answer, however many it has."""
+        deadline = time.monotonic() + TIMEOUT
+        while not (self._buffer.count(b"\n") >= count if count else self._ends_answer()):
+            if time.monotonic() > deadline:
+                raise LinkError(f"{self.name}: {what} is answered too slowly; until now came {_cut(self._buffer)}")
+            self._receive(what)
+        if not count:
+            lines, self._buffer = self._buffer.split(b"\n")[:-1], b""
+        else:
+            *lines, self._buffer = self._buffer.split(b"\n", count)
+        return [line.decode("latin-1").strip() for line in lines]
+
+    def _ends_answer(self) -> bool:
+        return self._buffer.endswith(b"\n") and not self._buffer.endswith(b" \n")
+
+    def _ask(self, question: str) -> list[str]:
+        """Return the lines of the answer to a question."""
+        self._send(f"{question}\n".encode())
+        return self._lines(0, question)
+
+    def _named(self, command: str, names: Sequence[str]) -> list[float]:
+        """Return the numbers that a question gives for these names."""
+        return self._values(command, self._ask(f"{command} {' '.join(names)}"), names)
+
+    def _table(self, command: str) -> Mapping[str, float]:
+        """Return all numbers that a question gives, by name."""
+        return dict(self._pair(command, line) for line in self._ask(command))
+
+    def _values(self, command: str, lines: Sequence[str], names: Sequence[str]) -> list[float]:
+        pairs = [self._pair(command, line) for line in lines]
+        if [name for name, _ in pairs] != list(names):
+            raise AnswerError(
+                f"{self.name}: {command} was asked for {', '.join(names)} and answered for "
+                f"{shown(', '.join(name for name, _ in pairs), SHOWN)}"
+            )
+        return [value for _, value in pairs]
+
+    def _pair(self, command: str, line: str) -> tuple[str, float]:
+        name, equals, text = line.partition("=")
+        try:
+            value = float(text) if equals else math.nan
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise AnswerError(f"{self.name}: {command} answered '{shown(line, SHOWN)}', not a name and a number")
+        return name.strip(), value
+
+    def _error(self, answer: str) -> int:
+        """Return the error code of an answer to ``ERR?``; 0: none."""
+        if not answer.removeprefix("-").isdecimal():
+            raise AnswerError(f"{self.name}: ERR? answered '{shown(answer, SHOWN)}', not a number")
+        return int(answer)
+
+
+DEVICE = GcsDevice
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    host, colon, port = address.rpartition(":")
+    if not colon:
+        host, port = address, str(PORT)
+    if not host or not port.isdigit() or not 0 < int(port) < 65_536:
+        raise UsageError(f"address '{address}' of a gcs device; give HOST or HOST:PORT, such as 192.0.2.1:{PORT}")
+    return host.strip("[]"), int(port)
+
+
+def _meaning(code: int) -> str:
+    return f"{code} ({MEANINGS.get(code, 'see its manual')})"
+
+
+def _cut(data: bytes) -> str:
+    return f"'{shown(data[:SHOWN].decode('latin-1'))}'" if data else "nothing"

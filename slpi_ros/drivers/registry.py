@@ -1,0 +1,18 @@
+"""The devices by name. A new one is its own file with a class `DEVICE`, and an entry here."""
+
+from collections.abc import Sequence
+from importlib import import_module
+
+from slpi_ros.drivers.base import Channel, Device
+from slpi_ros.errors import UsageError
+
+# Imported when they are used, as one may need a package that the others do not.
+MODULES = {"gcs": "slpi_ros.drivers.gcs"}
+
+
+def make_device(kind: str, address: str, channels: Sequence[Channel]) -> Device:
+    """Return the device of that kind and address, not yet open; UsageError if there is none or the address is none."""
+    if kind not in MODULES:
+        raise UsageError(f"no device '{kind}'; choose one of {', '.join(MODULES)}")
+    device: Device = import_module(MODULES[kind]).DEVICE(address, channels)
+    return device

@@ -1,0 +1,365 @@
+"""What the node `driver` does with a device, without ROS: the cycle, the last limits, a lost link, the end."""
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from slpi_ros.compensator.amplifier import FOREIGN_NS, FOREIGN_REPORTS, TOLERATED_SHARE
+from slpi_ros.compensator.statistics import Timing
+from slpi_ros.drivers.base import Device, DeviceError, Found, Reading, UnsuitableError
+from slpi_ros.effects.excitation import MEAN_SPEED
+from slpi_ros.errors import SlpiError
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.limits import Limits, RateLimiter, volts
+
+# Time between two attempts to reach a device, and longest sleep of the thread, seconds.
+RETRY, LONGEST_SLEEP = 0.25, 0.05
+# A voltage that was written may be reported for this time.
+BAND_NS = 3 * SECOND_NS // 10
+# The commands are told to be held at a limit for this time.
+HELD_NS = SECOND_NS
+# A voltage of the device's range may be off by rounding, volts.
+ROUNDING = 1e-6
+
+
+class State(Enum):
+    """State of a device."""
+
+    OPENING = "opening"
+    LOST = "lost"  # no link; it is tried again and again
+    HELD = "held"  # read, but never written until it is armed
+    ARMED = "armed"  # follows the commands
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """Settings of a `DeviceLoop`; voltages are those at the stage."""
+
+    axes: tuple[str, ...]
+    limits: tuple[Limits, ...]
+    rate: float = 1000.0  # Hz
+    take_over_servo: bool = False
+    rearm: bool = False
+    rest: tuple[float, ...] | None = None  # V, to ramp to at the end; None: hold
+
+
+@dataclass(frozen=True)
+class Status:
+    """State of a device and its reason."""
+
+    state: State
+    reason: str = ""  # why it is not armed, and what to do
+    since: float = 0.0  # s, system time at which the state began
+
+
+@dataclass
+class LoopCounts:
+    """Counters of a `DeviceLoop`."""
+
+    cycles: int = 0
+    late: int = 0  # cycles that were left out, as the one before took too long
+    rejected: int = 0  # commands
+    losses: int = 0  # of the link
+
+
+class DeviceLoop:
+    """Reads a device and moves it within limits, in a thread of its own; no other thread ever waits for the device.
+
+    Parameters
+    ----------
+    device : the device; used by the thread of `run` alone
+    settings : axes, limits and rate
+    on_reading : called by the thread with each reading
+    now_ns : the steady clock (ns)
+
+    The first opening raises its error out of `run`. Nothing is written before the first command, and the first voltage
+    starts from the one that the device had. After an error the device is opened anew until it succeeds; then it is only
+    read until `arm`, or armed at once with ``rearm``.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        settings: LoopSettings,
+        on_reading: Callable[[Reading], None],
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.status, self.counts, self.timing = Status(State.OPENING), LoopCounts(), Timing()
+        self.found: Found | None = None
+        self.latest: Reading | None = None
+        self.answers: deque[tuple[str, bool, str]] = deque()  # request, whether it succeeded, text
+        self._device, self._settings, self._on_reading, self._now_ns = device, settings, on_reading, now_ns
+        self._limiters = [RateLimiter(limits, 1.0 / settings.rate) for limits in settings.limits]
+        spans = [limits.upper - limits.lower for limits in settings.limits]
+        # At the end there is always a slew limit.
+        self._fastest = [
+            math.inf if each.slew < math.inf else MEAN_SPEED * span
+            for each, span in zip(settings.limits, spans, strict=True)
+        ]
+        self._spans = spans
+        self._lock = threading.Lock()
+        self._goal: tuple[float, ...] | None = None  # V, of the last command
+        self._requests: set[str] = set()
+        self._written: tuple[float, ...] = ()
+        self._sent: deque[tuple[int, tuple[float, ...]]] = deque()
+        self._offsets: tuple[float, ...] = ()
+        self._outside, self._outside_ns = 0, 0
+        self._limited_ns = [-(1 << 62)] * len(spans)
+        self._retry_ns = 0
+        self._ending = False
+
+    # Called by other threads: none of them waits
+
+    def command(self, voltages: Sequence[float]) -> str:
+        """Take the voltages (V) of all axes as the goal; return why they are rejected, or ""."""
+        axes = self._settings.axes
+        status = self.status
+        if len(voltages) != len(axes) or not all(map(math.isfinite, voltages)):
+            reason = f"{list(voltages)[:8]}: send one finite voltage for each of the axes {', '.join(axes)}"
+        elif status.state is not State.ARMED or self._ending:
+            reason = status.reason or "the device is not open yet"
+        else:
+            with self._lock:
+                self._goal = tuple(voltages)
+            return ""
+        self.counts.rejected += 1
+        return reason
+
+    def request(self, what: str) -> None:
+        """Ask for "arm" or "stop"; the outcome appears in `answers`."""
+        with self._lock:
+            self._requests.add(what)
+
+    def end(self) -> None:
+        """Ask the thread to end: after the ramp to rest, if there is one."""
+        self._ending = True
+
+    @property
+    def limited(self) -> tuple[str, ...]:
+        """Axes whose commands were beyond the voltage limits lately."""
+        now_ns = self._now_ns()
+        pairs = zip(self._settings.axes, self._limited_ns, strict=True)
+        return tuple(axis for axis, last_ns in pairs if now_ns - last_ns < HELD_NS)
+
+    # The thread
+
+    def run(self) -> None:
+        """Open the device and serve it until `end`; raise the error of the first opening."""
+        period_ns = round(SECOND_NS / self._settings.rate)
+        try:
+            due_ns = self._now_ns()
+            while not self._ending or self._returning():
+                self._wait_until(due_ns)
+                began_ns = self._now_ns()
+                if not self._lost:
+                    self.timing.note(due_ns, began_ns)
+                self.turn()
+                due_ns += period_ns
+                behind = (self._now_ns() - due_ns) // period_ns
+                if behind > 0:
+                    # No burst of cycles to make up for one that took long.
+                    self.counts.late += behind
+                    due_ns += behind * period_ns
+        finally:
+            self._device.close()
+
+    def turn(self) -> None:
+        """Do one cycle: open the device; write what is due, and read; or try to reach it again."""
+        if self.status.state is State.OPENING:
+            self._open(first=True)
+            return
+        if self._lost:
+            self._refuse_requests()
+            if self._now_ns() >= self._retry_ns:
+                self._try_again()
+            return
+        self._serve_requests()
+        if self._lost:
+            return
+        now_ns = self._now_ns()
+        try:
+            reading = self._device.exchange(self._next(now_ns))
+        except DeviceError as error:
+            self._lose(error)
+            return
+        self.counts.cycles += 1
+        self.latest = reading
+        self._on_reading(reading)
+        if self.status.state is State.ARMED:
+            self._compare(reading, now_ns)
+
+    @property
+    def _lost(self) -> bool:
+        return self.status.state is State.LOST
+
+    def _wait_until(self, due_ns: int) -> None:
+        while (wait := (due_ns - self._now_ns()) * 1e-9) > 0.0:
+            time.sleep(min(wait, LONGEST_SLEEP))
+            if self._ending:
+                return
+
+    # Opening
+
+    def _open(self, *, first: bool = False, arm: bool = False) -> None:
+        """Open the device and check it; afterwards it is armed or held. Raises DeviceError."""
+        found = self._device.open()
+        self._require_range(found)
+        reason = ""
+        # Releasing the servo may move the stage a little: only where somebody has agreed to motion.
+        arm = arm or first or self._settings.rearm
+        if any(found.servo):
+            axes = [axis for axis, on in zip(self._settings.axes, found.servo, strict=True) if on]
+            told = (
+                f"{self._device.name}: the servo of axis {', '.join(axes)} is on: the device moves the voltage itself"
+            )
+            if not self._settings.take_over_servo:
+                raise UnsuitableError(f"{told}; switch it off, or set take_over_servo")
+            if arm:
+                found = self._device.release_servo()
+                if any(found.servo):
+                    raise UnsuitableError(f"{told}, and it does not switch it off; do so at the device")
+            else:
+                reason = f"{told}; ~/arm switches it off and goes on"
+        self.found, self.latest = found, found.reading
+        self._start(found)
+        if arm:
+            self._set(State.ARMED)
+        else:
+            lost = self.status.reason
+            self._set(State.HELD, reason or f"the link was lost ({lost}) and is back; call ~/arm to go on")
+
+    def _start(self, found: Found) -> None:
+        """Start from the voltages that the device has; older goals are dropped."""
+        with self._lock:
+            self._goal = None
+        for limiter, v in zip(self._limiters, found.setpoints, strict=True):
+            limiter.start(v)
+        self._written = found.setpoints
+        self._sent.clear()
+        self._outside = 0
+        pairs = zip(found.reading.voltages, found.setpoints, strict=True)
+        self._offsets = tuple(abs(told - setpoint) for told, setpoint in pairs)
+
+    def _require_range(self, found: Found) -> None:
+        """Raise UnsuitableError where the limits are beyond the device's own range."""
+        for axis, limits, low, high in zip(
+            self._settings.axes, self._settings.limits, found.lowest, found.highest, strict=True
+        ):
+            if limits.lower < low - ROUNDING or limits.upper > high + ROUNDING:
+                raise UnsuitableError(
+                    f"{self._device.name}: axis '{axis}': voltage_min {limits.lower:g} and voltage_max "
+                    f"{limits.upper:g} V are beyond the device's own range, {low:g} to {high:g} V; give limits within"
+                )
+
+    def _try_again(self) -> None:
+        try:
+            self._open()
+        except DeviceError as error:
+            self._device.close()
+            self._set(State.LOST, str(error))
+            self._retry_ns = self._now_ns() + round(RETRY * SECOND_NS)
+
+    def _lose(self, error: SlpiError) -> None:
+        self._device.close()
+        self.counts.losses += 1
+        self._set(State.LOST, str(error))
+        self._retry_ns = self._now_ns() + round(RETRY * SECOND_NS)
+
+    def _set(self, state: State, reason: str = "") -> None:
+        """Set the state; it goes on since it began, if only its reason is another."""
+        since = self.status.since if state is self.status.state else time.time()
+        self.status = Status(state, reason, since)
+        if state is not State.ARMED:
+            with self._lock:
+                self._goal = None
+
+    # Requests
+
+    def _taken(self) -> set[str]:
+        with self._lock:
+            requests, self._requests = self._requests, set()
+        return requests
+
+    def _refuse_requests(self) -> None:
+        for what in self._taken():
+            self.answers.append((what, False, self.status.reason))
+
+    def _serve_requests(self) -> None:
+        if not self._requests:
+            return
+        requests = self._taken()
+        if "stop" in requests:
+            self._set(State.HELD, "stopped by ~/stop; call ~/arm to go on")
+            told = self.latest.voltages if self.latest else ()
+            self.answers.append(("stop", True, f"held at {volts(*told)} V; no block was being played"))
+        if "arm" not in requests:
+            return
+        if self.status.state is State.ARMED:
+            self.answers.append(("arm", True, "it was armed"))
+            return
+        try:
+            self._open(arm=True)
+        except DeviceError as error:
+            self._lose(error)
+            self.answers.append(("arm", False, str(error)))
+        else:
+            self.answers.append(("arm", True, f"goes on from {volts(*self._written)} V"))
+
+    # Voltages
+
+    def _next(self, now_ns: int) -> tuple[float, ...] | None:
+        """Return the voltages (V) to write; None if they are those that were written last, or nothing is commanded."""
+        goal = self._goal
+        if self._ending and self._settings.rest:
+            goal = self._settings.rest
+        if goal is None or self.status.state is not State.ARMED:
+            return None
+        fastest = self._fastest if self._ending else [math.inf] * len(goal)
+        wanted = tuple(
+            limiter.step(v, now_ns, rate) for limiter, v, rate in zip(self._limiters, goal, fastest, strict=True)
+        )
+        for place, (v, limits) in enumerate(zip(goal, self._settings.limits, strict=True)):
+            if not limits.lower <= v <= limits.upper:
+                self._limited_ns[place] = now_ns
+        if wanted == self._written:
+            return None
+        self._sent.append((now_ns, self._written))
+        self._written = wanted
+        return wanted
+
+    def _returning(self) -> bool:
+        """Return whether the way to rest is not at its end yet."""
+        rest = self._settings.rest
+        return rest is not None and self.status.state is State.ARMED and self._written != rest
+
+    def _compare(self, reading: Reading, now_ns: int) -> None:
+        """Hold if the device says, again and again, another voltage than what was written."""
+        # Then its command is not in volts, its own limits are narrower, or somebody else moves it.
+        while self._sent and now_ns - self._sent[0][0] > BAND_NS:
+            self._sent.popleft()
+        for place, told in enumerate(reading.voltages):
+            band = [self._written[place], *(v[place] for _, v in self._sent)] if self._differs(place, told) else [told]
+            tolerated = TOLERATED_SHARE * self._spans[place] + self._offsets[place]
+            if not min(band) - tolerated <= told <= max(band) + tolerated:
+                break
+        else:
+            self._outside = 0
+            return
+        if not self._outside:
+            self._outside_ns = now_ns
+        self._outside += 1
+        if self._outside >= FOREIGN_REPORTS and now_ns - self._outside_ns >= FOREIGN_NS:
+            self._set(
+                State.HELD,
+                f"{self._device.name}: axis '{self._settings.axes[place]}' is at {volts(told)} V, but "
+                f"{volts(self._written[place])} V was written: the device limits the voltage, its command is not in "
+                "volts, or somebody else moves it; find out which, then call ~/arm",
+            )
+
+    def _differs(self, place: int, told: float) -> bool:
+        """Return whether a report is off by more than what means nothing, without a look at the past."""
+        return abs(told - self._written[place]) > TOLERATED_SHARE * self._spans[place]

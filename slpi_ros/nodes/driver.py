@@ -1,0 +1,281 @@
+"""Node ``driver``: a real amplifier and sensor on the topics of a stage."""
+
+import math
+import threading
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from slpi_ros.drivers.base import Channel, Reading
+from slpi_ros.drivers.registry import MODULES, make_device
+from slpi_ros.errors import SlpiError, UsageError, shown
+from slpi_ros.excitation.drives import slew_limits
+from slpi_ros.io.cdr import serialise
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.limits import Limits, volts
+from slpi_ros.nodes.common import COMMANDS, ERROR, WARN, DeferredService, Diagnostics, Health, request_stop
+from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
+
+VOLTAGE = (-10_000.0, 10_000.0)
+HOLD, REST = "hold", "rest"
+# Period of diagnostics, and of looks at what the thread of the device has done, seconds.
+REPORT_PERIOD, LOOK_PERIOD, LOG_PERIOD = 0.5, 0.05, 5.0
+# Share of the cycles that may be left out before it is told.
+LATE_SHARE = 0.02
+# Characters of a device's own identity in messages.
+LONGEST_IDENTITY = 100
+
+DECLARATIONS = (
+    Declaration(
+        "device", "", f"Kind of the device: {', '.join(MODULES)}; required.", read_only=True, choices=tuple(MODULES)
+    ),
+    Declaration("address", "", "Where the device is; gcs: host or host:port.", read_only=True),
+    Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
+    Declaration("channels", ["1"], "The device's name of each axis, in the order of axes.", read_only=True),
+    Declaration(
+        "voltage_min", math.nan, "Lower voltage limit, volts; required. One value, or one for each axis.",
+        read_only=True, number=True,
+    ),
+    Declaration(
+        "voltage_max", math.nan, "Upper voltage limit, volts; required. One value, or one for each axis.",
+        read_only=True, number=True,
+    ),
+    Declaration(
+        "slew_limit", math.nan,
+        "Maximum rate of a voltage, V/s; NaN: the voltage range in 0.1 s. 0: no limit. One value, or one for each "
+        "axis.",
+        read_only=True, between=(0.0, 1e9), number=True, each_axis=True,
+    ),
+    Declaration(
+        "rate", 1000.0, "Cycles per second: one writing and one reading, hertz.",
+        read_only=True, between=(1.0, 10_000.0), number=True,
+    ),
+    Declaration(
+        "amplifier_gain", 1.0,
+        "Voltage at the stage for one volt of the device, V/V: of an amplifier behind it. One value, or one for each "
+        "axis.",
+        read_only=True, between=(1e-6, 1e6), number=True, each_axis=True,
+    ),
+    Declaration(
+        "sensor_scale", 1e-6,
+        "Displacement for one unit of the device's position, metres; negative where they count against each other. One "
+        "value, or one for each axis.",
+        read_only=True, between=(-1.0, 1.0), number=True, each_axis=True,
+    ),
+    Declaration(
+        "sensor_offset", 0.0, "Added to the displacement, metres. One value, or one for each axis.",
+        read_only=True, between=(-1.0, 1.0), number=True, each_axis=True,
+    ),
+    Declaration(
+        "take_over_servo", False,
+        "Whether to switch off a servo that is on at the device, which may move the stage a little.", read_only=True,
+    ),
+    Declaration(
+        "rearm", False, "Whether to go on by itself after a lost link; if false, nothing moves until ~/arm.",
+        read_only=True,
+    ),
+    Declaration(
+        "at_exit", HOLD, "hold: the output stays as it is at the end. rest: it goes to rest_voltage at the slew limit.",
+        read_only=True, choices=(HOLD, REST),
+    ),
+    Declaration(
+        "rest_voltage", 0.0, "Voltage to go to at the end, volts. One value, or one for each axis.",
+        read_only=True, between=VOLTAGE, number=True, each_axis=True,
+    ),
+    Declaration(
+        "hardware_id", "", "Identifier of the stage in stage_state; empty: what the device says of itself.",
+        read_only=True,
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DriverSettings:
+    """Validated settings of the driver."""
+
+    values: Values  # all parameters by name
+    channels: tuple[Channel, ...]
+    loop: LoopSettings
+
+    @classmethod
+    def of(cls, given: Values) -> "DriverSettings":
+        """Return the settings from a mapping of parameter names to values."""
+        values, axes, names = validated(DECLARATIONS, given), given["axes"], list(given["channels"] or ())
+        if len(names) != len(axes) or len(set(names)) != len(names):
+            raise UsageError(
+                f"parameter channels is {names!r}; give the device's name of each of the axes {', '.join(axes)}, each "
+                "once"
+            )
+        if 0.0 in values["sensor_scale"]:
+            raise UsageError("parameter sensor_scale is 0; give metres for one unit of the device's position")
+        low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
+        slew = slew_limits(values["slew_limit"], low, high)
+        limits = tuple(
+            Limits(lowest, highest, rate or math.inf) for lowest, highest, rate in zip(low, high, slew, strict=True)
+        )
+        rest = values["rest_voltage"] if values["at_exit"] == REST else None
+        if rest and any(each.clip(v) != v for each, v in zip(limits, rest, strict=True)):
+            raise UsageError(f"parameter rest_voltage is {volts(*rest)} V; give it within voltage_min and voltage_max")
+        columns = (values[name] for name in ("amplifier_gain", "sensor_scale", "sensor_offset"))
+        loop = LoopSettings(tuple(axes), limits, values["rate"], values["take_over_servo"], values["rearm"], rest)
+        return cls(values, tuple(map(Channel, names, *columns)), loop)
+
+
+class Driver(Node):
+    """Connect a real amplifier and sensor with the topics of a stage.
+
+    Subscribes to ``voltage_command`` (std_msgs/Float64MultiArray, volts in the order of the axes) and publishes
+    ``stage_state`` (sensor_msgs/JointState), stamped when the position was read: the displacement in metres in
+    ``position``, the voltage that the device says it has in ``effort``. Opening the device changes no output; the first
+    voltage starts from the one that is there, and every voltage keeps the limits of this node. A configuration beyond
+    the device's own range is refused. The device is served by a thread of its own.
+
+    When the link is lost nothing is published; ``/diagnostics`` tells the device and since when. It is opened again
+    until that succeeds; then it is read, and moved only after ``~/arm`` (std_srvs/Trigger), or with ``rearm``.
+    ``~/stop`` holds the output until ``~/arm``. Parameters in `DECLARATIONS`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("driver")
+        settings = Parameters(self, DECLARATIONS, DriverSettings.of).settings
+        values = settings.values
+        self._values = values
+        device = make_device(values["device"], values["address"], settings.channels)
+        self._device_name = device.name
+        self._limits = dict(zip(values["axes"], settings.loop.limits, strict=True))
+        self._names = (len(values["axes"]), *values["axes"])
+        self._frame = values["hardware_id"]
+        self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
+        self._diagnostics = Diagnostics(self, "driver")
+        self._loop = DeviceLoop(device, settings.loop, self._publish)
+        self._failure: SlpiError | None = None
+        self._told = self._loop.status
+        self._reported_at, self._cycles_before, self._late_before = time.monotonic(), 0, 0
+        self._deferred = {
+            name: DeferredService(self, f"~/{name}", partial(self._ask, name)) for name in ("arm", "stop")
+        }
+        self._commands = self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, COMMANDS)
+        # The system clock may be set back.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(LOOK_PERIOD, self._look, clock=steady)
+        self._thread = threading.Thread(target=self._run, name=device.name, daemon=True)
+        self._thread.start()
+
+    def destroy_node(self) -> None:
+        """Let the thread of the device end, after the ramp to rest if there is one; then destroy the node."""
+        self._loop.end()
+        while self._thread.is_alive():
+            # A join without timeout would not be interrupted by a signal.
+            self._thread.join(LOOK_PERIOD)
+        super().destroy_node()
+
+    # The thread of the device
+
+    def _run(self) -> None:
+        try:
+            self._loop.run()
+        except SlpiError as error:
+            self._failure = error
+
+    def _publish(self, reading: Reading) -> None:
+        if not self._frame and self._loop.found is not None:
+            self._frame = shown(self._loop.found.identity, LONGEST_IDENTITY)
+        age_ns = time.monotonic_ns() - reading.read_ns
+        seconds, rest = divmod(self.get_clock().now().nanoseconds - age_ns, SECOND_NS)
+        # As bytes: a message object takes several times longer.
+        self._publisher.publish(
+            serialise(seconds, rest, self._frame, *self._names, reading.positions, (), reading.voltages)
+        )
+
+    # Callbacks
+
+    def _on_command(self, command: Float64MultiArray) -> None:
+        if reason := self._loop.command(command.data):
+            self.get_logger().warning(
+                f"commands rejected so far: {self._loop.counts.rejected}; the last one: {reason}",
+                throttle_duration_sec=LOG_PERIOD,
+            )
+
+    def _ask(self, what: str) -> str:
+        self._loop.request(what)
+        return ""
+
+    def _look(self) -> None:
+        """Pass on what the thread of the device has done."""
+        if self._failure is not None:
+            request_stop(self._failure)
+            return
+        while self._loop.answers:
+            what, success, text = self._loop.answers.popleft()
+            self._deferred[what].answer(success, text)
+        status, now = self._loop.status, time.monotonic()
+        changed = status.state is not self._told.state
+        if changed:
+            self._tell()
+        self._told = status
+        if changed or now - self._reported_at >= REPORT_PERIOD:
+            self._report(now)
+
+    def _tell(self) -> None:
+        """Log a new state."""
+        status, found = self._loop.status, self._loop.found
+        if status.state is State.ARMED and found is not None:
+            self.get_logger().info(
+                f"{self._device_name}: {shown(found.identity, LONGEST_IDENTITY)}, at {volts(*found.setpoints)} V: "
+                f"takes {self._commands.topic_name}, publishes {self._publisher.topic_name}"
+            )
+            for note in found.notes:
+                self.get_logger().info(f"{self._device_name}: {note}")
+        elif status.state is State.LOST:
+            self.get_logger().error(f"{status.reason}; trying again")
+        else:
+            self.get_logger().warning(status.reason)
+
+    def _report(self, now: float) -> None:
+        loop, status, found, reading = self._loop, self._loop.status, self._loop.found, self._loop.latest
+        elapsed, self._reported_at = now - self._reported_at, now
+        cycles, late = loop.counts.cycles - self._cycles_before, loop.counts.late - self._late_before
+        self._cycles_before, self._late_before = loop.counts.cycles, loop.counts.late
+        since = datetime.fromtimestamp(status.since, UTC).isoformat(timespec="seconds") if status.since else ""
+        problems = []
+        if status.state is State.LOST:
+            problems.append((ERROR, f"no link since {since}: {status.reason}"))
+        elif status.state is State.HELD:
+            problems.append((WARN, f"held since {since}: {status.reason}"))
+        for axis in loop.limited:
+            limits = self._limits[axis]
+            problems.append(
+                (WARN, f"commands of axis '{axis}' are beyond {limits.lower:g} to {limits.upper:g} V and held there")
+            )
+        if status.state is not State.LOST and late > LATE_SHARE * (cycles + late):
+            problems.append(
+                (WARN, f"{late} of {cycles + late} cycles left out, as the device or this computer took longer than "
+                       f"{1e3 / self._values['rate']:.3g} ms; set rate to {cycles / elapsed:.0f} or less")
+            )  # fmt: skip
+        timing = loop.timing.report()
+        values: dict[str, object] = {
+            "state": status.state.value,
+            "since": since,
+            "reason": status.reason,
+            "device": self._device_name,
+            "identity": shown(found.identity, LONGEST_IDENTITY) if found else "",
+            "cycles_per_second": f"{cycles / elapsed:.1f}",
+            "cycles_left_out": loop.counts.late,
+            "lateness_p99_ms": f"{timing.latency[1] * 1e3:.3f}" if timing else "",
+            "commands_rejected": loop.counts.rejected,
+            "links_lost": loop.counts.losses,
+        }
+        if reading is not None:
+            values |= {
+                f"{axis}.voltage": f"{v:.4f}" for axis, v in zip(self._values["axes"], reading.voltages, strict=True)
+            }
+        loop.timing.restart()
+        summary = f"{self._device_name}: {status.state.value}"
+        self._diagnostics.report(Health(tuple(problems), summary, values, self._frame))

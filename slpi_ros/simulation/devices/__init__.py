@@ -1,0 +1,1 @@
+"""The protocols of real devices, with a simulated stage behind them."""

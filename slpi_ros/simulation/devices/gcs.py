@@ -1,0 +1,294 @@
+"""A controller that speaks PI's General Command Set over TCP, with a simulated stage behind it.
+
+Written independently of the driver. What is simulated: axes, one output for each, the servo as a switch that holds the
+voltage, the own range of voltages, error codes. Syntax: user manual of E-727 (E727T0005, page 178).
+"""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slpi_ros.errors import UsageError
+from slpi_ros.simulation.stage import Stage
+
+IDENTITY = "(c)2020 Physik Instrumente (PI) GmbH & Co. KG, E-727.SIMULATED, 0123456789, 13.21.00.09"
+COMMANDS = (
+    "*IDN?", "ERR?", "HLP?", "ONL?", "POS?", "SAI?", "SVA", "SVA?", "SVO", "SVO?", "TMN?", "TMX?", "VMA?", "VMI?",
+    "VOL?",
+)  # fmt: skip
+MICROMETRE = 1e-6
+# Time between looks at whether the simulator shall end, seconds.
+LOOK = 0.02
+
+SILENT, HALF, WRONG_AXIS, ERROR, LATE, TWICE, LOST, NONSENSE, NOT_FINITE = FAULTS = (
+    "silent", "half", "wrong_axis", "error", "late", "twice", "lost", "nonsense", "not_finite",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What goes wrong with the next answers to a question; UsageError if there is no such fault."""
+
+    kind: str  # one of `FAULTS`
+    question: str = "POS?"  # of `ERR?` for `error`, whatever is given
+    times: int = 1  # how many answers
+    seconds: float = 0.3  # how late an answer comes, or how long no connection is accepted after a loss
+    code: int = 17  # that ``ERR?`` tells
+
+    def __post_init__(self) -> None:
+        if self.kind not in FAULTS:
+            raise UsageError(f"no fault '{self.kind}'; choose one of {', '.join(FAULTS)}")
+
+
+@dataclass(frozen=True)
+class OutputChange:
+    """One change of the voltage at an output."""
+
+    time_ns: int  # steady clock
+    axis: str
+    voltage: float  # V
+
+
+class _LostError(Exception):
+    """The link is to be lost."""
+
+
+class GcsSimulator:
+    """A simulated controller, which serves one client after the other in a thread of its own.
+
+    Parameters
+    ----------
+    axes : names of the axes; output channels are numbered from 1
+    stage : what moves; by default a random one
+    voltage_range : own range, V
+    voltages : at the outputs at the start, V
+    servo : whether the servo is on at the start
+    units_per_volt : of ``SVA``, which is not in volts on every controller
+    without : commands that this controller has not got
+    answer_delay : time until an answer, s
+    port : TCP port; 0 for a free one
+    """
+
+    def __init__(
+        self,
+        axes: Sequence[str] = ("1",),
+        stage: Stage | None = None,
+        *,
+        voltage_range: tuple[float, float] = (-20.0, 120.0),
+        voltages: Sequence[float] | None = None,
+        servo: bool = False,
+        units_per_volt: float = 1.0,
+        without: Sequence[str] = (),
+        answer_delay: float = 0.0,
+        host: str = "127.0.0.1",
+        port: int = 0,
+    ) -> None:
+        self.axes = list(axes)
+        self.stage = stage or Stage.random(self.axes, seed=1, noise_rms=0.0)
+        self.low, self.high = voltage_range
+        self.log: list[OutputChange] = []
+        self.received: list[str] = []  # all commands, in order
+        self.cycles = 0  # number of answers to POS?
+        self.fault: Fault | None = None
+        self.servo = dict.fromkeys(self.axes, servo)
+        self.online = dict.fromkeys(self.axes, True)
+        self.units_per_volt, self._delay = units_per_volt, answer_delay
+        self._known = [command for command in COMMANDS if command not in without]
+        self._outputs = {str(place): axis for place, axis in enumerate(self.axes, 1)}
+        self._voltages = dict(zip(self.axes, voltages or [0.0] * len(self.axes), strict=True))
+        self._error = 0
+        self._begun = time.monotonic()
+        self._refused_until = 0.0
+        self._lock = threading.RLock()  # of the stage: a hand is another thread
+        self._move()
+        self._server = socket.create_server((host, port))
+        self._server.settimeout(LOOK)
+        self.address = "{}:{}".format(*self._server.getsockname()[:2])
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="gcs simulator", daemon=True)
+        self._handlers: dict[str, Callable[[list[str]], list[str]]] = {
+            "*IDN?": lambda _: [IDENTITY],
+            "ERR?": self._tell_error,
+            "HLP?": lambda _: ["The following commands are available:", *self._known, "end of help"],
+            "ONL?": lambda given: self._tell_output(given, lambda axis: str(int(self.online[axis]))),
+            "POS?": self._tell_positions,
+            "SAI?": lambda _: self.axes,
+            "SVA": self._set_voltages,
+            "SVA?": lambda given: self._tell(given, lambda axis: f"{self.voltage(axis) * self.units_per_volt:.6f}"),
+            "SVO": self._set_servo,
+            "SVO?": lambda given: self._tell(given, lambda axis: str(int(self.servo[axis]))),
+            "TMN?": lambda given: self._tell(given, lambda _: "0.0000"),
+            "TMX?": lambda given: self._tell(given, lambda _: "25.0000"),
+            "VMA?": lambda given: self._tell_output(given, lambda _: f"{self.high:.4f}"),
+            "VMI?": lambda given: self._tell_output(given, lambda _: f"{self.low:.4f}"),
+            "VOL?": lambda given: self._tell_output(given, lambda axis: f"{self.voltage(axis):.6f}"),
+        }
+
+    def __enter__(self) -> "GcsSimulator":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the server."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._server.close()
+
+    def voltage(self, axis: str) -> float:
+        """Return the voltage (V) at the output of an axis."""
+        return self._voltages[axis]
+
+    def set_by_hand(self, axis: str, voltage: float) -> None:
+        """Set a voltage (V) as the knob of the controller does."""
+        self._output(axis, voltage)
+
+    # The link
+
+    def _serve(self) -> None:
+        while not self._ending.is_set():
+            try:
+                client, _ = self._server.accept()
+            except TimeoutError:
+                continue
+            with client:
+                if time.monotonic() >= self._refused_until:
+                    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    client.settimeout(LOOK)
+                    with suppress(_LostError, ConnectionError):
+                        self._talk(client)
+
+    def _talk(self, client: socket.socket) -> None:
+        buffer = b""
+        while not self._ending.is_set():
+            try:
+                data = client.recv(65_536)
+            except TimeoutError:
+                continue
+            if not data:
+                return
+            *lines, buffer = (buffer + data).split(b"\n")
+            answers = [self._answer(line.decode("latin-1").strip()) for line in lines]
+            if self._delay:
+                time.sleep(self._delay)
+            if any(answers):
+                client.sendall(b"".join(answers))
+
+    # Commands
+
+    def _answer(self, line: str) -> bytes:
+        if not line:
+            return b""
+        self.received.append(line)
+        command, *given = line.split()
+        if command not in self._known:
+            self._error = 2
+            return b""
+        fault = self._due(command)
+        if fault and fault.kind == ERROR:
+            self._error = fault.code
+        answer = self._handlers[command](given)
+        data = " \n".join(answer).encode("latin-1") + b"\n" if answer else b""
+        return self._spoilt(data, fault) if fault else data
+
+    def _due(self, command: str) -> Fault | None:
+        """Return the fault that this question meets, which counts."""
+        fault = self.fault
+        if fault is None or command != ("ERR?" if fault.kind == ERROR else fault.question):
+            return None
+        self.fault = replace(fault, times=fault.times - 1) if fault.times > 1 else None
+        return fault
+
+    def _spoilt(self, data: bytes, fault: Fault) -> bytes:
+        if fault.kind == LOST:
+            self._refused_until = time.monotonic() + fault.seconds
+            raise _LostError
+        if fault.kind == LATE:
+            self._ending.wait(fault.seconds)
+        first = self.axes[0].encode()
+        return {
+            SILENT: b"",
+            HALF: data[: len(data) // 2],
+            WRONG_AXIS: data.replace(first + b"=", b"Z="),
+            TWICE: data + data,
+            NONSENSE: b"\xff\x00<html>=1e\n" * max(data.count(b"\n"), 1),
+            NOT_FINITE: first + b"=nan\n",
+        }.get(fault.kind, data)
+
+    def _tell_error(self, _: list[str]) -> list[str]:
+        code, self._error = self._error, 0
+        return [str(code)]
+
+    def _tell(self, given: list[str], value: Callable[[str], str]) -> list[str]:
+        """Return a line for each axis that was asked for, or for all."""
+        if any(axis not in self.axes for axis in given):
+            self._error = 15
+            return []
+        return [f"{axis}={value(axis)}" for axis in given or self.axes]
+
+    def _tell_output(self, given: list[str], value: Callable[[str], str]) -> list[str]:
+        """Return a line for each output channel that was asked for, or for all."""
+        if any(output not in self._outputs for output in given):
+            self._error = 17
+            return []
+        return [f"{output}={value(self._outputs[output])}" for output in given or self._outputs]
+
+    def _tell_positions(self, given: list[str]) -> list[str]:
+        self.cycles += 1
+        readings = dict(zip(self.axes, self.stage.measure(self._move()), strict=True))
+        return self._tell(given, lambda axis: f"{readings[axis] / MICROMETRE:.6f}")
+
+    def _set_voltages(self, given: list[str]) -> list[str]:
+        wanted = dict(zip(given[::2], given[1::2], strict=False))
+        try:
+            values = {axis: float(text) / self.units_per_volt for axis, text in wanted.items()}
+        except ValueError:
+            values = {}
+        if not values or len(given) % 2:
+            self._error = 1
+        elif any(axis not in self.axes for axis in values):
+            self._error = 15
+        elif any(self.servo[axis] for axis in values):
+            self._error = 303
+        elif not all(self.low <= v <= self.high for v in values.values()):
+            self._error = 302
+        else:
+            for axis, v in values.items():
+                self._output(axis, v)
+        return []
+
+    def _set_servo(self, given: list[str]) -> list[str]:
+        if len(given) != 2 or given[0] not in self.axes or given[1] not in ("0", "1"):
+            self._error = 1
+        else:
+            # Without a jump: the voltage of the servo stays.
+            self.servo[given[0]] = given[1] == "1"
+        return []
+
+    # The stage
+
+    def _output(self, axis: str, voltage: float) -> None:
+        with self._lock:
+            if voltage != self._voltages[axis]:
+                self._voltages[axis] = voltage
+                self.log.append(OutputChange(time.monotonic_ns(), axis, voltage))
+                self._move()
+
+    def _move(self) -> list[float]:
+        """Move the stage to the present time; return its readings (m) without noise."""
+        low, high = self.stage.voltage_range
+        with self._lock:
+            voltages = np.clip([self._voltages[axis] for axis in self.axes], low, high).tolist()
+            return self.stage.step(time.monotonic() - self._begun, voltages)

@@ -1,0 +1,173 @@
+"""The driver as a process of its own, between DDS and a simulated controller over TCP."""
+
+import signal
+import socket
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
+from nodes.ros_helpers import RELIABLE, NodeProcess, on_graph, started, values_of  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_msgs.msg import Float64MultiArray  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from slpi_ros.simulation.devices.gcs import LOST, Fault, GcsSimulator  # noqa: E402
+
+RATE, SLEW = 200.0, 500.0
+LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0, "slew_limit": SLEW, "rate": RATE}
+# Of the limiter at most two periods count at once.
+LARGEST_STEP = 2.0 * SLEW / RATE + 2e-6
+
+
+class Bench:
+    """What stands at both ends of a driver."""
+
+    def __init__(self, graph, node):
+        self.graph, self.node = graph, node
+        graph.tested = node
+        self.states = graph.record(JointState, "stage_state")
+        self.commands = graph.node.create_publisher(Float64MultiArray, "voltage_command", RELIABLE)
+        graph.watch_diagnostics()
+
+    def connect(self):
+        self.graph.spin_until(self.commands.get_subscription_count, "the ears of the driver")
+        self.graph.spin_until(lambda: self.states, "a state")
+        return self
+
+    def status(self, state):
+        return self.graph.wait_for_status(
+            "/driver: driver", lambda status: values_of(status)["state"] == state, f"the state {state}"
+        )
+
+    def reach(self, *voltages):
+        """Send voltages until the device says that it has them."""
+
+        def there():
+            self.commands.publish(Float64MultiArray(data=list(voltages)))
+            return list(self.states[-1].effort) == list(voltages)
+
+        self.graph.spin_until(there, f"{voltages} V")
+
+    def call(self, name):
+        return self.graph.call(Trigger, f"/driver/{name}", Trigger.Request())
+
+
+@contextmanager
+def driver(address, **parameters):
+    given = {"device": "gcs", "address": address, **LIMITS, **parameters}
+    with on_graph() as graph, started("driver", given) as node:
+        yield Bench(graph, node)
+
+
+def largest_step(simulator, begin):
+    path = [begin, *(each.voltage for each in simulator.log)]
+    return float(np.max(np.abs(np.diff(path)), initial=0.0))
+
+
+def test_voltages_go_to_the_device_and_positions_come_back():
+    channels = {"axes": ["x", "y"], "channels": ["2", "1"], "sensor_offset": [1e-6, 0.0]}
+    with GcsSimulator(["1", "2"], voltages=[10.0, 20.0]) as simulator, driver(simulator.address, **channels) as bench:
+        bench.connect()
+        assert list(bench.states[0].name) == ["x", "y"] and list(bench.states[0].effort) == [20.0, 10.0]
+        assert simulator.log == []
+        bench.reach(60.0, 30.0)
+        assert (simulator.voltage("1"), simulator.voltage("2")) == (30.0, 60.0)
+        last, told = bench.states[-1], simulator._move()
+        assert list(last.position) == pytest.approx([told[1] + 1e-6, told[0]], abs=2e-9)
+        assert "E-727" in last.header.frame_id
+        stamps = [state.header.stamp.sec + state.header.stamp.nanosec * 1e-9 for state in bench.states]
+        assert all(np.diff(stamps) > 0.0)
+        status = bench.status("armed")
+        assert status.level < DiagnosticStatus.ERROR and values_of(status)["device"] == f"gcs {simulator.address}"
+        answer = bench.call("stop")
+        assert answer.success and "60, 30 V" in answer.message
+        bench.status("held")
+        assert bench.call("arm").success
+
+
+def test_a_lost_link_is_told_and_nothing_moves_until_it_is_armed():
+    with GcsSimulator(voltages=[20.0]) as simulator, driver(simulator.address) as bench:
+        bench.connect().reach(40.0)
+        simulator.fault = Fault(LOST, seconds=1.5)
+        status = bench.status("lost")
+        assert status.level == DiagnosticStatus.ERROR and simulator.address in status.message
+        assert values_of(status)["since"]
+        silent = len(bench.states)
+        held = bench.status("held")
+        assert "~/arm" in held.message
+        bench.graph.spin_until(lambda: len(bench.states) > silent + 5, "states again")
+        for _ in range(5):
+            bench.commands.publish(Float64MultiArray(data=[80.0]))
+        bench.graph.wait_for_status(
+            "/driver: driver", lambda status: int(values_of(status)["commands_rejected"]) >= 5, "a rejection"
+        )
+        assert simulator.voltage("1") == 40.0
+        assert bench.call("arm").success
+        bench.reach(80.0)
+        assert largest_step(simulator, 20.0) <= LARGEST_STEP
+
+
+@pytest.mark.parametrize(
+    ("end", "parameters", "voltage"),
+    [(signal.SIGTERM, {}, 60.0), (signal.SIGKILL, {}, 60.0), (signal.SIGINT, {"at_exit": "rest"}, 0.0)],
+)
+def test_its_end_and_the_next_start(end, parameters, voltage):
+    with GcsSimulator(voltages=[20.0]) as simulator:
+        with driver(simulator.address, **parameters) as bench:
+            bench.connect().reach(60.0)
+            code = bench.node.stop(end)
+            assert code == (-end if end == signal.SIGKILL else 0) and "Traceback" not in bench.node.stderr
+        assert simulator.voltage("1") == voltage
+        with driver(simulator.address) as bench:
+            bench.connect()
+            assert list(bench.states[0].effort) == [voltage] and simulator.voltage("1") == voltage
+            bench.reach(50.0)
+        assert largest_step(simulator, 20.0) <= LARGEST_STEP
+
+
+def test_a_simulated_device_as_a_node():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = "{}:{}".format(*server.getsockname())
+    with started("device_simulator", {"address": address, "voltage": 15.0, "noise_rms": 0.0}) as device:
+        # Until it listens, a driver would end.
+        while "own range" not in device.stderr:
+            assert device.process.poll() is None
+        with driver(address, rearm=True) as bench:
+            bench.connect()
+            assert list(bench.states[0].effort) == [15.0]
+            bench.reach(25.0)
+            assert bench.graph.set_parameters("/device_simulator", fault="half") == ""
+            lost = bench.graph.wait_for_status(
+                "/driver: driver", lambda status: values_of(status)["links_lost"] == "1", "the loss"
+            )
+            assert "gcs" in values_of(lost)["device"]
+            bench.reach(35.0)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "code", "complaint"),
+    [
+        ({"device": "abacus"}, 2, "abacus"),
+        ({"address": ""}, 2, "address"),
+        ({"voltage_min": float("nan")}, 2, "voltage_min"),
+        ({"channels": ["1", "2"]}, 2, "channels"),
+        ({"sensor_scale": 0.0}, 2, "sensor_scale"),
+        ({"at_exit": "rest", "rest_voltage": 200.0}, 2, "rest_voltage"),
+        ({"voltage_max": 130.0}, 1, "own range"),
+        ({"channels": ["A"]}, 1, "'A'"),
+        ({"address": "127.0.0.1:1"}, 1, "127.0.0.1:1"),
+    ],
+)
+def test_what_cannot_work_ends_with_one_line(parameters, code, complaint):
+    with GcsSimulator() as simulator:
+        process = NodeProcess("driver", {"device": "gcs", "address": simulator.address, **LIMITS, **parameters}, ())
+        try:
+            assert process.wait() == code
+            said = process.stderr
+        finally:
+            process.kill()
+    assert complaint in said and "Traceback" not in said and len(said.splitlines()) == 1

@@ -10,7 +10,6 @@ from pathlib import Path
 import accuracy
 import engine
 import identification
-import measured
 
 KEPT = Path(__file__).with_name("kept_figures.json")
 # A figure that has grown by more than this share is marked.
@@ -35,7 +34,7 @@ def main() -> None:
     parser.add_argument("--speed", action="store_true", help="only the speed of the engine and of the identification")
     options, _ = parser.parse_known_args()
     figures: dict[str, float] = {}
-    for part in (engine, identification) if options.speed else (engine, identification, measured, accuracy):
+    for part in (engine, identification) if options.speed else (engine, identification, accuracy):
         print(f"\n== {part.__doc__.splitlines()[0]}")
         found = part.main()
         figures |= found if isinstance(found, dict) else {}

@@ -169,7 +169,12 @@ def rows_of(records: Sequence[Series], most: int) -> list[NDArray[np.int64]]:
     """Return the indices of fitted samples, evenly spaced, at most `most` in all."""
     known = [np.flatnonzero(one.fitted & np.isfinite(one.y)) for one in records]
     share = max(1.0, sum(each.size for each in known) / most)
-    return [each[np.unique((np.arange(0.0, each.size, share)).astype(np.int64))] for each in known]
+    counts = [int(np.ceil(each.size / share)) for each in known]
+    # A product may be rounded up to the next index.
+    return [
+        each[np.minimum((share * np.arange(count)).astype(np.int64), each.size - 1)]
+        for each, count in zip(known, counts, strict=True)
+    ]
 
 
 def search_lag(cost: Callable[[float, float], float], period: float) -> tuple[float, float]:

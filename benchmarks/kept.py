@@ -1,0 +1,31 @@
+"""The file of kept figures: a section for each command, with its date, the versions it ran with, and its figures."""
+
+import json
+import platform
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+KEPT = Path(__file__).with_name("kept_figures.json")
+PACKAGES = ("numba", "numpy", "osqp", "scipy")
+
+
+def read(section: str, path: Path = KEPT) -> dict[str, Any]:
+    """Return a section: ``date``, ``command``, ``versions`` and ``figures``; empty if there is none."""
+    if not path.exists():
+        return {}
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")).get(section, {})
+    return found
+
+
+def write(section: str, command: str, figures: Any, path: Path = KEPT) -> None:
+    """Replace the figures of a section; the others stay as they are."""
+    document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    document[section] = {
+        "date": datetime.now(UTC).date().isoformat(),
+        "command": command,
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
+        "figures": figures,
+    }
+    path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,0 +1,124 @@
+"""Measured records: every method on the parts that were not fitted, one row a part.
+
+    python -m benchmarks.measured.bench [--only TASK ..] [--method NAME ..] [--keep]
+
+Errors are those of a free run, rms in % of the range of the judged part. ``*`` marks the best of a row, ``=`` what lies
+within its own 95 % interval of it. The environment variable SLPI_MEASURED_DATA gives the folder of the tables, as
+``python -m benchmarks.measured.fetch`` makes it. ``--keep`` writes the figures to the file of kept figures, task by
+task.
+"""
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from benchmarks import kept
+from benchmarks.measured.manifest import Manifest, read_manifest
+from benchmarks.measured.methods import METHODS, Method
+from benchmarks.measured.scores import Score, Tables, score
+
+SECTION, COMMAND = "measured", "make bench-measured"
+
+
+def data_folder() -> Path | None:
+    """Return the folder of the tables; None, with a line on standard output, where there is none."""
+    folder = Path(os.environ.get("SLPI_MEASURED_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+    if folder.is_dir():
+        return folder
+    print("no measured data: python -m benchmarks.measured.fetch -o FOLDER, then set SLPI_MEASURED_DATA to FOLDER")
+    return None
+
+
+def marks(row: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Return ``*`` for the method with the least error of a row, ``=`` for those within their own interval of it."""
+    scored = {name: cell for name, cell in row.items() if "rms" in cell}
+    if not scored:
+        return {}
+    best = min(scored, key=lambda name: float(scored[name]["rms"]))
+    least = float(scored[best]["rms"])
+    return {name: "*" if name == best else "=" if float(cell["low"]) <= least else "" for name, cell in scored.items()}
+
+
+def table(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], figure: str) -> list[str]:
+    """Return the lines of the table of one figure, ``rms`` with marks or another one without."""
+    names = list(dict.fromkeys(name for row in rows.values() for name in row))
+    lines = [f"{'':<42}" + "".join(f"{name[:11]:>12}" for name in names)]
+    for label, row in rows.items():
+        marked = marks(row) if figure == "rms" else {}
+        cells = []
+        for name in names:
+            cell = row.get(name, {})
+            cells.append(f"{cell[figure]:.3f}{marked.get(name) or ' '}" if figure in cell else "refused ")
+        lines.append(f"{label:<42}" + "".join(f"{cell:>12}" for cell in cells))
+    return lines
+
+
+def run(
+    manifest: Manifest, folder: Path, tasks: Sequence[str], methods: Sequence[Method], keep: bool
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Score every method on every task; return the cells by row and method."""
+    tables = Tables(folder)
+    rows: dict[str, dict[str, dict[str, Any]]] = dict(kept.read(SECTION).get("figures", {})) if keep else {}
+    for task in manifest.tasks:
+        if task.name not in tasks:
+            continue
+        began = time.perf_counter()
+        found: dict[str, dict[str, dict[str, Any]]] = {}
+        for method in methods:
+            for part, cell in score(tables, task, method).items():
+                label = f"{task.name}: {part}"
+                found.setdefault(label, {})[method.name] = _rounded(cell)
+        for label, row in found.items():
+            rows[label] = {**rows.get(label, {}), **row}
+        print(f"\n{task.name}, fitted to {'; '.join(map(str, task.fitted))} ({time.perf_counter() - began:.0f} s)")
+        print("\n".join(table(found, "rms")), flush=True)
+        for label, row in found.items():
+            for name, figures in row.items():
+                if said := figures.get("said") or figures.get("refused"):
+                    print(f"  {label}, {name}: {said}")
+        if keep:
+            kept.write(SECTION, COMMAND, rows)
+    return rows
+
+
+def _rounded(cell: Score | str) -> dict[str, Any]:
+    if isinstance(cell, str):
+        return {"refused": cell}
+    figures = {key: value for key, value in asdict(cell).items() if value != ""}
+    return {key: round(value, 4) if isinstance(value, float) else value for key, value in figures.items()}
+
+
+def main() -> int:
+    """Print the tables."""
+    manifest = read_manifest()
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="+", metavar="TASK", help="these tasks alone")
+    parser.add_argument("--method", nargs="+", metavar="NAME", help="these methods alone")
+    parser.add_argument("--keep", action="store_true", help=f"write the figures to {kept.KEPT.name}")
+    options = parser.parse_args()
+    folder = data_folder()
+    if folder is None:
+        return 0
+    methods = [one for one in METHODS if one.name in (options.method or [one.name])]
+    tasks = options.only or [task.name for task in manifest.tasks]
+    began = time.perf_counter()
+    rows = run(manifest, folder, tasks, methods, options.keep)
+    for title, figure in (
+        ("rms error without its mean, % of range; * best, = within its own interval of the best", "rms"),
+        ("rms error with its mean, % of range", "absolute"),
+        ("time of the fit, s", "fit_seconds"),
+        ("time of a sample of a free run, us", "sample_microseconds"),
+    ):
+        print(f"\n{title}")
+        print("\n".join(table(rows, figure)))
+    print(f"\n{time.perf_counter() - began:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,218 @@
+"""What every method is given and gives back, and what several of them share: scaling, histories, lag and delay."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Most samples of all fitted records together that enter a least-squares problem, and that of a search.
+MOST_ROWS, SEARCH_ROWS = 8000, 2500
+# Lag and delay that are tried, in sampling periods.
+LAGS = (0.0, *np.geomspace(0.5, 100.0, 10).tolist())
+DELAYS = (0.0, *np.geomspace(0.25, 30.0, 8).tolist())
+# A lag or delay is kept if it lowers the rms error of the fit by more than this share.
+WORTHWHILE = 0.01
+
+
+@dataclass(frozen=True)
+class Series:
+    """One record of one axis.
+
+    Parameters
+    ----------
+    name : str
+    t : ndarray, shape (N,), s
+    v : ndarray, shape (N,), V
+    y : ndarray, shape (N,), in the unit of the table; NaN where nothing was read
+    fitted : ndarray of bool, shape (N,)
+        The samples that may be fitted. Earlier voltages may be used, other displacements not.
+    """
+
+    name: str
+    t: FloatArray
+    v: FloatArray
+    y: FloatArray
+    fitted: Mask
+
+
+class Fitted(Protocol):
+    """A fitted model."""
+
+    def simulate(self, name: str, t: FloatArray, v: FloatArray, history: tuple[float, ...]) -> FloatArray:
+        """Return the displacement, shape (N,), of a free run: from voltages alone.
+
+        `history` are the voltages (V) between which the actuator had moved before the record, oldest first; empty: it
+        had never moved. `name` is that of the record: a fitted one has a constant and an initial state of its own.
+        """
+        ...
+
+
+class Method(Protocol):
+    """A kind of model and the way in which it is fitted."""
+
+    @property
+    def name(self) -> str:
+        """Name in the table."""
+        ...
+
+    def fit(self, records: Sequence[Series]) -> Fitted:
+        """Fit the model to all records together."""
+        ...
+
+
+def possible_histories(records: Sequence[Series]) -> tuple[tuple[float, ...], ...]:
+    """Return the histories before a record that are tried: never moved, or from either end of the fitted range."""
+    low = min(float(np.nanmin(one.v)) for one in records)
+    high = max(float(np.nanmax(one.v)) for one in records)
+    return ((), (high, low), (low, high))
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Voltage to -1..1 of the fitted range, displacement to shares of the fitted range around its mean."""
+
+    v_middle: float
+    v_half: float
+    y_mean: float
+    y_range: float
+
+    @classmethod
+    def of(cls, records: Sequence[Series]) -> "Scale":
+        """Return the scale of the fitted samples."""
+        v = np.concatenate([one.v for one in records])
+        y = np.concatenate([one.y[one.fitted] for one in records])
+        low, high = float(np.nanmin(v)), float(np.nanmax(v))
+        return cls((low + high) / 2.0, (high - low) / 2.0, float(np.nanmean(y)), float(np.nanmax(y) - np.nanmin(y)))
+
+    def voltage(self, v: FloatArray) -> FloatArray:
+        """Return V as shares."""
+        return (v - self.v_middle) / self.v_half
+
+    def displacement(self, y: FloatArray) -> FloatArray:
+        """Return displacements as shares."""
+        return (y - self.y_mean) / self.y_range
+
+    def back(self, y: FloatArray) -> FloatArray:
+        """Return shares as displacements."""
+        return self.y_mean + self.y_range * y
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scaled record with a history in front of it.
+
+    Parameters
+    ----------
+    t : ndarray, shape (M + N,), s
+    u : ndarray, shape (M + N,)
+        Scaled voltage; the first M samples are the history.
+    skipped : int
+        M.
+    """
+
+    t: FloatArray
+    u: FloatArray
+    skipped: int
+
+    @property
+    def period(self) -> float:
+        """Sampling period, s."""
+        return float(np.median(np.diff(self.t[self.skipped :])))
+
+
+def prepare(t: FloatArray, u: FloatArray, history: Sequence[float]) -> Prepared:
+    """Put a history, scaled voltages, in front of a record: straight lines with the record's own mean speed."""
+    finite = np.isfinite(u)
+    if not finite.all():
+        u = np.interp(t, t[finite], u[finite])
+    if not history:
+        return Prepared(t, u, 0)
+    period = float(np.median(np.diff(t)))
+    moving = np.abs(np.diff(u))
+    step = float(np.mean(moving[moving > 0.1 * moving.max()])) if moving.max() > 0.0 else 0.1
+    corners = [*history, float(u[0])]
+    legs = [
+        np.linspace(a, b, max(2, min(5000, int(abs(b - a) / step) + 1)), endpoint=False)
+        for a, b in zip(corners, corners[1:], strict=False)
+    ]
+    before = np.concatenate(legs)
+    times = t[0] - period * np.arange(before.size, 0, -1)
+    return Prepared(np.concatenate((times, t)), np.concatenate((before, u)), before.size)
+
+
+def delayed(prepared: Prepared, delay: float, lag: float) -> FloatArray:
+    """Return the scaled voltage behind a delay and a first-order lag (s), exact for a voltage that is held.
+
+    Before the first sample the voltage had its first value.
+    """
+    t, u = prepared.t, prepared.u
+    if delay > 0.0:
+        u = np.interp(t - delay, t, u)
+    if lag <= 0.0:
+        return u
+    steps = np.diff(t, prepend=t[0])
+    return _lagged(u, -np.expm1(-steps / lag))
+
+
+def _lagged(u: FloatArray, shares: FloatArray) -> FloatArray:
+    from benchmarks.measured.methods.operators import lagged
+
+    return lagged(u, shares)
+
+
+def rows_of(records: Sequence[Series], most: int) -> list[NDArray[np.int64]]:
+    """Return the indices of fitted samples, evenly spaced, at most `most` in all."""
+    known = [np.flatnonzero(one.fitted & np.isfinite(one.y)) for one in records]
+    share = max(1.0, sum(each.size for each in known) / most)
+    counts = [int(np.ceil(each.size / share)) for each in known]
+    # A product may be rounded up to the next index.
+    return [
+        each[np.minimum((share * np.arange(count)).astype(np.int64), each.size - 1)]
+        for each, count in zip(known, counts, strict=True)
+    ]
+
+
+def search_lag(cost: Callable[[float, float], float], period: float) -> tuple[float, float]:
+    """Return the delay and the lag (s) with the least cost: grids, then finer ones around their best.
+
+    Parameters
+    ----------
+    cost : callable
+        The rms error of the fit with a delay and a lag, s.
+    period : float, s
+        Sampling period.
+    """
+    bare = cost(0.0, 0.0)
+    lag, least = _finest(lambda x: cost(0.0, x), [period * x for x in LAGS])
+    delay, both = _finest(lambda x: cost(x, lag), [period * x for x in DELAYS])
+    only_delay, alone = _finest(lambda x: cost(x, 0.0), [period * x for x in DELAYS])
+    if both < (1.0 - WORTHWHILE) * min(least, alone):
+        lag, both = _finest(lambda x: cost(delay, x), [lag * x for x in (0.3, 0.5, 0.7, 0.85, 1.0, 1.2)])
+        return delay, lag
+    if min(least, alone) < (1.0 - WORTHWHILE) * bare:
+        return (0.0, lag) if least <= alone else (only_delay, 0.0)
+    return 0.0, 0.0
+
+
+def _finest(cost: Callable[[float], float], values: Sequence[float]) -> tuple[float, float]:
+    found = {x: cost(x) for x in values}
+    for _ in range(2):
+        ordered = sorted(found)
+        best = min(found, key=lambda x: found[x])
+        at = ordered.index(best)
+        beside = [ordered[max(at - 1, 0)], ordered[min(at + 1, len(ordered) - 1)]]
+        found |= {(best + other) / 2.0: cost((best + other) / 2.0) for other in beside if other != best}
+    best = min(found, key=lambda x: found[x])
+    return best, found[best]
+
+
+def each_history(records: Sequence[Series], scale: Scale) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """Yield each record's number with each possible history, scaled."""
+    for number in range(len(records)):
+        for history in possible_histories(records):
+            yield number, tuple(float(x) for x in scale.voltage(np.asarray(history)))

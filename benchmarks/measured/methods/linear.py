@@ -1,0 +1,331 @@
+"""Methods that are linear in their weights behind a delay and a lag: line, Prandtl-Ishlinskii models, Preisach.
+
+The weights that hysteresis asks to be non-negative are so (non-negative least squares), others are free. Every fitted
+record has a constant of its own. Delay and lag of the input, and a rate parameter where there is one, are searched.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar, nnls
+
+from benchmarks.measured.methods import operators
+from benchmarks.measured.methods.base import (
+    MOST_ROWS,
+    SEARCH_ROWS,
+    FloatArray,
+    Prepared,
+    Scale,
+    Series,
+    delayed,
+    possible_histories,
+    prepare,
+    rows_of,
+    search_lag,
+)
+
+IntArray = NDArray[np.int64]
+
+# Ridge on the weights, as a share of the mean square of their columns: settles weights that no sample tells apart. The
+# first is that of the searches; that of the fit is the best of all on blocks left out.
+RIDGES, BLOCKS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2), 5
+
+
+class Features(Protocol):
+    """The columns of a method that is linear in its weights."""
+
+    @property
+    def name(self) -> str:
+        """Name of the method."""
+        ...
+
+    @property
+    def free(self) -> int:
+        """Number of first columns whose weights may be negative."""
+        ...
+
+    def columns(self, prepared: Prepared, u: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the columns at `rows` for a scaled voltage `u` behind delay and lag, (R, C)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Line:
+    """The best straight line: no hysteresis."""
+
+    name: str = "line"
+    free: int = 1
+
+    def columns(self, prepared: Prepared, u: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the voltage."""
+        return u[rows, None]
+
+
+@dataclass(frozen=True)
+class Plays:
+    """Classical Prandtl-Ishlinskii model (Kuhnen 2003, doi:10.3166/ejc.9.407-418): play operators."""
+
+    name: str = "PI"
+    count: int = 30
+    free: int = 0
+
+    @property
+    def radii(self) -> FloatArray:
+        """Return the radii, (K,), shares of half the voltage range; the first is 0: the reversible part."""
+        return np.arange(self.count) / self.count
+
+    def columns(self, prepared: Prepared, u: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the states of the play operators."""
+        return operators.plays(u, self.radii, rows)
+
+
+@dataclass(frozen=True)
+class Creep:
+    """PI with creep operators (Kuhnen and Janocha 1998): linear creep of the voltage and of some play operators."""
+
+    name: str = "PI, creep"
+    count: int = 25
+    free: int = 0
+    creeping: tuple[float, ...] = (0.0, 0.15, 0.4)
+    decades: int = 6
+
+    def columns(self, prepared: Prepared, u: FloatArray, rows: IntArray) -> FloatArray:
+        """Return play operators, and the lags of some of them with time constants over the record's decades."""
+        own = operators.plays(u, np.arange(self.count) / self.count, rows)
+        t = prepared.t
+        longest = float(t[-1] - t[prepared.skipped])
+        constants = np.geomspace(3.0 * prepared.period, max(longest / 2.0, 10.0 * prepared.period), self.decades)
+        shares = -np.expm1(-np.diff(t, prepend=t[0])[:, None] / constants)
+        every = np.arange(u.size)
+        slow = [
+            operators.relaxations(operators.plays(u, np.array([radius]), every)[:, 0], shares, rows)
+            for radius in self.creeping
+        ]
+        return np.hstack([own, *slow])
+
+
+@dataclass(frozen=True)
+class RatePlays:
+    """Rate-dependent PI (Al Janaideh and Krejci 2013, doi:10.1109/TMECH.2012.2205265): radii ``r + b |du/dt|``."""
+
+    widening: float = 0.0
+    name: str = "rate-dependent PI"
+    count: int = 30
+    free: int = 0
+
+    def columns(self, prepared: Prepared, u: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the states of the play operators; `widening` in seconds, the voltage being scaled."""
+        rate = np.abs(np.gradient(u, prepared.t))
+        # The rate of a noisy voltage is that over five samples.
+        smooth = np.convolve(np.pad(rate, 2, mode="edge"), np.full(5, 0.2), "valid")
+        return operators.rate_plays(u, self.widening * smooth, np.arange(self.count) / self.count, rows)
+
+
+@dataclass(frozen=True)
+class Preisach:
+    """Classical Preisach model: density constant in each cell of the plane, and a reversible part."""
+
+    cells: int = 24
+    fine: int = 6
+    name: str = "Preisach"
+    free: int = 0
+
+    def columns(self, prepared: Prepared, u: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the share of each cell that is switched on."""
+        return np.hstack([u[rows, None], operators.relays(u, self.cells, self.fine, rows)])
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """A fitted method of this kind."""
+
+    features: Features
+    scale: Scale
+    weights: FloatArray
+    constants: dict[str, float]
+    delay: float
+    lag: float
+
+    def simulate(self, name: str, t: FloatArray, v: FloatArray, history: tuple[float, ...]) -> FloatArray:
+        """Return the displacement, shape (N,)."""
+        before = [float(x) for x in self.scale.voltage(np.asarray(history, dtype=np.float64))]
+        prepared = prepare(t, self.scale.voltage(v), before)
+        u = delayed(prepared, self.delay, self.lag)
+        rows = np.arange(prepared.skipped, u.size)
+        constant = self.constants.get(name, float(np.mean(list(self.constants.values()))))
+        return self.scale.back(self.features.columns(prepared, u, rows) @ self.weights + constant)
+
+
+def solve(
+    columns: FloatArray, y: FloatArray, record: IntArray, free: int, share: float = RIDGES[0]
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return weights, the constant of each record, and the rms error.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (R, C)
+    y : ndarray, shape (R,)
+    record : ndarray of int, shape (R,)
+        Number of the record of each row.
+    free : int
+        Number of first columns whose weights may be negative.
+    share : float
+        Ridge, see `RIDGES`.
+    """
+    count = int(record.max()) + 1
+    # A constant of each record: taken out as the mean.
+    sizes = np.bincount(record, minlength=count)
+    means = np.array([np.bincount(record, column, count) / sizes for column in columns.T]).T
+    y_means = np.bincount(record, y, count) / sizes
+    a, b = columns - means[record], y - y_means[record]
+    a = np.hstack([a, -a[:, :free]])
+    # The normal equations, as a square root: the time then does not depend on the number of rows.
+    gram = a.T @ a
+    ridge = share * float(np.mean(np.diag(gram))) + 1e-300
+    root = np.linalg.cholesky(gram + ridge * np.eye(gram.shape[0])).T
+    try:
+        found, _ = nnls(root, np.linalg.solve(root.T, a.T @ b), maxiter=20 * gram.shape[0])
+    except RuntimeError:
+        # The iteration limit: a bounded solver instead.
+        from scipy.optimize import lsq_linear
+
+        found = lsq_linear(root, np.linalg.solve(root.T, a.T @ b), bounds=(0.0, np.inf)).x
+    weights = found[: columns.shape[1]].copy()
+    weights[:free] -= found[columns.shape[1] :]
+    error = columns @ weights - y
+    constants = -np.bincount(record, error, count) / sizes
+    return weights, constants, float(np.sqrt(np.mean((error + constants[record]) ** 2)))
+
+
+def solve_with_ridge(
+    columns: FloatArray, y: FloatArray, record: IntArray, free: int
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return what `solve` does with the ridge that predicts blocks left out best."""
+    errors = np.zeros(len(RIDGES))
+    for left_out in np.array_split(np.arange(y.size), BLOCKS):
+        kept = np.ones(y.size, dtype=np.bool_)
+        kept[left_out] = False
+        # A block may hold a whole record: numbers without gaps.
+        _, number = np.unique(record[kept], return_inverse=True)
+        for k, share in enumerate(RIDGES):
+            weights, _, _ = solve(columns[kept], y[kept], number, free, share)
+            # Without its mean, as the errors of the table.
+            errors[k] += float(np.var(columns[left_out] @ weights - y[left_out])) * left_out.size
+    return solve(columns, y, record, free, RIDGES[int(np.argmin(errors))])
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Scaled records, their histories, and the rows that are fitted."""
+
+    records: tuple[Series, ...]
+    scale: Scale
+    prepared: tuple[Prepared, ...]
+    rows: tuple[IntArray, ...]
+    y: FloatArray = field(repr=False)
+    record: IntArray = field(repr=False)
+
+    @classmethod
+    def of(cls, records: Sequence[Series], histories: Sequence[tuple[float, ...]], most: int) -> "Problem":
+        """Prepare records, each with the history given."""
+        scale = Scale.of(records)
+        rows = rows_of(records, most)
+        prepared = tuple(
+            prepare(one.t, scale.voltage(one.v), [float(x) for x in scale.voltage(np.asarray(history, dtype=float))])
+            for one, history in zip(records, histories, strict=True)
+        )
+        y = np.concatenate([scale.displacement(one.y[at]) for one, at in zip(records, rows, strict=True)])
+        number = np.concatenate([np.full(at.size, k) for k, at in enumerate(rows)])
+        moved = tuple(at + one.skipped for at, one in zip(rows, prepared, strict=True))
+        return cls(tuple(records), scale, prepared, moved, y, number)
+
+    @property
+    def period(self) -> float:
+        """Shortest sampling period, s."""
+        return min(one.period for one in self.prepared)
+
+    def columns(self, features: Features, delay: float, lag: float) -> FloatArray:
+        """Return the columns at the fitted rows."""
+        return np.vstack(
+            [
+                features.columns(one, delayed(one, delay, lag), at)
+                for one, at in zip(self.prepared, self.rows, strict=True)
+            ]
+        )
+
+    def cost(self, features: Features, delay: float, lag: float) -> float:
+        """Return the rms error of the fit."""
+        return solve(self.columns(features, delay, lag), self.y, self.record, features.free)[2]
+
+
+def likely_histories(records: Sequence[Series]) -> list[tuple[float, ...]]:
+    """Return the history of each record with which a classical model fits best, V."""
+    possible = possible_histories(records)
+    features, chosen = Plays(count=15), []
+    for one in records:
+        costs = [Problem.of([one], [history], SEARCH_ROWS).cost(features, 0.0, 0.0) for history in possible]
+        chosen.append(possible[int(np.argmin(costs))])
+    return chosen
+
+
+@dataclass(frozen=True)
+class LinearMethod:
+    """A method of this kind.
+
+    Parameters
+    ----------
+    features : Features
+    name : str
+    with_lag : bool
+        Whether delay and lag are fitted.
+    search : Features, optional
+        Coarser columns for the search of delay and lag. Default: the same.
+    """
+
+    features: Features
+    name: str
+    with_lag: bool = True
+    search: Features | None = None
+
+    def fit(self, records: Sequence[Series]) -> LinearModel:
+        """Search delay, lag and rate parameter, then solve for the weights."""
+        histories = likely_histories(records)
+        coarse = Problem.of(records, histories, SEARCH_ROWS)
+        features, delay, lag = self.features, 0.0, 0.0
+        tried = self.search or features
+        if self.with_lag:
+            delay, lag = search_lag(lambda d, x: coarse.cost(tried, d, x), coarse.period)
+        if isinstance(features, RatePlays):
+            features, delay, lag = _with_rate(features, coarse, delay, lag)
+        problem = Problem.of(records, histories, MOST_ROWS)
+        columns = problem.columns(features, delay, lag)
+        weights, constants, _ = solve_with_ridge(columns, problem.y, problem.record, features.free)
+        own = {one.name: float(c) for one, c in zip(records, constants, strict=True)}
+        return LinearModel(features, problem.scale, weights, own, delay, lag)
+
+
+def _with_rate(features: RatePlays, problem: Problem, delay: float, lag: float) -> tuple[RatePlays, float, float]:
+    """Search the widening, with the lag that was found and without: both widen loops at one frequency."""
+    found: list[tuple[float, float, float, float]] = []
+    rates = [np.abs(np.gradient(one.u, one.t)) for one in problem.prepared]
+    fastest = max(float(np.percentile(rate, 95.0)) for rate in rates)
+    for d, x in {(delay, lag), (delay, 0.0), (0.0, 0.0)}:
+
+        def cost(widening: float, d: float = d, x: float = x) -> float:
+            return problem.cost(replace(features, widening=widening), d, x)
+
+        best = minimize_scalar(cost, bounds=(0.0, 0.3 / fastest), method="bounded", options={"maxiter": 15})
+        found += [(float(best.fun), float(best.x), d, x), (cost(0.0), 0.0, d, x)]
+    _, widening, delay, lag = min(found)
+    return replace(features, widening=widening), delay, lag
+
+
+LINE = LinearMethod(Line(), "line", with_lag=False)
+PI = LinearMethod(Plays(), "PI", with_lag=False)
+PI_LAG = LinearMethod(Plays(), "PI, lag")
+PI_CREEP = LinearMethod(Creep(), "PI, creep", search=Plays(count=15))
+PI_RATE = LinearMethod(RatePlays(), "rate-dep. PI", search=Plays(count=15))
+PREISACH = LinearMethod(Preisach(), "Preisach", search=Preisach(8, 4))

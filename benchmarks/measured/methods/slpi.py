@@ -1,0 +1,90 @@
+"""The package's own model, SLPI, without and with the causes that its diagnosis of the fitted records finds."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import slpi_ros
+from benchmarks.measured.methods.base import FloatArray, Series
+from slpi_ros.effects.base import Effect
+from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.rate_dependence import RateDependence
+from slpi_ros.errors import SlpiError
+from slpi_ros.io.record import Record
+from slpi_ros.model.axis_model import AxisModel, Start
+
+AXIS = "x"
+# The package counts in metres, the tables in micrometres or in what stands for them.
+UNIT = 1e-6
+
+
+@dataclass(frozen=True)
+class SlpiModel:
+    """An identified model, and what was found."""
+
+    model: AxisModel
+    fitted: frozenset[str]
+    first: str
+    said: str
+
+    def simulate(self, name: str, t: FloatArray, v: FloatArray, history: tuple[float, ...]) -> FloatArray:
+        """Return the displacement, shape (N,)."""
+        model = self.model
+        if name not in self.fitted:
+            # Creep and rate law that continue from before a record belong to that record.
+            model = replace(model, effects=tuple(_settled(effect) for effect in model.effects))
+        seconds = t - t[0]
+        if name == self.first and not history:
+            # The state that the identification found for this record.
+            return model.simulate(seconds, v) / UNIT
+        path = np.array([model.start.voltage, *history, float(v[0])])
+        level = replace(model, effects=()).after(path)
+        start = Start(float(v[0]), level.displacement, history)
+        return replace(model, start=start).simulate(seconds, v) / UNIT
+
+
+def _settled(effect: Effect) -> Effect:
+    match effect:
+        case Creep():
+            return replace(effect, initial=0.0)
+        case RateDependence():
+            return replace(effect, initial=())
+    return effect
+
+
+def _record(one: Series) -> Record:
+    stamps = np.round((one.t - one.t[0]) * 1e9).astype(np.int64)
+    return Record(stamps, {AXIS: one.v}, {AXIS: UNIT * one.y}, source=one.name)
+
+
+@dataclass(frozen=True)
+class SlpiMethod:
+    """Identification, and diagnosis if `causes`."""
+
+    name: str
+    causes: bool
+
+    def fit(self, records: Sequence[Series]) -> SlpiModel:
+        """Identify a model with the options that ``slpi identify`` has by default."""
+        whole = [_record(one) for one in records]
+        start = stop = None
+        if len(records) == 1 and not records[0].fitted.all():
+            times = records[0].t[records[0].fitted] - records[0].t[0]
+            start, stop = float(times[0]), float(np.nextafter(times[-1], np.inf))
+        model, said = slpi_ros.identify(whole, "slpi", start=start, stop=stop), ""
+        if self.causes:
+            try:
+                diagnosis = slpi_ros.diagnose(whole, model, start=start, stop=stop)
+            except SlpiError as error:
+                said = f"no diagnosis: {error}"
+            else:
+                model, found = diagnosis.extended, diagnosis.axes[AXIS]
+                kept = ", ".join(effect.name for effect in model.axes[AXIS].effects)
+                said = f"{found.verdict}; in the model: {kept or 'nothing'}"
+        names = frozenset(one.name for one in records)
+        return SlpiModel(model.axes[AXIS], names, records[0].name, said)
+
+
+SLPI = SlpiMethod("SLPI", causes=False)
+SLPI_CAUSES = SlpiMethod("SLPI, causes", causes=True)

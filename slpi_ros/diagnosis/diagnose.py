@@ -34,8 +34,9 @@ REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects that leave more than noise are part of the model if they leave at most this share of the error (a third of its
 # mean square), and if the free run of the extended model shows this share of the held-out gain.
 LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
-# Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices.
-REFINED = 3
+# Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
+# ratio of the error of the coarser one to that with it.
+REFINED, COARSER = 3, 1.05
 # A zero has moved if its shift exceeds this multiple of the error; number of parts for the uncertainty of a gain;
 # fewest samples of a comparison.
 ZERO, STRETCHES, FEWEST = 4.0, 8, 50
@@ -253,14 +254,16 @@ def _ambiguous(selection: Selection) -> list[str]:
 
 
 def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
-    """Return the selection of effects, made with a coarser hysteresis, and the joint fit with that of the evidence."""
-    coarse = base if base.evidence.coarse is base.evidence else Explanation(base.evidence.coarse, base.effects)
-    selection = _of_kind(coarse, of_family.coarse if of_family else None)
-    now = selection.now
-    finest = of_family if of_family and BIAS in selection.structures else base.evidence
-    if now.evidence.basis is not finest.basis:
-        now = Explanation(replace(now.evidence, basis=finest.basis), now.effects).refined(REFINED)
-    return replace(selection, base=base, now=now)
+    """Return the selection of effects, made with a coarser hysteresis if that is as good, and the joint fit without."""
+    evidence = base.evidence
+    coarse = base if evidence.coarse is evidence else Explanation(evidence.coarse, base.effects)
+    if coarse is not base and coarse.held_out.rms <= COARSER * base.held_out.rms:
+        selection = _of_kind(coarse, of_family.coarse if of_family else None)
+        finest = of_family if of_family and BIAS in selection.structures else evidence
+        now = Explanation(replace(selection.now.evidence, basis=finest.basis), selection.now.effects).refined(REFINED)
+        if selection.now.held_out.rms <= COARSER * now.held_out.rms:
+            return replace(selection, base=base, now=now)
+    return _of_kind(base, of_family)
 
 
 def _of_kind(base: Explanation, of_family: Evidence | None) -> Selection:

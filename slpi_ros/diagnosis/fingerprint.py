@@ -150,7 +150,8 @@ def _variables(record: Signals) -> dict[str, FloatArray]:
     return {
         "time": t,
         "voltage": v,
-        "displacement": record.y,
+        # That of the model: where the stage rests, the measured one is the residual itself.
+        "displacement": record.y - record.residual,
         "rate": rate,
         "acceleration": slopes(t, rate),
         "time since the last turn": np.maximum(t - t[last], 0.0),

@@ -400,7 +400,7 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
                 one for one in contenders(without, [name]) if one.counts_beside(without) and not one.effect.at_bound
             ]
             now = anew[0].explanation if anew else without
-        elif not effect.plausible(seen(now)):
+        elif effect.at_bound or not effect.plausible(seen(now)):
             refused.add(name)
             now = _without(name, now, rivals, refused)
     # Of several records, that an effect holds on those that are left out says more than its standard deviations, which

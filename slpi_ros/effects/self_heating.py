@@ -1,4 +1,4 @@
-"""Self-heating: the sensitivity of the stage follows the power that its own motion dissipates."""
+"""Self-heating: the sensitivity of the stage follows the mean square rate of its voltage, as dissipated power."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -25,12 +25,15 @@ from slpi_ros.effects.parameters import Fit, parameter
 
 # Number of time constants of the candidates; the shortest (s), and the longest as a multiple of the longest record.
 TIME_CONSTANTS, SHORTEST, LONGEST = 12, 1.0, 2.0
-# Largest change of the sensitivity that is plausible, largest that there is at all, and largest distance of the origin
+# Largest change of the sensitivity that is plausible, bound of the change, and largest distance of the origin
 # from the displacement range, as a share of that range.
 LARGEST, MOST, ORIGIN = 0.3, 0.5, 0.3
 # Mean square rate at the start of a record, in multiples of the largest one in the records: none below, and none that
 # is plausible above, where the stage that cools down would stand for any drift of the sensitivity.
 WARM, HOT = 0.02, 2.0
+# Smallest fall of the mean square rate within a record, as a share of its largest: of a stage that only warms up nobody
+# can say that it does not drift.
+COOLS = 0.3
 # A change of the sensitivity at the start below this is none.
 NO_START = 1e-4
 # Largest number of bursts of the drive, share of the time that they take, and number of slow loops in each pause;
@@ -64,8 +67,8 @@ class SelfHeating(EffectBase):
     name: ClassVar[str] = "self_heating"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "fast motion warms the piezo, and its sensitivity follows, within seconds to minutes"
-    compensated: ClassVar[str] = "exactly, from a cold start"
+    what: ClassVar[str] = "the sensitivity follows how fast the voltage moves, within seconds to minutes"
+    compensated: ClassVar[str] = "yes, from a cold start"
     needs_voltage: ClassVar[bool] = True
     changes_gain: ClassVar[bool] = True
     excitation: ClassVar[Excitation] = Excitation(
@@ -120,15 +123,16 @@ class SelfHeating(EffectBase):
         return MOST / abs(self.gain) if self.gain else inf
 
     def plausible(self, context: FitContext) -> bool:
-        """Return whether the change is small, with an origin near the measured displacements."""
+        """Return whether the change is small, comes and goes, and has an origin near the measured displacements."""
         y = context.y[context.used]
         near = float(y.min()) - ORIGIN * context.motion <= self.origin <= float(y.max()) + ORIGIN * context.motion
         # The voltage that the hysteresis feels is at most as fast as that at the piezo.
-        rates = _mean_square_rates(
-            self.time_constant, EffectContext(context.t, records=context.records, voltage=context.u)
-        )
+        around = EffectContext(context.t, records=context.records, voltage=context.u)
+        rates = _mean_square_rates(self.time_constant, around)
         largest = float(rates.max())
-        return near and abs(self.gain) * largest <= LARGEST and max((0.0, *self.initial)) <= HOT * largest
+        fall = max(float(np.max(np.maximum.accumulate(own) - own)) for own in around.split(rates))
+        moderate = abs(self.gain) * largest <= LARGEST and max((0.0, *self.initial)) <= HOT * largest
+        return near and moderate and fall >= COOLS * largest
 
     def factor(self, around: EffectContext) -> FloatArray:
         """Return ``1 + gain P``, shape (N,)."""
@@ -176,7 +180,7 @@ class SelfHeating(EffectBase):
         rate = (0.01 / abs(self.gain)) ** 0.5 if self.gain else inf
         way = "falls" if self.gain < 0 else "rises"
         return (
-            f"fast motion warms the stage: at {rate:.3g} V/s rms the sensitivity {way} by 1 %, with a time constant of "
+            f"the sensitivity follows the motion: at {rate:.3g} V/s rms it {way} by 1 %, with a time constant of "
             f"{self.time_constant:.3g} s"
         )
 

@@ -195,4 +195,4 @@ def test_with_a_measured_voltage_it_is_found_as_with_the_command():
 
 
 def test_the_sentence_holds_the_figures():
-    assert "158 V/s rms the sensitivity falls by 1 %" in HEAT.describe() and "7 s" in HEAT.describe()
+    assert "158 V/s rms it falls by 1 %" in HEAT.describe() and "7 s" in HEAT.describe()

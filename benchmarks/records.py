@@ -54,16 +54,17 @@ def free_run(model: AxisModel, record: Record, axis: str, others: Collection[tup
     v, y = record.voltage[axis], record.displacement[axis]
     known = np.isfinite(y)
     # Creep and rate law that continue from before a record are specific to the record, like its initial state.
-    settled = replace(model, effects=tuple(_settled(one) for one in model.effects))
+    calm = replace(model, effects=tuple(settled(one) for one in model.effects))
     errors = [
         replace(each, start=Start(float(v[0]), 0.0, history)).simulate(record.t, v)[known] - y[known]
         for history in {(), (float(v[0]),), model.start.history, *others}
-        for each in (model, settled)
+        for each in (model, calm)
     ]
     return 100.0 * min(float(np.std(error)) for error in errors) / float(np.ptp(y[known]))
 
 
-def _settled(effect: Effect) -> Effect:
+def settled(effect: Effect) -> Effect:
+    """Return an effect without what continues from before the record that it was fitted to."""
     match effect:
         case Creep():
             return replace(effect, initial=0.0)

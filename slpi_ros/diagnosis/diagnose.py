@@ -255,10 +255,10 @@ def _ambiguous(selection: Selection) -> list[str]:
 
 def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
     """Return the selection of effects, made with a coarser hysteresis if that is as good, and the joint fit without."""
-    evidence = base.evidence
-    coarse = base if evidence.coarse is evidence else Explanation(evidence.coarse, base.effects)
-    if coarse is not base and coarse.held_out.rms <= COARSER * base.held_out.rms:
-        selection = _of_kind(coarse, of_family.coarse if of_family else None)
+    evidence, coarse = base.evidence, base.evidence.coarse
+    quick = Explanation(coarse, base.effects) if coarse is not evidence else None
+    if quick and quick.held_out.rms <= COARSER * base.held_out.rms:
+        selection = _of_kind(quick, of_family.coarse if of_family else None)
         finest = of_family if of_family and BIAS in selection.structures else evidence
         now = Explanation(replace(selection.now.evidence, basis=finest.basis), selection.now.effects).refined(REFINED)
         if selection.now.held_out.rms <= COARSER * now.held_out.rms:

@@ -56,8 +56,8 @@ def independent_trials(before: Score, tried: Sequence[Score]) -> float:
     gains = np.array([part for after in tried for part in _gains_of_blocks(before, after)])
     # A form far from the data may have losses beyond all bounds, of which the squares would overflow.
     largest, count = np.abs(gains).max(axis=1), before.losses.size
-    gains = gains[(largest > 0.0) & np.isfinite(largest)]
-    gains = gains / np.abs(gains).max(axis=1, keepdims=True)
+    usable = (largest > 0.0) & np.isfinite(largest)
+    gains = gains[usable] / largest[usable, None]
     directions = gains / np.linalg.norm(gains, axis=1, keepdims=True)
     shares = (_signs(count) @ directions.T).max(axis=1, initial=0.0)
     # The sum of gains with random signs, relative to the root of the sum of their squares, as Student's t.

@@ -11,6 +11,7 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 from slpi_ros.drivers.base import (
     TIMEOUT,
@@ -97,7 +98,7 @@ class GcsDevice(Device):
             f"{axis} from {v:.3f} to {w:.3f} V" for axis, v, w in zip(self._axes, before, after, strict=True)
         )
         note = f"the servo was switched off: {moves}"
-        return Found(**{**vars(found), "notes": (note, *found.notes)})
+        return replace(found, notes=(note, *found.notes))
 
     def exchange(self, voltages: Sequence[float] | None) -> Reading:
         """Send ``SVA`` and all questions at once, so that there is one wait."""

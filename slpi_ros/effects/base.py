@@ -27,6 +27,9 @@ Sharing = Literal["shared", "separate", "either"]
 TimeShift = Literal["none", "partly", "only"]
 # Time shifts below this share of the sampling period may be due to the hold of commands between samples.
 HELD = 0.6
+# Largest distance of the origin of an effect from the measured displacements, as a share of their range: with an origin
+# far away a change of the sensitivity is a drift.
+NEAR = 0.3
 # A shift of one to this number of sampling periods may be any effect that only shifts.
 FEW_SAMPLES = 3.0
 # Number of spectral bins on either side of a peak that are attributed to the peak.
@@ -468,6 +471,11 @@ class FitContext:
     def motion(self) -> float:
         """Range of the measured displacement, metres."""
         return float(np.ptp(self.y[self.used]))
+
+    def near_motion(self, displacement: float) -> bool:
+        """Return whether a displacement (m) is at most the share `NEAR` of the motion away from the measured ones."""
+        y, margin = self.y[self.used], NEAR * self.motion
+        return float(y.min()) - margin <= displacement <= float(y.max()) + margin
 
 
 def usual_step(t: FloatArray) -> float:

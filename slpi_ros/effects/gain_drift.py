@@ -27,9 +27,8 @@ from slpi_ros.effects.parameters import Fit, parameter, require
 UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
 # Numbers of knots at equal shares of the way of the voltage.
 OF_TRAVEL = (8, 16)
-# Largest distance of the origin from the displacement range, as a share of that range: with an origin far away, a gain
-# drift is a thermal drift; largest gain: no piezo changes by more; and shortest duration (s).
-ORIGIN, LARGEST, TAKES = 0.3, 0.3, 10.0
+# Largest gain: no piezo changes by more; and shortest duration (s).
+LARGEST, TAKES = 0.3, 10.0
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
@@ -86,8 +85,7 @@ class GainDrift(EffectBase):
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether it is small and slow, with an origin near the measured displacements."""
-        y = context.y[context.used]
-        near = float(y.min()) - ORIGIN * context.motion <= self.origin <= float(y.max()) + ORIGIN * context.motion
+        near = context.near_motion(self.origin)
         return near and max(map(abs, self.gains)) <= LARGEST and self.times[-1] >= TAKES
 
     def factor(self, t: FloatArray) -> FloatArray:

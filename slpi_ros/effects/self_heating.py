@@ -25,9 +25,8 @@ from slpi_ros.effects.parameters import Fit, parameter
 
 # Number of time constants of the candidates; the shortest (s), and the longest as a multiple of the longest record.
 TIME_CONSTANTS, SHORTEST, LONGEST = 12, 1.0, 2.0
-# Largest change of the sensitivity that is plausible, bound of the change, and largest distance of the origin
-# from the displacement range, as a share of that range.
-LARGEST, MOST, ORIGIN = 0.3, 0.5, 0.3
+# Largest change of the sensitivity that is plausible, and bound of the change.
+LARGEST, MOST = 0.3, 0.5
 # Mean square rate at the start of a record, in multiples of the largest one in the records: none below, and none that
 # is plausible above, where the stage that cools down would stand for any drift of the sensitivity.
 WARM, HOT = 0.02, 2.0
@@ -124,8 +123,7 @@ class SelfHeating(EffectBase):
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether the change is small, comes and goes, and has an origin near the measured displacements."""
-        y = context.y[context.used]
-        near = float(y.min()) - ORIGIN * context.motion <= self.origin <= float(y.max()) + ORIGIN * context.motion
+        near = context.near_motion(self.origin)
         # The voltage that the hysteresis feels is at most as fast as that at the piezo.
         around = EffectContext(context.t, records=context.records, voltage=context.u)
         rates = _mean_square_rates(self.time_constant, around)

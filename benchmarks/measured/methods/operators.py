@@ -19,19 +19,9 @@ def lagged(u: FloatArray, shares: FloatArray) -> FloatArray:
     return out
 
 
-@njit(cache=True)
 def plays(u: FloatArray, radii: FloatArray, rows: IntArray) -> FloatArray:
     """Return the states of play operators with constant radii at increasing `rows`, (R, K), from rest at ``u[0]``."""
-    states = np.full(radii.size, u[0])
-    out = np.empty((rows.size, radii.size))
-    at = 0
-    for k in range(u.size):
-        for i in range(radii.size):
-            states[i] = max(u[k] - radii[i], min(u[k] + radii[i], states[i]))
-        while at < rows.size and rows[at] == k:
-            out[at] = states
-            at += 1
-    return out
+    return envelope_plays(u, u, radii, rows)
 
 
 @njit(cache=True)
@@ -49,20 +39,9 @@ def envelope_plays(rising: FloatArray, falling: FloatArray, radii: FloatArray, r
     return out
 
 
-@njit(cache=True)
 def rate_plays(u: FloatArray, widening: FloatArray, radii: FloatArray, rows: IntArray) -> FloatArray:
     """Return play operators whose radii grow by `widening`, (N,), (R, K)."""
-    states = np.full(radii.size, u[0])
-    out = np.empty((rows.size, radii.size))
-    at = 0
-    for k in range(u.size):
-        for i in range(radii.size):
-            radius = radii[i] + widening[k]
-            states[i] = max(u[k] - radius, min(u[k] + radius, states[i]))
-        while at < rows.size and rows[at] == k:
-            out[at] = states
-            at += 1
-    return out
+    return envelope_plays(u - widening, u + widening, radii, rows)
 
 
 @njit(cache=True)

@@ -7,9 +7,7 @@ import numpy as np
 
 import slpi_ros
 from benchmarks.measured.methods.base import FloatArray, Series
-from slpi_ros.effects.base import Effect
-from slpi_ros.effects.creep import Creep
-from slpi_ros.effects.rate_dependence import RateDependence
+from benchmarks.records import settled
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, Start
@@ -33,7 +31,7 @@ class SlpiModel:
         model = self.model
         if name not in self.fitted:
             # Creep and rate law that continue from before a record belong to that record.
-            model = replace(model, effects=tuple(_settled(effect) for effect in model.effects))
+            model = replace(model, effects=tuple(settled(effect) for effect in model.effects))
         seconds = t - t[0]
         if name == self.first and not history:
             # The state that the identification found for this record.
@@ -42,15 +40,6 @@ class SlpiModel:
         level = replace(model, effects=()).after(path)
         start = Start(float(v[0]), level.displacement, history)
         return replace(model, start=start).simulate(seconds, v) / UNIT
-
-
-def _settled(effect: Effect) -> Effect:
-    match effect:
-        case Creep():
-            return replace(effect, initial=0.0)
-        case RateDependence():
-            return replace(effect, initial=())
-    return effect
 
 
 def _record(one: Series) -> Record:

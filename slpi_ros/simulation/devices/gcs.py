@@ -130,7 +130,7 @@ class GcsSimulator:
         }
 
     def __enter__(self) -> "GcsSimulator":
-        self._thread.start()
+        self.start()
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -2,7 +2,9 @@
 
 Every record is drawn from a seed, identified and diagnosed, and only then compared with the truth. A name is wrong if
 the cause is not there and no alternative is it; a diagnosis is silent if it claims to be complete although more than
-1.5 times the sensor noise is left, or says nothing of a cause of at least three times the noise.
+1.5 times the sensor noise is left, or says nothing of a cause of at least three times the noise. An ambiguous
+diagnosis with the truth among its alternatives is right where the record that it asks for decides: that is simulated on
+the same stage, and both are diagnosed together.
 """
 
 # To be set before NumPy is imported: the processes share the cores.
@@ -13,13 +15,16 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import time
 from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from multiprocessing import get_context
 
 import numpy as np
-from hidden import CONFUSABLE, NAMES, hide
+from hidden import CONFUSABLE, NAMES, again, hide
 from hidden.unknown import KINDS, NEAR, hide_unknown
+from next_record import advised_drive
+from numpy.typing import NDArray
 from scipy.stats import beta
 
 import slpi_ros
@@ -29,6 +34,7 @@ from slpi_ros.simulation.axis import SimulatedAxis
 from slpi_ros.simulation.character import Character
 from slpi_ros.simulation.parameters import AxisParameters
 
+FloatArray = NDArray[np.float64]
 GROUPS = ("single", "pair", "simulator", "clean", "unknown")
 SAMPLES = 40_000
 # Group "simulator": the simulated stage of the package and its default calibration drive (s, Hz), sensor noise (m), lag
@@ -57,6 +63,14 @@ class Outcome:
     goes_with: str
     seconds: float
     failure: str = ""
+    # What both records together say, if the first one is ambiguous: the same as `verdict` and `named`.
+    then: str = ""
+    then_named: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def decided(self) -> bool:
+        """Whether the record that an ambiguous diagnosis asks for decides for what is hidden."""
+        return bool(self.then) and self.then != "ambiguous" and {one[0] for one in self.then_named} == self.allowed
 
     @property
     def allowed(self) -> frozenset[str]:
@@ -87,6 +101,8 @@ class Outcome:
         named = ", ".join(one[0] + (f" (or {'/'.join(one[1:])})" if one[1:] else "") for one in self.named) or "-"
         mark = "".join(text for text, is_so in ((" WRONG", self.wrong), (" SILENT", self.silent)) if is_so)
         told = f"{self.verdict} {named}; left {self.left:.2f} (noise {self.noise:.2f}) {self.goes_with}"
+        if self.then:
+            told += f"; with the next record {self.then} {', '.join('/'.join(one) for one in self.then_named) or '-'}"
         return (
             f"{self.case.group:<8}{self.case.seed:4d} {'+'.join(self.case.hidden) or 'clean':<32}{self.seconds:5.1f} s "
             f"{self.failure or told}{mark}"
@@ -97,42 +113,86 @@ def run(case: Case) -> Outcome:
     """Hide, identify, diagnose, and compare."""
     began = time.process_time()
     try:
-        record, axis, floor = _drawn(case)
-        model = slpi_ros.identify(record)
+        stage = _drawn(case)
+        model = slpi_ros.identify(stage.record)
         began = time.process_time()
-        found = slpi_ros.diagnose(record, model, axes=[axis]).axes[axis]
+        found = slpi_ros.diagnose(stage.record, model, axes=[stage.axis]).axes[stage.axis]
+        outcome = Outcome(
+            case,
+            found.verdict,
+            tuple((one.name, *one.alternatives) for one in found.effects),
+            found.after_rms / stage.floor,
+            found.noise_rms / stage.floor,
+            f"{found.left[0].variable} {found.left[0].share:.0%}" if found.left else "",
+            time.process_time() - began,
+        )
+        if found.verdict != "ambiguous" or not outcome.right or case.group == "unknown":
+            return outcome
+        second = stage.next(found.next_experiment or "")
+        if second is None:
+            return replace(outcome, then="no record advised")
+        both = slpi_ros.diagnose([stage.record, second], model, axes=[stage.axis]).axes[stage.axis]
+        return replace(
+            outcome, then=both.verdict, then_named=tuple((one.name, *one.alternatives) for one in both.effects)
+        )
     # One failing case must not end a long run; it is printed and counts as wrong.
     except Exception as error:
         return Outcome(case, "failed", (), 0.0, 0.0, "", 0.0, f"{type(error).__name__}: {error}"[:150])
-    return Outcome(
-        case,
-        found.verdict,
-        tuple((one.name, *one.alternatives) for one in found.effects),
-        found.after_rms / floor,
-        found.noise_rms / floor,
-        f"{found.left[0].variable} {found.left[0].share:.0%}" if found.left else "",
-        time.process_time() - began,
-    )
 
 
-def _drawn(case: Case) -> tuple[Record, str, float]:
+@dataclass(frozen=True)
+class Drawn:
+    """Record of a stage, the axis that counts, its sensor noise (m rms), and what makes another record of the stage.
+
+    `another` takes times (s) and voltages (V) by axis, shape (N,) each.
+    """
+
+    record: Record
+    axis: str
+    floor: float
+    another: Callable[[FloatArray, Mapping[str, FloatArray]], Record] | None = None
+
+    def next(self, next_experiment: str) -> Record | None:
+        """Return the record that a diagnosis recommends; None if it recommends none."""
+        others = [axis for axis in self.record.axes if axis != self.axis]
+        advice = next_experiment.replace("OTHER THIS", " ".join([*others, self.axis]))
+        _, t, voltage = advised_drive(advice, "--seed", "1")
+        if not voltage or self.another is None:
+            return None
+        own = voltage.get(self.axis, next(iter(voltage.values())))
+        rest = {axis: np.full(t.size, self.record.voltage[axis].min()) for axis in others}
+        return self.another(t, {**rest, **{axis: v for axis, v in voltage.items() if axis in others}, self.axis: own})
+
+
+def _drawn(case: Case) -> Drawn:
     if case.group == "unknown":
         one = hide_unknown(case.hidden[0], case.seed, SAMPLES)
-        return one.record, "x", one.floor
+        return Drawn(one.record, "x", one.floor)
     if case.group == "simulator":
-        return _simulated(case.seed), "x", NOISE
+        stage = _simulated(case.seed)
+        t, v = calibration_drive(0.0, 100.0, duration=DURATION, rate=RATE, seed=case.seed)
+        return Drawn(_run(stage, t, v, 1), "x", NOISE, lambda t, v: _run(stage, t, v["x"], 2))
     hidden = hide(case.seed, case.hidden, samples=SAMPLES, base="preisach" if case.group == "clean" else None)
     axis = next((truth.axis for truth in hidden.truth), "x")
-    return hidden.record, axis, hidden.floor[axis]
+
+    def another(t: FloatArray, v: Mapping[str, FloatArray]) -> Record:
+        return again(hidden, 2, {name: v[name] for name in hidden.record.axes}, 1.0 / float(t[1] - t[0])).record
+
+    return Drawn(hidden.record, axis, hidden.floor[axis], another)
 
 
-def _simulated(seed: int) -> Record:
-    """Return the calibration record of a simulated stage with creep and lag."""
+def _simulated(seed: int) -> SimulatedAxis:
+    """Return a simulated stage with creep and lag."""
     character = Character(lag=LAG, creep=float(np.random.default_rng(seed).uniform(*CREEP)))
-    axis = SimulatedAxis(replace(AxisParameters.random(seed), noise_rms=NOISE), seed, character)
-    t, v = calibration_drive(0.0, 100.0, duration=DURATION, rate=RATE, seed=seed)
-    _, measured = axis.run(t, v)
-    return slpi_ros.Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": measured}, "calibration")
+    return SimulatedAxis(replace(AxisParameters.random(seed), noise_rms=NOISE), seed, character)
+
+
+def _run(axis: SimulatedAxis, t: FloatArray, v: FloatArray, number: int) -> Record:
+    """Return the record of a drive; the stage goes on from where the one before ended."""
+    # An hour apart.
+    _, measured = axis.run(3600.0 * number + t, v)
+    stamps = np.round((3600.0 * number + t) * 1e9).astype(np.int64)
+    return slpi_ros.Record(stamps, {"x": v}, {"x": measured}, f"record {number}")
 
 
 def cases(groups: list[str], draws: int, seed: int, only: str | None) -> list[Case]:
@@ -175,10 +235,12 @@ def table(outcomes: list[Outcome]) -> None:
         if own:
             bad = sum(one.wrong or one.silent or bool(one.failure) for one in own)
             bound = float(beta.ppf(0.95, bad + 1, len(own) - bad)) if bad < len(own) else 1.0
-            open_ones = sum(one.verdict == "ambiguous" for one in own)
+            open_ones = [one for one in own if one.verdict == "ambiguous"]
+            decided = sum(one.decided for one in open_ones)
             print(
                 f"{group}: {sum(one.right for one in own)} of {len(own)} right, {bad} wrong or silent "
-                f"({bad / len(own):.1%}; one-sided 95 % bound {bound:.1%}), {open_ones} ambiguous"
+                f"({bad / len(own):.1%}; one-sided 95 % bound {bound:.1%}), {len(open_ones)} ambiguous"
+                f"{f', {decided} decided by the record asked for' if group != 'unknown' else ''}"
             )
     times = [one.seconds for one in outcomes]
     print(f"CPU time of a diagnosis: median {np.median(times):.1f} s, longest {max(times):.1f} s")

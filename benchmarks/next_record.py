@@ -159,26 +159,29 @@ def advised(case: Case) -> Outcome:
     else:
         return Outcome(case, (name,), failure=f"not drawn: none of {TRIES} first records is ambiguous")
     told = ", ".join("/".join((each.name, *each.alternatives)) for each in alone.effects)
-    advice, voltage = advised_drive(alone.next_experiment or "", case)
-    if voltage is None:
+    options = ("--rate", f"{case.rate:g}", "--duration", f"{case.seconds:g}", "--seed", str(case.seed))
+    advice, _, voltage = advised_drive(alone.next_experiment or "", *options)
+    if not voltage:
         return Outcome(case, (name,), first=told, failure=f"no drive is advised, first {told}: {alone.next_experiment}")
-    records = [first, again(hidden, 2, {"x": voltage}, case.rate).record]
+    records = [first, again(hidden, 2, {"x": voltage["x"]}, case.rate).record]
     return _diagnosed(Outcome(case, (name,), first=told, advice=advice), records, model)[0]
 
 
-def advised_drive(next_experiment: str, case: Case) -> tuple[str, FloatArray | None]:
-    """Run the recommended command; return the effect that it is intended for, and its voltages (None on failure)."""
+def advised_drive(next_experiment: str, *options: str) -> tuple[str, FloatArray, dict[str, FloatArray]]:
+    """Run the recommended command, with further options; return the effect that it is intended for, and its drive.
+
+    The drive is its times (s) and voltages (V) by axis, shape (N,) each; there are none where nothing is recommended.
+    """
     command = re.search(r"`slpi (excite .*?)`", next_experiment)
     if not command:
-        return "", None
+        return "", np.empty(0), {}
     words = shlex.split(command[1])
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         table = Path(folder) / "drive.csv"
-        options = ["-o", str(table), "--rate", f"{case.rate:g}", "--duration", f"{case.seconds:g}"]
-        if slpi([*words, *options, "--seed", str(case.seed)]):
-            return "", None
-        voltage = read_table(table, "V")[1]["x"]
-    return words[words.index("--for") + 1] if "--for" in words else "calibration", voltage
+        if slpi([*words, "-o", str(table), *options]):
+            return "", np.empty(0), {}
+        t, voltage = read_table(table, "V")
+    return words[words.index("--for") + 1] if "--for" in words else "calibration", t, voltage
 
 
 def pair(case: Case) -> Outcome:

@@ -5,7 +5,10 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import MOST_LINES, Command, Result
+from slpi_ros.cli.command import MOST_LINES, Command, Result, finding_lines
+
+# Largest number of warnings on the records without -v.
+MOST_WARNINGS = 3
 
 
 def _add_options(command: ArgumentParser) -> None:
@@ -33,11 +36,15 @@ def _run(options: Namespace) -> Result:
     # The model is not checked: an extended model may be extended again.
     common.allow_folder(options, options.output, *FILES)
     with output_folder(options.output, *FILES) as folder:
-        diagnosis = diagnose(DiagnoseRequest(source, model)).diagnosis
+        done = diagnose(DiagnoseRequest(source, model))
+        diagnosis = done.diagnosis
         write_files(folder, diagnosis)
     limits = diagnosis_limits(diagnosis)
     found_any = any(found.effects for found in diagnosis.axes.values())
-    page, lines = f"{folder / PAGE}: open it in a browser", describe_diagnosis(diagnosis)
+    page = f"{folder / PAGE}: open it in a browser"
+    warned = [line for found in done.findings for line in finding_lines(found, all_levels=False)]
+    described = describe_diagnosis(diagnosis)
+    lines = [*described[: MOST_LINES - 2 - len(warned[:MOST_WARNINGS])], *warned[:MOST_WARNINGS], page]
     if found_any or not limits:
         tested = Path(options.output) / "extended_model.json" if found_any else options.model
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(str(tested))}"
@@ -45,11 +52,11 @@ def _run(options: Namespace) -> Result:
         experiments = (found.next_experiment for found in diagnosis.axes.values())
         next_command = next(filter(None, experiments), f"slpi show {shlex.quote(options.model)}")
     return Result(
-        [*lines[: MOST_LINES - 2], page] if len(lines) >= MOST_LINES else [*lines, page],
+        lines,
         format_document(diagnosis.to_document(), "diagnosis"),
         next_command,
         verdict(limits),
-        [*lines, page],
+        [*warned, *described, page],
     )
 
 

@@ -44,11 +44,12 @@ def _add_options(command: ArgumentParser) -> None:
 def _run(options: Namespace) -> Result:
     import numpy as np
 
+    from slpi_ros.arrays.rates import fastest
     from slpi_ros.excitation.drives import SLEW_USED, excite
     from slpi_ros.excitation.path import with_path
     from slpi_ros.io.outputs import allow_table
     from slpi_ros.io.tables import table_header, write_table
-    from slpi_ros.model.coverage import FASTER, fastest
+    from slpi_ros.model.coverage import FASTER
 
     if options.model and not options.for_path:
         raise UsageError("--model is of use with --for-path only; give the path, or leave it out")

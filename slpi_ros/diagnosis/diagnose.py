@@ -9,9 +9,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.arrays.rates import fastest
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
-from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
+from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
 from slpi_ros.diagnosis.selection import BIAS, Selection, is_own, seen, select
 from slpi_ros.diagnosis.significance import NO_WORSE, counts
@@ -24,7 +25,6 @@ from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.repeatability import Repeatability, repeatability_of
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import ABOVE_NOISE, AxisModel, Start
-from slpi_ros.model.coverage import fastest
 from slpi_ros.model.sensor import IDEAL, corrected
 from slpi_ros.model.stage_model import StageModel
 
@@ -136,11 +136,7 @@ def _diagnose_axis(
     given = _given(model, runs, selection)
     source = ", ".join(part.source for part in evidence.parts)
     extension = _extension(model, selection, given, source)
-    tried = [extension] if extension else []
-    if _ambiguous(selection):
-        # Causes that the model will do without are judged alike, in an extension by all of them.
-        tried.append(_extended_by(model, selection, (), source))
-    if _of_another_kind(selection) or any(_not_as_judged(one.with_own, runs, selection) for one in tried):
+    if _of_another_kind(selection) or (extension and _not_as_judged(extension.with_own, runs, selection)):
         # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
         selection = _without_causes(selection)
         given = _given(model, runs, selection)
@@ -150,41 +146,34 @@ def _diagnose_axis(
     if not (extension or selection.named):
         # Nothing is explained, so that nothing is fitted beside the hysteresis of the given kind.
         selection = replace(selection, now=selection.base)
-    extension = extension or _Extension(model, [named.name for named in selection.named], runs, runs)
+    extension = extension or _Extension(model, runs, runs)
     outcomes = _outcomes(runs, extension.runs, selection.now)
     noise, repeats, alike = selection.now.noise, _repeatability(selection.now), driven_alike(records, axis)
-    found = judged(selection, noise, repeats, before, given, outcomes, extension.left_out, alike)
+    found = judged(selection, noise, repeats, before, given, outcomes, alike)
     return found, extension.model
 
 
 class _Extension(NamedTuple):
-    """Refitted model, the effects of the selection that it does without, and its free run on each record.
+    """Refitted model, and its free run on each record.
 
     `with_own` are its free runs with what belongs to each record, such as drift, by which the causes are judged.
     """
 
     model: AxisModel
-    left_out: Sequence[str]
     runs: Sequence[FreeRun]
     with_own: Sequence[FreeRun]
 
 
 def _extension(model: AxisModel, selection: Selection, given: Given, source: str) -> _Extension | None:
     """Return the extension of a model by the effects of a selection; None if nothing is to refit."""
-    left_out = _ambiguous(selection)
-    # If effects remain ambiguous, parameters that were fitted together with them are not reliable on other records.
-    if not (given.changed or BIAS in selection.structures or (selection.named and not left_out)):
+    # An effect that the records do not distinguish from others is part of it: at their drive rates each of these
+    # predicts the same, and what is left without any is larger than what they differ by at others.
+    if not (given.changed or BIAS in selection.structures or selection.named):
         return None
-    return _extended_by(model, selection, left_out, source)
-
-
-def _extended_by(model: AxisModel, selection: Selection, left_out: Sequence[str], source: str) -> _Extension:
-    """Return the extension of a model by the effects of a selection but those `left_out`."""
-    final = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in left_out])
-    extended = _extended(model, final, source)
+    extended = _extended(model, selection.now, source)
     runs = _runs(extended, selection.now)
-    own = any(isinstance(one, EachRecord) for one in final.effects)
-    return _Extension(extended, left_out, runs, _runs(extended, final, own=True) if own else runs)
+    own = any(isinstance(one, EachRecord) for one in selection.now.effects)
+    return _Extension(extended, runs, _runs(extended, selection.now, own=True) if own else runs)
 
 
 def _of_another_kind(selection: Selection) -> bool:
@@ -234,23 +223,6 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
         return True
     shown = 1.0 - rms_of(after) / rms_of(runs)
     return _more_than_noise(selection) and shown < GAIN_SHOWN * (1.0 - _share_left(selection))
-
-
-def _ambiguous(selection: Selection) -> list[str]:
-    """Return the effects that cannot be distinguished from others whose predictions on other records differ."""
-    # Held-out records can resolve this, except for dynamic effects at a single drive frequency. Effects that only shift
-    # in time predict the same wherever they cannot be distinguished.
-    alone = one_speed(selection.now.evidence)
-    return [
-        named.name
-        for named in selection.named
-        if (alone and EFFECTS[named.name].dynamic)
-        or (
-            named.alternatives
-            and not named.confirmed
-            and not all(EFFECTS[name].time_shift == "only" for name in (named.name, *named.alternatives))
-        )
-    ]
 
 
 def _selected(base: Explanation, of_family: Evidence | None) -> Selection:

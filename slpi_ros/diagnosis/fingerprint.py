@@ -11,14 +11,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, IntArray
+from slpi_ros.arrays.rates import slopes
 from slpi_ros.effects.base import usual_step, wave
 from slpi_ros.effects.jumps import jumps
 from slpi_ros.errors import length
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.drive import smallest_turn
 from slpi_ros.identification.signal_statistics import noise
-from slpi_ros.model.coverage import slopes
 
 # Number of blocks of a record, of which every fifth is held out in turn.
 BLOCKS, FOLDS = 40, 5
@@ -34,6 +34,9 @@ MOST_LINES, MOST_JUMPS, LINE = 6, 8, 30.0
 TALL = 0.1
 # Largest number of samples of a record, evenly thinned, for functions of a variable.
 ENOUGH = 40_000
+
+# In a record with fewer turns, a function of time stands for parts of the drive as well.
+FEWEST_TURNS = KNOTS_OF_TIME
 
 # What each variable suggests to look at.
 HINTS: Mapping[str, str] = {
@@ -137,13 +140,18 @@ def _of_variables(records: Sequence[Signals]) -> Iterator[Left]:
             columns = columns[:, :KNOTS] - columns[:, KNOTS:]
         share, fitted = _share(columns, records)
         if share >= LEAST_SHARE:
-            yield Left(name, share, _evidence(name, unit, share, x, fitted), _curve(x, fitted), unit)
+            hint = HINTS[name]
+            turns = min(_turns(record).size for record in records)
+            if name == "time" and turns < FEWEST_TURNS:
+                hint = f"a record with {turns} turns cannot tell time from its drive: record more cycles, or {hint}"
+            evidence = _evidence(name, unit, share, x, fitted, up if branches else None)
+            yield Left(name, share, f"{evidence}; {hint}", _curve(x, fitted), unit)
 
 
 def _variables(record: Signals) -> dict[str, FloatArray]:
     """Return the variables of a record, shape (N,) each, in SI units; the position in the loop is 0..1."""
     t, v = record.t, record.v
-    ends = reversals(v, max(smallest_turn(v, noise(v, t)), 1e-9 * float(np.ptp(v)))) if v.size > 4 else np.array([0])
+    ends = _turns(record)
     last = ends[np.maximum(np.searchsorted(ends, np.arange(v.size), side="right") - 1, 0)]
     way = np.abs(np.diff(v[ends], append=v[-1]))[np.searchsorted(ends, last)]
     rate = slopes(t, v)
@@ -159,6 +167,12 @@ def _variables(record: Signals) -> dict[str, FloatArray]:
             0.0, 1.0
         ),
     }
+
+
+def _turns(record: Signals) -> IntArray:
+    """Return the indices of the reversals of the voltage of a record, its first sample included."""
+    t, v = record.t, record.v
+    return reversals(v, max(smallest_turn(v, noise(v, t)), 1e-9 * float(np.ptp(v)))) if v.size > 4 else np.array([0])
 
 
 def _hats(x: FloatArray, knots: int, *, even: bool) -> FloatArray:
@@ -189,12 +203,15 @@ def _share(matrix: FloatArray, records: Sequence[Signals]) -> tuple[float, Float
     return float(np.clip(share, 0.0, 1.0)), matrix @ fitted(whole, right)
 
 
-def _evidence(name: str, unit: str, share: float, x: FloatArray, fitted: FloatArray) -> str:
-    low, high = int(np.argmin(fitted)), int(np.argmax(fitted))
-    return (
-        f"{share:.0%} of the mean square goes with the {name}: from {length(fitted[low])} at "
-        f"{_quantity(x[low], unit)} to {length(fitted[high])} at {_quantity(x[high], unit)}; {HINTS[name]}"
-    )
+def _evidence(name: str, unit: str, share: float, x: FloatArray, fitted: FloatArray, rate: FloatArray | None) -> str:
+    """Return a clause with the extremes of a fitted function; `rate` is given where rising and falling differ."""
+
+    def at(k: int) -> str:
+        branch = "" if rate is None else " while rising" if rate[k] > 0.0 else " while falling"
+        return f"{length(fitted[k])} at {_quantity(x[k], unit)}{branch}"
+
+    extremes = at(int(np.argmin(fitted))), at(int(np.argmax(fitted)))
+    return f"{share:.0%} of the mean square goes with the {name}: from {extremes[0]} to {extremes[1]}"
 
 
 def _quantity(value: float, unit: str) -> str:

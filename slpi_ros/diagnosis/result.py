@@ -207,15 +207,13 @@ def judged(
     before_rms: float,
     given: Given,
     records: tuple[RecordOutcome, ...],
-    left_out_of_model: Sequence[str],
     driven_alike: Sequence[str],
 ) -> AxisDiagnosis:
     """Return the diagnosis of one axis; `noise_rms` is that of the sensor, `before_rms` the held-out error (m)."""
-    # `left_out_of_model` are identified effects that the extended model does not contain, and `driven_alike` other axes
-    # with the same drive as this one.
+    # `driven_alike` are other axes with the same drive as this one.
     base, now = selection.base, selection.now
     effects = _named_effects(selection)
-    verdict = _verdict(selection, effects, noise_rms, left_out_of_model)
+    verdict = _verdict(selection, effects, noise_rms)
     signals = _signals(now)
     left = fingerprint(signals)
     return AxisDiagnosis(
@@ -223,7 +221,7 @@ def judged(
         summary=_of_given(given, selection, before_rms)
         + _summary(verdict, selection, effects, noise_rms, before_rms)
         + _goes_with(left, verdict, signals)
-        + _not_in_model(now, left_out_of_model, selection.dropped)
+        + _in_model(now, effects, selection.dropped)
         + _mixed(now.evidence)
         + _cannot_tell(driven_alike),
         noise_rms=noise_rms,
@@ -277,11 +275,11 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) ->
     return f"{sentence}; {gained}; {instead}"
 
 
-def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float, left_out: Sequence[str]) -> str:
+def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float) -> str:
     more_than_noise = selection.now.held_out.rms_of_records > ABOVE_NOISE * noise_rms
     if not effects:
         return UNEXPLAINED if more_than_noise or BIAS in selection.structures else NOTHING_FOUND
-    if left_out or any(named.alternatives for named in effects):
+    if any(named.alternatives for named in effects):
         return AMBIGUOUS
     return PARTLY_NAMED if more_than_noise else NAMED
 
@@ -327,12 +325,13 @@ def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
     return f"The given model is off by {error} rms on this record. " if BIAS in selection.structures else ""
 
 
-def _not_in_model(now: Explanation, left_out: Sequence[str], dropped: Sequence[str]) -> str:
-    own = [effect.name for effect in now.effects if isinstance(effect, EachRecord) and effect.name not in left_out]
+def _in_model(now: Explanation, effects: Sequence[NamedEffect], dropped: Sequence[str]) -> str:
+    own = [effect.name for effect in now.effects if isinstance(effect, EachRecord)]
     said = f" Each record's own, and not in the extended model: {', '.join(own)}." if own else ""
-    if left_out:
+    if undecided := [named.name for named in effects if named.alternatives and named.name not in own]:
         said += (
-            f" Not in the extended model: {', '.join(left_out)}; these records do not tell how that acts on other ones."
+            f" In the extended model as one of several possible causes: {', '.join(undecided)}; proved at the drive "
+            "rates of these records only."
         )
     if dropped:
         said += f" Dropped, as what is gained does not hold elsewhere: {', '.join(dropped)}."

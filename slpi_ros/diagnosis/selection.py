@@ -15,7 +15,6 @@ from slpi_ros.diagnosis.significance import (
     ALIKE,
     LEAST_GAIN,
     NO_WORSE,
-    carries_over_clearly,
     chance_of_gain,
     clearly_better,
     counts,
@@ -283,8 +282,7 @@ class Named:
     # Effects that the records do not distinguish from it; next best effect, and the held-out rms error (m) with that.
     alternatives: tuple[str, ...]
     runner_up: tuple[str, float] | None
-    # Whether the errors on held-out records confirm it; whether it has separate parameters in each record.
-    confirmed: bool
+    # Whether it has separate parameters in each record.
     own: bool
 
 
@@ -479,12 +477,12 @@ def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation
 
 
 def _tried(name: str, now: Explanation, rest: Explanation, rivals: Sequence[Effect]) -> list[Contender]:
-    """Return the rivals of an effect as candidates in its place, the best one first; `rest` is the fit without it."""
+    """Return the plausible rivals of an effect in its place, the best one first; `rest` is the fit without it."""
     present = {effect.name for effect in now.effects}
     absent = {rival.name: rival for rival in rivals if rival.name not in present}
     tried = [Contender(other, now.replacing(name, rival).refined(1)) for other, rival in absent.items()]
     refined = _refined(tried, rest, rest.held_out.rms**2 - now.held_out.rms**2)
-    return sorted(refined, key=lambda contender: contender.rms)
+    return sorted((one for one in refined if one.effect.plausible(seen(one.explanation))), key=_error)
 
 
 def _best_structure(now: Explanation, taken: tuple[str, ...]) -> tuple[str | None, Explanation]:
@@ -520,8 +518,8 @@ def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[E
 
 def _in_its_place(
     name: str, now: Explanation, rivals: Sequence[Effect]
-) -> tuple[tuple[str, ...], tuple[str, float] | None, bool]:
-    """Return the alternatives to an effect, its best rival with the error, and whether held-out records confirm it."""
+) -> tuple[tuple[str, ...], tuple[str, float] | None]:
+    """Return the alternatives to an effect, and its best rival with the held-out error."""
     rest, best = now.without(name), Contender(name, now)
     tried = _tried(name, now, rest, rivals)
     alone = one_speed(now.evidence)
@@ -530,8 +528,7 @@ def _in_its_place(
         # At a single frequency a better fit only means a more suitable loop shape.
         others = [*(other.name for other in tried), *(key for key in EFFECTS if EFFECTS[key].time_shift != "only")]
         alternatives = [other for other in others if other != name and EFFECTS[other].dynamic][:1]
-    confirmed = carries_over_clearly(rest.held_out, now.held_out)
-    return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None, confirmed
+    return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None
 
 
 def _do_not_close(now: Explanation) -> FloatArray:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.arrays.rates import rates
 from slpi_ros.errors import RecordError
-from slpi_ros.model.coverage import rates
 
 # A delay is accepted if it reduces the difference between model and desired displacement by this factor.
 BETTER = 1.1

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
+from slpi_ros.arrays.rates import rates
 from slpi_ros.diagnosis.fingerprint import Left, Signals, lines_of
 from slpi_ros.diagnosis.tracking import ErrorPart, Tracking, track
 from slpi_ros.errors import SlpiError, UsageError
@@ -24,7 +25,7 @@ from slpi_ros.identification.repeatability import repeatability_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import RESOLUTION, START_MEMORIES, AxisModel, StartMemory
-from slpi_ros.model.coverage import rates, record_beyond
+from slpi_ros.model.coverage import record_beyond
 from slpi_ros.model.stage_model import StageModel
 
 SCHEMA = "slpi_ros/verification/2"

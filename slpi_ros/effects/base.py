@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.arrays.rates import fastest
 from slpi_ros.effects.excitation import Excitation
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.effects.parameters import Leaf, facts_of, leaves, require_facts, with_leaves
@@ -466,6 +467,13 @@ class FitContext:
     def step(self) -> float:
         """Median sampling interval, seconds."""
         return usual_step(self.t)
+
+    @property
+    def fastest(self) -> float:
+        """Fastest rate of the voltage in any record (V/s), without jumps."""
+        if not self.records:
+            return fastest(self.t, self.v)
+        return max(self.of_record(k).fastest for k in range(len(self.records)))
 
     @property
     def motion(self) -> float:

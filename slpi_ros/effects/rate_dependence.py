@@ -14,6 +14,7 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
+    FitContext,
     ResidualContext,
     Side,
     Signal,
@@ -121,6 +122,10 @@ class RateDependence(EffectBase):
                 "rate_dependence has a retired form (a power of the rate); identify and diagnose again from its bags"
             )
         return given, spread
+
+    def plausible(self, context: FitContext) -> bool:
+        """Return whether the records reach the rate above which loops widen; below it the law is a lag, ``c / s0``."""
+        return self.onset_rate <= context.fastest
 
     @property
     def lasting(self) -> "RateDependence":

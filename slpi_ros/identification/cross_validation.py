@@ -9,6 +9,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
+from slpi_ros.arrays.rates import rates
 from slpi_ros.errors import SlpiError
 from slpi_ros.hysteresis.slpi_published import separate
 from slpi_ros.identification.drive import smallest_turn
@@ -18,7 +19,6 @@ from slpi_ros.identification.repeatability import Repeatability, repeatability_o
 from slpi_ros.identification.samples import Samples, select_thinned
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
-from slpi_ros.model.coverage import rates
 
 CLASSICAL = "pi"
 # Number of samples to which a record is thinned; more samples cost time and give the same errors.

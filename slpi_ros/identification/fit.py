@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from slpi_ros.arrays.rates import fastest
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError, length
 from slpi_ros.identification.least_squares import Fitted
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES, fit_family, fit_multi_slope, fit_plays
@@ -17,7 +18,6 @@ from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_thinned
 from slpi_ros.identification.signal_statistics import white_noise
 from slpi_ros.io.record import Record, common_stage, release
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
-from slpi_ros.model.coverage import fastest
 from slpi_ros.model.sensor import Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
 

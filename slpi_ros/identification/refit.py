@@ -14,6 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays.rates import fastest
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.chain import forward, lasting
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError
@@ -27,7 +28,6 @@ from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.identification.signal_statistics import white_noise
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, Start
-from slpi_ros.model.coverage import fastest
 from slpi_ros.model.stage_model import StageModel
 
 # Standard deviations of the prior, for the gain (relative) and for the smooth deviation of each parameter (share of the

@@ -91,12 +91,12 @@ def test_drift_takes_another_course(benchmarks, drive):
 
 
 def test_the_advised_command_is_run(next_record):
-    case = next_record.Case("advised", 0, SECONDS, RATE)
     advice = "Record `slpi excite -o drive.csv --voltage-min 5 --voltage-max 85 --for creep`. And so on."
-    name, voltage = next_record.advised_drive(advice, case)
-    assert name == "creep" and voltage.size == SECONDS * RATE + 1
-    assert voltage.min() == 5.0 and 70.0 < voltage.max() <= 85.0
-    assert next_record.advised_drive("Nothing to record.", case) == ("", None)
+    options = ("--rate", f"{RATE:g}", "--duration", f"{SECONDS:g}")
+    name, t, voltage = next_record.advised_drive(advice, *options)
+    assert name == "creep" and t.size == voltage["x"].size == SECONDS * RATE + 1
+    assert voltage["x"].min() == 5.0 and 70.0 < voltage["x"].max() <= 85.0
+    assert next_record.advised_drive("Nothing to record.")[0] == ""
 
 
 def test_a_third_record_begins_where_the_memory_is_known(next_record, benchmarks, stage, drive):

@@ -8,12 +8,12 @@ from calibration.stages import stage_of
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from slpi_ros.arrays.rates import fastest
 from slpi_ros.excitation.drives import Drive, excite
 from slpi_ros.excitation.path import with_path
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.fit import identify
 from slpi_ros.io.record import Record
-from slpi_ros.model.coverage import fastest
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.simulation.character import Character
 

@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slpi_ros.arrays.rates import fastest
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.fit import identify
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
-from slpi_ros.model.coverage import FASTER, fastest, fastest_displacement, path_beyond, record_beyond
+from slpi_ros.model.coverage import FASTER, fastest_displacement, path_beyond, record_beyond
 
 # 20 µm over 100 V, recorded at up to 200 V/s or 40 µm/s.
 SHAPE = PrandtlIshlinskii(np.array([0.0]), np.array([2e-7]))

@@ -150,7 +150,7 @@ bench-platforms: build
 	$(VENV) benchmarks/platforms.py $(RECORD) .venv .venv-jazzy
 
 bench-latency: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/latency.py
+	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/latency.py --keep
 
 bench-driver: build
 	$(IN_WORKSPACE) $(VENV) benchmarks/driver.py

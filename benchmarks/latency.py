@@ -9,6 +9,7 @@ import argparse
 import os
 from contextlib import ExitStack
 
+import kept
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 from round_trip import Client, Trip, compensator, echo, identified_stage
@@ -22,8 +23,13 @@ UNLIMITED = {"slew_limit": 0.0}
 STARTS = 5
 
 
-def measure(model: StageModel, executor: str, seconds: float, rate: float, beside: str = "") -> None:
-    """Print the lines of the table for one executor; `beside` is the Python of another environment, if any."""
+def measure(
+    model: StageModel, executor: str, seconds: float, rate: float, beside: str = ""
+) -> dict[str, dict[str, float]]:
+    """Print the lines of the table for one executor, and return its figures by node; times in microseconds.
+
+    `beside` is the Python of another environment, if any.
+    """
     cases = {
         "echo": lambda name: echo(name, "echo", executor),
         "compensator": lambda name: compensator(name, model, executor, **UNLIMITED),
@@ -42,24 +48,27 @@ def measure(model: StageModel, executor: str, seconds: float, rate: float, besid
                 for name, process in processes.items():
                     client.run(name, process, rate, BLOCK_S, trips[name])
             client.close()
-    floor = trips["echo"].percentiles()
+    floor, figures = trips["echo"].percentiles(), {}
     for name, trip in trips.items():
         p50, p99 = trip.percentiles()
         ratio = f"{p50 / floor[0]:.2f} / {p99 / floor[1]:.2f}"
         print(
             f"{name + ', ' + executor:<32} {p50:8.0f} {p99:8.0f} {ratio:>12} {trip.lost:6d} {trip.cpu:6.0%}", flush=True
         )
+        figures[name] = {"p50": round(p50), "p99": round(p99), "lost": trip.lost}
+    return figures
 
 
-def main(seconds: float = 8.0, rate: float = 1000.0, beside: str = "") -> None:
-    """Print the table, with nodes of the Python `beside` too."""
+def main(seconds: float = 8.0, rate: float = 1000.0, beside: str = "", keep: bool = False) -> None:
+    """Print the table, with nodes of the Python `beside` too; `keep` writes it to the file of kept figures."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     print(f"{STARTS} starts of all nodes, {seconds:g} s at {rate:g} Hz each, in blocks of {BLOCK_S:g} s in turn")
     print(f"two axes, reliable, depth 100; load of the machine before: {os.getloadavg()[0]:.2f}")
     print(f"{'':<32} {'p50 us':>8} {'p99 us':>8} {'of echo':>12} {'lost':>6} {'CPU':>6}")
     model = identified_stage()
-    for executor in ("events", "default"):
-        measure(model, executor, seconds, rate, beside)
+    figures = {executor: measure(model, executor, seconds, rate, beside) for executor in ("events", "default")}
+    if keep:
+        kept.write("latency", "make bench-latency", figures)
     rclpy.try_shutdown()
 
 
@@ -68,5 +77,6 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--rate", type=float, default=1000.0)
     parser.add_argument("--beside", default="", metavar="PYTHON", help="nodes of another environment in the same run")
+    parser.add_argument("--keep", action="store_true", help="write the figures to kept_figures.json")
     options = parser.parse_args()
-    main(options.seconds, options.rate, options.beside)
+    main(options.seconds, options.rate, options.beside, options.keep)

@@ -1,9 +1,9 @@
-"""The table of README and the picture, from the file of kept figures.
+"""The tables of README and of the page on measured records, and the picture, from the file of kept figures.
 
     python -m benchmarks.measured.report [--check]
 
-Writes what stands between two marks in README.md, and ``docs/images/measured.svg``. With ``--check`` README is compared
-only; the exit code is 1 if it differs.
+Writes what stands between marks in README.md and docs/explanation/measured.md, and ``docs/images/measured.svg``. With
+``--check`` the pages are compared only; the exit code is 1 if one differs.
 """
 
 import argparse
@@ -20,7 +20,9 @@ from benchmarks.measured.manifest import Manifest, read_manifest
 
 ROOT = Path(__file__).resolve().parents[2]
 README, PICTURE = ROOT / "README.md", ROOT / "docs" / "images" / "measured.svg"
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+PAGE = ROOT / "docs" / "explanation" / "measured.md"
+# Section of the kept figures of ``make bench-latency``.
+LATENCY = "latency"
 # Methods whose figures stand in README. The best of all others has a column of its own.
 COLUMNS = ("PI", "PI, lag", "SLPI", "SLPI, causes")
 Rows = Mapping[str, Mapping[str, Mapping[str, Any]]]
@@ -52,9 +54,55 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
         f"Free-run rms error without its mean on parts that were not fitted, % of their range; {date}, `{command}`. "
         f"Bold: the best of the row, of all {count} methods; =: the best is within the 95 % interval of this one. "
         f"SLPI, with or without causes, is best in {wins} of {len(rows)} rows, and best or within its interval of the "
-        f"best in {near}. [All methods, with intervals](docs/images/measured.svg)."
+        f"best in {near}. {_cost(rows)} "
+        "[All methods, with intervals, offsets and times](docs/explanation/measured.md)."
     )
     return "\n".join([*lines, "", said])
+
+
+def _cost(rows: Rows) -> str:
+    """Return a sentence with the median gain over the classical models, and what it costs."""
+    ours = [row["SLPI, causes"] for row in rows.values()]
+    gains = [
+        np.median([row[other]["rms"] / row["SLPI, causes"]["rms"] for row in rows.values() if "rms" in row[other]])
+        for other in ("PI", "PI, lag")
+    ]
+    fit, sample = (np.median([cell[key] for cell in ours]) for key in ("fit_seconds", "sample_microseconds"))
+    return (
+        f"With causes, in the median of the rows, the error of PI is {gains[0]:.1f} times as large, that of PI with a "
+        f"lag {gains[1]:.1f} times; the fit takes {fit:.0f} s, a sample of a long simulation {sample:.1f} µs."
+    )
+
+
+def full_tables(rows: Rows, date: str, command: str) -> str:
+    """Return the tables of the page: every method on every row."""
+    names = list(dict.fromkeys(name for row in rows.values() for name in row))
+    parts = [f"{date}, `{command}`."]
+    for title, figure, text in (
+        ("Without the mean error", "rms", "{0[rms]:.3f} ({0[low]:.3f} to {0[high]:.3f})"),
+        ("With the mean error", "absolute", "{0[absolute]:.3f}"),
+        ("Time of the fit, s", "fit_seconds", "{0[fit_seconds]:.1f}"),
+        ("Time of a sample, µs", "sample_microseconds", "{0[sample_microseconds]:.2f}"),
+    ):
+        parts += ["", f"### {title}", "", f"| judged | {' | '.join(names)} |", f"|---|{'---|' * len(names)}"]
+        for label, row in rows.items():
+            known = {name: float(cell[figure]) for name, cell in row.items() if figure in cell}
+            best = min(known, key=lambda name: known[name]) if figure in ("rms", "absolute") else None
+            cells = [text.format(row[name]) if name in known else "refused" for name in names]
+            cells = [f"**{cell}**" if name == best else cell for name, cell in zip(names, cells, strict=True)]
+            parts.append(f"| {label} | {' | '.join(cells)} |")
+    return "\n".join(parts)
+
+
+def latency_line(section: Mapping[str, Any]) -> str:
+    """Return the sentence of README on the latency."""
+    echo, compensator = (section["figures"]["events"][name] for name in ("echo", "compensator"))
+    return (
+        f"Latency of the compensator, from a desired displacement to its voltage over DDS at 1 kHz, two axes: median "
+        f"{compensator['p50']:.0f} µs, 99th percentile {compensator['p99']:.0f} µs, so a jitter of "
+        f"{compensator['p99'] - compensator['p50']:.0f} µs; a node that only echoes: {echo['p50']:.0f} and "
+        f"{echo['p99']:.0f} µs ({section['date']}, `{section['command']}`, loopback of a shared machine)."
+    )
 
 
 def _cell(cell: Mapping[str, Any], mark: str) -> str:
@@ -64,12 +112,22 @@ def _cell(cell: Mapping[str, Any], mark: str) -> str:
     return f"**{figure}**" if mark == "*" else f"{figure} {mark}".strip()
 
 
-def with_table(text: str, table: str) -> str:
-    """Return a page with the table between its marks; ValueError if it has none."""
-    if text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise ValueError(f"the page does not have the marks {BEGIN} and {END} once")
-    before, rest = text.split(BEGIN)
-    return f"{before}{BEGIN}\n{table}\n{END}{rest.split(END)[1]}"
+def with_part(text: str, name: str, part: str) -> str:
+    """Return a page with a generated part between the marks of this name; ValueError if it has none."""
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    if text.count(begin) != 1 or text.count(end) != 1:
+        raise ValueError(f"the page does not have the marks {begin} and {end} once")
+    before, rest = text.split(begin)
+    return f"{before}{begin}\n{part}\n{end}{rest.split(end)[1]}"
+
+
+def pages() -> dict[Path, str]:
+    """Return README and the page on measured records as the kept figures want them."""
+    section, latency = kept.read(SECTION), kept.read(LATENCY)
+    rows, date, command = section["figures"], section["date"], section["command"]
+    readme = with_part(README.read_text("utf-8"), "measured", readme_table(rows, read_manifest(), date, command))
+    readme = with_part(readme, "latency", latency_line(latency))
+    return {README: readme, PAGE: with_part(PAGE.read_text("utf-8"), "measured", full_tables(rows, date, command))}
 
 
 def draw(rows: Rows, path: Path) -> None:
@@ -110,19 +168,19 @@ def draw(rows: Rows, path: Path) -> None:
 
 
 def main() -> int:
-    """Write table and picture, or compare the table."""
+    """Write the pages and the picture, or compare the pages."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--check", action="store_true", help="compare README with the kept figures; write nothing")
+    parser.add_argument("--check", action="store_true", help="compare with the kept figures; write nothing")
     options = parser.parse_args()
-    section = kept.read(SECTION)
-    text = README.read_text(encoding="utf-8")
-    new = with_table(text, readme_table(section["figures"], read_manifest(), section["date"], section["command"]))
+    new = pages()
+    differ = [path for path, text in new.items() if text != path.read_text(encoding="utf-8")]
     if options.check:
-        if new != text:
-            print("README.md differs from the kept figures: python -m benchmarks.measured.report", file=sys.stderr)
-        return int(new != text)
-    README.write_text(new, encoding="utf-8")
-    draw(section["figures"], PICTURE)
+        for path in differ:
+            print(f"{path} differs from the kept figures: python -m benchmarks.measured.report", file=sys.stderr)
+        return int(bool(differ))
+    for path in differ:
+        path.write_text(new[path], encoding="utf-8")
+    draw(kept.read(SECTION)["figures"], PICTURE)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""README's table of measured records is the one of the kept figures."""
+"""README and the page on measured records hold the kept figures."""
 
 import pytest
 
@@ -13,11 +13,9 @@ def section():
     return kept.read(SECTION)
 
 
-def test_readme_holds_the_kept_figures():
-    found = section()
-    table = report.readme_table(found["figures"], read_manifest(), found["date"], found["command"])
-    text = report.README.read_text(encoding="utf-8")
-    assert report.with_table(text, table) == text, "python -m benchmarks.measured.report"
+@pytest.mark.parametrize("path", [report.README, report.PAGE])
+def test_a_page_holds_the_kept_figures(path):
+    assert report.pages()[path] == path.read_text(encoding="utf-8"), "python -m benchmarks.measured.report"
 
 
 def test_every_row_and_method_is_kept():
@@ -28,18 +26,25 @@ def test_every_row_and_method_is_kept():
         assert set(row) == {method.name for method in METHODS}, label
 
 
-def test_a_changed_figure_is_seen():
-    found = section()
-    label, name = next(iter(found["figures"])), "PI"
-    found["figures"][label][name]["rms"] += 0.01
-    table = report.readme_table(found["figures"], read_manifest(), found["date"], found["command"])
-    text = report.README.read_text(encoding="utf-8")
-    assert report.with_table(text, table) != text
+@pytest.mark.parametrize("figure", ["rms", "absolute"])
+def test_a_changed_figure_is_seen(monkeypatch, figure):
+    found = {name: kept.read(name) for name in (SECTION, report.LATENCY)}
+    next(iter(found[SECTION]["figures"].values()))["PI"][figure] += 0.01
+    monkeypatch.setattr(kept, "read", found.__getitem__)
+    changed = {path for path, text in report.pages().items() if text != path.read_text(encoding="utf-8")}
+    assert changed == ({report.README, report.PAGE} if figure == "rms" else {report.PAGE})
+
+
+def test_the_latency_is_in_the_page(monkeypatch):
+    found = {name: kept.read(name) for name in (SECTION, report.LATENCY)}
+    found[report.LATENCY]["figures"]["events"]["compensator"]["p99"] += 100.0
+    monkeypatch.setattr(kept, "read", found.__getitem__)
+    assert report.pages()[report.README] != report.README.read_text(encoding="utf-8")
 
 
 def test_a_page_without_marks():
     with pytest.raises(ValueError, match="marks"):
-        report.with_table("no marks", "table")
+        report.with_part("no marks", "measured", "table")
 
 
 def test_picture(tmp_path):

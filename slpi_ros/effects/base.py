@@ -31,6 +31,8 @@ HELD = 0.6
 # Largest distance of the origin of an effect from the measured displacements, as a share of their range: with an origin
 # far away a change of the sensitivity is a drift.
 NEAR = 0.3
+# Fewest knots whose ratio counts, and largest ratio of a slow change: see `is_course`.
+FEWEST_KNOTS, LARGEST_RATIO = 5, 0.5
 # A shift of one to this number of sampling periods may be any effect that only shifts.
 FEW_SAMPLES = 3.0
 # Number of spectral bins on either side of a peak that are attributed to the peak.
@@ -494,6 +496,17 @@ def usual_step(t: FloatArray) -> float:
 def longest(around: EffectContext) -> float:
     """Return the duration (s) of the longest record."""
     return max(float(t[-1] - t[0]) for t in around.split(around.t))
+
+
+def is_course(knots: Sequence[float]) -> bool:
+    """Return whether the values at knots are those of a slow change that the knots resolve, not up and down by turns.
+
+    Von Neumann's ratio of the mean square of successive differences to twice the variance: 1 for independent values.
+    """
+    if len(knots) < FEWEST_KNOTS:
+        return True
+    values = np.asarray(knots)
+    return bool(np.sum(np.diff(values) ** 2) <= 2.0 * LARGEST_RATIO * np.sum((values - values.mean()) ** 2))
 
 
 def wave(phase: FloatArray) -> FloatArray:

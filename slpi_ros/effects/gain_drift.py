@@ -18,6 +18,7 @@ from slpi_ros.effects.base import (
     Side,
     Signal,
     StreamingBase,
+    is_course,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
@@ -84,9 +85,9 @@ class GainDrift(EffectBase):
         )
 
     def plausible(self, context: FitContext) -> bool:
-        """Return whether it is small and slow, with an origin near the measured displacements."""
-        near = context.near_motion(self.origin)
-        return near and max(map(abs, self.gains)) <= LARGEST and self.times[-1] >= TAKES
+        """Return whether it is small, slow and resolved by its knots, with an origin near the displacements."""
+        near, slow = context.near_motion(self.origin), self.times[-1] >= TAKES and is_course(self.gains)
+        return near and slow and max(map(abs, self.gains)) <= LARGEST
 
     def factor(self, t: FloatArray) -> FloatArray:
         """Return ``1 + g``, shape (N,), at times `t`, shape (N,), seconds from the record's start."""

@@ -8,7 +8,16 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FitContext, ResidualContext, Side, Signal
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectBase,
+    EffectContext,
+    FitContext,
+    ResidualContext,
+    Side,
+    Signal,
+    is_course,
+)
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
 
@@ -62,9 +71,10 @@ class ThermalDrift(EffectBase):
         )
 
     def plausible(self, context: FitContext) -> bool:
-        """Return whether it is slow."""
+        """Return whether it is slow, and resolved by its knots."""
         pairs = zip(np.diff(self.values).tolist(), np.diff(self.times).tolist(), strict=True)
-        return self.times[-1] >= TAKES and all(abs(dy) <= RATE * context.motion * dt for dy, dt in pairs)
+        slow = self.times[-1] >= TAKES and is_course(self.values)
+        return slow and all(abs(dy) <= RATE * context.motion * dt for dy, dt in pairs)
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with drift, shape (N,), metres."""

@@ -19,9 +19,10 @@ OK, BAD_TIME, NOT_FINITE, OUT_OF_RANGE, UNREACHABLE = range(5)
 STEPS, USUAL = 1200, 1e-4
 # Stored displacements of each mode, and how many more a step needs.
 HISTORY = 128
-# Largest difference to the stream of Python, as a share of the voltage range: double, float, and float with states that
-# hardly change in a step.
-DOUBLE, FLOAT, FLOAT_SLOW = 1e-12, 1e-5, 1e-4
+# Largest difference to the stream of Python, as a share of the voltage range: double; float; float with states that hardly
+# change in a step, or with the logarithm of a small step. The inverse of a mode multiplies what rounding leaves, that of a
+# lag by its time constant over the step.
+DOUBLE, FLOAT, FLOAT_SLOW, RINGING = 1e-12, 1e-5, 1e-4, 10.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,15 @@ def usual_step(stage: ExportedStage) -> float:
     """Return a step (s), in whole nanoseconds, which resolves all modes."""
     lowest = min((float(row[1]) for axis in stage.axes for row in axis.laws.factors if row[0] > 0.0), default=inf)
     return max(USUAL, round(1e9 * 4.0 / ((HISTORY - 4) * lowest)) * 1e-9)
+
+
+def float_limit(stage: ExportedStage) -> float:
+    """Return the largest difference of the float build on the vectors, as a share of the voltage range."""
+    found = FLOAT
+    for laws in (axis.laws for axis in stage.axes):
+        own = FLOAT_SLOW if laws.relaxations.size or laws.rate.size else FLOAT
+        found = max(found, own * (1.0 + laws.lag / usual_step(stage)) * (RINGING if laws.modes.size else 1.0))
+    return found
 
 
 def path(stage: ExportedStage, steps: int, seed: int = 1) -> tuple[NDArray[np.int64], FloatArray]:
@@ -144,9 +154,7 @@ def program_files(stage: ExportedStage, steps: int = STEPS) -> dict[str, str]:
         )
     ]
     ranges = [repr(axis.allowed.upper - axis.allowed.lower) for axis in stage.axes]
-    slow = any(axis.laws.relaxations.size for axis in stage.axes)
-    more: dict[str, Any] = {
-        "rows": rows, "ranges": ranges, "double_limit": repr(DOUBLE), "float_limit": repr(FLOAT_SLOW if slow else FLOAT)
-    }  # fmt: skip
+    limits = {"double_limit": repr(DOUBLE), "float_limit": repr(float_limit(stage))}
+    more: dict[str, Any] = {"rows": rows, "ranges": ranges, **limits}
     context = {**context_of(stage), **more}
     return {"slpi_test.c": templates().get_template("slpi_test.c.j2").render(context)}

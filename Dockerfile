@@ -7,6 +7,7 @@ SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 # hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends \
+        python3-jinja2 \
         python3-jsonschema \
         python3-matplotlib \
         python3-numba \

@@ -40,7 +40,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-export test-export-arm FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -79,6 +79,8 @@ help:
 	@echo 'make bench-calibrator  the calibrator on 20 hidden stages, and 30 faults; an hour'
 	@echo 'make bench-promise     the error that the calibrator promises on 20 stages, and that of scans later; half an hour'
 	@echo 'make bench-fleet    300 bags of 30 stages on Dask: changes found, one worker beside two, 20 minutes'
+	@echo 'make bench-export   the exported C inverse beside the stream of Python: agreement, time, memory; a few minutes'
+	@echo 'make test-export-arm  the exported C inverse on simulated Cortex-M4F and M7; as root it installs the tools (apt, 1 GB)'
 	@echo 'make clean      remove what was built and all caches'
 	@echo 'make distclean  the same, and the environments'
 	@echo 'PYTHON=/path/to/python3.12 chooses the Python; 3.11 and 3.12 work'
@@ -213,6 +215,15 @@ bench-promise: build
 
 bench-fleet: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/fleet.py
+
+# Tools of 1 GB, so that neither `make test` nor anybody else needs them.
+test-export-arm: build
+	@command -v arm-none-eabi-gcc qemu-system-arm >/dev/null || { apt-get update && apt-get install -y \
+		--no-install-recommends gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm; }
+	PYTHONPATH=.:test $(VENV) test/export/run_arm.py
+
+bench-export: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/export.py
 
 clean:
 	rm -rf build build-* install install-* log log-* dist docs/_build .hypothesis .mypy_cache .pytest_cache .ruff_cache

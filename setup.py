@@ -17,7 +17,7 @@ setup(
     maintainer_email="todo@todo.todo",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     # slpi_ros/msg_schemas is a link to the top-level folder, so that every install carries the schemas
-    package_data={NAME: ["py.typed", "msg_schemas/*.json", "reports/assets/*"]},
+    package_data={NAME: ["py.typed", "msg_schemas/*.json", "reports/assets/*", "export/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),
@@ -31,6 +31,7 @@ setup(
     # Ubuntu 24.04 where it has the package.
     install_requires=[
         "setuptools",
+        "jinja2>=3.1.2",
         "jsonschema>=4.10.3",
         "matplotlib>=3.6.3",
         "numba>=0.58.1",

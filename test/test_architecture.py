@@ -19,7 +19,7 @@ LAYERS = (
     {"papers", "nodes", "fleet"},
     {"reports"},
     {"calibration"},
-    {"workflows"},
+    {"workflows", "export"},
     {"diagnosis"},
     {"identification", "compensator"},
     {"model", "excitation"},

@@ -19,6 +19,7 @@ class Laws(NamedTuple):
     """Parameters of the effects of an axis, each as its method `laws` returns them; without the effect: empty or 0."""
 
     lag: float = 0.0  # s
+    slew: float = np.inf  # V/s, of the amplifier
     rate: FloatArray = np.empty(0)  # (0,) or (3,): threshold (V), onset rate (V/s), reversible gain (m/V)
     relaxations: FloatArray = np.empty((2, 0))  # (2, K): time constants (s) and gains of the creep
     rest_of_creep: float = np.inf  # m, its origin; inf: the displacement at the start
@@ -183,7 +184,7 @@ def mode_after(dt: float, x: float, modes: FloatArray, k: int) -> tuple[float, f
 
 
 @compiled
-def unringing(dt: float, wanted: float, factors: FloatArray, f: int, times: FloatArray, values: FloatArray) -> float:
+def unringing(dt: float, wanted: float, factors: FloatArray, f: int, gaps: FloatArray, values: FloatArray) -> float:
     """Return the input (m) of a mode, as `Unringing.inverse`."""
     first, last, taps = int(factors[f, MATRIX + 5]), int(factors[f, MATRIX + 6]), MATRIX + 1
     spacing = max(dt, factors[f, 4])
@@ -199,19 +200,19 @@ def unringing(dt: float, wanted: float, factors: FloatArray, f: int, times: Floa
             b * (1 + delay) - a * delay,
         )
         factors[f, taps + 2], factors[f, taps + 3] = c * (1 + delay) - b * delay, -c * delay
-    now = times[f, last - 1]
-    later, value, at = now + dt, wanted, now + dt - spacing
+    later, earlier, at, value = 0.0, dt, spacing, wanted
     needed, k = factors[f, taps] * wanted, 1
     for place in range(last - 1, first - 1, -1):
-        earlier, before = times[f, place], values[f, place]
-        while at >= earlier:
-            share = (at - earlier) / (later - earlier) if later > earlier else 0.0
+        before = values[f, place]
+        while at <= earlier:
+            share = (earlier - at) / (earlier - later) if earlier > later else 0.0
             needed += factors[f, taps + k] * (before + (value - before) * share)
             k += 1
             if k == 4:
                 return float(needed)
-            at -= spacing
+            at += spacing
         later, value = earlier, before
+        earlier += gaps[f, place]
     left = 0.0
     for tap in range(k, 4):
         left += factors[f, taps + tap]
@@ -220,13 +221,13 @@ def unringing(dt: float, wanted: float, factors: FloatArray, f: int, times: Floa
 
 @compiled
 def resonance_inverse(
-    dt: float, wanted: float, factors: FloatArray, inputs: FloatArray, times: FloatArray, values: FloatArray
+    dt: float, wanted: float, factors: FloatArray, inputs: FloatArray, gaps: FloatArray, values: FloatArray
 ) -> float:
     """Return the input (m) of the modes, as `StreamingResonance.inverse`."""
     for f in range(factors.shape[0]):
         inputs[f] = wanted
         if factors[f, 0] > 0.0:
-            wanted = unringing(dt, wanted, factors, f, times, values)
+            wanted = unringing(dt, wanted, factors, f, gaps, values)
         elif dt >= factors[f, 7]:
             wanted = wanted + (wanted - factors[f, MOVED]) * (factors[f, 6] / dt)
         else:
@@ -236,7 +237,7 @@ def resonance_inverse(
 
 
 @compiled
-def factors_forward(dt: float, factors: FloatArray, inputs: FloatArray, times: FloatArray, values: FloatArray) -> None:
+def factors_forward(dt: float, factors: FloatArray, inputs: FloatArray, gaps: FloatArray, values: FloatArray) -> None:
     """Advance the factors of the inverse of a resonance, as `move` of each."""
     for f in range(factors.shape[0]):
         if not factors[f, 0] > 0.0:
@@ -244,13 +245,17 @@ def factors_forward(dt: float, factors: FloatArray, inputs: FloatArray, times: F
             factors[f, MOVED], factors[f, MOVED + 1], factors[f, MOVED + 2] = x, position, velocity
             continue
         first, last = int(factors[f, MATRIX + 5]), int(factors[f, MATRIX + 6])
-        now = times[f, last - 1] + dt
         if dt <= 0.0:
             last -= 1
-        times[f, last], values[f, last] = now, inputs[f]
-        oldest = now - 4 * max(factors[f, 4], dt)
-        while last + 1 - first > 2 and times[f, first + 1] <= oldest:
-            first += 1
+        else:
+            gaps[f, last] = dt
+        values[f, last] = inputs[f]
+        oldest, age = 4 * max(factors[f, 4], dt), 0.0
+        for place in range(last, first, -1):
+            age += gaps[f, place]
+            if age >= oldest:
+                first = place - 1
+                break
         factors[f, MATRIX + 5], factors[f, MATRIX + 6] = first, last + 1
 
 
@@ -272,6 +277,13 @@ def lag_forward(dt: float, x: float, time_constant: float, lag: FloatArray) -> f
     output: float = lag[1] + (one.now * (x - lag[1]) + one.before * (lag[0] - lag[1]))
     lag[0], lag[1] = x, output
     return output
+
+
+@compiled
+def slew_forward(dt: float, x: float, rate: float, output: float) -> float:
+    """Return the voltage at the piezo (V), as `StreamingSlew.forward`; `output` is the last one."""
+    most, way = rate * dt, x - output
+    return x if -most <= way <= most else output + (most if way > 0.0 else -most)
 
 
 @compiled
@@ -310,7 +322,7 @@ def inverse_path(
     shape = (rest, symmetric_rest, first, branches)
     at = np.array([int(direction), depth, 0, 0])
     ends, knots = np.empty((2, 2)), engine.room(first, branches)
-    has_rate, has_lag = laws.rate.size > 0, laws.lag > 0.0
+    has_rate, has_lag, has_slew = laws.rate.size > 0, laws.lag > 0.0, laws.slew < np.inf
     x, k, m, f = point[1], laws.relaxations.shape[1], laws.modes.shape[0], laws.factors.shape[0]
     creep = np.zeros((k + 1, 7))
     creep[:k, TAU], creep[:k, GAIN] = laws.relaxations[0], laws.relaxations[1]
@@ -325,13 +337,13 @@ def inverse_path(
     modes[:, MOVED : MOVED + 2] = factors[:, MOVED : MOVED + 2] = x
     factors[:, MATRIX + 6] = 1.0
     # Inputs of the factors, now and before.
-    inputs, times, values = np.full(f, x), np.zeros((f, 2 * dt.size + 4)), np.empty((f, 2 * dt.size + 4))
+    inputs, gaps, values = np.full(f, x), np.full((f, 2 * dt.size + 4), np.inf), np.empty((f, 2 * dt.size + 4))
     values[:, 0] = x
     has_heat, heating = laws.heating.size > 0, np.zeros(8)
     if has_heat:
         heating[:SPAN], heating[VOLTAGE] = laws.heating, point[0]
     origin, factor = laws.gain[0], laws.gain[1]
-    lag, command, beside = np.array([point[0], point[0]]), point[0], 0.0
+    lag, command, beside, slewed = np.array([point[0], point[0]]), point[0], 0.0, point[0]
     # As `StreamingRateDependence`: applied voltage, last three ``w``, last desired displacement.
     rate = np.array([point[0], 0.0, 0.0, 0.0, np.nan])
     for n in range(dt.size):
@@ -339,22 +351,23 @@ def inverse_path(
         if n == 0 or dt[n] > longest:
             # At the start, and during a pause, the voltage is held.
             pause, axis = dt[n] - counted, point[1] + beside
-            if has_lag and n:
-                lag_forward(pause, command, laws.lag, lag)
+            if n:
+                reached = lag_forward(pause, command, laws.lag, lag) if has_lag else command
+                slewed = slew_forward(pause, reached, laws.slew, slewed) if has_slew else slewed
             if k:
                 axis = creep_forward(pause, axis, creep)
             if m:
                 axis = contact_forward(axis, contact)
                 axis = modes_forward(pause, axis, rest_share, modes)
-                resonance_inverse(pause, axis, factors, inputs, times, values)
-                factors_forward(pause, factors, inputs, times, values)
+                resonance_inverse(pause, axis, factors, inputs, gaps, values)
+                factors_forward(pause, factors, inputs, gaps, values)
             if has_heat:
                 heating_forward(pause, axis, heating[VOLTAGE], heating)
         h = origin + (wanted[n] - origin) / factor
         if has_heat:
             h = heating_inverse(counted, h, heating)
         if m:
-            h = resonance_inverse(counted, h, factors, inputs, times, values)
+            h = resonance_inverse(counted, h, factors, inputs, gaps, values)
         h = contact_inverse(h, contact)
         if k:
             h = creep_inverse(counted, h, creep)
@@ -378,16 +391,18 @@ def inverse_path(
         missing = h - (point[1] + beside)
         if not abs(missing) > rounding[0]:
             missing = 0.0
-        if has_lag:
+        if has_lag or has_slew:
             inside, goal = v, v
-            if counted > 0.0:
+            if has_lag and counted > 0.0:
                 one = hold(counted, laws.lag)
                 shift = DAMPING * one.before
                 goal = v + (one.kept * (v - lag[1]) + (one.before - shift) * (v - lag[0])) / (one.now + shift)
             v = min(max(goal, lower), upper)
             if missing == 0.0 and abs(goal - v) > rounding[1] * (1.0 + abs(goal)):
                 missing = goal - v
-            reached = lag_forward(counted, v, laws.lag, lag)
+            reached = lag_forward(counted, v, laws.lag, lag) if has_lag else v
+            if has_slew:
+                reached = slewed = slew_forward(counted, reached, laws.slew, slewed)
             if reached != inside:
                 point[0], point[1], at[0], at[1] = v_0, y_0, s_0, depth_0
                 if at[3]:
@@ -416,7 +431,7 @@ def inverse_path(
         axis = contact_forward(axis, contact)
         if m:
             axis = modes_forward(counted, axis, rest_share, modes)
-            factors_forward(counted, factors, inputs, times, values)
+            factors_forward(counted, factors, inputs, gaps, values)
         if has_heat:
             axis = heating_forward(counted, axis, rate[0] if has_rate else point[0], heating)
         short = wanted[n] - (origin + factor * (axis - origin))

@@ -4,8 +4,8 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import zip_longest
-from math import pi, sqrt
+from itertools import pairwise, zip_longest
+from math import inf, pi, sqrt
 from typing import Any, ClassVar
 
 import numpy as np
@@ -66,7 +66,8 @@ class Unringing:
     """Inverse of a mode as a finite impulse response, ``sum_k taps[k] y(t - k spacing)``."""
 
     # The sum of the taps is 1. Two zeros are at the poles of the mode, and one more compensates the remaining delay but
-    # `known` (s).
+    # `known` (s). Each desired displacement is stored with the time since the one before it: a clock that runs for days
+    # has too few digits.
     def __init__(self, mode: Mode, known: float) -> None:
         self._mode, self._late = mode, mode.lag - known
         self._spacing = self._shortest = SPACING / mode.omega
@@ -93,12 +94,17 @@ class Unringing:
     @property
     def state(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Stored desired displacements: ages (s), and values (m), constant before the oldest."""
-        return tuple(self._now - t for t, _ in self._desired), tuple(y for _, y in self._desired)
+        ages, age = [0.0], 0.0
+        for gap, _ in list(self._desired)[:0:-1]:
+            age += gap
+            ages.append(age)
+        return tuple(reversed(ages)), tuple(y for _, y in self._desired)
 
     @state.setter
     def state(self, state: tuple[tuple[float, ...], tuple[float, ...]]) -> None:
-        self._now = 0.0
-        self._desired = deque((-age, y) for age, y in zip(*state, strict=True))
+        ages, values = state
+        gaps = [inf, *(older - age for older, age in pairwise(ages))]
+        self._desired = deque(zip(gaps, values, strict=True))
 
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the input (m) for `wanted` (m) after `dt` (s); keep the state."""
@@ -106,18 +112,19 @@ class Unringing:
         if spacing != self._spacing:
             self._spacing, self._taps = spacing, self._of(spacing)
         taps = self._taps
-        later, value, at = self._now + dt, wanted, self._now + dt - spacing
+        later, earlier, at, value = 0.0, dt, spacing, wanted
         needed, k = taps[0] * wanted, 1
-        # From the newest sample to the oldest, with linear interpolation.
-        for earlier, before in reversed(self._desired):
-            while at >= earlier:
-                share = (at - earlier) / (later - earlier) if later > earlier else 0.0
+        # From the newest sample to the oldest, with linear interpolation; ages count from now.
+        for gap, before in reversed(self._desired):
+            while at <= earlier:
+                share = (earlier - at) / (earlier - later) if earlier > later else 0.0
                 needed += taps[k] * (before + (value - before) * share)
                 k += 1
                 if k == len(taps):
                     return needed
-                at -= spacing
+                at += spacing
             later, value = earlier, before
+            earlier += gap
         # Not `sum`, which rounds otherwise than the compiled inverse.
         left = 0.0
         for tap in taps[k:]:
@@ -126,13 +133,14 @@ class Unringing:
 
     def move(self, dt: float, wanted: float) -> None:
         """Advance by `dt` (s) to `wanted` (m), and forget what is older than all taps."""
-        self._now += dt
         desired = self._desired
-        if dt <= 0.0:
-            desired.pop()
-        desired.append((self._now, wanted))
-        oldest = self._now - 4 * max(self._shortest, dt)
-        while len(desired) > 2 and desired[1][0] <= oldest:
+        desired.append((dt, wanted) if dt > 0.0 else (desired.pop()[0], wanted))
+        oldest, age, kept = 4 * max(self._shortest, dt), 0.0, 1
+        for gap, _ in reversed(desired):
+            age, kept = age + gap, kept + 1
+            if age >= oldest:
+                break
+        while len(desired) > kept:
             desired.popleft()
 
 

@@ -114,6 +114,10 @@ class Slew(EffectBase):
         """Describe the rate."""
         return f"the amplifier's voltage does not change faster than {self.rate:.4g} V/s"
 
+    def laws(self) -> Mapping[str, float]:
+        """Return the rate (V/s) for the compiled inverse."""
+        return {"slew": self.rate}
+
     def streaming(self) -> "StreamingSlew":
         """Return the streaming limit."""
         return StreamingSlew(self.rate)

@@ -1,0 +1,59 @@
+"""``slpi export``: the causal inverse of a model as C source, or as an FMU."""
+
+import math
+from argparse import ArgumentParser, Namespace
+
+from slpi_ros.cli import options as common
+from slpi_ros.cli.command import Command, Result
+from slpi_ros.errors import UsageError
+
+
+def _add_options(command: ArgumentParser) -> None:
+    from slpi_ros.export.targets import TARGETS
+
+    command.add_argument("model", metavar="MODEL.json", help="model of the stage")
+    common.add_output(command, "DIR", "folder for the files")
+    common.add_axes(command, help="axes of the export; default: all")
+    command.add_argument(
+        "--target", choices=tuple(TARGETS), default="c", help="C11 source (default), or units for simulators (FMI)"
+    )
+    command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
+    command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
+    command.add_argument(
+        "--slew-limit", metavar="V/S", type=float, default=0.0, help="rate limit; 0 (default): no limit"
+    )
+
+
+def _run(options: Namespace) -> Result:
+    from slpi_ros.export.stage import ExportedStage
+    from slpi_ros.export.targets import TARGETS
+    from slpi_ros.model.document import load_model
+    from slpi_ros.model.limits import Limits
+
+    if options.slew_limit < 0.0 or math.isnan(options.slew_limit):
+        raise UsageError(f"--slew-limit {options.slew_limit:g}: give a positive number of V/s, or 0 for no limit")
+    model = load_model(options.model)
+    limits = Limits(options.voltage_min, options.voltage_max, options.slew_limit or math.inf)
+    stage, target = ExportedStage.of(model, limits, options.axis), TARGETS[options.target]
+    options.remarks += target.allow(options.output, overwrite=options.overwrite)
+    names = target.write(options.output, stage)
+    lines = [line for axis in stage.axes for line in axis.describe]
+    document = {
+        "folder": options.output,
+        "files": names,
+        "axes": {
+            axis.name: {
+                "effects": axis.inverted, "left_out": axis.left_out,
+                "voltage_range_V": [axis.allowed.lower, axis.allowed.upper],
+            } for axis in stage.axes
+        },
+    }  # fmt: skip
+    return Result(lines, document, target.next(options.output), f"wrote {', '.join(names)}")
+
+
+COMMAND = Command(
+    "write the causal inverse of a model as C source or as an FMU",
+    "slpi export model.json -o controller --slew-limit 1000",
+    _add_options,
+    _run,
+)

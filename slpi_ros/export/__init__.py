@@ -1,0 +1,1 @@
+"""The causal inverse of a stage as C source and as an FMU, from templates."""

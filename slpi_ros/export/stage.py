@@ -1,0 +1,229 @@
+"""What is exported: the axes of a model with their limits, the numbers of their inverse, and what is left out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, isfinite, isinf
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray
+from slpi_ros.effects.paths import Laws
+from slpi_ros.errors import UsageError
+from slpi_ros.hysteresis.kinds import DESCRIPTIONS, PathModel
+from slpi_ros.hysteresis.loop_family import LoopFamily
+from slpi_ros.hysteresis.shapes import FAR, Branches
+from slpi_ros.hysteresis.turning_points import Memory, MemoryState
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.limits import Limits
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.model.streaming import StageStream, accepted_range
+
+
+class Known(NamedTuple):
+    """The fields of `slpi_ros.effects.paths.Laws` that the exported inverse has, in its order."""
+
+    lag: float
+    slew: float
+    rate: FloatArray
+    relaxations: FloatArray
+    rest_of_creep: float
+    contact: FloatArray
+    modes: FloatArray
+    rest: float
+    factors: FloatArray
+    heating: FloatArray
+    gain: FloatArray
+
+
+class Base(NamedTuple):
+    """Branch without a turning point: its origin (V, m), and its curve, knots of shape (2, k), V and m."""
+
+    voltage: float
+    displacement: float
+    knots: FloatArray
+
+
+@dataclass(frozen=True)
+class ExportedAxis:
+    """One axis of an export; UsageError, which names it, where its model cannot be exported."""
+
+    name: str
+    model: AxisModel
+    limits: Limits
+    # Axes beside it, whose motion it may contain.
+    others: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.model.hysteresis, PathModel):
+            raise UsageError(
+                f"axis '{self.name}': kind '{self.model.kind}' needs the whole path in advance and cannot be exported; "
+                "identify kind 'slpi'"
+            )
+        chain, refused = self.model.chain, list[str]()
+        for effect in (*chain.before, *([chain.around] if chain.around else []), *chain.own):
+            if effect.streaming() is None:
+                # It is a delay, which only future setpoints undo, or part of the limits.
+                known = bool(effect.shift) or effect.passes != (-inf, inf) or effect.acts_on == "voltage"
+            else:
+                laws = effect.laws()
+                known = laws is not None and laws.keys() <= set(Known._fields)
+            refused += [] if known else [effect.name]
+        refused += [effect.name for effect in chain.shared if not effect.coupling]
+        if refused:
+            raise UsageError(f"axis '{self.name}': effect '{refused[0]}' cannot be exported; leave it out of the model")
+
+    @cached_property
+    def laws(self) -> Laws:
+        """Parameters of the effects."""
+        chain, found = self.model.chain, dict[str, Any]()
+        for effect in (*chain.before, *([chain.around] if chain.around else []), *chain.own):
+            if effect.streaming() is not None:
+                found |= effect.laws() or {}
+        return Laws(**found)
+
+    @cached_property
+    def memory(self) -> Memory:
+        """Memory at the end of the record; not to be moved."""
+        return self.model.memory()
+
+    @property
+    def primed(self) -> bool:
+        """Whether a long fall led to the first voltage of the memory."""
+        start = self.model.initial("end")
+        return bool(start.history) and not start.from_rest
+
+    @cached_property
+    def start(self) -> MemoryState:
+        """State at the end of the record, without the turning point far outside that a primed memory begins with."""
+        state = self.memory.snapshot()
+        first = 1 if self.primed else 0
+        turns = state.turn_voltages[first:], state.turn_displacements[first:]
+        return MemoryState(state.direction, state.voltage, state.displacement, *turns)
+
+    @cached_property
+    def base(self) -> Base:
+        """Branch without a turning point, as the stream has it."""
+        if not self.primed:
+            rest, _, first, _ = self.memory.shape_arrays()
+            return Base(float(rest[0]), float(rest[1]), first)
+        state = self.memory.snapshot()
+        top = state.turn_voltages[0]
+        assert not isinstance(self.model.hysteresis, PathModel)
+        return Base(top, state.turn_displacements[0], self.model.hysteresis.branch(-1, top).knots)
+
+    @cached_property
+    def near_base(self) -> Base:
+        """The same branch, of a primed memory with its origin at the upper limit: for numbers of few digits."""
+        base = self.base
+        if not self.primed:
+            return base
+        # A knot is put there, so that no piece within the limits begins far outside.
+        u, f = base.knots
+        at = base.voltage - self.allowed.upper
+        reached = float(np.interp(at, u, f))
+        place = int(np.searchsorted(u, at))
+        knots = np.array([np.insert(u, place, at) - at, np.insert(f, place, reached) - reached])
+        return Base(self.allowed.upper, base.displacement - reached, knots)
+
+    @cached_property
+    def branches(self) -> Branches:
+        """Curves of all branches."""
+        return self.memory.shape_arrays()[3]
+
+    @cached_property
+    def allowed(self) -> Limits:
+        """Limits of the command: those given, within the identified range and what passes the effects."""
+        limits = self.limits.within(self.model.voltage_range)
+        return self.model.stream(limits).restricted(limits)
+
+    @property
+    def accepted(self) -> tuple[float, float]:
+        """Smallest and largest desired displacement (m)."""
+        return accepted_range(self.model.displacement_range)
+
+    @property
+    def inverted(self) -> list[str]:
+        """Names of the effects that the inverse compensates."""
+        chain = self.model.chain
+        inside = (*chain.before, *([chain.around] if chain.around else []), *chain.own, *chain.shared)
+        return [effect.name for effect in inside if not effect.shift]
+
+    @property
+    def left_out(self) -> list[str]:
+        """Effects that the inverse does not contain, and why."""
+        chain = self.model.chain
+        told = [f"{effect.name}: its inverse needs setpoints ahead" for effect in chain.before if effect.shift]
+        told += [f"{effect.name}: of the {effect.side}" for effect in chain.measured]
+        named = {effect.name for effect in (*chain.measured, *chain.before)} | set(self.inverted)
+        told += [f"{each.name}: of the {each.side}" for each in self.model.effects if each.name not in named]
+        away = [axis for effect in chain.shared for axis in effect.coupling if axis not in self.others]
+        return told + [f"{chain.shared[0].name} with {axis}: not in this export, assumed at rest" for axis in away]
+
+    @property
+    def densest(self) -> float | None:
+        """Largest density (m/V^2) of the Everett function; None where it has none, such as single operators."""
+        if not isinstance(self.model.hysteresis, LoopFamily):
+            return None
+        cells, everett = np.diff(self.model.hysteresis.grid), self.model.hysteresis.everett
+        mixed = -np.diff(np.diff(everett, axis=0), axis=1)
+        inside = np.tri(cells.size, k=-1, dtype=bool)[:, :]
+        density = mixed / np.outer(cells, cells)
+        # A cell on the diagonal is a triangle.
+        diagonal = np.diag(everett, -1) / (0.5 * cells**2)
+        return float(max(np.abs(density[inside]).max(initial=0.0), np.abs(diagonal).max()))
+
+    @property
+    def describe(self) -> list[str]:
+        """Return the lines that say what the axis is."""
+        low, high = self.allowed.lower, self.allowed.upper
+        slew = "none" if isinf(self.allowed.slew) else f"{self.allowed.slew:g} V/s"
+        effects = ", ".join(self.inverted) or "none"
+        return [
+            f"axis {self.name}: {DESCRIPTIONS[self.model.kind]}",
+            f"  limits {low:.6g} to {high:.6g} V, slew limit {slew}",
+            f"  desired displacements {self.accepted[0]:.6g} to {self.accepted[1]:.6g} m",
+            f"  effects that are compensated: {effects}",
+            *(f"  left out: {told}" for told in self.left_out),
+        ]
+
+
+@dataclass(frozen=True)
+class ExportedStage:
+    """The axes of an export, in order."""
+
+    axes: tuple[ExportedAxis, ...]
+    model: StageModel
+
+    @classmethod
+    def of(cls, model: StageModel, limits: Limits, names: Sequence[str] | None = None) -> "ExportedStage":
+        """Return the export of the axes `names` (default: all) within `limits` and their identified ranges."""
+        chosen = {name: model.axis(name) for name in (model.axes if names is None else names)}
+        others = tuple(chosen)
+        axes = tuple(ExportedAxis(name, axis, limits, others) for name, axis in chosen.items())
+        for axis in axes:
+            require_numbers(axis)
+        return cls(axes, StageModel(chosen, model.hardware_id, model.created))
+
+    def stream(self) -> StageStream:
+        """Return the causal compensator that the exported inverse equals."""
+        streams = {axis.name: axis.model.stream(axis.limits) for axis in self.axes}
+        return StageStream(streams, self.model.coupling, self.model.origins)
+
+    @cached_property
+    def gains(self) -> FloatArray:
+        """Coupling gains (m/m), shape (n, n): of the row's axis by the motion of the column's axis."""
+        rows: Mapping[str, Mapping[str, float]] = {axis.name: axis.model.chain.gains for axis in self.axes}
+        names = list(rows)
+        return np.array([[0.0 if one == other else rows[one].get(other, 0.0) for other in names] for one in names])
+
+
+def require_numbers(axis: ExportedAxis) -> None:
+    """Raise UsageError if limits leave no voltage, or a voltage of the model is no number of a stage."""
+    allowed = axis.allowed
+    if not (isfinite(allowed.lower) and isfinite(allowed.upper) and max(abs(allowed.lower), abs(allowed.upper)) < FAR):
+        raise UsageError(
+            f"axis '{axis.name}': limits {allowed.lower:g} to {allowed.upper:g} V are too wide for an export; "
+            "give --voltage-min and --voltage-max"
+        )

@@ -1,0 +1,160 @@
+"""Test vectors of an export: steps with what the stream of Python answers, and a program that runs them."""
+
+from dataclasses import dataclass
+from math import inf, nan, pi
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slpi_ros.arrays import FloatArray
+from slpi_ros.errors import SlpiError, UnreachableError
+from slpi_ros.export.c_source import context_of, templates
+from slpi_ros.export.stage import ExportedStage
+from slpi_ros.model.streaming import StageStream
+
+# Codes of slpi_inverse.h.
+OK, BAD_TIME, NOT_FINITE, OUT_OF_RANGE, UNREACHABLE = range(5)
+# Number of steps, the usual one (s), and the smallest share of what `SLPI_HISTORY` resolves of a mode.
+STEPS, USUAL = 1200, 1e-4
+# Stored displacements of each mode, and how many more a step needs.
+HISTORY = 128
+# Largest difference to the stream of Python, as a share of the voltage range: double; float; float with states that hardly
+# change in a step, or with the logarithm of a small step. The inverse of a mode multiplies what rounding leaves, that of a
+# lag by its time constant over the step.
+DOUBLE, FLOAT, FLOAT_SLOW, RINGING = 1e-12, 1e-5, 1e-4, 10.0
+
+
+@dataclass(frozen=True)
+class Vectors:
+    """Steps: times (s, (N,)), displacements (m, (N, axes)), expected voltages (V, (N, axes)), and codes (N,)."""
+
+    dt: FloatArray
+    desired: FloatArray
+    volts: FloatArray
+    codes: NDArray[np.int64]
+
+
+def code_of(error: SlpiError) -> int:
+    """Return the code of slpi_inverse.h for an error of the stream."""
+    text = str(error)
+    if isinstance(error, UnreachableError):
+        return OUT_OF_RANGE
+    if "not finite" in text:
+        return NOT_FINITE
+    return BAD_TIME if "backwards" in text else UNREACHABLE
+
+
+def usual_step(stage: ExportedStage) -> float:
+    """Return a step (s), in whole nanoseconds, which resolves all modes."""
+    lowest = min((float(row[1]) for axis in stage.axes for row in axis.laws.factors if row[0] > 0.0), default=inf)
+    return max(USUAL, round(1e9 * 4.0 / ((HISTORY - 4) * lowest)) * 1e-9)
+
+
+def float_limit(stage: ExportedStage) -> float:
+    """Return the largest difference of the float build on the vectors, as a share of the voltage range."""
+    found = FLOAT
+    for laws in (axis.laws for axis in stage.axes):
+        own = FLOAT_SLOW if laws.relaxations.size or laws.rate.size else FLOAT
+        found = max(found, own * (1.0 + laws.lag / usual_step(stage)) * (RINGING if laws.modes.size else 1.0))
+    return found
+
+
+def path(stage: ExportedStage, steps: int, seed: int = 1) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return stamps (ns, (N,)) and displacements (m, (N, axes)) of a path with turns, holds, jumps and pauses."""
+    rng = np.random.default_rng(seed)
+    dt = np.full(steps, round(usual_step(stage) * 1e9), dtype=np.int64)
+    dt[0] = 0
+    dt[rng.integers(1, steps, steps // 40)] = 0
+    longer = rng.integers(1, steps, steps // 30)
+    dt[longer] = (dt[longer] * rng.uniform(1.0, 40.0, longer.size)).astype(np.int64)
+    dt[rng.integers(1, steps, 3)] = rng.integers(50_000_000, 3_000_000_000, 3)
+    y = np.column_stack([_displacements(axis.model.displacement_range, steps, rng) for axis in stage.axes])
+    return np.cumsum(dt), y
+
+
+def _displacements(span: tuple[float, float], steps: int, rng: np.random.Generator) -> FloatArray:
+    """Return a path within a range (m), and a little beyond it at times, shape (N,)."""
+    low, high = span
+    parts, last, count = list[FloatArray](), 0.5, 0
+    while count < steps:
+        kind, length = rng.integers(6), int(rng.integers(5, 60))
+        goal = float(rng.uniform(0.02, 0.98))
+        if kind == 0:
+            part = np.full(length, last)
+        elif kind == 1:
+            part = goal + (last - goal) * np.cos(np.linspace(0.0, 7.0 * pi, 3 * length))
+        elif kind == 2:
+            # Loops within loops.
+            turns = goal + (last - goal) * (-0.85) ** np.arange(1, 12)
+            part = np.interp(np.arange(6 * turns.size) / 6.0, np.arange(turns.size + 1), np.append(last, turns))
+        elif kind == 3:
+            part = np.full(length, goal)
+        elif kind == 4 and rng.uniform() < 0.3:
+            part = np.linspace(last, rng.choice([-0.1, 1.1]), length)
+        else:
+            part = np.linspace(last, goal, length)
+        parts.append(part)
+        last, count = float(part[-1]), count + part.size
+    return low + (high - low) * np.concatenate(parts)[:steps]
+
+
+def vectors(stage: ExportedStage, steps: int = STEPS, seed: int = 1) -> Vectors:
+    """Return steps with the answers of the stream, and among them some that it refuses."""
+    stamps, desired = path(stage, steps, seed)
+    rng = np.random.default_rng(seed)
+    stream, names = stage.stream(), [axis.name for axis in stage.axes]
+    before, rows = 0.0, list[tuple[float, list[float], list[float], int]]()
+    refused = set(rng.integers(2, steps, 12).tolist())
+    for k, (stamp, y) in enumerate(zip((stamps * 1e-9).tolist(), desired.tolist(), strict=True)):
+        if k in refused:
+            low, high = stage.axes[-1].accepted
+            for dt, wrong in ((0.0, nan), (0.0, high + (high - low)), (-1e-3, y[-1]), (nan, y[-1])):
+                rows.append(_answered(stream, names, before, dt, [*y[:-1], wrong]))
+        try:
+            rows.append(_answered(stream, names, before, stamp - before, y, stamp))
+        except SlpiError:
+            # Beyond the model: the axes before it have moved.
+            break
+        before = stamp
+    times, wanted, volts, codes = zip(*rows, strict=True)
+    return Vectors(np.array(times), np.array(wanted), np.array(volts), np.array(codes, dtype=np.int64))
+
+
+def _answered(
+    stream: StageStream, names: list[str], before: float, dt: float, y: list[float], stamp: float | None = None
+) -> tuple[float, list[float], list[float], int]:
+    """Return one step with its answer; SlpiError if the model does not reach it."""
+    code = OK
+    try:
+        stream.step(before + dt if stamp is None else stamp, dict(zip(names, y, strict=True)))
+    except SlpiError as error:
+        code = BAD_TIME if dt != dt else code_of(error)
+        if code == UNREACHABLE:
+            raise
+    return dt, y, [stream.streams[name].voltage for name in names], code
+
+
+def program_files(stage: ExportedStage, steps: int = STEPS) -> dict[str, str]:
+    """Return the program that runs the vectors, by file name."""
+    found = vectors(stage, steps)
+
+    def constant(value: float) -> str:
+        return "SLPI_NAN" if value != value else repr(value)
+
+    rows = [
+        {
+            "dt": constant(dt),
+            "desired": [constant(one) for one in y],
+            "volts": [constant(v) for v in volts],
+            "code": code,
+        }
+        for dt, y, volts, code in zip(
+            *(found.dt.tolist(), found.desired.tolist(), found.volts.tolist(), found.codes.tolist()), strict=True
+        )
+    ]
+    ranges = [repr(axis.allowed.upper - axis.allowed.lower) for axis in stage.axes]
+    limits = {"double_limit": repr(DOUBLE), "float_limit": repr(float_limit(stage))}
+    more: dict[str, Any] = {"rows": rows, "ranges": ranges, **limits}
+    context = {**context_of(stage), **more}
+    return {"slpi_test.c": templates().get_template("slpi_test.c.j2").render(context)}

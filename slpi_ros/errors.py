@@ -20,6 +20,8 @@ HOW_TO_GET = {
     "osqp": "pip install osqp",
     "pandas": _FLEET,
     "pyarrow": _FLEET,
+    "pymodbus": "pip install 'slpi_ros[labjack]', or pip install pymodbus",
+    "serial": "apt install python3-serial, or pip install pyserial",
     "rosbags": "pip install rosbags",
     "scipy": "apt install python3-scipy, or pip install scipy",
     "threadpoolctl": "apt install python3-threadpoolctl, or pip install threadpoolctl",

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from slpi_ros.errors import SlpiError
+from slpi_ros.errors import SlpiError, UsageError
 
 # Longest time that a device may take to accept a connection or to answer, seconds.
 TIMEOUT = 0.2
@@ -108,3 +108,13 @@ class Device(ABC):
     def write(self, voltages: Sequence[float]) -> Reading:
         """Write voltages (V); return what is read after them."""
         return self.exchange(voltages)
+
+
+def host_and_port(kind: str, address: str, default: int) -> tuple[str, int]:
+    """Return host and port of an address, by default this port; UsageError if it is none."""
+    host, colon, port = address.rpartition(":")
+    if not colon:
+        host, port = address, str(default)
+    if not host or not port.isdigit() or not 0 < int(port) < 65_536:
+        raise UsageError(f"address '{address}' of a {kind} device; give HOST or HOST:PORT, such as 192.0.2.1:{default}")
+    return host.strip("[]"), int(port)

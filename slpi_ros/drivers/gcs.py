@@ -23,8 +23,9 @@ from slpi_ros.drivers.base import (
     Reading,
     RefusedError,
     UnsuitableError,
+    host_and_port,
 )
-from slpi_ros.errors import UsageError, shown
+from slpi_ros.errors import shown
 
 PORT = 50_000
 NEEDED = ("POS?", "SVA")
@@ -53,7 +54,7 @@ class GcsDevice(Device):
 
     def __init__(self, address: str, channels: Sequence[Channel]) -> None:
         super().__init__("gcs", address, channels)
-        self._host, self._port = _host_and_port(address)
+        self._host, self._port = host_and_port("gcs", address, PORT)
         self._socket: socket.socket | None = None
         self._buffer = b""
         self._axes = [channel.name for channel in channels]
@@ -311,15 +312,6 @@ class GcsDevice(Device):
 
 
 DEVICE = GcsDevice
-
-
-def _host_and_port(address: str) -> tuple[str, int]:
-    host, colon, port = address.rpartition(":")
-    if not colon:
-        host, port = address, str(PORT)
-    if not host or not port.isdigit() or not 0 < int(port) < 65_536:
-        raise UsageError(f"address '{address}' of a gcs device; give HOST or HOST:PORT, such as 192.0.2.1:{PORT}")
-    return host.strip("[]"), int(port)
 
 
 def _meaning(code: int) -> str:

@@ -14,7 +14,7 @@ from slpi_ros.drivers.base import (
 )
 from slpi_ros.drivers.registry import make_device
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.devices.gcs import (
+from slpi_ros.simulation.devices.base import (
     ERROR,
     FAULTS,
     HALF,
@@ -26,8 +26,8 @@ from slpi_ros.simulation.devices.gcs import (
     TWICE,
     WRONG_AXIS,
     Fault,
-    GcsSimulator,
 )
+from slpi_ros.simulation.devices.gcs import GcsSimulator
 
 ERRORS = {
     SILENT: LinkError,

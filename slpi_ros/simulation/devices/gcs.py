@@ -9,11 +9,21 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 
-import numpy as np
-
-from slpi_ros.errors import UsageError
+from slpi_ros.simulation.devices.base import (
+    ERROR,
+    HALF,
+    LATE,
+    LOOK,
+    LOST,
+    NONSENSE,
+    NOT_FINITE,
+    SILENT,
+    TWICE,
+    WRONG_AXIS,
+    Fault,
+    SimulatedDevice,
+)
 from slpi_ros.simulation.stage import Stage
 
 IDENTITY = "(c)2020 Physik Instrumente (PI) GmbH & Co. KG, E-727.SIMULATED, 0123456789, 13.21.00.09"
@@ -22,43 +32,13 @@ COMMANDS = (
     "VOL?",
 )  # fmt: skip
 MICROMETRE = 1e-6
-# Time between looks at whether the simulator shall end, seconds.
-LOOK = 0.02
-
-SILENT, HALF, WRONG_AXIS, ERROR, LATE, TWICE, LOST, NONSENSE, NOT_FINITE = FAULTS = (
-    "silent", "half", "wrong_axis", "error", "late", "twice", "lost", "nonsense", "not_finite",
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Fault:
-    """What goes wrong with the next answers to a question; UsageError if there is no such fault."""
-
-    kind: str  # one of `FAULTS`
-    question: str = "POS?"  # of `ERR?` for `error`, whatever is given
-    times: int = 1  # how many answers
-    seconds: float = 0.3  # how late an answer comes, or how long no connection is accepted after a loss
-    code: int = 17  # that ``ERR?`` tells
-
-    def __post_init__(self) -> None:
-        if self.kind not in FAULTS:
-            raise UsageError(f"no fault '{self.kind}'; choose one of {', '.join(FAULTS)}")
-
-
-@dataclass(frozen=True)
-class OutputChange:
-    """One change of the voltage at an output."""
-
-    time_ns: int  # steady clock
-    axis: str
-    voltage: float  # V
 
 
 class _LostError(Exception):
     """The link is to be lost."""
 
 
-class GcsSimulator:
+class GcsSimulator(SimulatedDevice):
     """A simulated controller, which serves one client after the other in a thread of its own.
 
     Parameters
@@ -74,6 +54,9 @@ class GcsSimulator:
     port : TCP port; 0 for a free one
     """
 
+    usual_axes, usual_address = ("1",), "127.0.0.1:50000"
+    question, error_question = "POS?", "ERR?"
+
     def __init__(
         self,
         axes: Sequence[str] = ("1",),
@@ -88,24 +71,14 @@ class GcsSimulator:
         host: str = "127.0.0.1",
         port: int = 0,
     ) -> None:
-        self.axes = list(axes)
-        self.stage = stage or Stage.random(self.axes, seed=1, noise_rms=0.0)
-        self.low, self.high = voltage_range
-        self.log: list[OutputChange] = []
-        self.received: list[str] = []  # all commands, in order
-        self.cycles = 0  # number of answers to POS?
-        self.fault: Fault | None = None
+        super().__init__(axes, stage, voltage_range=voltage_range, voltages=voltages, answer_delay=answer_delay)
         self.servo = dict.fromkeys(self.axes, servo)
         self.online = dict.fromkeys(self.axes, True)
-        self.units_per_volt, self._delay = units_per_volt, answer_delay
+        self.units_per_volt = units_per_volt
         self._known = [command for command in COMMANDS if command not in without]
         self._outputs = {str(place): axis for place, axis in enumerate(self.axes, 1)}
-        self._voltages = dict(zip(self.axes, voltages or [0.0] * len(self.axes), strict=True))
         self._error = 0
-        self._begun = time.monotonic()
         self._refused_until = 0.0
-        self._lock = threading.RLock()  # of the stage: a hand is another thread
-        self._move()
         self._server = socket.create_server((host, port))
         self._server.settimeout(LOOK)
         self.address = "{}:{}".format(*self._server.getsockname()[:2])
@@ -129,13 +102,6 @@ class GcsSimulator:
             "VOL?": lambda given: self._tell_output(given, lambda axis: f"{self.voltage(axis):.6f}"),
         }
 
-    def __enter__(self) -> "GcsSimulator":
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def start(self) -> None:
         """Begin to serve."""
         self._thread.start()
@@ -146,14 +112,6 @@ class GcsSimulator:
         if self._thread.is_alive():
             self._thread.join()
         self._server.close()
-
-    def voltage(self, axis: str) -> float:
-        """Return the voltage (V) at the output of an axis."""
-        return self._voltages[axis]
-
-    def set_by_hand(self, axis: str, voltage: float) -> None:
-        """Set a voltage (V) as the knob of the controller does."""
-        self._output(axis, voltage)
 
     # The link
 
@@ -181,8 +139,8 @@ class GcsSimulator:
                 return
             *lines, buffer = (buffer + data).split(b"\n")
             answers = [self._answer(line.decode("latin-1").strip()) for line in lines]
-            if self._delay:
-                time.sleep(self._delay)
+            if self.answer_delay:
+                time.sleep(self.answer_delay)
             if any(answers):
                 client.sendall(b"".join(answers))
 
@@ -196,20 +154,12 @@ class GcsSimulator:
         if command not in self._known:
             self._error = 2
             return b""
-        fault = self._due(command)
+        fault = self.due(command)
         if fault and fault.kind == ERROR:
             self._error = fault.code
         answer = self._handlers[command](given)
         data = " \n".join(answer).encode("latin-1") + b"\n" if answer else b""
         return self._spoilt(data, fault) if fault else data
-
-    def _due(self, command: str) -> Fault | None:
-        """Return the fault that this question meets, which counts."""
-        fault = self.fault
-        if fault is None or command != ("ERR?" if fault.kind == ERROR else fault.question):
-            return None
-        self.fault = replace(fault, times=fault.times - 1) if fault.times > 1 else None
-        return fault
 
     def _spoilt(self, data: bytes, fault: Fault) -> bytes:
         if fault.kind == LOST:
@@ -247,7 +197,7 @@ class GcsSimulator:
 
     def _tell_positions(self, given: list[str]) -> list[str]:
         self.cycles += 1
-        readings = dict(zip(self.axes, self.stage.measure(self._move()), strict=True))
+        readings = self.measure()
         return self._tell(given, lambda axis: f"{readings[axis] / MICROMETRE:.6f}")
 
     def _set_voltages(self, given: list[str]) -> list[str]:
@@ -266,7 +216,7 @@ class GcsSimulator:
             self._error = 302
         else:
             for axis, v in values.items():
-                self._output(axis, v)
+                self.output(axis, v)
         return []
 
     def _set_servo(self, given: list[str]) -> list[str]:
@@ -277,18 +227,5 @@ class GcsSimulator:
             self.servo[given[0]] = given[1] == "1"
         return []
 
-    # The stage
 
-    def _output(self, axis: str, voltage: float) -> None:
-        with self._lock:
-            if voltage != self._voltages[axis]:
-                self._voltages[axis] = voltage
-                self.log.append(OutputChange(time.monotonic_ns(), axis, voltage))
-                self._move()
-
-    def _move(self) -> list[float]:
-        """Move the stage to the present time; return its readings (m) without noise."""
-        low, high = self.stage.voltage_range
-        with self._lock:
-            voltages = np.clip([self._voltages[axis] for axis in self.axes], low, high).tolist()
-            return self.stage.step(time.monotonic() - self._begun, voltages)
+SIMULATOR = GcsSimulator

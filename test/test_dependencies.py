@@ -18,7 +18,7 @@ MISSING = "raise ModuleNotFoundError(f'No module named {__name__!r}', name=__nam
 BROKEN = "raise ImportError('built for another Python')"
 NO_LIBRARY = "raise OSError('libLLVM.so: cannot open shared object file')"
 # Packages that are imported by another name.
-IMPORTED = {"pyserial": "serial"}
+IMPORTED = {"pyserial": "serial", "pyyaml": "yaml"}
 FLEET = {"bokeh", "dask", "distributed", "pandas", "pyarrow"}
 
 

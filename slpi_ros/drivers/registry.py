@@ -7,7 +7,11 @@ from slpi_ros.drivers.base import Channel, Device
 from slpi_ros.errors import UsageError, dependencies_needed
 
 # Imported when they are used, as one may need a package that the others do not.
-MODULES = {"gcs": "slpi_ros.drivers.gcs", "labjack": "slpi_ros.drivers.labjack"}
+MODULES = {
+    "gcs": "slpi_ros.drivers.gcs",
+    "labjack": "slpi_ros.drivers.labjack",
+    "serial": "slpi_ros.drivers.serial",
+}
 
 
 def make_device(kind: str, address: str, channels: Sequence[Channel]) -> Device:

@@ -7,12 +7,13 @@ from rclpy.node import Node
 from slpi_ros.errors import UsageError
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 from slpi_ros.simulation.devices.base import FAULTS, Fault, SimulatedDevice
-from slpi_ros.simulation.devices.registry import MODULES, make_simulator
+from slpi_ros.simulation.devices.registry import SIMULATORS, make_simulator
 
 VOLTAGE = (-10_000.0, 10_000.0)
 NO_FAULT = "none"
+WITH_SERVO = ("gcs", "nv200")
 DECLARATIONS = (
-    Declaration("device", "gcs", "Kind of the device.", read_only=True, choices=tuple(MODULES)),
+    Declaration("device", "gcs", "Kind of the device.", read_only=True, choices=tuple(SIMULATORS)),
     Declaration("address", "", "Where to serve, as for the driver; empty: where the kind usually is.", read_only=True),
     Declaration(
         "channels", [""],
@@ -27,7 +28,7 @@ DECLARATIONS = (
         "voltage", 0.0, "Voltage at the outputs at the start, volts of the device.", read_only=True, between=VOLTAGE,
         number=True,
     ),
-    Declaration("servo", False, "gcs: whether the servo is on at the start.", read_only=True),
+    Declaration("servo", False, f"{', '.join(WITH_SERVO)}: whether the servo is on at the start.", read_only=True),
     Declaration(
         "answer_delay", 0.0003, "Time until an answer, seconds.", read_only=True, between=(0.0, 10.0), number=True
     ),
@@ -69,7 +70,7 @@ class DeviceSimulator(Node):
 
 def _started(values: Values) -> SimulatedDevice:
     """Return the simulator, which serves; UsageError if that does not go."""
-    own = {"servo": True} if values["servo"] and values["device"] == "gcs" else {}
+    own = {"servo": True} if values["servo"] and values["device"] in WITH_SERVO else {}
     channels = [name for name in values["channels"] or () if name]
     given = (values[name] for name in ("seed", "noise_rms", "voltage", "answer_delay"))
     try:

@@ -36,7 +36,10 @@ DECLARATIONS = (
     Declaration(
         "device", "", f"Kind of the device: {', '.join(MODULES)}; required.", read_only=True, choices=tuple(MODULES)
     ),
-    Declaration("address", "", "Where the device is; gcs, labjack: host or host:port.", read_only=True),
+    Declaration(
+        "address", "", "Where the device is: host or host:port, a serial port, or DIALECT:PORT of a serial device.",
+        read_only=True,
+    ),
     Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
     Declaration("channels", ["1"], "The device's name of each axis, in the order of axes.", read_only=True),
     Declaration(

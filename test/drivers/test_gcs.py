@@ -200,7 +200,7 @@ def test_addresses_that_are_none(address):
 
 
 def test_the_port_is_that_of_the_manual():
-    assert make_device("gcs", "192.0.2.1", [Channel("1")])._port == 50_000
+    assert make_device("gcs", "192.0.2.1", [Channel("1")])._stream._port == 50_000
 
 
 def test_unknown_devices():

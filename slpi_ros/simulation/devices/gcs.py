@@ -1,29 +1,14 @@
-"""A controller that speaks PI's General Command Set over TCP, with a simulated stage behind it.
+"""A controller that speaks PI's General Command Set over TCP or a pseudo terminal, with a simulated stage behind it.
 
 Written independently of the driver. What is simulated: axes, one output for each, the servo as a switch that holds the
 voltage, the own range of voltages, error codes. Syntax: user manual of E-727 (E727T0005, page 178).
 """
 
-import socket
-import threading
-import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from typing import Any
 
-from slpi_ros.simulation.devices.base import (
-    ERROR,
-    HALF,
-    LATE,
-    LOOK,
-    LOST,
-    NONSENSE,
-    NOT_FINITE,
-    SILENT,
-    TWICE,
-    WRONG_AXIS,
-    Fault,
-    SimulatedDevice,
-)
+from slpi_ros.simulation.devices.base import ERROR, HALF, NONSENSE, NOT_FINITE, TWICE, WRONG_AXIS, Fault
+from slpi_ros.simulation.devices.stream import StreamSimulator
 from slpi_ros.simulation.stage import Stage
 
 IDENTITY = "(c)2020 Physik Instrumente (PI) GmbH & Co. KG, E-727.SIMULATED, 0123456789, 13.21.00.09"
@@ -34,12 +19,8 @@ COMMANDS = (
 MICROMETRE = 1e-6
 
 
-class _LostError(Exception):
-    """The link is to be lost."""
-
-
-class GcsSimulator(SimulatedDevice):
-    """A simulated controller, which serves one client after the other in a thread of its own.
+class GcsSimulator(StreamSimulator):
+    """A simulated controller.
 
     Parameters
     ----------
@@ -51,7 +32,7 @@ class GcsSimulator(SimulatedDevice):
     units_per_volt : of ``SVA``, which is not in volts on every controller
     without : commands that this controller has not got
     answer_delay : time until an answer, s
-    port : TCP port; 0 for a free one
+    place : host and port, or the path of a pseudo terminal
     """
 
     usual_axes, usual_address = ("1",), "127.0.0.1:50000"
@@ -68,22 +49,17 @@ class GcsSimulator(SimulatedDevice):
         units_per_volt: float = 1.0,
         without: Sequence[str] = (),
         answer_delay: float = 0.0,
-        host: str = "127.0.0.1",
-        port: int = 0,
+        **place: Any,
     ) -> None:
-        super().__init__(axes, stage, voltage_range=voltage_range, voltages=voltages, answer_delay=answer_delay)
+        super().__init__(
+            axes, stage, voltage_range=voltage_range, voltages=voltages, answer_delay=answer_delay, **place
+        )
         self.servo = dict.fromkeys(self.axes, servo)
         self.online = dict.fromkeys(self.axes, True)
         self.units_per_volt = units_per_volt
         self._known = [command for command in COMMANDS if command not in without]
         self._outputs = {str(place): axis for place, axis in enumerate(self.axes, 1)}
         self._error = 0
-        self._refused_until = 0.0
-        self._server = socket.create_server((host, port))
-        self._server.settimeout(LOOK)
-        self.address = "{}:{}".format(*self._server.getsockname()[:2])
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="gcs simulator", daemon=True)
         self._handlers: dict[str, Callable[[list[str]], list[str]]] = {
             "*IDN?": lambda _: [IDENTITY],
             "ERR?": self._tell_error,
@@ -102,54 +78,10 @@ class GcsSimulator(SimulatedDevice):
             "VOL?": lambda given: self._tell_output(given, lambda axis: f"{self.voltage(axis):.6f}"),
         }
 
-    def start(self) -> None:
-        """Begin to serve."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """End the server."""
-        self._ending.set()
-        if self._thread.is_alive():
-            self._thread.join()
-        self._server.close()
-
-    # The link
-
-    def _serve(self) -> None:
-        while not self._ending.is_set():
-            try:
-                client, _ = self._server.accept()
-            except TimeoutError:
-                continue
-            with client:
-                if time.monotonic() >= self._refused_until:
-                    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    client.settimeout(LOOK)
-                    with suppress(_LostError, ConnectionError):
-                        self._talk(client)
-
-    def _talk(self, client: socket.socket) -> None:
-        buffer = b""
-        while not self._ending.is_set():
-            try:
-                data = client.recv(65_536)
-            except TimeoutError:
-                continue
-            if not data:
-                return
-            *lines, buffer = (buffer + data).split(b"\n")
-            answers = [self._answer(line.decode("latin-1").strip()) for line in lines]
-            if self.answer_delay:
-                time.sleep(self.answer_delay)
-            if any(answers):
-                client.sendall(b"".join(answers))
-
     # Commands
 
-    def _answer(self, line: str) -> bytes:
-        if not line:
-            return b""
-        self.received.append(line)
+    def reply(self, line: str) -> bytes:
+        """Return the lines of the answer to a command; b"" if it has none."""
         command, *given = line.split()
         if command not in self._known:
             self._error = 2
@@ -159,17 +91,12 @@ class GcsSimulator(SimulatedDevice):
             self._error = fault.code
         answer = self._handlers[command](given)
         data = " \n".join(answer).encode("latin-1") + b"\n" if answer else b""
-        return self._spoilt(data, fault) if fault else data
+        return self.spoilt(data, fault) if fault else data
 
-    def _spoilt(self, data: bytes, fault: Fault) -> bytes:
-        if fault.kind == LOST:
-            self._refused_until = time.monotonic() + fault.seconds
-            raise _LostError
-        if fault.kind == LATE:
-            self._ending.wait(fault.seconds)
+    def spoil(self, data: bytes, fault: Fault) -> bytes:
+        """Return an answer as this fault leaves it."""
         first = self.axes[0].encode()
         return {
-            SILENT: b"",
             HALF: data[: len(data) // 2],
             WRONG_AXIS: data.replace(first + b"=", b"Z="),
             TWICE: data + data,
@@ -226,6 +153,3 @@ class GcsSimulator(SimulatedDevice):
             # Without a jump: the voltage of the servo stays.
             self.servo[given[0]] = given[1] == "1"
         return []
-
-
-SIMULATOR = GcsSimulator

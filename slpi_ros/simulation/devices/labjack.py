@@ -227,6 +227,3 @@ class LabjackSimulator(SimulatedDevice):
             if at in self._outputs:
                 self.output(self._outputs[at], voltage)
         return None
-
-
-SIMULATOR = LabjackSimulator

@@ -1,4 +1,4 @@
-"""The simulated devices by name. A new one is its own file with a class `SIMULATOR`, and an entry here."""
+"""The simulated devices by name. A new one is its own file and an entry here."""
 
 from collections.abc import Sequence
 from importlib import import_module
@@ -9,7 +9,12 @@ from slpi_ros.simulation.devices.base import SimulatedDevice
 from slpi_ros.simulation.stage import Stage
 
 # Imported when they are used, as one may need a package that the others do not.
-MODULES = {"gcs": "slpi_ros.simulation.devices.gcs", "labjack": "slpi_ros.simulation.devices.labjack"}
+SIMULATORS = {
+    "gcs": "gcs.GcsSimulator",
+    "labjack": "labjack.LabjackSimulator",
+    "nv200": "serial.Nv200Simulator",
+    "mdt69xb": "serial.MdtSimulator",
+}
 
 
 def make_simulator(
@@ -26,7 +31,7 @@ def make_simulator(
 
     Parameters
     ----------
-    kind : one of `MODULES`
+    kind : one of `SIMULATORS`
     address : where to serve, as the kind's drivers take it
     axes : the device's names of its axes
     seed, noise_rms : of the random stage, and of its sensor (m rms)
@@ -38,10 +43,11 @@ def make_simulator(
     ------
     UsageError : there is no such kind, the address is none, or a voltage is outside the range
     """
-    if kind not in MODULES:
-        raise UsageError(f"no simulated device '{kind}'; choose one of {', '.join(MODULES)}")
+    if kind not in SIMULATORS:
+        raise UsageError(f"no simulated device '{kind}'; choose one of {', '.join(SIMULATORS)}")
+    module, name = SIMULATORS[kind].split(".")
     with dependencies_needed():
-        made: type[SimulatedDevice] = import_module(MODULES[kind]).SIMULATOR
+        made: type[SimulatedDevice] = getattr(import_module(f"slpi_ros.simulation.devices.{module}"), name)
     names = list(axes) or list(made.usual_axes)
     simulator = made(
         names,

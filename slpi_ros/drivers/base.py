@@ -1,9 +1,10 @@
 """The interface of a device: an amplifier together with the sensor of the stage, and what goes wrong with it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import SlpiError, UsageError
 
 # Longest time that a device may take to accept a connection or to answer, seconds.
@@ -74,6 +75,23 @@ class Found:
     notes: tuple[str, ...] = ()  # what the user should know
 
 
+@dataclass(frozen=True)
+class Block:
+    """Voltages that a device plays by its own clock, one sample each `period`."""
+
+    period: float  # s, a multiple of the device's `block_period`
+    voltages: FloatArray  # V at the stage, (N, channels)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a device recorded while it played a block."""
+
+    times: FloatArray  # s since the first sample, (M,)
+    positions: FloatArray  # m, (M, channels)
+    voltages: FloatArray  # V at the stage, (M, channels)
+
+
 class Device(ABC):
     """A device with one or more channels; all voltages are those at the stage (V), all positions displacements (m).
 
@@ -100,6 +118,33 @@ class Device(ABC):
     @abstractmethod
     def close(self) -> None:
         """End the connection; changes no output. Never raises."""
+
+    # Blocks, where the device has a clock and a memory of its own: `load`, `play`, then `played` until it is the number
+    # of samples, then `recorded`. `block_period` and `longest_block` are known once the device is open.
+
+    block_period = 0.0  # s, shortest time between two samples; 0: it plays no blocks
+    longest_block = 0  # samples
+
+    def load(self, block: Block) -> Generator[None]:
+        """Load a block in pieces of one wait each; nothing moves."""
+        raise UnsuitableError(f"{self.name}: it plays no blocks")
+
+    def play(self) -> None:
+        """Begin to play what was loaded."""
+        raise UnsuitableError(f"{self.name}: it plays no blocks")
+
+    def played(self) -> int:
+        """Return the number of samples that were played; all of them, once it has ended."""
+        raise UnsuitableError(f"{self.name}: it plays no blocks")
+
+    def halt(self) -> int:
+        """Stop where it is; return the number of samples that were played."""
+        raise UnsuitableError(f"{self.name}: it plays no blocks")
+
+    def recorded(self) -> Generator[None, None, Recording | None]:
+        """Return, in pieces of one wait each, what was recorded of the last block; None if nothing was."""
+        return None
+        yield
 
     def read(self) -> Reading:
         """Read without writing."""

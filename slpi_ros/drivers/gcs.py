@@ -7,11 +7,22 @@ page 178).
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-from slpi_ros.drivers.base import AnswerError, Channel, Device, Found, Reading, RefusedError, UnsuitableError
+from slpi_ros.drivers.base import (
+    AnswerError,
+    Block,
+    Channel,
+    Device,
+    Found,
+    Reading,
+    Recording,
+    RefusedError,
+    UnsuitableError,
+)
+from slpi_ros.drivers.gcs_waves import GcsWaves
 from slpi_ros.drivers.stream import SHOWN, stream_to
 from slpi_ros.errors import shown
 
@@ -43,6 +54,7 @@ class GcsDevice(Device):
         self._known: frozenset[str] = frozenset()
         self._outputs: list[str] = []  # output channel of each axis; [] if the controller does not tell voltages
         self._poll = b""
+        self._waves: GcsWaves | None = None
 
     def open(self) -> Found:
         """Connect, then only ask."""
@@ -68,6 +80,13 @@ class GcsDevice(Device):
         ids = " ".join(self._axes)
         volts = f"VOL? {' '.join(self._outputs)}" if self._outputs else f"SVA? {ids}"
         self._poll = f"POS? {ids}\n{volts}\nERR?\n".encode()
+        self._waves = GcsWaves(self.name, self._known, self._axes, axes, self._ask, self._command)
+        self.block_period, self.longest_block = self._waves.period, self._waves.longest
+        if self.block_period and self._waves.running:
+            raise UnsuitableError(
+                f"{self.name}: its wave generator is running and moves the voltage itself; wait for its end, or stop "
+                "it at the controller"
+            )
         return self._found(identity)
 
     def release_servo(self) -> Found:
@@ -107,6 +126,42 @@ class GcsDevice(Device):
     def close(self) -> None:
         """End the connection; the controller keeps its voltages."""
         self._stream.close()
+
+    # Blocks
+
+    def load(self, block: Block) -> Generator[None]:
+        """Load a block into the wave tables."""
+        yield from self._generators.load(block, self.channels)
+
+    def play(self) -> None:
+        """Start the wave generators."""
+        self._generators.start()
+
+    def played(self) -> int:
+        """Return the number of samples that the wave generators have played."""
+        return self._generators.played()
+
+    def halt(self) -> int:
+        """Stop the wave generators; the voltage stays."""
+        return self._generators.stop()
+
+    def recorded(self) -> Generator[None, None, Recording | None]:
+        """Read the data recorder."""
+        return (yield from self._generators.recorded(self.channels))
+
+    @property
+    def _generators(self) -> GcsWaves:
+        if self._waves is None or not self._waves.period:
+            raise UnsuitableError(f"{self.name}: it plays no blocks")
+        return self._waves
+
+    def _command(self, text: str) -> None:
+        """Send a command that has no answer; RefusedError if the controller reports an error."""
+        self._stream.send(f"{text}\nERR?\n".encode())
+        code = self._error(" ".join(self._lines(0, "ERR?")))
+        self._stream.require_end()
+        if code:
+            raise RefusedError(f"{self.name}: error {_meaning(code)} after '{shown(text, SHOWN)}'")
 
     # What the controller says of itself
 

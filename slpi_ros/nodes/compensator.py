@@ -775,7 +775,7 @@ def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayL
     """Return stamp (ns), names, times (ns) and positions of a serialized JointTrajectory."""
     # An unreadable message gives no names; positions of different lengths are returned as such. Both are then rejected.
     if arrays := decode_trajectory(data):
-        return arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.positions
+        return arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.values
     try:
         message = deserialize_message(data, JointTrajectory)
     except RuntimeError:

@@ -5,7 +5,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -35,8 +35,7 @@ class Fault:
             raise UsageError(f"no fault '{self.kind}'; choose one of {', '.join(FAULTS)}")
 
 
-@dataclass(frozen=True)
-class OutputChange:
+class OutputChange(NamedTuple):
     """One change of the voltage at an output."""
 
     time_ns: int  # steady clock
@@ -117,13 +116,19 @@ class SimulatedDevice(ABC):
         """Set a voltage (V) as the knob of a controller does."""
         self.output(axis, voltage)
 
-    def output(self, axis: str, voltage: float, time_ns: int | None = None) -> None:
+    def output(self, axis: str, voltage: float) -> None:
         """Set the voltage (V) of an axis, and log it if it is another one."""
         with self._lock:
             if voltage != self._voltages[axis]:
-                self._voltages[axis] = voltage
-                self.log.append(OutputChange(time.monotonic_ns() if time_ns is None else time_ns, axis, voltage))
-                self.move(time_ns)
+                self.note(axis, [voltage], [time.monotonic_ns()])
+                self.move()
+
+    def note(self, axis: str, voltages: Sequence[float], times_ns: Sequence[int]) -> None:
+        """Set and log the voltages (V) of an axis at times (ns); the stage follows when it is looked at."""
+        before = [self._voltages[axis], *voltages]
+        self._voltages[axis] = before[-1]
+        changes = zip(times_ns, voltages, before, strict=False)
+        self.log += [OutputChange(t, axis, v) for t, v, last in changes if v != last]
 
     def move(self, time_ns: int | None = None) -> list[float]:
         """Move the stage to the present time; return its readings (m) without noise."""

@@ -4,17 +4,19 @@ Written independently of the driver. What is simulated: axes, one output for eac
 voltage, the own range of voltages, error codes. Syntax: user manual of E-727 (E727T0005, page 178).
 """
 
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from slpi_ros.simulation.devices.base import ERROR, HALF, NONSENSE, NOT_FINITE, TWICE, WRONG_AXIS, Fault
+from slpi_ros.simulation.devices.gcs_waves import SimulatedWaves
 from slpi_ros.simulation.devices.stream import StreamSimulator
 from slpi_ros.simulation.stage import Stage
 
 IDENTITY = "(c)2020 Physik Instrumente (PI) GmbH & Co. KG, E-727.SIMULATED, 0123456789, 13.21.00.09"
 COMMANDS = (
     "*IDN?", "ERR?", "HLP?", "ONL?", "POS?", "SAI?", "SVA", "SVA?", "SVO", "SVO?", "TMN?", "TMX?", "VMA?", "VMI?",
-    "VOL?",
+    "VOL?", "WAV", "WSL", "WGC", "WTR", "WGO", "WGO?", "WGI?", "SPA?", "RTR", "DRC", "DRR?",
 )  # fmt: skip
 MICROMETRE = 1e-6
 
@@ -77,11 +79,14 @@ class GcsSimulator(StreamSimulator):
             "VMI?": lambda given: self._tell_output(given, lambda _: f"{self.low:.4f}"),
             "VOL?": lambda given: self._tell_output(given, lambda axis: f"{self.voltage(axis):.6f}"),
         }
+        self.waves = SimulatedWaves(self)
+        self._handlers |= self.waves.handlers
 
     # Commands
 
     def reply(self, line: str) -> bytes:
         """Return the lines of the answer to a command; b"" if it has none."""
+        self.waves.advance(time.monotonic_ns())
         command, *given = line.split()
         if command not in self._known:
             self._error = 2
@@ -103,6 +108,16 @@ class GcsSimulator(StreamSimulator):
             NONSENSE: b"\xff\x00<html>=1e\n" * max(data.count(b"\n"), 1),
             NOT_FINITE: first + b"=nan\n",
         }.get(fault.kind, data)
+
+    def set_by_hand(self, axis: str, voltage: float) -> None:
+        """Set a voltage (V) as the knob of the controller does."""
+        self.waves.advance(time.monotonic_ns())
+        super().set_by_hand(axis, voltage)
+
+    def fail(self, code: int) -> list[str]:
+        """Note an error for ``ERR?``; return no answer."""
+        self._error = code
+        return []
 
     def _tell_error(self, _: list[str]) -> list[str]:
         code, self._error = self._error, 0
@@ -139,6 +154,8 @@ class GcsSimulator(StreamSimulator):
             self._error = 15
         elif any(self.servo[axis] for axis in values):
             self._error = 303
+        elif any(self.waves.moves(axis) for axis in values):
+            self._error = 73
         elif not all(self.low <= v <= self.high for v in values.values()):
             self._error = 302
         else:

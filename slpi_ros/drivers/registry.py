@@ -12,6 +12,8 @@ MODULES = {
     "labjack": "slpi_ros.drivers.labjack",
     "serial": "slpi_ros.drivers.serial",
 }
+# What the first axis is called, by kind or dialect, where nobody says a name.
+FIRST_CHANNEL = {"gcs": "1", "labjack": "DAC0:AIN0", "nv200": "1", "mdt69xb": "x"}
 
 
 def make_device(kind: str, address: str, channels: Sequence[Channel]) -> Device:

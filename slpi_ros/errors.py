@@ -20,9 +20,12 @@ HOW_TO_GET = {
     "osqp": "pip install osqp",
     "pandas": _FLEET,
     "pyarrow": _FLEET,
+    "pymodbus": "pip install 'slpi_ros[labjack]', or pip install pymodbus",
+    "serial": "apt install python3-serial, or pip install pyserial",
     "rosbags": "pip install rosbags",
     "scipy": "apt install python3-scipy, or pip install scipy",
     "threadpoolctl": "apt install python3-threadpoolctl, or pip install threadpoolctl",
+    "yaml": "apt install python3-yaml, or pip install pyyaml",
 }
 _OF_ROS = ("ament_index_python", "builtin_interfaces", "launch", "launch_ros", "rcl_interfaces", "rclpy", "rpyutils")
 _ENDINGS_OF_ROS = ("_msgs", "_srvs")

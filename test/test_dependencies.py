@@ -17,6 +17,8 @@ ROOT = Path(__file__).resolve().parents[1]
 MISSING = "raise ModuleNotFoundError(f'No module named {__name__!r}', name=__name__)"
 BROKEN = "raise ImportError('built for another Python')"
 NO_LIBRARY = "raise OSError('libLLVM.so: cannot open shared object file')"
+# Packages that are imported by another name.
+IMPORTED = {"pyserial": "serial", "pyyaml": "yaml"}
 FLEET = {"bokeh", "dask", "distributed", "pandas", "pyarrow"}
 
 
@@ -46,7 +48,9 @@ def test_setup_py_and_the_ways_to_get_packages_name_the_same_ones():
     text = (ROOT / "setup.py").read_text()
     (needed,) = re.findall(r"install_requires=\[(.*?)\]", text, re.DOTALL)
     (fleet,) = re.findall(r"^FLEET = \[(.*?)\]\n", text, re.DOTALL | re.MULTILINE)
-    named = set(re.findall(r'"([\w-]+)', needed + fleet)) | {"distributed"}
+    (drivers,) = re.findall(r"^DRIVERS = \{(.*?)\}\n", text, re.DOTALL | re.MULTILINE)
+    of_drivers = {IMPORTED.get(name, name) for name in re.findall(r'"([\w-]+)(?:\[\w+\])?>=', drivers)}
+    named = set(re.findall(r'"([\w-]+)', needed + fleet)) | {"distributed"} | of_drivers
     assert named - {"setuptools"} == HOW_TO_GET.keys()
 
 

@@ -1,13 +1,18 @@
-"""``slpi doctor``: checks of bags, a model and a running ROS graph."""
+"""``slpi doctor``: checks of bags, a model, a device and a running ROS graph."""
 
 import math
 import shlex
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.progress import report_progress
+
+if TYPE_CHECKING:
+    from slpi_ros.reports.doctor import Check
 
 COMMANDS_TOPIC = "voltage_command"
 # Longest time to watch a running graph, seconds.
@@ -28,6 +33,16 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "--seconds", metavar="S", type=common.seconds, default=3.0, help="time to watch a running graph; default: 3 s"
     )
+    command.add_argument(
+        "--device",
+        metavar="DEVICE:ADDRESS",
+        help="device to be opened and read, as of the node driver, such as gcs:192.0.2.1; nothing is written to it; "
+        "default: none",
+    )
+    command.add_argument(
+        "--channels", metavar="NAME", nargs="+", default=[],
+        help="the device's names of its axes; default: the first one of its kind",
+    )  # fmt: skip
     command.add_argument("--no-ros", action="store_true", help="check the files only; default: also a running graph")
 
 
@@ -69,7 +84,13 @@ def _run(options: Namespace) -> Result:
             checks += check_record(read_bag(bag, options.topic), model, limits)
         except SlpiError as error:
             checks.append(Check(FAILED, str(error)))
-    if options.no_ros or find_spec("rclpy") is None:
+    table: list[str] = []
+    if options.device:
+        told, table = _read_device(options.device, options.channels)
+        checks += told
+    if options.device:
+        checks.append(Check(NOTE, "ROS: not checked beside a device, which serves one program at a time"))
+    elif options.no_ros or find_spec("rclpy") is None:
         why = "--no-ros" if options.no_ros else "no rclpy; source the setup file of ROS 2 to check a running graph"
         checks.append(Check(NOTE if files or options.no_ros else FAILED, f"ROS: not checked: {why}"))
     else:
@@ -82,9 +103,15 @@ def _run(options: Namespace) -> Result:
         else:
             checks.append(Check(NOTE, "ROS: no node is running; only the files were checked"))
     verdict, lines, details = described(checks)
+    if table:
+        # All of it, as the YAML is to be copied.
+        lines, details, verdict = [verdict, *table, *lines], [verdict, *table, *details], ""
     well = not any(check.level == FAILED for check in checks)
     if not well:
-        next_command = command_line("slpi", "doctor", *options.bags, *(["--model", options.model] if model else []))
+        more = [*(["--model", options.model] if model else []), *(["--device", options.device] if table else [])]
+        next_command = command_line("slpi", "doctor", *options.bags, *more)
+    elif options.device:
+        next_command = "ros2 run slpi_ros driver --ros-args --params-file driver.yaml"
     elif options.bags and model is None:
         next_command = command_line("slpi", "identify", *options.bags, "-o", "model.json")
     elif options.bags:
@@ -96,8 +123,29 @@ def _run(options: Namespace) -> Result:
     return Result(lines, doctor_document(checks), next_command, verdict, details, well)
 
 
+def _read_device(device: str, channels: Sequence[str]) -> "tuple[list[Check], list[str]]":
+    """Open a device and read it; return the checks, and the lines with its table and the YAML to start with."""
+    from slpi_ros.drivers.base import Channel
+    from slpi_ros.drivers.registry import FIRST_CHANNEL, make_device
+    from slpi_ros.reports.device import check_device, device_parameters, device_table
+    from slpi_ros.reports.doctor import FAILED, Check
+
+    kind, _, address = device.partition(":")
+    dialect = address.partition(":")[0]
+    names = list(channels) or [FIRST_CHANNEL.get(dialect) or FIRST_CHANNEL.get(kind, "1")]
+    opened = make_device(kind, address, [Channel(name) for name in names])
+    try:
+        found = opened.open()
+    except SlpiError as error:
+        return [Check(FAILED, str(error))], []
+    finally:
+        opened.close()
+    yaml = device_parameters(kind, address, found, names)
+    return check_device(opened.name, found, names), [*device_table(found, names), "", "driver.yaml:", *yaml, ""]
+
+
 COMMAND = Command(
-    "check bags, a model and a running ROS graph, and say what to do",
+    "check bags, a model, a device and a running ROS graph, and say what to do",
     "slpi doctor calibration --model model.json",
     _add_options,
     _run,

@@ -79,6 +79,7 @@ class Axis:
         self._rest: tuple[int, float, float] | None = None
         # Time (s) for which ticks have moved the effects on since the last sample.
         self._ticked = 0.0
+        self._in_block = False  # a device moves the axis by itself
         # Setpoint and displacement of the model as a sensor with delay or lag tells them; None without these.
         self._setpoint: Sensed | None = None
         self._expected: Sensed | None = None
@@ -397,7 +398,7 @@ class Axis:
             self._residuals.expect(each)
         if expected or not self._expected:
             self._residuals.measure(x)
-        if self.ramp is None:
+        if self.ramp is None and not self._in_block:
             self._sensor_watch.read(told, x, now_ns)
         desired = self._setpoint.at(now_ns) if self._setpoint else None
         if desired is not None or not self._setpoint:
@@ -460,7 +461,7 @@ class Axis:
     def watch_sensor(self, fault_time: float, now_ns: int) -> Fault | None:
         """Switch the feedback off if its sensor has been faulty for `fault_time` (s); return a new fault."""
         feedback = self._feedback
-        if not (self._loop_settings.enabled and feedback and fault_time) or self.fault or self.ramp:
+        if not (self._loop_settings.enabled and feedback and fault_time) or self.fault or self.ramp or self._in_block:
             return None
         self.fault = self._sensor_watch.judge(now_ns, fault_time)
         if self.fault:
@@ -518,6 +519,31 @@ class Axis:
             self.stream.restore(self._applied.snapshot())
         self.stream.pace = self.output
 
+    # Blocks
+
+    def begin_block(self) -> None:
+        """Hold while a device plays a block by itself; nothing follows."""
+        self._leave_feedback()
+        self.drop_goal()
+        self.start_memory, self._in_block = None, True
+
+    def play(self, voltages: Sequence[float], period: float, now_ns: int) -> None:
+        """Let memory and effects follow voltages (V) that were played, `period` (s) apart."""
+        for v in voltages:
+            self.stream.drive(v, period)
+            if self._feedback:
+                self._applied.drive(v, period)
+        if voltages:
+            self.output.start(voltages[-1])
+        self.given_ns = now_ns
+
+    def end_block(self, now_ns: int) -> None:
+        """Go on with commands, from the voltage that was played last."""
+        self._in_block = False
+        self.given_ns = now_ns
+        self.amplifier.output(self.voltage, now_ns)
+        self._settle()
+
     # Ramps
 
     def start_ramp(self, ramp: Ramp | Brake, now_ns: int) -> None:
@@ -549,6 +575,10 @@ class Axis:
         if not self.ramp:
             return
         self.ramp, self.due_ns = None, None
+        self._settle()
+
+    def _settle(self) -> None:
+        """Go on from the present voltage after motion without desired displacements."""
         if self._feedback:
             self._restart_feedback()
             self._forget_residuals()

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.amplifier import REARM_NS, STEADY_NS
 from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.block import Block, BlockFollower, plan
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.ownership import Ownership
 from slpi_ros.compensator.persistence import (
@@ -50,6 +51,8 @@ class OperatingMode(Enum):
     TRAJECTORY = "trajectory"
     # A ramp to the safe voltages is running; a desired displacement ends it.
     RAMPING = "ramping"
+    # A device plays a block by itself; only its end, or deactivation, ends it.
+    BLOCK = "block"
     # The memory is being reset; only deactivation interrupts the reset.
     RESETTING = "resetting"
 
@@ -86,6 +89,7 @@ class Controller:
         self.identified: StageModel | None = None
         self.trajectory = TrajectoryExecutor(period, self._place)
         self.watchdog = CommandWatchdog()
+        self.block: BlockFollower | None = None  # the last one
         self._stage: StageStream | None = None
         self._hardware_id = hardware_id
         self._by_name = {axis.name: axis for axis in self.axes}
@@ -146,6 +150,7 @@ class Controller:
                 f"the model has hardware id '{model.hardware_id}', this stage has '{self._hardware_id}'; "
                 "use a model of this stage, or correct hardware_id"
             )
+        self._require_no_block(0)
         turns, identified = {name: each.reversal_voltages for name, each in (saved or {}).items()}, model
         model = model.shifted({name: each.zero.offset for name, each in (saved or {}).items()})
         prepared = []
@@ -203,6 +208,7 @@ class Controller:
         self._end_reset()
         if self.mode is OperatingMode.TRAJECTORY:
             self._end_trajectory()
+        self._end_block(now_ns)
         for axis in self.axes:
             axis.stop_ramp()
             axis.drop_goal()
@@ -233,6 +239,7 @@ class Controller:
 
     def _begin_output(self, now_ns: int) -> None:
         """Require that voltages may be output, from where the amplifiers are; RejectedError with the reason if not."""
+        self._require_no_block(now_ns)
         self.ownership.begin_output(now_ns)
         self._read_voltages()
 
@@ -334,6 +341,7 @@ class Controller:
         """Return the named axes; RejectedError unless they can accept `count` desired displacements now."""
         if self.mode is not OperatingMode.STREAMING or self.model is None or not self.ownership.owned:
             self._require_ready()
+            self._require_no_block(now_ns)
             if self.mode is OperatingMode.TRAJECTORY:
                 raise RejectedError(
                     rejection.FOLLOWING, f"{self.activity(now_ns)}; wait, or cancel it with an empty one"
@@ -443,6 +451,83 @@ class Controller:
         ]
         self.check_pace(CHECKED_FIRST)
 
+    def follow_block(
+        self,
+        names: Sequence[str],
+        time_from_start_ns: ArrayLike,
+        positions: ArrayLike,
+        now_ns: int,
+        stamp_ns: int,
+    ) -> Block:
+        """Return a trajectory as one block of voltages from the present ones on, which a device plays from now on.
+
+        It is checked as a whole, or raises and nothing changes. Until `told` has heard of its end nothing else moves.
+        """
+        self.counts.trajectories += 1
+        try:
+            self._require_ready()
+            path = Trajectory.of(names, time_from_start_ns, positions, axes=self.names)
+            path.check_reach({axis.name: axis.stream.accepted for axis in self.axes})
+            self._begin_output(now_ns)
+            if self.mode is OperatingMode.TRAJECTORY:
+                raise RejectedError(rejection.FOLLOWING, f"{self.activity(now_ns)}; wait, or cancel it first")
+            for axis in self.axes:
+                axis.begin_block()
+            try:
+                block = plan(path, self.axes, self._stage, self.trajectory.period, stamp_ns)
+            except RejectedError:
+                for axis in self.axes:
+                    axis.end_block(now_ns)
+                raise
+        except RejectedError:
+            self.counts.trajectories_rejected += 1
+            raise
+        self.mode, self.too_fast = OperatingMode.BLOCK, block.missed
+        self.block = BlockFollower(block, self._by_name, now_ns)
+        self.watchdog.feed(now_ns)
+        return block
+
+    def told(self, stamp_ns: int, state: str, sample: int, reason: str, now_ns: int) -> bool:
+        """Take what a driver tells of a block; return whether the present one has ended with it."""
+        block = self.block
+        if self.mode is not OperatingMode.BLOCK or block is None or stamp_ns != block.block.stamp_ns:
+            return False
+        block.hear(state, sample, reason, now_ns)
+        self._read_voltages()
+        if not block.done:
+            return False
+        self._end_block(now_ns)
+        return True
+
+    def watch_block(self, now_ns: int) -> str:
+        """Return why a block is given up now, as nothing is heard of it; "" if not."""
+        block = self.block
+        if self.mode is not OperatingMode.BLOCK or block is None:
+            return ""
+        why = block.silent(now_ns)
+        if not why:
+            block.band(now_ns)
+            return ""
+        self._end_block(now_ns)
+        if block.state:
+            # It may still be moving.
+            self.ownership.obstacle = rejection.NOT_ARMED, why
+        return why
+
+    def _end_block(self, now_ns: int) -> None:
+        if self.mode is OperatingMode.BLOCK:
+            for axis in self.axes:
+                axis.end_block(now_ns)
+            self._read_voltages()
+            self.watchdog.feed(now_ns)
+            self.mode = OperatingMode.STREAMING
+
+    def _require_no_block(self, now_ns: int) -> None:
+        if self.mode is OperatingMode.BLOCK:
+            raise RejectedError(
+                rejection.FOLLOWING, f"{self.activity(now_ns)}; wait, or cancel it with an empty trajectory"
+            )
+
     def check_pace(self, points: int = CHECKED_LATER) -> None:
         """Look at the next points of the trajectory: whether the slew limit will make one late (`too_fast`)."""
         for check in self._checks:
@@ -453,6 +538,8 @@ class Controller:
         """Return a text that describes the present activity."""
         if self.mode is OperatingMode.RESETTING:
             return "resetting the memory"
+        if self.mode is OperatingMode.BLOCK:
+            return "a device plays a block"
         deadline_ns = self.trajectory.next_deadline_ns
         if deadline_ns is None:
             return "compensating"
@@ -539,6 +626,7 @@ class Controller:
 
     def hold(self, now_ns: int) -> None:
         """End all motion: axes in motion decelerate to rest during the next calls of `advance`, the others hold."""
+        self._end_block(now_ns)
         self.cancel(now_ns)
         self._release((), now_ns)
         if self.active:

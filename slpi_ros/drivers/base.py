@@ -1,10 +1,11 @@
 """The interface of a device: an amplifier together with the sensor of the stage, and what goes wrong with it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
-from slpi_ros.errors import SlpiError
+from slpi_ros.arrays import FloatArray
+from slpi_ros.errors import SlpiError, UsageError
 
 # Longest time that a device may take to accept a connection or to answer, seconds.
 TIMEOUT = 0.2
@@ -74,6 +75,23 @@ class Found:
     notes: tuple[str, ...] = ()  # what the user should know
 
 
+@dataclass(frozen=True)
+class Block:
+    """Voltages that a device plays by its own clock, one sample each `period`."""
+
+    period: float  # s, a multiple of the device's `block_period`
+    voltages: FloatArray  # V at the stage, (N, channels)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a device recorded while it played a block."""
+
+    times: FloatArray  # s since the first sample, (M,)
+    positions: FloatArray  # m, (M, channels)
+    voltages: FloatArray  # V at the stage, (M, channels)
+
+
 class Device(ABC):
     """A device with one or more channels; all voltages are those at the stage (V), all positions displacements (m).
 
@@ -101,6 +119,33 @@ class Device(ABC):
     def close(self) -> None:
         """End the connection; changes no output. Never raises."""
 
+    # Blocks, where the device has a clock and a memory of its own: `load`, `play`, then `played` until it is the number
+    # of samples, then `recorded`. `block_period` and `longest_block` are known once the device is open.
+
+    block_period = 0.0  # s, shortest time between two samples; 0: it plays no blocks
+    longest_block = 0  # samples
+
+    def load(self, block: Block) -> Generator[None]:
+        """Load a block in pieces of one wait each; nothing moves."""
+        raise UnsuitableError(f"{self.name}: it plays no blocks")
+
+    def play(self) -> None:
+        """Begin to play what was loaded."""
+        raise UnsuitableError(f"{self.name}: it plays no blocks")
+
+    def played(self) -> int:
+        """Return the number of samples that were played; all of them, once it has ended."""
+        raise UnsuitableError(f"{self.name}: it plays no blocks")
+
+    def halt(self) -> int:
+        """Stop where it is; return the number of samples that were played."""
+        raise UnsuitableError(f"{self.name}: it plays no blocks")
+
+    def recorded(self) -> Generator[None, None, Recording | None]:
+        """Return, in pieces of one wait each, what was recorded of the last block; None if nothing was."""
+        return None
+        yield
+
     def read(self) -> Reading:
         """Read without writing."""
         return self.exchange(None)
@@ -108,3 +153,13 @@ class Device(ABC):
     def write(self, voltages: Sequence[float]) -> Reading:
         """Write voltages (V); return what is read after them."""
         return self.exchange(voltages)
+
+
+def host_and_port(kind: str, address: str, default: int) -> tuple[str, int]:
+    """Return host and port of an address, by default this port; UsageError if it is none."""
+    host, colon, port = address.rpartition(":")
+    if not colon:
+        host, port = address, str(default)
+    if not host or not port.isdigit() or not 0 < int(port) < 65_536:
+        raise UsageError(f"address '{address}' of a {kind} device; give HOST or HOST:PORT, such as 192.0.2.1:{default}")
+    return host.strip("[]"), int(port)

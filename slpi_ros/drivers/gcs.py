@@ -1,4 +1,4 @@
-"""Controllers of Physik Instrumente (PI) that speak the General Command Set (GCS 2) over TCP.
+"""Controllers of Physik Instrumente (PI) that speak the General Command Set (GCS 2) over TCP or a serial port.
 
 Commands and answers are lines of ASCII. Each line of an answer but the last one ends with a space before the line feed.
 What a controller has not got is left out: it lists its commands on ``HLP?``. Syntax: user manual of E-727 (E727T0005,
@@ -6,34 +6,30 @@ page 178).
 """
 
 import math
-import select
-import socket
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 from slpi_ros.drivers.base import (
-    TIMEOUT,
     AnswerError,
+    Block,
     Channel,
     Device,
     Found,
-    LinkError,
     Reading,
+    Recording,
     RefusedError,
     UnsuitableError,
 )
-from slpi_ros.errors import UsageError, shown
+from slpi_ros.drivers.gcs_waves import GcsWaves
+from slpi_ros.drivers.stream import SHOWN, stream_to
+from slpi_ros.errors import shown
 
 PORT = 50_000
 NEEDED = ("POS?", "SVA")
 # `SVA?` and `VOL?` of one axis may differ by this share of the device's own range, or where it tells none by this, V.
 AGREEMENT, AGREEMENT_V = 0.01, 1.0
-# Longest answer, bytes: a list of commands has some ten thousand.
-LONGEST = 1 << 18
-# Characters of an answer that are shown in a message.
-SHOWN = 60
 MEANINGS = {
     1: "syntax of a parameter",
     2: "unknown command",
@@ -49,22 +45,20 @@ MEANINGS = {
 
 
 class GcsDevice(Device):
-    """A PI controller over TCP; one that has been opened is moved by ``SVA`` alone."""
+    """A PI controller; one that has been opened is moved by ``SVA`` alone."""
 
     def __init__(self, address: str, channels: Sequence[Channel]) -> None:
         super().__init__("gcs", address, channels)
-        self._host, self._port = _host_and_port(address)
-        self._socket: socket.socket | None = None
-        self._buffer = b""
+        self._stream = stream_to("gcs", address, PORT)
         self._axes = [channel.name for channel in channels]
         self._known: frozenset[str] = frozenset()
         self._outputs: list[str] = []  # output channel of each axis; [] if the controller does not tell voltages
         self._poll = b""
+        self._waves: GcsWaves | None = None
 
     def open(self) -> Found:
         """Connect, then only ask."""
-        self.close()
-        self._connect()
+        self._stream.open()
         identity = " ".join(self._ask("*IDN?"))
         self._known = frozenset(line.split()[0].upper() for line in self._ask("HLP?") if line.split())
         if lacking := [command for command in NEEDED if command not in self._known]:
@@ -86,12 +80,19 @@ class GcsDevice(Device):
         ids = " ".join(self._axes)
         volts = f"VOL? {' '.join(self._outputs)}" if self._outputs else f"SVA? {ids}"
         self._poll = f"POS? {ids}\n{volts}\nERR?\n".encode()
+        self._waves = GcsWaves(self.name, self._known, self._axes, axes, self._ask, self._command)
+        self.block_period, self.longest_block = self._waves.period, self._waves.longest
+        if self.block_period and self._waves.running:
+            raise UnsuitableError(
+                f"{self.name}: its wave generator is running and moves the voltage itself; wait for its end, or stop "
+                "it at the controller"
+            )
         return self._found(identity)
 
     def release_servo(self) -> Found:
         """Switch the servo of all axes off; UnsuitableError if the voltage then is not that of ``SVA?``."""
         before = self.read().voltages
-        self._send("".join(f"SVO {axis} 0\n" for axis in self._axes).encode())
+        self._stream.send("".join(f"SVO {axis} 0\n" for axis in self._axes).encode())
         after = self.read().voltages
         found = self._found(" ".join(self._ask("*IDN?")))
         moves = ", ".join(
@@ -107,12 +108,11 @@ class GcsDevice(Device):
             pairs = zip(self.channels, voltages, strict=True)
             command = "SVA " + " ".join(f"{each.name} {each.device_volts(v):.6f}" for each, v in pairs)
         sent_ns = time.monotonic_ns()
-        self._send(f"{command}\n".encode() + self._poll if command else self._poll)
+        self._stream.send(f"{command}\n".encode() + self._poll if command else self._poll)
         count = len(self._axes)
         lines = self._lines(2 * count + 1, command or "POS?")
         received_ns = time.monotonic_ns()
-        if self._buffer:
-            raise AnswerError(f"{self.name}: it sent {_cut(self._buffer)} beyond what was asked")
+        self._stream.require_end()
         positions = self._values("POS?", lines[:count], self._axes)
         told = self._values("VOL?" if self._outputs else "SVA?", lines[count:-1], self._outputs or self._axes)
         if code := self._error(lines[-1]):
@@ -125,10 +125,43 @@ class GcsDevice(Device):
 
     def close(self) -> None:
         """End the connection; the controller keeps its voltages."""
-        if self._socket is not None:
-            with suppress(OSError):
-                self._socket.close()
-        self._socket, self._buffer = None, b""
+        self._stream.close()
+
+    # Blocks
+
+    def load(self, block: Block) -> Generator[None]:
+        """Load a block into the wave tables."""
+        yield from self._generators.load(block, self.channels)
+
+    def play(self) -> None:
+        """Start the wave generators."""
+        self._generators.start()
+
+    def played(self) -> int:
+        """Return the number of samples that the wave generators have played."""
+        return self._generators.played()
+
+    def halt(self) -> int:
+        """Stop the wave generators; the voltage stays."""
+        return self._generators.stop()
+
+    def recorded(self) -> Generator[None, None, Recording | None]:
+        """Read the data recorder."""
+        return (yield from self._generators.recorded(self.channels))
+
+    @property
+    def _generators(self) -> GcsWaves:
+        if self._waves is None or not self._waves.period:
+            raise UnsuitableError(f"{self.name}: it plays no blocks")
+        return self._waves
+
+    def _command(self, text: str) -> None:
+        """Send a command that has no answer; RefusedError if the controller reports an error."""
+        self._stream.send(f"{text}\nERR?\n".encode())
+        code = self._error(" ".join(self._lines(0, "ERR?")))
+        self._stream.require_end()
+        if code:
+            raise RefusedError(f"{self.name}: error {_meaning(code)} after '{shown(text, SHOWN)}'")
 
     # What the controller says of itself
 
@@ -215,66 +248,17 @@ class GcsDevice(Device):
 
     # Lines
 
-    def _connect(self) -> None:
-        try:
-            self._socket = socket.create_connection((self._host, self._port), TIMEOUT)
-            # A command leaves at once, not with the next one.
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        except OSError as error:
-            raise LinkError(
-                f"{self.name}: no connection ({error.strerror or error}); check that the controller is on, its address "
-                "and its port, and that no other program is connected to it"
-            ) from error
-
-    def _send(self, data: bytes) -> None:
-        if self._socket is None:
-            raise LinkError(f"{self.name}: it is not open")
-        if self._buffer or select.select([self._socket], [], [], 0.0)[0]:
-            # An answer that comes late or twice would be taken for the next one.
-            self._receive("an answer without a question")
-            raise AnswerError(f"{self.name}: it sent {_cut(self._buffer)} without having been asked")
-        try:
-            self._socket.sendall(data)
-        except OSError as error:
-            raise LinkError(f"{self.name}: the link was lost ({error.strerror or error})") from error
-
-    def _receive(self, what: str) -> None:
-        """Add what has come to the buffer, waiting for it if there is nothing."""
-        assert self._socket is not None
-        try:
-            data = self._socket.recv(65_536)
-        except TimeoutError:
-            raise LinkError(
-                f"{self.name}: no whole answer to {what} within {TIMEOUT:g} s; until then came {_cut(self._buffer)}"
-            ) from None
-        except OSError as error:
-            raise LinkError(f"{self.name}: the link was lost ({error.strerror or error})") from error
-        if not data:
-            raise LinkError(f"{self.name}: it closed the connection")
-        self._buffer += data
-        if len(self._buffer) > LONGEST:
-            raise AnswerError(f"{self.name}: it sent more than {LONGEST} bytes; they begin with {_cut(self._buffer)}")
-
     def _lines(self, count: int, what: str) -> list[str]:
         """Return the next lines; `count` 0: those of one answer, however many it has."""
-        deadline = time.monotonic() + TIMEOUT
-        while not (self._buffer.count(b"\n") >= count if count else self._ends_answer()):
-            if time.monotonic() > deadline:
-                raise LinkError(f"{self.name}: {what} is answered too slowly; until now came {_cut(self._buffer)}")
-            self._receive(what)
-        if not count:
-            lines, self._buffer = self._buffer.split(b"\n")[:-1], b""
-        else:
-            *lines, self._buffer = self._buffer.split(b"\n", count)
-        return [line.decode("latin-1").strip() for line in lines]
-
-    def _ends_answer(self) -> bool:
-        return self._buffer.endswith(b"\n") and not self._buffer.endswith(b" \n")
+        data = self._stream.until(partial(_end_of_lines, count) if count else _end_of_answer, what)
+        return [line.decode("latin-1").strip() for line in data.split(b"\n")[:-1]]
 
     def _ask(self, question: str) -> list[str]:
         """Return the lines of the answer to a question."""
-        self._send(f"{question}\n".encode())
-        return self._lines(0, question)
+        self._stream.send(f"{question}\n".encode())
+        lines = self._lines(0, question)
+        self._stream.require_end()
+        return lines
 
     def _named(self, command: str, names: Sequence[str]) -> list[float]:
         """Return the numbers that a question gives for these names."""
@@ -313,18 +297,18 @@ class GcsDevice(Device):
 DEVICE = GcsDevice
 
 
-def _host_and_port(address: str) -> tuple[str, int]:
-    host, colon, port = address.rpartition(":")
-    if not colon:
-        host, port = address, str(PORT)
-    if not host or not port.isdigit() or not 0 < int(port) < 65_536:
-        raise UsageError(f"address '{address}' of a gcs device; give HOST or HOST:PORT, such as 192.0.2.1:{PORT}")
-    return host.strip("[]"), int(port)
-
-
 def _meaning(code: int) -> str:
     return f"{code} ({MEANINGS.get(code, 'see its manual')})"
 
 
-def _cut(data: bytes) -> str:
-    return f"'{shown(data[:SHOWN].decode('latin-1'))}'" if data else "nothing"
+def _end_of_lines(count: int, data: bytes) -> int:
+    at = -1
+    for _ in range(count):
+        at = data.find(b"\n", at + 1)
+        if at < 0:
+            return 0
+    return at + 1
+
+
+def _end_of_answer(data: bytes) -> int:
+    return len(data) if data.endswith(b"\n") and not data.endswith(b" \n") else 0

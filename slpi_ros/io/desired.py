@@ -124,6 +124,6 @@ def _of_trajectory(arrays: TrajectoryArrays | None, logged_ns: int, where: str) 
     # Without a stamp it begins when it arrives.
     time_ns = (arrays.start_ns or logged_ns) + arrays.time_from_start_ns
     return [
-        DesiredPath(axis, time_ns, np.ascontiguousarray(arrays.positions[:, place]), linear=True)
+        DesiredPath(axis, time_ns, np.ascontiguousarray(arrays.values[:, place]), linear=True)
         for place, axis in enumerate(arrays.names)
     ]

@@ -170,19 +170,19 @@ class TrajectoryArrays:
     start_ns: int  # header stamp
     names: tuple[str, ...]
     time_from_start_ns: IntArray  # (N,)
-    positions: FloatArray  # m, (N, names)
+    values: FloatArray  # of the field that was read: positions in m, or effort in V; (N, names)
 
 
-def decode_trajectory(data: bytes) -> TrajectoryArrays | None:
+def decode_trajectory(data: bytes, field: str = "positions") -> TrajectoryArrays | None:
     """Decode a serialised JointTrajectory; return None if its points differ in layout or the message is invalid."""
     # Points of equal layout are decoded as one array, which is much faster than point by point.
     try:
-        return _decode(data)
+        return _decode(data, field)
     except (struct.error, UnicodeDecodeError, IndexError, ValueError, TypeError, MemoryError, LimitError):
         return None
 
 
-def _decode(data: bytes) -> TrajectoryArrays | None:
+def _decode(data: bytes, field: str) -> TrajectoryArrays | None:
     reader = CdrReader(data)
     start_ns = reader.integer("i") * SECOND_NS + reader.integer()
     reader.string()
@@ -190,14 +190,14 @@ def _decode(data: bytes) -> TrajectoryArrays | None:
     points = reader.integer()
     if points * SMALLEST_POINT > len(data):
         return None
-    times, positions = np.empty(points, np.int64), np.empty((points, len(names)), order="F")
+    times, read = np.empty(points, np.int64), np.empty((points, len(names)), order="F")
     done = 0
     while done < points:
         begin = reader.at
-        if reader.doubles("positions")[0] != len(names):
-            return None
-        for field in ("velocities", "accelerations", "effort"):
-            reader.doubles(field)
+        for each in ("positions", "velocities", "accelerations", "effort"):
+            count, _ = reader.doubles(each)
+            if each == field and count != len(names):
+                return None
         reader.integer("i", "sec")
         reader.integer("I", "nanosec")
         size = reader.at - begin
@@ -208,6 +208,45 @@ def _decode(data: bytes) -> TrajectoryArrays | None:
         if rows is None:
             return None
         times[done : done + alike] = rows["sec"].astype(np.int64) * SECOND_NS + rows["nanosec"]
-        positions[done : done + alike] = rows["positions"]
+        read[done : done + alike] = rows[field]
         done += alike
-    return TrajectoryArrays(start_ns, names, times, positions)
+    return TrajectoryArrays(start_ns, names, times, read)
+
+
+def encode_trajectory(
+    stamp_ns: int, names: Sequence[str], times_ns: IntArray, positions: FloatArray, effort: FloatArray
+) -> bytes:
+    """Return a serialised JointTrajectory: times (ns) since its stamp (N,), positions (m) and effort (V), (N, K).
+
+    Positions of shape (N, 0) are left out.
+    """
+    seconds, rest = divmod(stamp_ns, SECOND_NS)
+    parts = [serialise(seconds, rest, "", len(names), *names, len(times_ns))]
+    # Only the first point may begin at another place within eight bytes.
+    begin = (len(parts[0]) - 4) % 8
+    for rows in (slice(0, 1), slice(1, None)):
+        layout = _point_layout(begin, positions.shape[1], effort.shape[1])
+        points = np.zeros(len(times_ns[rows]), layout)
+        points["sec"], points["nanosec"] = np.divmod(times_ns[rows], SECOND_NS)
+        for name, values in (("positions", positions[rows]), ("effort", effort[rows])):
+            if values.shape[1]:
+                points[f"{name}_count"], points[name] = values.shape[1], values
+        parts.append(points.tobytes())
+        begin = (begin + layout.itemsize) % 8
+    return b"".join(parts)
+
+
+def _point_layout(begin: int, positions: int, effort: int) -> np.dtype[np.void]:
+    """Return the layout of a point of a trajectory that begins `begin` bytes after a multiple of eight."""
+    fields: dict[str, tuple[str, int]] = {}
+    at = begin
+    for name, count in (("positions", positions), ("velocities", 0), ("accelerations", 0), ("effort", effort)):
+        fields[f"{name}_count"] = "<u4", at - begin
+        at += 4
+        if count:
+            at += -at % 8
+            fields[name] = f"({count},)<f8", at - begin
+            at += 8 * count
+    fields["sec"], fields["nanosec"] = ("<i4", at - begin), ("<u4", at + 4 - begin)
+    formats, offsets = zip(*fields.values(), strict=True)
+    return np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": at + 8 - begin})

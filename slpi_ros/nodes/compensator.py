@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from numpy.typing import ArrayLike
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
@@ -25,10 +27,10 @@ from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.ownership import AUTO
 from slpi_ros.compensator.path_watch import PathWatch
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, model_id
-from slpi_ros.compensator.validation import RejectedError
+from slpi_ros.compensator.validation import STALE, RejectedError
 from slpi_ros.errors import ModelError, SlpiError, shown
 from slpi_ros.io.cdr import multiarray_header
-from slpi_ros.io.messages import SECOND_NS, JointStates, decode_trajectory
+from slpi_ros.io.messages import SECOND_NS, JointStates, decode_trajectory, encode_trajectory
 from slpi_ros.model.document import load_model
 from slpi_ros.model.limits import volts
 from slpi_ros.model.stage_model import StageModel
@@ -74,9 +76,9 @@ PATIENCE = Duration(seconds=1.0)
 class Compensator(LifecycleNode):
     """Lifecycle node that publishes the voltages of all axes for every message with desired displacements.
 
-    Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement``, ``stage_state`` and
-    ``stage_model``, publishes ``voltage_command``, ``tracking_error`` and ``/diagnostics``, provides the services
-    ``~/reset_memory``, ``~/set_zero`` and ``~/arm``.
+    Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement``, ``stage_state``,
+    ``stage_model`` and ``voltage_trajectory_state``, publishes ``voltage_command``, ``voltage_trajectory``,
+    ``tracking_error`` and ``/diagnostics``, provides the services ``~/reset_memory``, ``~/set_zero`` and ``~/arm``.
     Message types, units and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
     """
 
@@ -170,6 +172,7 @@ class Compensator(LifecycleNode):
             Float64MultiArray, "voltage_command", COMMANDS, qos_overriding_options=OVERRIDABLE
         )
         self._error_publisher = self.create_lifecycle_publisher(JointState, "tracking_error", DIAGNOSTICS)
+        self._block_publisher = self.create_lifecycle_publisher(JointTrajectory, "voltage_trajectory", COMMANDS)
         on_desired: dict[str, tuple[Any, Any]] = {
             "JointState": (JointState, self._on_joint_state),
             "Float64": (Float64, self._on_value),
@@ -181,6 +184,7 @@ class Compensator(LifecycleNode):
             self._subscribe(JointTrajectory, "desired_trajectory", self._on_trajectory, COMMANDS, raw=True),
             self._subscribe(JointState, "measured_displacement", self._on_measured, MEASUREMENTS, raw=True),
             self._subscribe(String, "stage_model", self._on_model, LATCHED),
+            self._subscribe(DiagnosticStatus, "voltage_trajectory_state", self._on_block_state, LATCHED),
         ]
         self._controller.configure()
         self._report()
@@ -257,6 +261,9 @@ class Compensator(LifecycleNode):
         if not controller.active:
             return
         before = controller.mode
+        if before is OperatingMode.BLOCK:
+            self._stop_block()
+            controller.hold(now_ns)
         if safety.ramps_on_deactivate and controller.ownership.owned:
             controller.ramp(safety.voltages, safety.rate, now_ns)
         else:
@@ -276,7 +283,7 @@ class Compensator(LifecycleNode):
     def _leave_topics(self) -> None:
         for subscription in self._subscriptions_of_state:
             self.destroy_subscription(subscription)
-        for publisher in (self._publisher, self._error_publisher):
+        for publisher in (self._publisher, self._error_publisher, self._block_publisher):
             self.destroy_lifecycle_publisher(publisher)
 
     # Desired and measured displacements
@@ -432,6 +439,12 @@ class Compensator(LifecycleNode):
         stamp_ns, names, times, positions = _read_trajectory(data)
         now_ns, clock_ns = self._clocks()
         start_ns = stamp_ns + clock_ns - self.get_clock().now().nanoseconds if stamp_ns else 0
+        if controller.mode is OperatingMode.BLOCK and not len(times):  # type: ignore[arg-type]
+            self._stop_block()
+            return
+        if self._settings.values["trajectory_output"] == "block" and len(times):  # type: ignore[arg-type]
+            self._send_block(names, times, positions, start_ns > clock_ns)
+            return
         try:
             controller.follow(names, times, positions, start_ns, now_ns, clock_ns)
         except RejectedError as error:
@@ -442,6 +455,46 @@ class Compensator(LifecycleNode):
         self._too_fast = ""
         self._tell_too_fast()
         self._report()
+
+    def _send_block(self, names: Sequence[str], times: ArrayLike, positions: ArrayLike, later: bool) -> None:
+        """Publish a trajectory as one block of voltages."""
+        try:
+            if later:
+                raise RejectedError(STALE, "a block begins as soon as the device has it; stamp the trajectory 0")
+            stamp_ns = self.get_clock().now().nanoseconds
+            block = self._controller.follow_block(names, times, positions, time.monotonic_ns(), stamp_ns)
+        except RejectedError as error:
+            self._reject("trajectory ", error)
+            return
+        none = np.zeros((len(block.voltages), 0))
+        self._block_publisher.publish(encode_trajectory(stamp_ns, block.names, block.times_ns, none, block.voltages))
+        self.get_logger().info(
+            f"block: {len(block.voltages)} samples of {block.period:g} s, the path begins after {block.lead_in}"
+        )
+        self._too_fast = ""
+        self._tell_too_fast()
+        self._report()
+
+    def _stop_block(self) -> None:
+        """Ask the driver to hold where it is; it tells at which sample."""
+        self._block_publisher.publish(JointTrajectory())
+
+    def _on_block_state(self, status: DiagnosticStatus) -> None:
+        values = {each.key: each.value for each in status.values}
+        seconds, _, rest = values.get("stamp", "").partition(".")
+        if not (seconds.isdecimal() and rest.isdecimal() and values.get("sample", "").isdecimal()):
+            return
+        stamp_ns, reason = int(seconds) * SECOND_NS + int(rest), values.get("reason", "")
+        if self._controller.told(stamp_ns, status.message, int(values["sample"]), reason, time.monotonic_ns()):
+            block = self._controller.block
+            assert block
+            said = f"block {shown(block.state)} at sample {block.sample}{': ' if reason else ''}{shown(reason)}"
+            if block.state == "ended":
+                self.get_logger().info(said)
+            else:
+                self.get_logger().warning(said)
+            self._save_memory(complete=False)
+            self._report()
 
     def _tell_too_fast(self) -> None:
         """Log once that a trajectory is too fast for the slew limit."""
@@ -559,6 +612,9 @@ class Compensator(LifecycleNode):
         self._tell_notes()
         self._tell_calibrations()
         self._tell_beyond()
+        if why := controller.watch_block(now_ns):
+            self.get_logger().error(f"block given up: {why}")
+            self._report()
         if controller.watch(self._settings.safety, now_ns):
             self._report()
         for axis, fault in controller.watch_sensors(values["feedback_fault_time"], now_ns):
@@ -775,7 +831,7 @@ def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayL
     """Return stamp (ns), names, times (ns) and positions of a serialized JointTrajectory."""
     # An unreadable message gives no names; positions of different lengths are returned as such. Both are then rejected.
     if arrays := decode_trajectory(data):
-        return arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.positions
+        return arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.values
     try:
         message = deserialize_message(data, JointTrajectory)
     except RuntimeError:

@@ -91,6 +91,13 @@ DECLARATIONS = (
         "Whether the node goes on by itself when somebody else has moved the stage and the reported voltages are "
         "steady; if false, ~/arm does that.",
     ),
+    # Trajectories
+    text(
+        "trajectory_output", "stream",
+        "stream: a trajectory is output sample by sample. block: as voltages in one message on voltage_trajectory, for "
+        "a driver that plays it by the device's clock.",
+        "stream", "block", read_only=True,
+    ),
     # Commands
     text(
         "desired_type", "JointState",

@@ -5,6 +5,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 
@@ -15,6 +16,7 @@ from slpi_ros.effects.excitation import MEAN_SPEED
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, RateLimiter, volts
+from slpi_ros.nodes.device_block import BlockPlayer, BlockRequest, BlockState, Told, refusal
 
 # Time between two attempts to reach a device, and longest sleep of the thread, seconds.
 RETRY, LONGEST_SLEEP = 0.25, 0.05
@@ -92,6 +94,10 @@ class DeviceLoop:
         self.found: Found | None = None
         self.latest: Reading | None = None
         self.answers: deque[tuple[str, bool, str]] = deque()  # request, whether it succeeded, text
+        self.block_states: deque[BlockState] = deque()
+        self.recorded: deque[BlockPlayer] = deque()  # blocks that ended with a recording
+        self._block: BlockPlayer | None = None
+        self._submitted: deque[BlockRequest] = deque()
         self._device, self._settings, self._on_reading, self._now_ns = device, settings, on_reading, now_ns
         self._limiters = [RateLimiter(limits, 1.0 / settings.rate) for limits in settings.limits]
         spans = [limits.upper - limits.lower for limits in settings.limits]
@@ -122,6 +128,8 @@ class DeviceLoop:
             reason = f"{list(voltages)[:8]}: send one finite voltage for each of the axes {', '.join(axes)}"
         elif status.state is not State.ARMED or self._ending:
             reason = status.reason or "the device is not open yet"
+        elif self._submitted or self._playing:
+            reason = "a block is being played; wait for its end, or stop it with an empty trajectory"
         else:
             with self._lock:
                 self._goal = tuple(voltages)
@@ -133,6 +141,10 @@ class DeviceLoop:
         """Ask for "arm" or "stop"; the outcome appears in `answers`."""
         with self._lock:
             self._requests.add(what)
+
+    def submit(self, request: BlockRequest) -> None:
+        """Take a block to play, or an empty one to stop; what becomes of it appears in `block_states`."""
+        self._submitted.append(request)
 
     def end(self) -> None:
         """Ask the thread to end: after the ramp to rest, if there is one."""
@@ -165,6 +177,8 @@ class DeviceLoop:
                     self.counts.late += behind
                     due_ns += behind * period_ns
         finally:
+            with suppress(DeviceError):
+                self._stop_block("the driver has ended")
             self._device.close()
 
     def turn(self) -> None:
@@ -182,6 +196,10 @@ class DeviceLoop:
             return
         now_ns = self._now_ns()
         try:
+            self._serve_blocks()
+            block = self._block
+            if block is not None and block.by_device:
+                self._play(block, now_ns)
             reading = self._device.exchange(self._next(now_ns))
         except DeviceError as error:
             self._lose(error)
@@ -189,7 +207,9 @@ class DeviceLoop:
         self.counts.cycles += 1
         self.latest = reading
         self._on_reading(reading)
-        if self.status.state is State.ARMED:
+        if block is not None:
+            self._after(block, reading)
+        if self.status.state is State.ARMED and not (block and block.playing_by_device):
             self._compare(reading, now_ns)
 
     @property
@@ -201,6 +221,77 @@ class DeviceLoop:
             time.sleep(min(wait, LONGEST_SLEEP))
             if self._ending:
                 return
+
+    # Blocks
+
+    @property
+    def _playing(self) -> bool:
+        return self._block is not None and not self._block.ended
+
+    def _serve_blocks(self) -> None:
+        """Begin with a block that has come, or say why not; stop the present one for an empty one."""
+        while self._submitted:
+            request = self._submitted.popleft()
+            if not request.times_ns.size:
+                self._stop_block("by an empty trajectory")
+                continue
+            axes, limits = self._settings.axes, self._settings.limits
+            if self.status.state is not State.ARMED or self._ending:
+                reason = self.status.reason or "the driver ends"
+            elif self._block is not None:
+                reason = "a block is being played; wait for its end, or stop it with an empty trajectory"
+            else:
+                reason = refusal(request, axes, limits, self._written, 1.0 / self._settings.rate)
+            if reason:
+                self.block_states.append(BlockState(Told.REFUSED, request.stamp_ns, 0, reason))
+                continue
+            with self._lock:
+                self._goal = None
+            block = BlockPlayer(request, axes, self._written, self.block_states)
+            block.tell(Told.ACCEPTED, block.prepare(self._device))
+            self._block = block
+
+    def _play(self, block: BlockPlayer, now_ns: int) -> None:
+        """Let the device go on with a block that it plays itself."""
+        ended = block.ended
+        block.turn(self._device, now_ns)
+        if block.ended and not ended:
+            self._resume(tuple(block.voltages[-1].tolist()))
+
+    def _after(self, block: BlockPlayer, reading: Reading) -> None:
+        """Look at a block after a cycle: whether it has ended, and what was recorded."""
+        block.note(reading)
+        if not block.by_device and not block.ended and block.sample >= block.count:
+            last = tuple(block.voltages[-1].tolist())
+            if all(abs(v - w) <= ROUNDING for v, w in zip(self._written, last, strict=True)):
+                block.finish(Told.ENDED)
+        if block.done:
+            if block.recording is not None:
+                self.recorded.append(block)
+            self._block = None
+
+    def _stop_block(self, reason: str) -> str:
+        """Stop the block that is being played where it is; return which sample that is, "" if there is none."""
+        block = self._block
+        if block is None or block.ended:
+            return ""
+        if block.playing_by_device:
+            block.sample = self._device.halt()
+            self._resume(self._device.read().voltages)
+        block.finish(Told.STOPPED, reason, self._device)
+        if block.done:
+            if block.recording is not None:
+                self.recorded.append(block)
+            self._block = None
+        return f"the block was stopped at sample {block.sample} of {block.count}"
+
+    def _resume(self, voltages: tuple[float, ...]) -> None:
+        """Go on from the voltages (V) at which the device has ended a block."""
+        for limiter, v in zip(self._limiters, voltages, strict=True):
+            limiter.start(v)
+        self._written = voltages
+        self._sent.clear()
+        self._outside = 0
 
     # Opening
 
@@ -264,6 +355,10 @@ class DeviceLoop:
             self._retry_ns = self._now_ns() + round(RETRY * SECOND_NS)
 
     def _lose(self, error: SlpiError) -> None:
+        if self._block is not None:
+            if not self._block.ended:
+                self._block.finish(Told.STOPPED, str(error))
+            self._block = None
         self._device.close()
         self.counts.losses += 1
         self._set(State.LOST, str(error))
@@ -293,9 +388,15 @@ class DeviceLoop:
             return
         requests = self._taken()
         if "stop" in requests:
+            try:
+                stopped = self._stop_block("by ~/stop")
+            except DeviceError as error:
+                self._lose(error)
+                self.answers.append(("stop", False, str(error)))
+                return
             self._set(State.HELD, "stopped by ~/stop; call ~/arm to go on")
-            told = self.latest.voltages if self.latest else ()
-            self.answers.append(("stop", True, f"held at {volts(*told)} V; no block was being played"))
+            told = self._written if stopped else self.latest.voltages if self.latest else ()
+            self.answers.append(("stop", True, f"held at {volts(*told)} V; {stopped or 'no block was being played'}"))
         if "arm" not in requests:
             return
         if self.status.state is State.ARMED:
@@ -313,9 +414,13 @@ class DeviceLoop:
 
     def _next(self, now_ns: int) -> tuple[float, ...] | None:
         """Return the voltages (V) to write; None if they are those that were written last, or nothing is commanded."""
+        block = self._block
         goal = self._goal
         if self._ending and self._settings.rest:
             goal = self._settings.rest
+        elif block is not None and not block.ended:
+            # Until the device has played it, nothing is written.
+            goal = None if block.by_device or self.status.state is not State.ARMED else block.goal(now_ns)
         if goal is None or self.status.state is not State.ARMED:
             return None
         fastest = self._fastest if self._ending else [math.inf] * len(goal)
@@ -334,6 +439,11 @@ class DeviceLoop:
     def _returning(self) -> bool:
         """Return whether the way to rest is not at its end yet."""
         rest = self._settings.rest
+        if rest is not None and self._playing:
+            try:
+                self._stop_block("the driver ends")
+            except DeviceError as error:
+                self._lose(error)
         return rest is not None and self.status.state is State.ARMED and self._written != rest
 
     def _compare(self, reading: Reading, now_ns: int) -> None:

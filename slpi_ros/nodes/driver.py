@@ -7,19 +7,24 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.drivers.base import Channel, Reading
 from slpi_ros.drivers.registry import MODULES, make_device
 from slpi_ros.errors import SlpiError, UsageError, shown
 from slpi_ros.excitation.drives import slew_limits
 from slpi_ros.io.cdr import serialise
-from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.io.messages import SECOND_NS, decode_trajectory, encode_trajectory
 from slpi_ros.model.limits import Limits, volts
-from slpi_ros.nodes.common import COMMANDS, ERROR, WARN, DeferredService, Diagnostics, Health, request_stop
+from slpi_ros.nodes.common import COMMANDS, ERROR, LATCHED, OK, WARN, DeferredService, Diagnostics, Health, request_stop
+from slpi_ros.nodes.device_block import BlockPlayer, BlockRequest, BlockState, Told
 from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 
@@ -36,7 +41,10 @@ DECLARATIONS = (
     Declaration(
         "device", "", f"Kind of the device: {', '.join(MODULES)}; required.", read_only=True, choices=tuple(MODULES)
     ),
-    Declaration("address", "", "Where the device is; gcs: host or host:port.", read_only=True),
+    Declaration(
+        "address", "", "Where the device is: host or host:port, a serial port, or DIALECT:PORT of a serial device.",
+        read_only=True,
+    ),
     Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
     Declaration("channels", ["1"], "The device's name of each axis, in the order of axes.", read_only=True),
     Declaration(
@@ -139,7 +147,11 @@ class Driver(Node):
 
     When the link is lost nothing is published; ``/diagnostics`` tells the device and since when. It is opened again
     until that succeeds; then it is read, and moved only after ``~/arm`` (std_srvs/Trigger), or with ``rearm``.
-    ``~/stop`` holds the output until ``~/arm``. Parameters in `DECLARATIONS`.
+    ``~/stop`` holds the output until ``~/arm``.
+
+    A block on ``voltage_trajectory`` (trajectory_msgs/JointTrajectory, volts in ``effort``) is checked as a whole, then
+    played by the device's clock, or streamed where the device cannot; ``voltage_trajectory_state`` tells how far it is,
+    ``recorded_trajectory`` what was recorded. Parameters in `DECLARATIONS`.
     """
 
     def __init__(self) -> None:
@@ -162,6 +174,9 @@ class Driver(Node):
             name: DeferredService(self, f"~/{name}", partial(self._ask, name)) for name in ("arm", "stop")
         }
         self._commands = self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, COMMANDS)
+        self.create_subscription(JointTrajectory, "voltage_trajectory", self._on_trajectory, COMMANDS, raw=True)
+        self._block_publisher = self.create_publisher(DiagnosticStatus, "voltage_trajectory_state", LATCHED)
+        self._recording_publisher = self.create_publisher(JointTrajectory, "recorded_trajectory", COMMANDS)
         # The system clock may be set back.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(LOOK_PERIOD, self._look, clock=steady)
@@ -203,6 +218,35 @@ class Driver(Node):
                 throttle_duration_sec=LOG_PERIOD,
             )
 
+    def _on_trajectory(self, data: bytes) -> None:
+        self._loop.submit(_read_block(data))
+
+    def _tell_block(self, state: BlockState) -> None:
+        seconds, rest = divmod(state.stamp_ns, SECOND_NS)
+        values = {"stamp": f"{seconds}.{rest:09d}", "sample": str(state.sample), "reason": state.reason}
+        self._block_publisher.publish(
+            DiagnosticStatus(
+                level=WARN if state.told in (Told.REFUSED, Told.STOPPED) else OK,
+                name=f"{self.get_fully_qualified_name()}: block",
+                message=state.told.value,
+                hardware_id=self._frame,
+                values=[KeyValue(key=key, value=shown(value)) for key, value in values.items()],
+            )
+        )
+        if state.told is not Told.PLAYING:
+            reason = f": {state.reason}" if state.reason else ""
+            self.get_logger().info(f"block {state.told.value} at sample {state.sample}{reason}")
+
+    def _publish_recording(self, block: BlockPlayer) -> None:
+        recording = block.recording
+        assert recording is not None
+        age_ns = time.monotonic_ns() - block.begun_ns
+        stamp_ns = self.get_clock().now().nanoseconds - age_ns
+        times_ns = np.round(recording.times * SECOND_NS).astype(np.int64)
+        self._recording_publisher.publish(
+            encode_trajectory(stamp_ns, self._values["axes"], times_ns, recording.positions, recording.voltages)
+        )
+
     def _ask(self, what: str) -> str:
         self._loop.request(what)
         return ""
@@ -215,6 +259,10 @@ class Driver(Node):
         while self._loop.answers:
             what, success, text = self._loop.answers.popleft()
             self._deferred[what].answer(success, text)
+        while self._loop.block_states:
+            self._tell_block(self._loop.block_states.popleft())
+        while self._loop.recorded:
+            self._publish_recording(self._loop.recorded.popleft())
         status, now = self._loop.status, time.monotonic()
         changed = status.state is not self._told.state
         if changed:
@@ -279,3 +327,22 @@ class Driver(Node):
         loop.timing.restart()
         summary = f"{self._device_name}: {status.state.value}"
         self._diagnostics.report(Health(tuple(problems), summary, values, self._frame))
+
+
+def _read_block(data: bytes) -> BlockRequest:
+    """Return a serialised JointTrajectory; one that cannot be read names no axis, so that it is refused."""
+    if arrays := decode_trajectory(data, "effort"):
+        return BlockRequest(arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.values)
+    try:
+        message = deserialize_message(data, JointTrajectory)
+    except RuntimeError:
+        return BlockRequest(0, (), np.zeros(1, np.int64), np.zeros((1, 0)))
+    stamp, points = message.header.stamp, message.points
+    times = [each.time_from_start.sec * SECOND_NS + each.time_from_start.nanosec for each in points]
+    lengths = {len(each.effort) for each in points}
+    # Points with different numbers of voltages are refused by their shape.
+    width = lengths.pop() if len(lengths) == 1 else 0
+    values = np.array([list(each.effort)[:width] for each in points], float).reshape(len(points), width)
+    return BlockRequest(
+        stamp.sec * SECOND_NS + stamp.nanosec, tuple(message.joint_names), np.array(times, np.int64), values
+    )

@@ -14,7 +14,7 @@ from slpi_ros.drivers.base import (
 )
 from slpi_ros.drivers.registry import make_device
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.devices.gcs import (
+from slpi_ros.simulation.devices.base import (
     ERROR,
     FAULTS,
     HALF,
@@ -26,8 +26,8 @@ from slpi_ros.simulation.devices.gcs import (
     TWICE,
     WRONG_AXIS,
     Fault,
-    GcsSimulator,
 )
+from slpi_ros.simulation.devices.gcs import GcsSimulator
 
 ERRORS = {
     SILENT: LinkError,
@@ -200,7 +200,7 @@ def test_addresses_that_are_none(address):
 
 
 def test_the_port_is_that_of_the_manual():
-    assert make_device("gcs", "192.0.2.1", [Channel("1")])._port == 50_000
+    assert make_device("gcs", "192.0.2.1", [Channel("1")])._stream._port == 50_000
 
 
 def test_unknown_devices():

@@ -38,7 +38,7 @@ def is_told(found: TrajectoryArrays, message: JointTrajectory) -> None:
     stamp = message.header.stamp
     assert found.start_ns == stamp.sec * 10**9 + stamp.nanosec
     assert list(found.names) == message.joint_names
-    assert found.positions.tolist() == [list(point.positions) for point in message.points]
+    assert found.values.tolist() == [list(point.positions) for point in message.points]
     times = [point.time_from_start.sec * 10**9 + point.time_from_start.nanosec for point in message.points]
     assert found.time_from_start_ns.tolist() == times
 
@@ -80,8 +80,8 @@ def test_noise_is_no_trajectory_or_one_that_noise_can_hold(noise):
     for data in (noise, b"\0\1\0\0" + noise):
         found = decode_trajectory(data)
         if found is not None:
-            assert found.positions.shape == (found.time_from_start_ns.size, len(found.names))
-            assert found.positions.nbytes <= len(data)
+            assert found.values.shape == (found.time_from_start_ns.size, len(found.names))
+            assert found.values.nbytes <= len(data)
 
 
 def test_big_endian_is_read_too():
@@ -92,4 +92,4 @@ def test_big_endian_is_read_too():
     ])  # fmt: skip
     found = decode_trajectory(b"\0\0\0\0" + body)
     assert (found.start_ns, found.names) == (5 * 10**9 + 7, ("x",))
-    assert (found.positions.tolist(), found.time_from_start_ns.tolist()) == ([[2.5]], [3 * 10**9 + 9])
+    assert (found.values.tolist(), found.time_from_start_ns.tolist()) == ([[2.5]], [3 * 10**9 + 9])

@@ -15,7 +15,8 @@ from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from slpi_ros.simulation.devices.gcs import LOST, Fault, GcsSimulator  # noqa: E402
+from slpi_ros.simulation.devices.base import LOST, Fault  # noqa: E402
+from slpi_ros.simulation.devices.gcs import GcsSimulator  # noqa: E402
 
 RATE, SLEW = 200.0, 500.0
 LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0, "slew_limit": SLEW, "rate": RATE}
@@ -76,7 +77,7 @@ def test_voltages_go_to_the_device_and_positions_come_back():
         assert simulator.log == []
         bench.reach(60.0, 30.0)
         assert (simulator.voltage("1"), simulator.voltage("2")) == (30.0, 60.0)
-        last, told = bench.states[-1], simulator._move()
+        last, told = bench.states[-1], simulator.move()
         assert list(last.position) == pytest.approx([told[1] + 1e-6, told[0]], abs=2e-9)
         assert "E-727" in last.header.frame_id
         stamps = [state.header.stamp.sec + state.header.stamp.nanosec * 1e-9 for state in bench.states]

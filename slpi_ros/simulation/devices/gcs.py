@@ -1,65 +1,28 @@
-"""A controller that speaks PI's General Command Set over TCP, with a simulated stage behind it.
+"""A controller that speaks PI's General Command Set over TCP or a pseudo terminal, with a simulated stage behind it.
 
 Written independently of the driver. What is simulated: axes, one output for each, the servo as a switch that holds the
 voltage, the own range of voltages, error codes. Syntax: user manual of E-727 (E727T0005, page 178).
 """
 
-import socket
-import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from typing import Any
 
-import numpy as np
-
-from slpi_ros.errors import UsageError
+from slpi_ros.simulation.devices.base import ERROR, HALF, NONSENSE, NOT_FINITE, TWICE, WRONG_AXIS, Fault
+from slpi_ros.simulation.devices.gcs_waves import SimulatedWaves
+from slpi_ros.simulation.devices.stream import StreamSimulator
 from slpi_ros.simulation.stage import Stage
 
 IDENTITY = "(c)2020 Physik Instrumente (PI) GmbH & Co. KG, E-727.SIMULATED, 0123456789, 13.21.00.09"
 COMMANDS = (
     "*IDN?", "ERR?", "HLP?", "ONL?", "POS?", "SAI?", "SVA", "SVA?", "SVO", "SVO?", "TMN?", "TMX?", "VMA?", "VMI?",
-    "VOL?",
+    "VOL?", "WAV", "WSL", "WGC", "WTR", "WGO", "WGO?", "WGI?", "SPA?", "RTR", "DRC", "DRR?",
 )  # fmt: skip
 MICROMETRE = 1e-6
-# Time between looks at whether the simulator shall end, seconds.
-LOOK = 0.02
-
-SILENT, HALF, WRONG_AXIS, ERROR, LATE, TWICE, LOST, NONSENSE, NOT_FINITE = FAULTS = (
-    "silent", "half", "wrong_axis", "error", "late", "twice", "lost", "nonsense", "not_finite",
-)  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Fault:
-    """What goes wrong with the next answers to a question; UsageError if there is no such fault."""
-
-    kind: str  # one of `FAULTS`
-    question: str = "POS?"  # of `ERR?` for `error`, whatever is given
-    times: int = 1  # how many answers
-    seconds: float = 0.3  # how late an answer comes, or how long no connection is accepted after a loss
-    code: int = 17  # that ``ERR?`` tells
-
-    def __post_init__(self) -> None:
-        if self.kind not in FAULTS:
-            raise UsageError(f"no fault '{self.kind}'; choose one of {', '.join(FAULTS)}")
-
-
-@dataclass(frozen=True)
-class OutputChange:
-    """One change of the voltage at an output."""
-
-    time_ns: int  # steady clock
-    axis: str
-    voltage: float  # V
-
-
-class _LostError(Exception):
-    """The link is to be lost."""
-
-
-class GcsSimulator:
-    """A simulated controller, which serves one client after the other in a thread of its own.
+class GcsSimulator(StreamSimulator):
+    """A simulated controller.
 
     Parameters
     ----------
@@ -71,8 +34,11 @@ class GcsSimulator:
     units_per_volt : of ``SVA``, which is not in volts on every controller
     without : commands that this controller has not got
     answer_delay : time until an answer, s
-    port : TCP port; 0 for a free one
+    place : host and port, or the path of a pseudo terminal
     """
+
+    usual_axes, usual_address = ("1",), "127.0.0.1:50000"
+    question, error_question = "POS?", "ERR?"
 
     def __init__(
         self,
@@ -85,32 +51,17 @@ class GcsSimulator:
         units_per_volt: float = 1.0,
         without: Sequence[str] = (),
         answer_delay: float = 0.0,
-        host: str = "127.0.0.1",
-        port: int = 0,
+        **place: Any,
     ) -> None:
-        self.axes = list(axes)
-        self.stage = stage or Stage.random(self.axes, seed=1, noise_rms=0.0)
-        self.low, self.high = voltage_range
-        self.log: list[OutputChange] = []
-        self.received: list[str] = []  # all commands, in order
-        self.cycles = 0  # number of answers to POS?
-        self.fault: Fault | None = None
+        super().__init__(
+            axes, stage, voltage_range=voltage_range, voltages=voltages, answer_delay=answer_delay, **place
+        )
         self.servo = dict.fromkeys(self.axes, servo)
         self.online = dict.fromkeys(self.axes, True)
-        self.units_per_volt, self._delay = units_per_volt, answer_delay
+        self.units_per_volt = units_per_volt
         self._known = [command for command in COMMANDS if command not in without]
         self._outputs = {str(place): axis for place, axis in enumerate(self.axes, 1)}
-        self._voltages = dict(zip(self.axes, voltages or [0.0] * len(self.axes), strict=True))
         self._error = 0
-        self._begun = time.monotonic()
-        self._refused_until = 0.0
-        self._lock = threading.RLock()  # of the stage: a hand is another thread
-        self._move()
-        self._server = socket.create_server((host, port))
-        self._server.settimeout(LOOK)
-        self.address = "{}:{}".format(*self._server.getsockname()[:2])
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="gcs simulator", daemon=True)
         self._handlers: dict[str, Callable[[list[str]], list[str]]] = {
             "*IDN?": lambda _: [IDENTITY],
             "ERR?": self._tell_error,
@@ -128,104 +79,45 @@ class GcsSimulator:
             "VMI?": lambda given: self._tell_output(given, lambda _: f"{self.low:.4f}"),
             "VOL?": lambda given: self._tell_output(given, lambda axis: f"{self.voltage(axis):.6f}"),
         }
-
-    def __enter__(self) -> "GcsSimulator":
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def start(self) -> None:
-        """Begin to serve."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """End the server."""
-        self._ending.set()
-        if self._thread.is_alive():
-            self._thread.join()
-        self._server.close()
-
-    def voltage(self, axis: str) -> float:
-        """Return the voltage (V) at the output of an axis."""
-        return self._voltages[axis]
-
-    def set_by_hand(self, axis: str, voltage: float) -> None:
-        """Set a voltage (V) as the knob of the controller does."""
-        self._output(axis, voltage)
-
-    # The link
-
-    def _serve(self) -> None:
-        while not self._ending.is_set():
-            try:
-                client, _ = self._server.accept()
-            except TimeoutError:
-                continue
-            with client:
-                if time.monotonic() >= self._refused_until:
-                    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    client.settimeout(LOOK)
-                    with suppress(_LostError, ConnectionError):
-                        self._talk(client)
-
-    def _talk(self, client: socket.socket) -> None:
-        buffer = b""
-        while not self._ending.is_set():
-            try:
-                data = client.recv(65_536)
-            except TimeoutError:
-                continue
-            if not data:
-                return
-            *lines, buffer = (buffer + data).split(b"\n")
-            answers = [self._answer(line.decode("latin-1").strip()) for line in lines]
-            if self._delay:
-                time.sleep(self._delay)
-            if any(answers):
-                client.sendall(b"".join(answers))
+        self.waves = SimulatedWaves(self)
+        self._handlers |= self.waves.handlers
 
     # Commands
 
-    def _answer(self, line: str) -> bytes:
-        if not line:
-            return b""
-        self.received.append(line)
+    def reply(self, line: str) -> bytes:
+        """Return the lines of the answer to a command; b"" if it has none."""
+        self.waves.advance(time.monotonic_ns())
         command, *given = line.split()
         if command not in self._known:
             self._error = 2
             return b""
-        fault = self._due(command)
+        fault = self.due(command)
         if fault and fault.kind == ERROR:
             self._error = fault.code
         answer = self._handlers[command](given)
         data = " \n".join(answer).encode("latin-1") + b"\n" if answer else b""
-        return self._spoilt(data, fault) if fault else data
+        return self.spoilt(data, fault) if fault else data
 
-    def _due(self, command: str) -> Fault | None:
-        """Return the fault that this question meets, which counts."""
-        fault = self.fault
-        if fault is None or command != ("ERR?" if fault.kind == ERROR else fault.question):
-            return None
-        self.fault = replace(fault, times=fault.times - 1) if fault.times > 1 else None
-        return fault
-
-    def _spoilt(self, data: bytes, fault: Fault) -> bytes:
-        if fault.kind == LOST:
-            self._refused_until = time.monotonic() + fault.seconds
-            raise _LostError
-        if fault.kind == LATE:
-            self._ending.wait(fault.seconds)
+    def spoil(self, data: bytes, fault: Fault) -> bytes:
+        """Return an answer as this fault leaves it."""
         first = self.axes[0].encode()
         return {
-            SILENT: b"",
             HALF: data[: len(data) // 2],
             WRONG_AXIS: data.replace(first + b"=", b"Z="),
             TWICE: data + data,
             NONSENSE: b"\xff\x00<html>=1e\n" * max(data.count(b"\n"), 1),
             NOT_FINITE: first + b"=nan\n",
         }.get(fault.kind, data)
+
+    def set_by_hand(self, axis: str, voltage: float) -> None:
+        """Set a voltage (V) as the knob of the controller does."""
+        self.waves.advance(time.monotonic_ns())
+        super().set_by_hand(axis, voltage)
+
+    def fail(self, code: int) -> list[str]:
+        """Note an error for ``ERR?``; return no answer."""
+        self._error = code
+        return []
 
     def _tell_error(self, _: list[str]) -> list[str]:
         code, self._error = self._error, 0
@@ -247,7 +139,7 @@ class GcsSimulator:
 
     def _tell_positions(self, given: list[str]) -> list[str]:
         self.cycles += 1
-        readings = dict(zip(self.axes, self.stage.measure(self._move()), strict=True))
+        readings = self.measure()
         return self._tell(given, lambda axis: f"{readings[axis] / MICROMETRE:.6f}")
 
     def _set_voltages(self, given: list[str]) -> list[str]:
@@ -262,11 +154,13 @@ class GcsSimulator:
             self._error = 15
         elif any(self.servo[axis] for axis in values):
             self._error = 303
+        elif any(self.waves.moves(axis) for axis in values):
+            self._error = 73
         elif not all(self.low <= v <= self.high for v in values.values()):
             self._error = 302
         else:
             for axis, v in values.items():
-                self._output(axis, v)
+                self.output(axis, v)
         return []
 
     def _set_servo(self, given: list[str]) -> list[str]:
@@ -276,19 +170,3 @@ class GcsSimulator:
             # Without a jump: the voltage of the servo stays.
             self.servo[given[0]] = given[1] == "1"
         return []
-
-    # The stage
-
-    def _output(self, axis: str, voltage: float) -> None:
-        with self._lock:
-            if voltage != self._voltages[axis]:
-                self._voltages[axis] = voltage
-                self.log.append(OutputChange(time.monotonic_ns(), axis, voltage))
-                self._move()
-
-    def _move(self) -> list[float]:
-        """Move the stage to the present time; return its readings (m) without noise."""
-        low, high = self.stage.voltage_range
-        with self._lock:
-            voltages = np.clip([self._voltages[axis] for axis in self.axes], low, high).tolist()
-            return self.stage.step(time.monotonic() - self._begun, voltages)

@@ -1,0 +1,160 @@
+"""A path as one block of voltages for a device that plays it by its own clock, and what of it was really played."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray, IntArray
+from slpi_ros.compensator import validation as rejection
+from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.trajectory import Trajectory
+from slpi_ros.compensator.validation import RejectedError
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.limits import RateLimiter
+from slpi_ros.model.streaming import StageStream
+
+# Most samples of a block: their voltages take some seconds to compute.
+LONGEST = 300_000
+# A driver answers within this time; while it plays, it tells the sample that often.
+PATIENCE_NS = 2 * SECOND_NS
+# What the driver may tell of a block.
+ACCEPTED, REFUSED, PLAYING, ENDED, STOPPED = "accepted", "refused", "playing", "ended", "stopped"
+
+
+@dataclass(frozen=True)
+class Block:
+    """Voltages of some axes, evenly spaced, from the present ones on."""
+
+    stamp_ns: int  # when it was made
+    names: tuple[str, ...]
+    period: float  # s
+    voltages: FloatArray  # V, (N, names)
+    lead_in: int  # samples until the path begins
+    missed: str = ""  # the first sample that the limits hold back, "" if none
+
+    @property
+    def times_ns(self) -> IntArray:
+        """Times since the start, shape (N,)."""
+        times: IntArray = np.round(np.arange(len(self.voltages)) * (self.period * SECOND_NS)).astype(np.int64)
+        return times
+
+
+def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, period: float, stamp_ns: int) -> Block:
+    """Return the block of voltages for a path; RejectedError if it is too long. The axes, in a block, stay as they are.
+
+    The samples are as far apart as the points where these are closer than `period` (s). First the limits let each axis
+    go to the beginning of the path; the time of the path starts there.
+    """
+    times = path.time_from_start_ns
+    closest = int(np.diff(times).min()) * 1e-9 if times.size > 1 else period
+    period = min(period, closest)
+    moved = [axis for axis in axes if axis.name in path.names]
+    grid = np.arange(int(round((times[-1] - times[0]) * 1e-9 / period)) + 1) * period * SECOND_NS + times[0]
+    if grid.size > LONGEST:
+        raise RejectedError(
+            rejection.LENGTH, f"{grid.size} samples of {period:g} s are more than {LONGEST}; send shorter paths"
+        )
+    columns = [path.names.index(axis.name) for axis in moved]
+    # What is late by itself begins earlier.
+    delays = [axis.model.chain.delay * SECOND_NS if axis.model else 0.0 for axis in moved]
+    pairs = zip(columns, delays, strict=True)
+    desired = np.stack([np.interp(grid + delay, times, path.positions[:, column]) for column, delay in pairs], 1)
+    saved = [(axis.stream.snapshot(), axis.stream.pace, axis.stream.coupled) for axis in moved]
+    try:
+        for axis in moved:
+            pace = RateLimiter(axis.output.limits, period, axis.voltage)
+            pace.begin(0)
+            axis.stream.pace = pace
+        return _compute(path, moved, stage, desired, period, stamp_ns)
+    finally:
+        for axis, (state, pace, coupled) in zip(moved, saved, strict=True):
+            axis.stream.restore(state)
+            axis.stream.pace, axis.stream.coupled = pace, coupled
+
+
+def _compute(
+    path: Trajectory,
+    moved: Sequence[Axis],
+    stage: StageStream | None,
+    desired: FloatArray,
+    period: float,
+    stamp_ns: int,
+) -> Block:
+    names = tuple(axis.name for axis in moved)
+    rows: list[list[float]] = [[axis.voltage for axis in moved]]
+    step_ns, now_ns, missed = round(period * SECOND_NS), 0, ""
+
+    def step(row: list[float]) -> list[float]:
+        nonlocal now_ns
+        now_ns += step_ns
+        if stage:
+            stage.decouple(dict(zip(names, row, strict=True)))
+        return [axis.stream.move(period, y, now_ns) for axis, y in zip(moved, row, strict=True)]
+
+    listed = desired.tolist()
+    # The way to the beginning of the path.
+    while True:
+        rows.append(step(listed[0]))
+        if not any(axis.stream.missed and not axis.stream.held for axis in moved):
+            break
+        if len(rows) > LONGEST:
+            raise RejectedError(rejection.OUT_OF_RANGE, "the beginning of the path is not reached; raise slew_limit")
+    lead_in = len(rows) - 1
+    for number, row in enumerate(listed[1:], 1):
+        rows.append(step(row))
+        if not missed:
+            late = [axis.name for axis in moved if axis.stream.missed]
+            if late:
+                held = any(axis.stream.held for axis in moved)
+                what = "out of reach, held at a voltage limit" if held else "too fast for slew_limit"
+                missed = f"axis '{late[0]}', {(number * period):.6g} s after the beginning of the path: {what}"
+    # What the limits held back at the end.
+    while any(axis.stream.missed and not axis.stream.held for axis in moved) and len(rows) <= 2 * LONGEST:
+        rows.append(step(listed[-1]))
+    return Block(stamp_ns, names, period, np.array(rows), lead_in, missed)
+
+
+class BlockFollower:
+    """Lets the memory of each axis follow a block up to the sample that the driver has told."""
+
+    def __init__(self, block: Block, axes: Mapping[str, Axis], now_ns: int) -> None:
+        self.block = block
+        self.state, self.sample, self.reason = "", 0, ""
+        self._axes = [axes[name] for name in block.names]
+        self._rows = block.voltages.tolist()
+        self._heard_ns = now_ns
+
+    def hear(self, state: str, sample: int, reason: str, now_ns: int) -> None:
+        """Take what the driver tells of this block."""
+        self.state, self.reason, self._heard_ns = state, reason, now_ns
+        last = min(max(sample, self.sample), len(self._rows)) if state in (PLAYING, ENDED, STOPPED) else self.sample
+        part = self._rows[self.sample : last]
+        for column, axis in enumerate(self._axes):
+            axis.play([row[column] for row in part], self.block.period, now_ns)
+        self.sample = last
+
+    @property
+    def done(self) -> bool:
+        """Whether the driver has told its end."""
+        return self.state in (REFUSED, ENDED, STOPPED)
+
+    def silent(self, now_ns: int) -> str:
+        """Return why nothing more is known of the block, "" while the driver tells it."""
+        if now_ns - self._heard_ns < PATIENCE_NS:
+            return ""
+        if not self.state:
+            return (
+                "no driver answers on voltage_trajectory_state; start one that plays blocks, or set trajectory_output "
+                "to stream"
+            )
+        return f"the driver no longer tells how far the block is (last sample {self.sample} of {len(self._rows)})"
+
+    def band(self, now_ns: int) -> None:
+        """Let the reports of the amplifiers be held against the samples that may be played by now."""
+        ahead = self.sample
+        if self.state == PLAYING:
+            ahead += int((now_ns - self._heard_ns) * 1e-9 / self.block.period)
+        row = self._rows[min(ahead, len(self._rows) - 1)]
+        for column, axis in enumerate(self._axes):
+            axis.amplifier.output(row[column], now_ns)

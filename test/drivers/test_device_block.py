@@ -1,0 +1,213 @@
+"""Blocks of voltages, judged by the log of the simulated device: played by its clock, or streamed."""
+
+import re
+import time
+from collections import deque
+
+import numpy as np
+import pytest
+from drivers.kinds import KINDS
+
+from slpi_ros.model.limits import Limits
+from slpi_ros.nodes.device_block import BlockRequest, Told
+from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
+from slpi_ros.simulation.devices.base import LOST, SILENT, Fault
+
+RATE, SLEW = 500.0, 2000.0
+
+
+class Bench:
+    """A loop with a simulated device, on the clock of the device or on one of the test."""
+
+    def __init__(self, kind, simulator, real=True, **settings):
+        self.kind, self.simulator, self.readings, self.states = kind, simulator, [], deque()
+        self._now_ns = None if real else 10**12
+        self.begin = {axis: simulator.voltage(axis) for axis in simulator.axes}
+        axes = tuple(f"a{number}" for number in range(len(simulator.axes)))
+        given = LoopSettings(axes, (Limits(0.0, 100.0, SLEW),) * len(axes), RATE, **settings)
+        self.axes = axes
+        self.loop = DeviceLoop(kind.make(simulator), given, self.readings.append, self.now_ns)
+        self.loop.block_states = self.states
+
+    def now_ns(self):
+        return time.monotonic_ns() if self._now_ns is None else self._now_ns
+
+    def turn(self, times=1):
+        for _ in range(times):
+            if self._now_ns is not None:
+                self._now_ns += int(1e9 / RATE)
+            self.loop.turn()
+
+    def until(self, done, most=20_000):
+        for _ in range(most):
+            if done():
+                return
+            self.turn()
+        raise AssertionError(f"in vain; {self.loop.status}, {self.told}")
+
+    @property
+    def told(self):
+        return [state.told for state in self.states]
+
+    def submit(self, voltages, period, names=None, stamp=7):
+        voltages = np.asarray(voltages, float)
+        times = np.round(np.arange(len(voltages)) * period * 1e9).astype(np.int64)
+        self.loop.submit(BlockRequest(stamp, names or self.axes[: voltages.shape[1]], times, voltages))
+
+    def path(self, place=0):
+        axis = self.simulator.axes[place]
+        own = [each.voltage for each in self.simulator.log if each.axis == axis]
+        return self.kind.gain * np.array([self.begin[axis], *own])
+
+    @property
+    def largest_step(self):
+        return max(float(np.abs(np.diff(self.path(place))).max(initial=0.0)) for place in range(len(self.axes)))
+
+
+@pytest.fixture
+def bench(request):
+    name, axes, voltages, real, *rest = request.param
+    kind = KINDS[name]
+    with kind.simulate(axes, voltages, **(rest[0] if rest else {})) as simulator:
+        made = Bench(kind, simulator, real)
+        made.turn()
+        yield made
+        made.loop._device.close()
+
+
+def wave(count, period, *begin, frequency=5.0, size=10.0):
+    t = np.arange(count) * period
+    return np.stack([v + size * (1.0 - np.cos(2 * np.pi * frequency * t)) for v in begin], 1)
+
+
+@pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], True)], indirect=True)
+@pytest.mark.parametrize("count", [4000, pytest.param(20_000, marks=pytest.mark.long)])
+def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
+    period = 5e-5
+    v = wave(count, period, 20.0, 30.0)
+    bench.submit(v, period)
+    bench.until(lambda: bench.loop.recorded)
+    assert bench.told[:2] == [Told.ACCEPTED, Told.PLAYING] and bench.told[-1] is Told.ENDED
+    assert bench.states[-1].sample == count and {state.stamp_ns for state in bench.states} == {7}
+    for place, axis in enumerate(bench.simulator.axes):
+        played = [each for each in bench.simulator.log if each.axis == axis]
+        changed = np.flatnonzero(np.diff(v[:, place])) + 1
+        np.testing.assert_array_equal([each.voltage for each in played], v[changed, place])
+        times = np.array([each.time_ns for each in played])
+        np.testing.assert_array_equal(times - times[0], (changed - changed[0]) * 50_000)
+    recording = bench.loop.recorded[0].recording
+    np.testing.assert_allclose(recording.times, np.arange(count) * period, atol=1e-12)
+    np.testing.assert_allclose(recording.voltages, v, atol=1e-8)
+    # The positions are those of the simulated stage, and the states went on meanwhile.
+    assert np.ptp(recording.positions[:, 0]) > 1e-7 and np.corrcoef(recording.positions[:, 0], v[:, 0])[0, 1] > 0.9
+    assert len(bench.readings) > 10
+    # Afterwards single voltages go on from its end.
+    assert bench.loop.command(v[-1].tolist()) == ""
+    bench.turn(5)
+    assert bench.loop.status.state is State.ARMED
+    assert bench.largest_step <= SLEW * 2.0 / RATE
+
+
+@pytest.mark.parametrize(
+    "bench",
+    [("labjack", 2, [20.0, 30.0], False), ("gcs", 2, [20.0, 30.0], False, {"without": ("WAV",)})],
+    indirect=True,
+)
+def test_where_a_device_cannot_it_is_streamed(bench):
+    v = wave(200, 2e-3, 20.0, 30.0)
+    bench.submit(v, 2e-3)
+    bench.until(lambda: bench.loop.recorded)
+    assert bench.told[-1] is Told.ENDED and "streamed" in bench.states[0].reason
+    assert bench.largest_step <= SLEW * 2.0 / RATE
+    np.testing.assert_allclose(bench.path()[-1], v[-1, 0], atol=1e-4)
+    recording = bench.loop.recorded[0].recording
+    assert np.ptp(recording.positions[:, 1]) > 1e-7
+
+
+@pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], False)], indirect=True)
+@pytest.mark.parametrize(
+    ("voltages", "names", "named"),
+    [
+        ([[20.0], [101.0]], None, "sample 1.*101 V"),
+        ([[20.0], [-1.0]], None, "-1 V"),
+        ([[20.0], [90.0]], None, "slew_limit"),
+        ([[40.0], [40.0]], None, "begins at 40 V, but the device is at 20 V"),
+        ([[20.0], [np.nan]], None, "finite"),
+        ([[20.0]], ("z",), "'z'"),
+        ([[20.0, 30.0]], ("a0", "a0"), "once"),
+        ([[20.0]], ("a0", "a1"), "shape"),
+    ],
+)
+def test_what_is_refused_moves_nothing(bench, voltages, names, named):
+    bench.submit(voltages, 2e-3, names)
+    bench.turn(3)
+    (state,) = bench.states
+    assert state.told is Told.REFUSED and re.search(named, state.reason)
+    assert bench.simulator.log == [] and not [each for each in bench.simulator.received if each.startswith("W")][1:]
+
+
+@pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], False)], indirect=True)
+def test_times_that_do_not_increase(bench):
+    bench.loop.submit(BlockRequest(7, ("a0",), np.array([0, 0]), np.array([[20.0], [20.0]])))
+    bench.turn(2)
+    assert bench.told == [Told.REFUSED]
+
+
+@pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], True), ("labjack", 2, [20.0, 30.0], True)], indirect=True)
+@pytest.mark.parametrize("how", ["stop", "empty"])
+def test_stopped_it_holds_where_it_is(bench, how):
+    count, period = 20_000, 5e-5
+    v = wave(count, period, 20.0, 30.0)
+    bench.submit(v, period)
+    bench.until(lambda: bench.simulator.log)
+    assert "block" in bench.loop.command([20.0, 30.0])
+    bench.submit(v, period, stamp=8)
+    bench.until(lambda: bench.states[-1].stamp_ns == 8)
+    assert bench.told[-1] is Told.REFUSED
+    if how == "stop":
+        bench.loop.request("stop")
+    else:
+        bench.submit(np.zeros((0, 2)), period)
+    bench.until(lambda: bench.told[-1] is Told.STOPPED)
+    sample, there = bench.states[-1].sample, bench.kind.volts(bench.simulator)
+    assert 0 < sample < count
+    # Streamed, it lags behind by a cycle.
+    np.testing.assert_allclose(there, v[sample - 1], atol=1e-5 if bench.loop._device.block_period else 2.0)
+    bench.turn(20)
+    assert bench.kind.volts(bench.simulator) == there
+    if how == "stop":
+        what, success, text = bench.loop.answers.popleft()
+        assert success and f"sample {sample} of {count}" in text and bench.loop.status.state is State.HELD
+    else:
+        assert bench.loop.status.state is State.ARMED
+        bench.loop.command([20.0, 30.0])
+        bench.until(lambda: bench.kind.volts(bench.simulator) == pytest.approx([20.0, 30.0], abs=1e-4))
+    assert bench.largest_step <= SLEW * 2.0 / RATE
+
+
+@pytest.mark.parametrize("bench", [("gcs", 1, [20.0], True), ("labjack", 1, [20.0], True)], indirect=True)
+@pytest.mark.parametrize("kind", [SILENT, LOST])
+def test_a_link_that_is_lost_ends_the_block_here(bench, kind):
+    v = wave(10_000, 5e-5, 20.0)
+    bench.submit(v, 5e-5)
+    bench.until(lambda: bench.simulator.log)
+    bench.simulator.fault = Fault(kind, seconds=0.0)
+    bench.until(lambda: bench.loop.status.state is State.LOST)
+    assert bench.told[-1] is Told.STOPPED and bench.states[-1].reason == bench.loop.status.reason
+    # A device that plays on by itself is not taken over before its end.
+    bench.until(lambda: bench.loop.status.state is State.HELD, most=10**7)
+    there = bench.kind.volts(bench.simulator)
+    bench.turn(5)
+    assert bench.kind.volts(bench.simulator) == there
+    if bench.loop._device.block_period:
+        assert there == v[-1].tolist()
+    assert bench.largest_step <= SLEW * 2.0 / RATE
+
+
+@pytest.mark.parametrize("bench", [("gcs", 1, [20.0], False)], indirect=True)
+def test_while_it_is_held_nothing_is_played(bench):
+    bench.loop.request("stop")
+    bench.turn()
+    bench.submit([[20.0], [20.0]], 2e-3)
+    bench.turn()
+    assert bench.told == [Told.REFUSED] and "~/arm" in bench.states[-1].reason

@@ -1,0 +1,89 @@
+"""What holds for every device, each over its own protocol; judged by the log of the simulated one."""
+
+import math
+import time
+
+import pytest
+from drivers.kinds import KINDS
+
+from slpi_ros.drivers.base import DeviceError, LinkError
+from slpi_ros.simulation.devices.base import FAULTS, LATE, LOST, Fault
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return KINDS[request.param]
+
+
+def test_opening_changes_no_output_and_tells_where_it_is(kind):
+    count = len(kind.axes)
+    begin = [37.5, 12.5][:count]
+    with kind.simulate(count, begin) as simulator:
+        device = kind.make(simulator)
+        found = device.open()
+        device.close()
+        device.open()
+        device.read()
+        device.close()
+        assert simulator.log == []
+    assert found.setpoints == pytest.approx(begin, abs=kind.rounding)
+    assert found.reading.voltages == pytest.approx(begin, abs=kind.rounding)
+    assert found.identity and found.servo == (False,) * count
+    assert all(low <= 0.0 and high >= 50.0 for low, high in zip(found.lowest, found.highest, strict=True))
+
+
+def test_a_cycle_writes_and_reads_each_axis(kind):
+    goal = [30.0, 8.0][: len(kind.axes)]
+    with kind.simulate(len(kind.axes)) as simulator:
+        device = kind.make(simulator)
+        device.open()
+        before = time.monotonic_ns()
+        reading = device.write(goal)
+        after = time.monotonic_ns()
+        told = simulator.move()
+        device.close()
+        assert kind.volts(simulator) == pytest.approx(goal, abs=kind.rounding)
+    assert before <= reading.read_ns <= after
+    assert reading.voltages == pytest.approx(goal, abs=kind.rounding)
+    assert reading.positions == pytest.approx(told if kind.sensor else [math.nan] * len(goal), abs=2e-9, nan_ok=True)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_told_in_time_and_a_new_opening_goes_on(kind, fault):
+    with kind.simulate(voltages=[20.0]) as simulator:
+        device = kind.make(simulator)
+        device.open()
+        simulator.fault = Fault(fault, seconds=0.25 if fault == LATE else 0.0)
+        with pytest.raises(DeviceError, match=f"^{device.name}: "):
+            # The second of two answers may come after the first has been read.
+            for _ in range(2):
+                device.read()
+        device.close()
+        for _ in range(200):
+            try:
+                found = device.open()
+                break
+            except DeviceError:
+                # At a serial port a late answer meets the next opening.
+                assert fault in (LATE, LOST)
+        assert simulator.log == [] and found.setpoints == pytest.approx([20.0], abs=kind.rounding)
+        assert device.write([21.0]).voltages == pytest.approx([21.0], abs=kind.rounding)
+        device.close()
+
+
+def test_beyond_its_own_range_it_refuses(kind):
+    with kind.simulate(voltages=[20.0]) as simulator:
+        device = kind.make(simulator)
+        beyond = device.open().highest[0] + 10.0
+        with pytest.raises(DeviceError):
+            device.write([beyond])
+        device.close()
+        assert simulator.log == []
+
+
+def test_not_open(kind):
+    with kind.simulate() as simulator:
+        device = kind.make(simulator)
+        with pytest.raises(LinkError):
+            device.read()
+        device.close()

@@ -1,0 +1,53 @@
+"""``slpi doctor --device``: what is there, what will bite, and the YAML to start with; nothing is written."""
+
+import json
+
+import pytest
+import yaml
+from drivers.kinds import KINDS
+from forked import completed
+
+from slpi_ros.simulation.devices.gcs import GcsSimulator
+from slpi_ros.simulation.devices.labjack import LabjackSimulator
+
+
+def doctor(*arguments):
+    return completed("slpi_ros.cli:main", ["doctor", *map(str, arguments)])
+
+
+@pytest.mark.parametrize("name", ["gcs", "labjack", "nv200", "mdt"])
+def test_a_device_is_read_and_a_yaml_is_printed(name):
+    kind = KINDS[name]
+    with kind.simulate(voltages=[20.0]) as simulator:
+        done = doctor("--device", f"{kind.device}:{kind.address.format(simulator.address)}")
+        assert simulator.log == []
+        assert not [line for line in simulator.received if line.startswith(("write", "SVA ", "set,", "SVO "))]
+    assert done.returncode == 0, done.stdout + done.stderr
+    text = done.stdout[done.stdout.index("driver:\n") :]
+    values = yaml.safe_load(text[: text.index("\n\n")])["driver"]["ros__parameters"]
+    assert values["device"] == kind.device and values["channels"] == [kind.axes[0]]
+    (low,), (high,) = values["voltage_min"], values["voltage_max"]
+    at = 20.0 / kind.gain
+    assert low <= at <= high and high - low <= 10.0
+    assert f"{at:.4f} V" in done.stdout
+
+
+def test_what_is_dangerous_fails():
+    with GcsSimulator(["1", "2"], servo=True) as simulator:
+        done = doctor("--device", f"gcs:{simulator.address}", "--channels", "1", "2")
+    assert done.returncode == 1 and "servo" in done.stdout and "FAILED: 2" in done.stdout
+    with LabjackSimulator(watchdog={61_600: 1, 61_620: 1}) as simulator:
+        done = doctor("--device", f"labjack:{simulator.address}", "--json")
+        assert simulator.log == []
+    assert done.returncode == 1 and "WATCHDOG_RESET_ENABLE" in json.loads(done.stdout)["checks"][0]["text"]
+
+
+@pytest.mark.parametrize("device", ["abacus:1", "gcs:host:port", "serial:/dev/x", "gcs"])
+def test_what_is_no_device(device):
+    done = doctor("--device", device)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+
+
+def test_nobody_answers():
+    done = doctor("--device", "gcs:127.0.0.1:1")
+    assert done.returncode == 1 and "no connection" in done.stdout

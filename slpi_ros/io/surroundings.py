@@ -1,0 +1,120 @@
+"""Scalar quantities that a bag holds beside the stage: temperature, humidity, pressure, force, other stages."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray, IntArray
+from slpi_ros.errors import RecordError
+from slpi_ros.io.alignment import Signals
+from slpi_ros.io.messages import JOINT_STATE, QUANTITY_TYPES, SECOND_NS
+from slpi_ros.io.record import Course
+
+# Topics of one stage itself: what goes with its displacement, or with the error of a model, is no cause of it.
+OWN = (
+    "desired_displacement",
+    "measured_displacement",
+    "tracking_error",
+    "displacement_uncertainty",
+    "recorded_trajectory",
+    "voltage_command",
+)
+# Largest number of quantities that are read without being named.
+MOST = 64
+
+
+class Chosen(NamedTuple):
+    """A topic, and the field of its messages; "" for all fields."""
+
+    topic: str
+    field: str
+
+    @classmethod
+    def of(cls, text: str) -> "Chosen":
+        """Return the choice that ``TOPIC[:FIELD]`` names."""
+        topic, _, field = text.partition(":")
+        return cls(topic, field)
+
+
+def key_of(topic: str, field: str, msgtype: str) -> str:
+    """Return the name of a quantity: its topic, and the field where the messages have several."""
+    return f"{topic}:{field}" if QUANTITY_TYPES[msgtype].several else topic
+
+
+def topics_beside(types: Mapping[str, str], stage: str) -> list[str]:
+    """Return the topics with quantities, by their types, beside the topic `stage` of the stage itself.
+
+    Of joint states only those of other stages: topics of the same last name.
+    """
+    last = stage.rsplit("/", 1)[-1]
+    found = []
+    for topic, msgtype in types.items():
+        name = topic.rsplit("/", 1)[-1]
+        if topic == stage or msgtype not in QUANTITY_TYPES or name in OWN:
+            continue
+        if msgtype != JOINT_STATE or name == last:
+            found.append(topic)
+    return sorted(found)
+
+
+def courses(signals: Signals, chosen: Chosen, msgtype: str, since_start: FloatArray) -> Iterator[tuple[str, Course]]:
+    """Yield name and course of each quantity of a topic with a value; RecordError if it lacks the chosen field.
+
+    `chosen` holds the full name of the topic, and `since_start` are the times of `since_start_of`.
+    """
+    kind, order = QUANTITY_TYPES[msgtype], np.argsort(since_start, kind="stable")
+    fields = {
+        f"{field}.{name}" if kind.several else field: column
+        for field, columns in signals.fields.items()
+        for name, column in columns.items()
+    }
+    if chosen.field and chosen.field not in fields:
+        raise RecordError(
+            f"topic '{chosen.topic}' has no field '{chosen.field}'; its messages, {msgtype}, have {', '.join(fields)}"
+        )
+    for field, column in fields.items():
+        if (not chosen.field or field == chosen.field) and np.isfinite(column).any():
+            yield key_of(chosen.topic, field, msgtype), (since_start[order], np.array(column)[order])
+
+
+def since_start_of(signals: Signals, first_ns: int, state: Signals) -> FloatArray:
+    """Return the times (s), shape (n,), of messages from the first stamp (ns) of a record of the messages `state`.
+
+    They are the header stamps if both have them, on one clock. Else they are the times of recording, less the usual
+    delay between stamp and recording of `state`.
+    """
+    stamp, of_state = signals.stamp, state.stamp
+    if stamp is not None and of_state is not None and _overlap(stamp, of_state):
+        times: IntArray = stamp
+    elif of_state is not None and of_state.min() <= first_ns <= of_state.max():
+        times = signals.logged - round(float(np.median(state.logged - of_state)))
+    else:
+        times = signals.logged
+    return (times - first_ns) / SECOND_NS
+
+
+def _overlap(one: IntArray, other: IntArray) -> bool:
+    return bool(max(one.min(), other.min()) <= min(one.max(), other.max()))
+
+
+def clean(course: Course) -> Course:
+    """Return a course without missing readings, at increasing times."""
+    t, value = course
+    known = np.isfinite(t) & np.isfinite(value)
+    t, value = t[known], value[known]
+    later = np.diff(t, prepend=-np.inf) > 0.0
+    return t[later], value[later]
+
+
+def named_in(surroundings: Mapping[str, Course], wanted: Sequence[str]) -> dict[str, Course]:
+    """Return the quantities that ``TOPIC[:FIELD]`` name, with or without leading slash and namespace."""
+    found = {}
+    for text in wanted:
+        topic, field = Chosen.of(text)
+        for key, course in surroundings.items():
+            own, _, own_field = key.partition(":")
+            same = own == topic or own.endswith("/" + topic.strip("/"))
+            if same and (not field or not own_field or field == own_field):
+                found[key] = course
+    return found

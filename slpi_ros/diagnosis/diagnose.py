@@ -15,7 +15,7 @@ from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
 from slpi_ros.diagnosis.selection import BIAS, Selection, is_own, seen, select
 from slpi_ros.diagnosis.significance import NO_WORSE, counts
-from slpi_ros.effects.registry import EFFECTS, in_order
+from slpi_ros.effects.registry import EFFECTS, base_name, in_order
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.free_run import FreeRun, free_run, likely_starts, rms_of
@@ -248,7 +248,7 @@ def _ambiguous(selection: Selection) -> list[str]:
         or (
             named.alternatives
             and not named.confirmed
-            and not all(EFFECTS[name].time_shift == "only" for name in (named.name, *named.alternatives))
+            and not all(EFFECTS[base_name(one)].time_shift == "only" for one in (named.name, *named.alternatives))
         )
     ]
 
@@ -286,6 +286,7 @@ def _repeatability(now: Explanation) -> Repeatability:
 
 
 def _run(model: AxisModel, part: Part, *, of_record: bool) -> FreeRun:
+    model = model.surrounded({key: (part.t, value) for key, value in part.surroundings.items()})
     known, starts = _known(part), _starts(model, part)
     return free_run(model, part.t, part.v, part.y, part.used, known, starts, others=part.others, of_record=of_record)
 

@@ -292,7 +292,7 @@ def verify(
     found: dict[str, list[RecordVerification]] = {name: [] for name in names}
     for record, path in zip(records, paths, strict=True):
         # Errors are those of the stage, not those of its sensor.
-        runs = _free_run(model.correct(record), model.stage_only, names, (start, stop), start_memory)
+        runs = _free_run(model.correct(record), model.stage_only.surrounded(record), names, (start, stop), start_memory)
         for name in names:
             axis, run = model.axis(name), runs[name]
             one = _judge(run, axis, record.source, tolerance, without_offset=without_offset)

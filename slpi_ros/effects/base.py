@@ -50,6 +50,8 @@ class EffectContext:
     start: float | None = None
     # Voltage (V) at the piezo, shape (N,), for effects on the displacement; None: it rests.
     voltage: FloatArray | None = None
+    # Recorded quantities by name, shape (N,), in their units.
+    surroundings: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def since_start(
@@ -134,6 +136,9 @@ class StreamingEffect(Streaming, Protocol):
     def reach(self, voltage: float) -> None:
         """Note the voltage (V) at the piezo for the next `forward`; called if the effect `needs_voltage`."""
 
+    def surround(self, key: str, value: float) -> None:
+        """Note the value of a recorded quantity for the next sample; called if the effect has `keys`."""
+
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the input, or a stable approximation, for the output `wanted` after `dt` (s); keep the state."""
 
@@ -170,6 +175,9 @@ class StreamingBase:
     def reach(self, voltage: float) -> None:
         """Do nothing."""
 
+    def surround(self, key: str, value: float) -> None:
+        """Do nothing."""
+
     def snapshot(self) -> Any:
         """Return nothing."""
         return ()
@@ -201,6 +209,9 @@ class EffectBase(Protocol):
     dynamic: ClassVar[bool] = False
     # Whether a change of the sensitivity between records may be its doing.
     changes_gain: ClassVar[bool] = False
+    # Effects that follow time alone: it counts only beside its `confounders`, which they contain, and then they are no
+    # alternatives.
+    proved_beside: ClassVar[tuple[str, ...]] = ()
     # Effect that it resembles if it continues from long before a record.
     resembles_when_old: ClassVar[str] = ""
 
@@ -226,6 +237,10 @@ class EffectBase(Protocol):
     def in_phase(self, context: "FitContext") -> bool:
         """Return whether one set of parameters can hold for all records of a fit, and for others."""
         return True
+
+    def confounders(self, context: "ResidualContext") -> FloatArray:
+        """Return signals (m, (N, k)) that others may add, beside which it has to prove itself; of most effects none."""
+        return np.empty((context.t.size, 0))
 
     @property
     def at_bound(self) -> bool:
@@ -327,6 +342,15 @@ class EffectBase(Protocol):
     def settling_time(self) -> float:
         """Time (s) after which the piezo has the voltage of the command."""
         return abs(self.shift)
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Names of the recorded quantities that it follows; of most effects none."""
+        return ()
+
+    def only(self, keys: Sequence[str]) -> "Effect | None":
+        """Return the effect with some of the quantities that it follows; None without any."""
+        return None
 
     @property
     def coupling(self) -> Mapping[str, float]:

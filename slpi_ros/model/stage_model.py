@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.effects.surroundings import smoothed
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel, StartMemory
@@ -136,6 +137,16 @@ class StageModel:
         See `AxisModel.correct`; axes that are not in the model, or not in the record, are unchanged.
         """
         return corrected(record, {name: axis.correct for name, axis in self.axes.items() if axis.corrects})
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Names of the quantities that an axis follows."""
+        return tuple(dict.fromkeys(key for axis in self.axes.values() for key in axis.quantities))
+
+    def surrounded(self, record: Record) -> "StageModel":
+        """Return the model in the surroundings of a record, on its clock; reference values where it has none."""
+        courses = {key: smoothed(record.surroundings[key]) for key in self.quantities if key in record.surroundings}
+        return replace(self, axes={name: axis.surrounded(courses) for name, axis in self.axes.items()})
 
     def shifted(self, offsets: Mapping[str, float]) -> "StageModel":
         """Return the model with zeros that have moved by `offsets` (m, by axis)."""

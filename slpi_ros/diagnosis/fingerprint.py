@@ -24,6 +24,8 @@ from slpi_ros.model.coverage import slopes
 BLOCKS, FOLDS = 40, 5
 # Number of knots of the function of a variable; for time one for each two blocks, so that it spans a held-out block.
 KNOTS, KNOTS_OF_TIME = 12, 20
+# The same for a recorded quantity: few, as it may drift, and with many any function of time would be one of it.
+KNOTS_OF_QUANTITY = 4
 # Weight of the roughness of a function, relative to the largest eigenvalue of its equations.
 ROUGHNESS = 1e-5
 # Smallest share of the mean square that is told.
@@ -50,13 +52,22 @@ HINTS: Mapping[str, str] = {
 }
 
 
+def hint(variable: str) -> str:
+    """Return what a variable suggests to look at; one that is not in `HINTS` is a recorded quantity."""
+    return HINTS.get(variable, "change that alone, on purpose, up and down, and record it")
+
+
 class Signals(NamedTuple):
-    """Used samples of one record, shape (N,) each: time (s), voltage (V), displacement and residual of a model (m)."""
+    """Used samples of one record, shape (N,) each: time (s), voltage (V), displacement and residual of a model (m).
+
+    `surroundings` are recorded quantities by name, in their units.
+    """
 
     t: FloatArray
     v: FloatArray
     y: FloatArray
     residual: FloatArray
+    surroundings: Mapping[str, FloatArray] = {}
 
 
 @dataclass(frozen=True)
@@ -80,7 +91,7 @@ class Left:
 def fingerprint(records: Sequence[Signals]) -> tuple[Left, ...]:
     """Return the measured variables that predict the residuals of records of one axis, the largest share first."""
     centred, thin = [_centred(record) for record in records], [_centred(_thinned(record)) for record in records]
-    found = [*_of_variables(thin), *_of_lines(centred), *_of_jumps(centred)]
+    found = [*_of_variables(thin), *_of_surroundings(thin), *_of_lines(centred), *_of_jumps(centred)]
     return tuple(sorted((one for one in found if one.share >= LEAST_SHARE), key=lambda one: -one.share))
 
 
@@ -108,7 +119,9 @@ def half_power(records: Sequence[Signals]) -> float:
 
 def _thinned(record: Signals) -> Signals:
     every = -(-record.t.size // ENOUGH)
-    return Signals(*(x[::every] for x in record))
+    beside = {key: value[::every] for key, value in record.surroundings.items()}
+    t, v, y, residual, _ = record
+    return Signals(t[::every], v[::every], y[::every], residual[::every], beside)
 
 
 def _centred(record: Signals) -> Signals:
@@ -138,6 +151,16 @@ def _of_variables(records: Sequence[Signals]) -> Iterator[Left]:
         share, fitted = _share(columns, records)
         if share >= LEAST_SHARE:
             yield Left(name, share, _evidence(name, unit, share, x, fitted), _curve(x, fitted), unit)
+
+
+def _of_surroundings(records: Sequence[Signals]) -> Iterator[Left]:
+    for key in records[0].surroundings if records else ():
+        if all(key in record.surroundings for record in records):
+            x = np.concatenate([record.surroundings[key] for record in records])
+            if np.ptp(x) > 0.0:
+                share, fitted = _share(_hats(x, KNOTS_OF_QUANTITY, even=False), records)
+                if share >= LEAST_SHARE:
+                    yield Left(key, share, _evidence(key, "", share, x, fitted), _curve(x, fitted))
 
 
 def _variables(record: Signals) -> dict[str, FloatArray]:
@@ -193,7 +216,7 @@ def _evidence(name: str, unit: str, share: float, x: FloatArray, fitted: FloatAr
     low, high = int(np.argmin(fitted)), int(np.argmax(fitted))
     return (
         f"{share:.0%} of the mean square goes with the {name}: from {length(fitted[low])} at "
-        f"{_quantity(x[low], unit)} to {length(fitted[high])} at {_quantity(x[high], unit)}; {HINTS[name]}"
+        f"{_quantity(x[low], unit)} to {length(fitted[high])} at {_quantity(x[high], unit)}; {hint(name)}"
     )
 
 

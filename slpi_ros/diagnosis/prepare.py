@@ -9,7 +9,6 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.effects.base import EffectContext, usual_step
 from slpi_ros.effects.filters import Uniform
-from slpi_ros.effects.surroundings import smoothed
 from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
@@ -24,7 +23,7 @@ from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.identification.signal_statistics import digit
 from slpi_ros.io.record import Record
-from slpi_ros.io.surroundings import clean
+from slpi_ros.io.surroundings import clean, smoothed
 from slpi_ros.model.axis_model import AxisModel
 
 # Smallest numbers of samples and of reversals that allow a cross-validation.

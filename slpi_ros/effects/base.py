@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from math import inf
-from typing import Any, ClassVar, Literal, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +84,15 @@ class EffectContext:
         return (
             np.split(signal, np.cumsum([record.t.size for record in self.records[:-1]])) if self.records else [signal]
         )
+
+
+class Followed(NamedTuple):
+    """A recorded quantity that an effect follows: name, reference value, and recorded range, in its unit."""
+
+    key: str
+    reference: float
+    lowest: float
+    highest: float
 
 
 Effected = TypeVar("Effected")
@@ -209,6 +218,8 @@ class EffectBase(Protocol):
     dynamic: ClassVar[bool] = False
     # Whether a change of the sensitivity between records may be its doing.
     changes_gain: ClassVar[bool] = False
+    # Whether it follows recorded quantities.
+    follows_quantities: ClassVar[bool] = False
     # Effects that follow time alone: it counts only beside its `confounders`, which they contain, and then they are no
     # alternatives.
     proved_beside: ClassVar[tuple[str, ...]] = ()
@@ -319,6 +330,11 @@ class EffectBase(Protocol):
         """The effect as it is after its record; None if it ends with it."""
         return None if self.side == "record" else self  # type: ignore[return-value]
 
+    @property
+    def anew(self) -> Self:
+        """The effect for another fit, without what it knows of the records of this one."""
+        return self
+
     def of_record(self, k: int) -> "Effect":
         """Return the effect as it is on the record of number `k` of those that it was fitted to."""
         return self  # type: ignore[return-value]
@@ -344,9 +360,14 @@ class EffectBase(Protocol):
         return abs(self.shift)
 
     @property
-    def keys(self) -> tuple[str, ...]:
-        """Names of the recorded quantities that it follows; of most effects none."""
+    def followed(self) -> "tuple[Followed, ...]":
+        """Recorded quantities that it follows; of most effects none."""
         return ()
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Names of the recorded quantities that it follows."""
+        return tuple(one.key for one in self.followed)
 
     def only(self, keys: Sequence[str]) -> "Effect | None":
         """Return the effect with some of the quantities that it follows; None without any."""

@@ -14,6 +14,7 @@ from slpi_ros.effects.base import (
     EffectBase,
     EffectContext,
     FitContext,
+    Followed,
     ResidualContext,
     Side,
     Signal,
@@ -24,8 +25,6 @@ from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loop
 from slpi_ros.effects.filters import filtered, hold
 from slpi_ros.effects.parameters import Fit, Leaf, parameter, require, text
 from slpi_ros.errors import length
-from slpi_ros.io.record import Course
-from slpi_ros.io.surroundings import clean
 
 # Largest number of quantities.
 MOST = 4
@@ -35,11 +34,6 @@ TIME_CONSTANTS, SHORTEST, LONGEST = 6, 1.0, 0.5
 LARGEST = 0.3
 # Time constants, as shares of a record, of the drifts beside which a quantity has to prove itself.
 SETTLES_WITHIN = (0.03, 0.1, 0.3)
-# Readings are smoothed from this number on, and as far as their white noise exceeds this share of their range; of more
-# than `MOST_READINGS` the means of equal numbers are taken.
-FEWEST_READINGS, NOISY, MOST_READINGS = 12, 2e-3, 1500
-# Ratio of the median magnitude of second differences of white noise to its standard deviation.
-SECOND_DIFFERENCES = 0.6745 * 6.0**0.5
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
@@ -96,6 +90,7 @@ class Surroundings(EffectBase):
     what: ClassVar[str] = "zero or sensitivity follow a recorded quantity (temperature, load, humidity, pressure)"
     compensated: ClassVar[str] = "yes, if the quantity is measured in use"
     changes_gain: ClassVar[bool] = True
+    follows_quantities: ClassVar[bool] = True
     proved_beside: ClassVar[tuple[str, ...]] = ("thermal_drift", "gain_drift")
     excitation: ClassVar[Excitation] = Excitation(
         "Full loops one after the other while one quantity alone is changed on purpose, up and down several times and "
@@ -127,9 +122,9 @@ class Surroundings(EffectBase):
         )
 
     @property
-    def keys(self) -> tuple[str, ...]:
-        """Names of the quantities."""
-        return tuple(one.key for one in self.quantities)
+    def followed(self) -> tuple[Followed, ...]:
+        """The quantities with what is known of their range."""
+        return tuple(Followed(one.key, one.reference, one.lowest, one.highest) for one in self.quantities)
 
     def joined(self, other: "Surroundings") -> "Surroundings | None":
         """Return the quantities of both; of one that both have that of this effect."""
@@ -175,6 +170,11 @@ class Surroundings(EffectBase):
     def lasting(self) -> "Surroundings":
         """The effect without the starts of its records."""
         return replace(self, initial=())
+
+    @property
+    def anew(self) -> "Surroundings":
+        """The effect without the starts of its records."""
+        return self.lasting
 
     def of_record(self, k: int) -> "Surroundings":
         """Return the effect with the start of the record of number `k` of those that it was fitted to."""
@@ -339,35 +339,6 @@ class StreamingSurroundings(StreamingBase):
             factor += one.sensitivity_gain * follows
             offset += one.offset_gain * follows
         return factor, offset
-
-
-def smoothed(course: Course) -> Course:
-    """Return a recorded quantity, noisy and with missing readings (NaN), without these and without most of the noise.
-
-    Between its readings it is linear, and beyond them as it is there.
-    """
-    return _smoothed(*clean(course))
-
-
-def _smoothed(t: FloatArray, value: FloatArray) -> Course:
-    """Return the readings without most of their noise."""
-    # An error of the quantity itself makes its gain look smaller: by the share of the noise in its variance.
-    if t.size < FEWEST_READINGS:
-        return t, value
-    noise = float(np.median(np.abs(np.diff(value, 2)))) / SECOND_DIFFERENCES
-    if not noise > NOISY * float(np.ptp(value)):
-        return t, value
-    from scipy.interpolate import make_smoothing_spline
-
-    each = -(-t.size // MOST_READINGS)
-    if each > 1:
-        whole = t.size // each * each
-        t, value = (x[:whole].reshape(-1, each).mean(axis=1) for x in (t, value))
-    # The weight of the roughness is chosen by generalised cross-validation, in units of the readings' interval.
-    x = (t - t[0]) / float(np.median(np.diff(t)))
-    scale = float(np.std(value)) or 1.0
-    smooth = make_smoothing_spline(x, (value - value.mean()) / scale)(x)
-    return t, value.mean() + scale * np.asarray(smooth, dtype=np.float64)
 
 
 def _lagged(value: FloatArray, time_constant: float, around: EffectContext) -> FloatArray:

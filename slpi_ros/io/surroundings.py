@@ -22,6 +22,11 @@ OWN = (
 )
 # Largest number of quantities that are read without being named.
 MOST = 64
+# Readings are smoothed from this number on, and as far as their white noise exceeds this share of their range; of more
+# than `MOST_READINGS` the means of equal numbers are taken.
+FEWEST_READINGS, NOISY, MOST_READINGS = 12, 2e-3, 1500
+# Ratio of the median magnitude of second differences of white noise to its standard deviation.
+SECOND_DIFFERENCES = 0.6745 * 6.0**0.5
 
 
 class Chosen(NamedTuple):
@@ -105,6 +110,35 @@ def clean(course: Course) -> Course:
     t, value = t[known], value[known]
     later = np.diff(t, prepend=-np.inf) > 0.0
     return t[later], value[later]
+
+
+def smoothed(course: Course) -> Course:
+    """Return a recorded quantity, noisy and with missing readings (NaN), without these and without most of the noise.
+
+    Between its readings it is linear, and beyond them as it is there.
+    """
+    return _smoothed(*clean(course))
+
+
+def _smoothed(t: FloatArray, value: FloatArray) -> Course:
+    """Return the readings without most of their noise."""
+    # An error of the quantity itself makes its gain look smaller: by the share of the noise in its variance.
+    if t.size < FEWEST_READINGS:
+        return t, value
+    noise = float(np.median(np.abs(np.diff(value, 2)))) / SECOND_DIFFERENCES
+    if not noise > NOISY * float(np.ptp(value)):
+        return t, value
+    from scipy.interpolate import make_smoothing_spline
+
+    each = -(-t.size // MOST_READINGS)
+    if each > 1:
+        whole = t.size // each * each
+        t, value = (x[:whole].reshape(-1, each).mean(axis=1) for x in (t, value))
+    # The weight of the roughness is chosen by generalised cross-validation, in units of the readings' interval.
+    x = (t - t[0]) / float(np.median(np.diff(t)))
+    scale = float(np.std(value)) or 1.0
+    smooth = make_smoothing_spline(x, (value - value.mean()) / scale)(x)
+    return t, value.mean() + scale * np.asarray(smooth, dtype=np.float64)
 
 
 def named_in(surroundings: Mapping[str, Course], wanted: Sequence[str]) -> dict[str, Course]:

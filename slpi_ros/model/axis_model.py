@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
-from slpi_ros.effects.base import Effect, EffectContext
+from slpi_ros.effects.base import Effect, EffectContext, Followed
 from slpi_ros.effects.chain import Chain, backward, forward, lasting
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import UnreachableError, UsageError
@@ -230,9 +230,14 @@ class AxisModel:
         return replace(around, surroundings={key: np.interp(t, *course) for key, course in self.surroundings.items()})
 
     @property
+    def followed(self) -> tuple[Followed, ...]:
+        """Quantities that the stage follows."""
+        return tuple(one for effect in self.effects for one in effect.followed)
+
+    @property
     def quantities(self) -> tuple[str, ...]:
         """Names of the quantities that the stage follows."""
-        return tuple(key for effect in self.effects for key in effect.keys)
+        return tuple(one.key for one in self.followed)
 
     def surrounded(self, courses: Mapping[str, Course]) -> "AxisModel":
         """Return the model in surroundings; quantities that the stage does not follow are ignored."""
@@ -333,8 +338,20 @@ class AxisModel:
         allowed, around = self._allowed(limits), self._around(t)
         if not self.causal and max(allowed.slew, allowed.acceleration) == inf and not self.chain.around:
             return self._command_known_path(y - coupled, around, allowed, self.initial(start_memory))
+        timed = self._timed
+        if timed and self.surroundings:
+            # They depend on time alone, and what comes after them is constant: undone for the whole path at once.
+            y, coupled = backward(timed, y - coupled, around), 0.0
+            rest = tuple(effect for effect in self.effects if effect not in timed)
+            self = replace(self, effects=rest)
         v, held = self.stream(limits, start_memory).run(t, y, coupled)
         return backward([effect for effect in self.chain.before if effect.shift], v, around), held
+
+    @property
+    def _timed(self) -> tuple[Effect, ...]:
+        """Effects on the axis itself from that on which follows recorded quantities."""
+        own = self.chain.own
+        return next((own[place:] for place, effect in enumerate(own) if effect.keys), ())
 
     def _command_known_path(
         self, y: FloatArray, around: EffectContext, allowed: Limits, start: Start
